@@ -1,0 +1,119 @@
+"""The one seam between a robot and what it is made of: hardware or a twin, chosen by one word.
+
+A body has rows as everything has: a bridge that serves three Crazyflies on one radio is one body of three rows.
+The runtime finds bodies by the entry-point group `zenpark.bodies`: the word before `://` (or the whole word) names one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import msgspec
+
+from agents.kinds import Kind
+from agents.rows import Array, Index, Mask
+
+
+class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Wobble about the place that a flying robot holds: an Ornstein-Uhlenbeck process on each horizontal axis."""
+
+    sigma: float  # [m] standard deviation
+    correlation_s: float = 0.5  # [s] correlation time
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.sigma < 1.0 and 0.0 < self.correlation_s < 1e3):
+            raise ValueError("hover_jitter needs 0 <= sigma < 1 m and correlation_s > 0")
+
+
+class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What nature adds to a simulated body; a field left out means: nothing of it."""
+
+    hover_jitter: Jitter | None = None
+    position_sigma: float | None = None  # [m] white noise of the measured position, per axis (planar for ground robots)
+    yaw_sigma: float | None = None  # [rad] white noise of the measured yaw
+    latency_s: float | None = None  # [s] from command to effect
+    odometry_drift: float | None = None  # [m per square root of m] random walk of the measured position with the way
+
+
+@dataclass(frozen=True)
+class BodyRequest:
+    """What a body is opened with; every sequence has one entry per row."""
+
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+    addresses: tuple[str, ...]  # the `body` of the experiment file: "twin", "radio://0/80/2M/E7E7E7E701", ...
+    start: Array  # (n, 3) [m]
+    yaw: Array  # (n,) [rad]
+    rate_hz: float  # how often it will be read and commanded
+    seed: int
+    disturbance: tuple[Disturbance, ...]
+
+
+@dataclass
+class BodyState:
+    """What a body knows of its rows. Unknown numbers are NaN.
+
+    Attributes:
+        time: (n,) when the pose was measured, on the clock of `read` [s].
+        position: (n, 3) measured [m].
+        velocity: (n, 3) measured or estimated [m/s].
+        yaw: (n,) measured [rad].
+        true_position: (n, 3) the truth of a twin [m].
+        true_yaw: (n,) the truth of a twin [rad].
+        battery: (n,) charge, 0 to 1.
+        flying: (n,) motors on, off the ground or about to be.
+    """
+
+    time: Array
+    position: Array
+    velocity: Array
+    yaw: Array
+    true_position: Array
+    true_yaw: Array
+    battery: Array
+    flying: Mask
+
+
+class Body(Protocol):
+    """What the runtime drives. `takes` of each row's kind says how a row of `command` is read."""
+
+    def open(self) -> None:
+        """Connects; returns when poses arrive.
+
+        Raises:
+            BodyError: If it cannot, saying what to plug in or to change.
+        """
+        ...
+
+    def read(self, t: float) -> BodyState:
+        """The newest state at time `t` [s] of the process's clock. Never blocks; a twin advances itself to `t`."""
+        ...
+
+    def command(self, setpoint: Array) -> None:
+        """One setpoint (n, 4) per row: x y z yaw, v_x v_y v_z yaw-rate, or v ω 0 0; rows of NaN are left alone."""
+        ...
+
+    def takeoff(self, rows: Index, height: Array) -> None:
+        """Flying rows climb to `height` (len(rows),) [m] by themselves."""
+        ...
+
+    def land(self, rows: Index) -> None:
+        """Flying rows descend and switch their motors off, ground robots halt, by themselves."""
+        ...
+
+    def stop(self, rows: Index) -> None:
+        """Motors off, at once, wherever the rows are: the emergency stop."""
+        ...
+
+    def close(self) -> None:
+        """Lets go of the device. Rows still in the air must have been landed before."""
+        ...
+
+
+class BodyError(RuntimeError):
+    """A body that cannot be opened or driven, with the remedy."""
+
+
+BodyFactory = Callable[[BodyRequest], Body]

@@ -1,0 +1,192 @@
+"""Who listens to whom, as arrays, and what the theory of graphs and of rigid frameworks says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from agents.rows import Array, Index, Mask
+
+
+@dataclass(frozen=True)
+class Links:
+    """Directed links sorted by listener: `listener`, `speaker` (E,) rows, target `distance` [m] and `gain` (E,).
+
+    In a robot's own process the listeners are its rows, renumbered from 0; the speakers keep the numbers that they
+    have in the experiment.
+    """
+
+    listener: Index
+    speaker: Index
+    distance: Array
+    gain: Array
+
+    def __len__(self) -> int:
+        return len(self.listener)
+
+    @cached_property
+    def _starts(self) -> Index:
+        """Where each listener that has links begins; the links are sorted by listener."""
+        return np.flatnonzero(np.diff(self.listener, prepend=-1))
+
+    @cached_property
+    def _heads(self) -> Index:
+        return self.listener[self._starts]
+
+    def onto_listeners(self, per_link: Array, rows: int) -> Array:
+        """Sum of a quantity (E, ...) over each listener's links -> (rows, ...)."""
+        total = np.zeros((rows, *per_link.shape[1:]))
+        if len(self):
+            total[self._heads] = np.add.reduceat(per_link, self._starts, axis=0)
+        return total
+
+    def of(self, rows: Index) -> Links:
+        """The links on which these rows listen; listeners renumbered 0..len(rows)-1, speakers keep their numbers."""
+        mine = np.isin(self.listener, rows)
+        order = np.argsort(rows)
+        listener = order[np.searchsorted(rows, self.listener[mine], sorter=order)]
+        by_listener = np.argsort(listener, kind="stable")
+        speaker, distance, gain = self.speaker[mine], self.distance[mine], self.gain[mine]
+        return Links(listener[by_listener], speaker[by_listener], distance[by_listener], gain[by_listener])
+
+    def repeated(self, times: int, rows: int) -> Links:
+        """The same links in `times` copies of an experiment of `rows` robots, one copy behind the other."""
+        shift = np.repeat(np.arange(times) * rows, len(self))
+        return Links(
+            np.tile(self.listener, times) + shift,
+            np.tile(self.speaker, times) + shift,
+            np.tile(self.distance, times),
+            np.tile(self.gain, times),
+        )
+
+
+def links(pairs: Sequence[tuple[int, int]], distance: Sequence[float], gain: Sequence[float]) -> Links:
+    """Links from (listener, speaker) pairs in any order."""
+    both = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+    order = np.lexsort((both[:, 1], both[:, 0]))
+    return Links(
+        both[order, 0], both[order, 1], np.array(distance, dtype=float)[order], np.array(gain, dtype=float)[order]
+    )
+
+
+def adjacency(net: Links, rows: int) -> Array:
+    """A (N, N): a_ij = 1 if i listens to j (paper, eq. (11))."""
+    matrix = np.zeros((rows, rows))
+    matrix[net.listener, net.speaker] = 1.0
+    return matrix
+
+
+def degree(net: Links, rows: int) -> Array:
+    """D (N, N): how many neighbours each robot listens to, on the diagonal."""
+    return np.diag(adjacency(net, rows).sum(axis=1))
+
+
+def laplacian(net: Links, rows: int) -> Array:
+    """L = D − A (N, N) (paper, eq. (5))."""
+    return degree(net, rows) - adjacency(net, rows)
+
+
+def edges(net: Links) -> Index:
+    """The undirected edges (M, 2), smaller row first, each once."""
+    pairs = np.sort(np.stack([net.listener, net.speaker], axis=1), axis=1)
+    return np.unique(pairs, axis=0).astype(np.intp).reshape(-1, 2)
+
+
+def reached(net: Links, rows: int, sources: Index) -> Mask:
+    """Which rows (N,) hear of the sources, directly or through others."""
+    hears = adjacency(net, rows) > 0
+    known = np.zeros(rows, dtype=bool)
+    known[sources] = True
+    for _ in range(rows):
+        wider = known | (hears @ known)
+        if (wider == known).all():
+            break
+        known = wider
+    return known
+
+
+def components(net: Links, rows: int) -> int:
+    """How many parts the network has when directions are ignored."""
+    label = np.arange(rows)
+    for i, j in edges(net):
+        label[label == label[j]] = label[i]
+    return len(np.unique(label))
+
+
+def rigidity_matrix(position: Array, pairs: Index, moves: Mask | None = None) -> Array:
+    """R (M, 3N): row of edge (i, j) holds (p_i − p_j)ᵀ at i and its negative at j.
+
+    Args:
+        position: (N, 3) [m].
+        pairs: (M, 2) undirected edges.
+        moves: (N, 3) which coordinates are free to move; columns of held ones (a hover height, the floor) are left
+            out, which gives the rigidity in the motions that the robots really have.
+    """
+    rows = len(position)
+    i, j = pairs[:, 0], pairs[:, 1]
+    edge = np.arange(len(pairs))
+    offset = position[i] - position[j]
+    matrix = np.zeros((len(pairs), rows, 3))
+    matrix[edge, i] = offset
+    matrix[edge, j] = -offset
+    matrix = matrix.reshape(len(pairs), rows * 3)
+    return matrix if moves is None else matrix[:, moves.ravel()]
+
+
+@dataclass(frozen=True)
+class Rigidity:
+    """Rank of the rigidity matrix, the rank that infinitesimal rigidity needs, and the smallest singular value of it."""
+
+    rank: int
+    needed: int
+    smallest: float
+
+    @property
+    def rigid(self) -> bool:
+        return self.rank >= self.needed
+
+
+def rigidity(position: Array, pairs: Index, moves: Mask | None = None) -> Rigidity:
+    """Infinitesimal rigidity of the framework in the motions that the robots have.
+
+    The rank needed is the number of free coordinates less the rigid motions that those coordinates allow: with all
+    heights held these are 3 (two translations and the yaw), in full space 6. They are counted, not assumed: the rank
+    of the rigid motions that leave every held coordinate alone.
+    """
+    free = np.ones_like(position, dtype=bool) if moves is None else moves
+    singular = np.linalg.svd(rigidity_matrix(position, pairs, free), compute_uv=False)
+    tolerance = 1e-9 * max(1.0, float(singular[0]) if len(singular) else 1.0)
+    rank = int((singular > tolerance).sum())
+    needed = int(free.sum()) - _rigid_motions(position, free)
+    smallest = float(singular[needed - 1]) if 0 < needed <= len(singular) else 0.0
+    return Rigidity(rank, needed, smallest)
+
+
+def _rigid_motions(position: Array, free: Mask) -> int:
+    """Dimension of the rigid motions (N, 3 velocities) that are zero in every held coordinate."""
+    x, y, z = (position - position.mean(axis=0)).T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    motions = np.array(
+        [
+            [one, zero, zero],
+            [zero, one, zero],
+            [zero, zero, one],
+            [zero, -z, y],
+            [z, zero, -x],
+            [-y, x, zero],
+        ]
+    ).transpose(0, 2, 1)  # (6, N, 3)
+    held = motions[:, ~free]
+    kept = _null_space(held.T) if held.size else np.eye(6)
+    moving = np.tensordot(kept.T, motions, axes=1).reshape(kept.shape[1], -1)
+    return int(np.linalg.matrix_rank(moving, tol=1e-9)) if moving.size else 0
+
+
+def _null_space(matrix: Array) -> Array:
+    """Basis (k, m) of the vectors that `matrix` (n, k) maps to zero."""
+    _, singular, right = np.linalg.svd(matrix)
+    rank = int((singular > 1e-9 * max(1.0, float(singular[0]))).sum())
+    return np.asarray(right[rank:].T)

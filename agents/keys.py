@@ -1,0 +1,64 @@
+"""Every Zenoh key expression of the project; nobody else spells a key."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Key expressions below one realm, so that several experiments can share a network."""
+
+    realm: str = "park"
+
+    def pose(self, robot: str) -> str:
+        """Pose for the neighbours, sent when the trigger says so."""
+        return f"{self.realm}/{robot}/pose"
+
+    def state(self, robot: str) -> str:
+        """Telemetry for recorder and viewers."""
+        return f"{self.realm}/{robot}/state"
+
+    def status(self, robot: str) -> str:
+        """Lifecycle and counters, at 1 Hz and on every change."""
+        return f"{self.realm}/{robot}/status"
+
+    def order(self, robot: str) -> str:
+        """Queryable that takes orders and always replies."""
+        return f"{self.realm}/{robot}/order"
+
+    def alive(self, robot: str) -> str:
+        """Liveliness token."""
+        return f"{self.realm}/{robot}/alive"
+
+    @property
+    def estop(self) -> str:
+        """Emergency stop for everyone."""
+        return f"{self.realm}/estop"
+
+    @property
+    def event(self) -> str:
+        """What the conductor says of the run: phases, losses, orders."""
+        return f"{self.realm}/run/event"
+
+    @property
+    def experiment(self) -> str:
+        """The experiment as it runs, late joiners included."""
+        return f"{self.realm}/run/experiment"
+
+    @property
+    def everything(self) -> str:
+        """All keys of the realm (not its verbatim `@` chunks)."""
+        return f"{self.realm}/**"
+
+    def robot(self, key: str) -> str:
+        """The robot that a key of this realm belongs to.
+
+        Raises:
+            ValueError: If the key is not `<realm>/<robot>/<what>`.
+        """
+        realm, _, rest = key.partition("/")
+        robot, _, what = rest.partition("/")
+        if realm != self.realm or not robot or not what:
+            raise ValueError(f"'{key}' is not a key of a robot in '{self.realm}'")
+        return robot

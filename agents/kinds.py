@@ -1,0 +1,84 @@
+"""The kinds of robots: size, limits, and which setpoint they take (figures: reference sheets of the makers)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+Takes = Literal["position", "velocity", "twist"]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of robot.
+
+    Attributes:
+        name: As in the experiment file.
+        takes: The setpoint that its body takes.
+        flies: Takes off and lands.
+        radius: Horizontal half-size [m].
+        height: Vertical size [m].
+        speed: Largest speed [m/s]; per axis for flying robots.
+        turn_rate: Largest yaw rate [rad/s].
+        response: Rate at which its position controller closes a position error [1/s].
+        turn_response: Rate at which it closes a yaw error [1/s].
+    """
+
+    name: str
+    takes: Takes
+    flies: bool
+    radius: float
+    height: float
+    speed: float
+    turn_rate: float
+    response: float
+    turn_response: float
+
+
+CRAZYFLIE: Final = Kind(
+    "crazyflie",
+    "position",
+    flies=True,
+    radius=0.065,
+    height=0.029,
+    speed=1.0,
+    turn_rate=math.radians(200.0),
+    response=2.0,  # position P of the firmware
+    turn_response=3.0,
+)
+TELLO: Final = Kind(
+    "tello",
+    "velocity",
+    flies=True,
+    radius=0.10,
+    height=0.041,
+    speed=1.0,  # rc 100
+    turn_rate=math.radians(100.0),
+    response=1.0,
+    turn_response=1.0,
+)
+KHEPERA4: Final = Kind(
+    "khepera4",
+    "twist",
+    flies=False,
+    radius=0.070,
+    height=0.058,
+    speed=0.2712,  # 400 units of 0.6781 mm/s, the cap of the paper's authors; the wheels could do three times that
+    turn_rate=2.0 * 0.2712 / 0.1054,
+    response=1.0,
+    turn_response=1.5,
+)
+TURTLEBOT3: Final = Kind(
+    "turtlebot3",
+    "twist",
+    flies=False,
+    radius=0.105,
+    height=0.192,
+    speed=0.22,
+    turn_rate=2.84,
+    response=1.0,
+    turn_response=1.5,
+)
+
+KINDS: Final[dict[str, Kind]] = {kind.name: kind for kind in (CRAZYFLIE, TELLO, KHEPERA4, TURTLEBOT3)}

@@ -1,0 +1,199 @@
+"""What goes over the network: the structs, their two encodings, and the check of what arrives.
+
+JSON is the default (every Zenoh tool prints it), MessagePack a setting for thin links; a reader tells them apart by
+the sample's encoding. What arrives is checked before it is believed: `decode` raises `Malformed` for anything that is
+not the struct, `check_pose` for a pose that no robot can have.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, Literal, TypeVar
+
+import msgspec
+
+Vector = tuple[float, float, float]
+Setpoint = tuple[float, float, float, float]
+Encoding = Literal["json", "msgpack"]
+OrderKind = Literal["takeoff", "start", "hold", "land", "stop", "get", "set"]
+
+JSON: Final = "application/json"  # plain, without a schema suffix: REST and command-line tools then print it
+MSGPACK: Final = "application/msgpack"
+MIME: Final[dict[Encoding, str]] = {"json": JSON, "msgpack": MSGPACK}
+
+MAX_PAYLOAD: Final = 64 * 1024  # [bytes]; the largest honest message (a state of a robot with 100 neighbours) has 20 kB
+FUTURE_S: Final = 5.0  # a stamp further ahead than this is a broken clock or a forgery, and would silence honest samples
+MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
+
+
+class Malformed(ValueError):
+    """A payload that is not what its key promises."""
+
+
+class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where a robot says that it is: position [m], velocity [m/s], yaw [rad], UTC `stamp` [s], running `seq`."""
+
+    robot: str
+    seq: int
+    stamp: float
+    position: Vector
+    velocity: Vector
+    yaw: float
+
+
+class Heard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A pose that reached its listener: whose, which one, when it was taken and when it was heard (UTC [s])."""
+
+    speaker: str
+    seq: int
+    stamp: float
+    arrived: float
+    position: Vector
+
+
+class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Telemetry of a body and its decision, for recorder and viewers.
+
+    `setpoint` is x, y, z, yaw [m, rad] for a body that takes positions, v_x, v_y, v_z [m/s], yaw rate [rad/s] for
+    velocities, and v [m/s], ω [rad/s], 0, 0 for twists. `error` [m] is Σ|d − distance| over the robot's links as the
+    robot itself sees it. `true_position` and `true_yaw` are known of twins only.
+    """
+
+    robot: str
+    seq: int
+    stamp: float
+    phase: str
+    position: Vector
+    velocity: Vector
+    yaw: float
+    goal: Vector
+    setpoint: Setpoint
+    error: float
+    true_position: Vector | None = None
+    true_yaw: float | None = None
+    heard: list[Heard] = []
+
+
+class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a robot is: lifecycle phase, what holds it, and its counters since the process began.
+
+    `missing` names neighbours that were never heard or are gone; `lost` counts, per neighbour, samples that the
+    sequence numbers prove were sent and never heard. `late_s` is the largest lateness of a tick since the last status.
+    `drive_s` is the UTC time at which the robot began to run the experiment (0 before), `decisions` and `ticks` count
+    from there.
+    """
+
+    robot: str
+    stamp: float
+    phase: str
+    reason: str
+    battery: float | None
+    sent: int
+    heard: int
+    lost: dict[str, int]
+    malformed: int
+    refused: int
+    ticks: int
+    missed: int
+    decisions: int
+    interventions: int
+    late_s: float
+    started: float
+    missing: list[str]
+    pid: int
+    cpu_s: float
+    rss_mb: float
+
+
+class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What an operator asks of a robot: `at` is a UTC start time [s]; `name` and `value` belong to get and set."""
+
+    order: OrderKind
+    at: float | None = None
+    name: str | None = None
+    value: float | None = None
+
+
+class Reply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A robot's answer to an order."""
+
+    robot: str
+    ok: bool
+    phase: str
+    reason: str = ""
+    value: float | None = None
+
+
+class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Emergency stop for everyone, with who asks and why."""
+
+    who: str
+    reason: str
+
+
+class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Something that happened in a run: `kind` is a word (`phase`, `start`, `lost`, `order`, ...), `source` who or what."""
+
+    stamp: float
+    kind: str
+    source: str
+    text: str
+
+
+Message = Pose | State | Status | Order | Reply | Stop | Event
+M = TypeVar("M", Pose, State, Status, Order, Reply, Stop, Event)
+
+_json = msgspec.json.Encoder()
+_msgpack = msgspec.msgpack.Encoder()
+_decoders: dict[tuple[type, bool], msgspec.json.Decoder[object] | msgspec.msgpack.Decoder[object]] = {}
+
+
+def encode(message: Message, encoding: Encoding = "json") -> bytes:
+    """The payload of a message."""
+    return _json.encode(message) if encoding == "json" else _msgpack.encode(message)
+
+
+def decode(payload: bytes, mime: str, kind: type[M]) -> M:
+    """The message in a payload, by its MIME type.
+
+    Raises:
+        Malformed: If the payload is too large, of another encoding, or not a `kind`.
+    """
+    if len(payload) > MAX_PAYLOAD:
+        raise Malformed(f"{len(payload)} bytes are more than a {kind.__name__} can have")
+    packed = mime.startswith(MSGPACK)
+    if not packed and not mime.startswith(JSON):
+        raise Malformed(f"encoding '{mime}' is neither {JSON} nor {MSGPACK}")
+    decoder = _decoders.get((kind, packed))
+    if decoder is None:
+        decoder = msgspec.msgpack.Decoder(kind) if packed else msgspec.json.Decoder(kind)
+        _decoders[kind, packed] = decoder
+    try:
+        message = decoder.decode(payload)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise Malformed(f"not a {kind.__name__}: {error}") from None
+    assert isinstance(message, kind)
+    return message
+
+
+def check_pose(pose: Pose, *, robot: str, now: float, reach: Vector) -> None:
+    """Refuses a pose that cannot be true.
+
+    Args:
+        pose: What arrived.
+        robot: Whose key it arrived on.
+        now: UTC time of arrival [s].
+        reach: Largest |x|, |y|, |z| [m] that a robot of this experiment can have.
+
+    Raises:
+        Malformed: If the name is another's, a number is not finite, the stamp lies in the future, the position is out
+            of reach, or the velocity is no robot's.
+    """
+    if pose.robot != robot:
+        raise Malformed(f"pose of '{pose.robot}' on the key of '{robot}'")
+    if not (0 < pose.seq < 2**53 and math.isfinite(pose.stamp) and 0.0 < pose.stamp < now + FUTURE_S):
+        raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
+    if not all(abs(value) <= limit for value, limit in zip(pose.position, reach, strict=True)):  # NaN fails too
+        raise Malformed(f"position {pose.position} is outside the arena")
+    if not all(abs(value) <= MAX_SPEED for value in pose.velocity) or not abs(pose.yaw) <= 1e3:
+        raise Malformed(f"velocity {pose.velocity} or yaw {pose.yaw} is impossible")

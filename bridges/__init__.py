@@ -1,0 +1,1 @@
+"""Bodies that are hardware, positioning systems and other middleware. One file per device."""

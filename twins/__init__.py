@@ -1,0 +1,1 @@
+"""Bodies that are simulated: row-wise models of the robots and what nature adds to them."""
