@@ -47,8 +47,21 @@ class BodyRequest:
     start: Array  # (n, 3) [m]
     yaw: Array  # (n,) [rad]
     rate_hz: float  # how often it will be read and commanded
-    seed: int
+    seeds: tuple[int, ...]
     disturbance: tuple[Disturbance, ...]
+
+    def of(self, rows: Index) -> BodyRequest:
+        """The same for some of the rows."""
+        return BodyRequest(
+            tuple(self.names[row] for row in rows),
+            tuple(self.kinds[row] for row in rows),
+            tuple(self.addresses[row] for row in rows),
+            self.start[rows],
+            self.yaw[rows],
+            self.rate_hz,
+            tuple(self.seeds[row] for row in rows),
+            tuple(self.disturbance[row] for row in rows),
+        )
 
 
 @dataclass

@@ -47,6 +47,11 @@ class Keys:
         return f"{self.realm}/run/experiment"
 
     @property
+    def recorder(self) -> str:
+        """Liveliness token of the recorder."""
+        return f"{self.realm}/run/recorder"
+
+    @property
     def everything(self) -> str:
         """All keys of the realm (not its verbatim `@` chunks)."""
         return f"{self.realm}/**"

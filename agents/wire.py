@@ -55,7 +55,7 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Telemetry of a body and its decision, for recorder and viewers.
 
     `setpoint` is x, y, z, yaw [m, rad] for a body that takes positions, v_x, v_y, v_z [m/s], yaw rate [rad/s] for
-    velocities, and v [m/s], ω [rad/s], 0, 0 for twists. `error` [m] is Σ|d − distance| over the robot's links as the
+    velocities, and v [m/s], ω [rad/s], 0, 0 for twists; goal and setpoint are None while a robot has none. `error` [m] is Σ|d − distance| over the robot's links as the
     robot itself sees it. `true_position` and `true_yaw` are known of twins only.
     """
 
@@ -66,8 +66,8 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     position: Vector
     velocity: Vector
     yaw: float
-    goal: Vector
-    setpoint: Setpoint
+    goal: Vector | None
+    setpoint: Setpoint | None
     error: float
     true_position: Vector | None = None
     true_yaw: float | None = None
@@ -146,6 +146,20 @@ M = TypeVar("M", Pose, State, Status, Order, Reply, Stop, Event)
 _json = msgspec.json.Encoder()
 _msgpack = msgspec.msgpack.Encoder()
 _decoders: dict[tuple[type, bool], msgspec.json.Decoder[object] | msgspec.msgpack.Decoder[object]] = {}
+
+
+def pose(robot: str, seq: int, stamp: float, position: list[float], velocity: list[float], yaw: float) -> Pose:
+    """A pose to send, rounded to micrometres and microradians: a third fewer bytes, and far below any sensor's noise."""
+    x, y, z = position
+    u, v, w = velocity
+    return Pose(
+        robot,
+        seq,
+        round(stamp, 6),
+        (round(x, 6), round(y, 6), round(z, 6)),
+        (round(u, 6), round(v, 6), round(w, 6)),
+        round(yaw, 6),
+    )
 
 
 def encode(message: Message, encoding: Encoding = "json") -> bytes:

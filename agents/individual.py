@@ -1,0 +1,102 @@
+"""The individual level (paper, figure 10): from a goal to the setpoint that the robot's body takes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from agents.kinds import Kind
+from agents.rows import Array, clamp, norm
+
+REACHED = 0.005  # [m] nearer than this a ground robot stands; half of what a 1 cm trigger lets its neighbours know
+TURNED = math.radians(2.0)  # [rad] nearer than this to the yaw wanted it stands
+
+
+def wrap(angle: Array) -> Array:
+    """Angle in (−π, π]."""
+    return np.asarray(math.pi - np.mod(math.pi - angle, 2.0 * math.pi))
+
+
+class Individual:
+    """Position controllers of rows of any kinds."""
+
+    def __init__(self, kinds: Sequence[Kind]) -> None:
+        takes = np.array([kind.takes for kind in kinds])
+        self._position = np.flatnonzero(takes == "position")
+        self._velocity = np.flatnonzero(takes == "velocity")
+        self._twist = np.flatnonzero(takes == "twist")
+        self._speed = np.array([kind.speed for kind in kinds])
+        self._response = np.array([kind.response for kind in kinds])
+        self._turn_response = np.array([kind.turn_response for kind in kinds])
+        driven = [kinds[row] for row in self._twist]
+        self._drive = {
+            name: np.array([getattr(kind, name) for kind in driven])
+            for name in ("response", "turn_response", "speed", "turn_rate")
+        }
+
+    def setpoint(self, goal: Array, toward: Array, position: Array, yaw: Array) -> Array:
+        """Setpoints (N, 4), in the meaning of each row's kind (see `agents.wire.State`).
+
+        Args:
+            goal: (N, 3) [m].
+            toward: (N,) yaw wanted at the goal [rad], NaN for any.
+            position: (N, 3) measured [m].
+            yaw: (N,) measured [rad].
+        """
+        setpoint = np.zeros((len(goal), 4))
+        if len(rows := self._position):
+            setpoint[rows, :3] = goal[rows]
+            setpoint[rows, 3] = np.where(np.isnan(toward[rows]), 0.0, toward[rows])
+        if len(rows := self._velocity):
+            velocity = self._response[rows, None] * (goal[rows] - position[rows])
+            setpoint[rows, :3] = clamp(velocity, -self._speed[rows, None], self._speed[rows, None])
+            turn = self._turn_response[rows] * wrap(toward[rows] - yaw[rows])
+            setpoint[rows, 3] = np.where(np.isnan(turn), 0.0, turn)
+        if len(rows := self._twist):
+            way = goal[rows, :2] - position[rows, :2]
+            setpoint[rows, :2] = drive(way, yaw[rows], toward[rows], **self._drive)
+        return setpoint
+
+
+def drive(
+    way: Array,
+    yaw: Array,
+    toward: Array,
+    *,
+    response: Array,
+    turn_response: Array,
+    speed: Array,
+    turn_rate: Array,
+) -> Array:
+    """Linear and angular speed (n, 2) of differential robots toward a point, and there to a yaw.
+
+    They cannot move sideways (paper, eq. (1)): the pose error is turned into distance and bearing. The law is that of
+    Farias et al. for the Khepera IV, v = K d (π − |α|)/π and ω = K_α sin α; α is taken to the nearer end of the robot,
+    which drives backward as well as forward, because formation goals lie behind it as often as before it.
+
+    Args:
+        way: (n, 2) goal less position [m].
+        yaw: (n,) [rad].
+        toward: (n,) yaw wanted at the goal [rad], NaN for any.
+        response: (n,) K [1/s].
+        turn_response: (n,) K_α [1/s].
+        speed: (n,) limit [m/s].
+        turn_rate: (n,) limit [rad/s].
+    """
+    distance = norm(way)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    along, across = cos * way[:, 0] + sin * way[:, 1], cos * way[:, 1] - sin * way[:, 0]
+    ahead = np.where(along >= 0.0, 1.0, -1.0)
+    alpha = np.arctan2(ahead * across, np.abs(along))
+    twist = np.empty((len(way), 2))
+    twist[:, 0] = ahead * np.minimum(response * distance * (1.0 - np.abs(alpha) / math.pi), speed)
+    twist[:, 1] = turn_response * np.sin(alpha)
+    there = distance <= REACHED
+    if there.any():
+        turn = wrap(toward - yaw)
+        settle = np.where(np.abs(turn) > TURNED, turn_response * turn, 0.0)  # NaN compares false: any yaw will do
+        twist[there, 0], twist[there, 1] = 0.0, settle[there]
+    twist[:, 1] = clamp(twist[:, 1], -turn_rate, turn_rate)
+    return twist

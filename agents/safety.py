@@ -1,0 +1,136 @@
+"""Safety, the last word before a body: whatever was decided, this is what may be sent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.kinds import Kind
+from agents.rows import Array, Index, Mask, clamp, norm
+
+ESCAPED = 0.25  # [m] this far outside the arena a robot is no longer under control
+ROUNDING = 1e-9  # smaller differences are arithmetic, not interventions
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What no setpoint may exceed.
+
+    Attributes:
+        low: (3,) smallest x, y, z of the arena [m].
+        high: (3,) largest x, y, z of the arena [m].
+        margin: Goals stay this far inside the walls [m].
+        speed: [m/s]; the kind's own where that is lower.
+        goal_step: Farthest goal from where the robot is [m].
+        own_silence_s: Own position older than this is none.
+        link_silence_s: A neighbour gone for this long is left out.
+    """
+
+    low: Array
+    high: Array
+    margin: float = 0.05
+    speed: float = np.inf
+    goal_step: float = 0.5
+    own_silence_s: float = 0.5
+    link_silence_s: float = 1.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What may be sent, and what else must happen.
+
+    Attributes:
+        setpoint: (N, 4) safe.
+        changed: (N,) the setpoint was not what had been decided.
+        blind: (N,) own position missing, stale or not finite: no closed loop is possible.
+        escaped: (N,) outside the arena beyond any doubt.
+    """
+
+    setpoint: Array
+    changed: Mask
+    blind: Mask
+    escaped: Mask
+
+
+class Safety:
+    """Checks setpoints of rows of any kinds."""
+
+    def __init__(self, kinds: Sequence[Kind], limits: Limits) -> None:
+        takes = np.array([kind.takes for kind in kinds])
+        self.limits = limits
+        self._position = np.flatnonzero(takes == "position")
+        self._takes_position = takes == "position"
+        self._velocity = np.flatnonzero(takes == "velocity")
+        self._twist = np.flatnonzero(takes == "twist")
+        self._speed = np.minimum(np.array([kind.speed for kind in kinds]), limits.speed)
+        self._turn_rate = np.array([kind.turn_rate for kind in kinds])
+        flies = np.array([kind.flies for kind in kinds])[:, None]
+        inside = np.array([limits.margin, limits.margin, 0.0])
+        floor, ceiling = np.array([0.0, 0.0, np.inf]), np.array([0.0, 0.0, limits.margin])
+        self._low = limits.low + inside - np.where(flies, 0.0, floor)  # ground robots have no business with heights
+        self._high = limits.high - inside - np.where(flies, ceiling, -floor)
+
+    def check(self, setpoint: Array, position: Array, yaw: Array, age: Array) -> Verdict:
+        """The last word.
+
+        Args:
+            setpoint: (N, 4) as decided, in the meaning of each row's kind.
+            position: (N, 3) measured [m].
+            yaw: (N,) measured [rad].
+            age: (N,) of that measurement [s].
+        """
+        limits = self.limits
+        blind = ~(np.isfinite(position.sum(axis=1) + yaw) & (age <= limits.own_silence_s))
+        wild = ~np.isfinite(setpoint.sum(axis=1))
+        safe, here = setpoint.copy(), position
+        if blind.any() or wild.any():
+            here = np.where(blind[:, None], 0.0, position)
+            safe[blind | wild] = 0.0
+            stay = wild & self._takes_position
+            safe[stay, :3] = here[stay]
+        if len(rows := self._position):
+            safe[rows, :3] = self._near(safe[rows, :3], here[rows], rows)
+        if len(rows := self._velocity):
+            safe[rows] = self._slow(safe[rows], here[rows], rows)
+        if len(rows := self._twist):
+            safe[rows, :2] = self._drive(safe[rows, :2], here[rows, :2], yaw[rows], rows)
+        changed = np.abs(safe - setpoint).max(axis=1) > ROUNDING
+        if blind.any() or wild.any():
+            changed = (changed | wild) & ~blind
+            # a body that controls its position on board keeps its last setpoint while the position is not known here
+            safe[blind & self._takes_position] = np.nan
+        beyond = np.maximum(here - limits.high, limits.low - here).max(axis=1)
+        return Verdict(safe, changed, blind, (beyond > ESCAPED) & ~blind)
+
+    def _near(self, target: Array, here: Array, rows: Index) -> Array:
+        """Goals inside the arena and not too far ahead of the robot."""
+        target = clamp(target, self._low[rows], self._high[rows])
+        step = target - here
+        length = norm(step)
+        far = length > self.limits.goal_step
+        if far.any():
+            target[far] = here[far] + step[far] * (self.limits.goal_step / length[far])[:, None]
+        return target
+
+    def _slow(self, velocity: Array, here: Array, rows: Index) -> Array:
+        """Velocities within the limits, and not out of the arena."""
+        speed, turn = self._speed[rows, None], self._turn_rate[rows]
+        linear = clamp(velocity[:, :3], -speed, speed)
+        outward = ((here > self._high[rows]) & (linear > 0)) | ((here < self._low[rows]) & (linear < 0))
+        velocity[:, :3] = np.where(outward, 0.0, linear)
+        velocity[:, 3] = clamp(velocity[:, 3], -turn, turn)
+        return velocity
+
+    def _drive(self, twist: Array, here: Array, yaw: Array, rows: Index) -> Array:
+        """Twists within the limits, and not out of the arena: turning on the spot is always allowed."""
+        speed, turn = self._speed[rows], self._turn_rate[rows]
+        v = clamp(twist[:, 0], -speed, speed)
+        low, high = self._low[rows, :2], self._high[rows, :2]
+        if ((here > high) | (here < low)).any():
+            heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * v[:, None]
+            outward = ((here > high) & (heading > 0)) | ((here < low) & (heading < 0))
+            v = np.where(outward.any(axis=1), 0.0, v)
+        twist[:, 0], twist[:, 1] = v, clamp(twist[:, 1], -turn, turn)
+        return twist

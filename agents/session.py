@@ -1,0 +1,312 @@
+"""Sessions on the Zenoh network and what a robot declares on them: every setting in one place.
+
+Everything that is received waits in a ring channel and is polled from the control loop. A callback would cost a thread
+each, a slow one stops all reception of its session, and one that is left open keeps the interpreter from exiting.
+A ring channel does none of this: it keeps the newest items and never blocks.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final, Literal, Protocol, Self, TypeVar
+
+import zenoh
+from zenoh.ext import (
+    AdvancedPublisher,
+    AdvancedSubscriber,
+    CacheConfig,
+    HistoryConfig,
+    MissDetectionConfig,
+    RecoveryConfig,
+    declare_advanced_publisher,
+    declare_advanced_subscriber,
+)
+from zenoh.handlers import Handler, RingChannel
+
+Mode = Literal["client", "peer", "router"]
+T_co = TypeVar("T_co", covariant=True)
+
+DEFAULT_PORT: Final = 7447
+DEFAULT_ENDPOINT: Final = f"tcp/127.0.0.1:{DEFAULT_PORT}"
+
+RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
+HEARTBEAT_S: Final = 0.5  # how long the loss of the last pose before a silence goes unnoticed
+
+# 4 threads instead of 7 in each client and a sixth less CPU at 50 Hz. Zenoh reads it once, at the first open.
+_RUNTIME: Final = (
+    "(acc:(handover:app),tx:(handover:app),net:(handover:app),rx:(worker_threads:1),app:(worker_threads:1))"
+)
+
+
+class EndpointError(ValueError):
+    """An endpoint that cannot or must not be used, with the remedy."""
+
+
+class Unreachable(ConnectionError):
+    """No router answers at the endpoints that were tried."""
+
+
+class Polled(Protocol[T_co]):
+    """Anything that hands out what arrived, one by one, and None when nothing waits."""
+
+    def try_recv(self) -> T_co | None: ...
+
+
+def config(
+    mode: Mode,
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    name: str | None = None,
+    lease_s: float = 2.0,
+) -> zenoh.Config:
+    """The configuration of every session: no multicast, no gossip, no shared memory, listening on loopback only.
+
+    Args:
+        mode: Robots are clients: a router forwards between clients, but not between two peers.
+        connect: Endpoints of the routers; a client uses the first that answers and fails over to the others.
+        listen: Loopback endpoints to listen on; a client needs none.
+        name: Shown by `zenpark keys`.
+        lease_s: After this silence [s] the others hold this session for dead. A killed process is noticed at once.
+
+    Raises:
+        EndpointError: If an endpoint is malformed, or one to listen on can be reached from outside this machine.
+    """
+    for endpoint in (*connect, *listen):
+        _check_form(endpoint)
+    for endpoint in listen:
+        _check_loopback(endpoint)
+    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
+    settings: dict[str, object] = {
+        "mode": mode,
+        "connect/endpoints": list(connect),
+        # An open that waits inside Zenoh does not hear Ctrl-C: fail at once and try again in Python.
+        "connect/timeout_ms": 0,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+        "listen/endpoints": list(listen),
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/link/tx/lease": round(lease_s * 1000),
+        "transport/shared_memory/enabled": False,
+        "queries_default_timeout": 2000,
+        "adminspace/enabled": True,  # read-only; how `zenpark keys` learns who is there
+    }
+    if name is not None:
+        settings["metadata"] = {"name": name}
+    made = zenoh.Config()
+    for key, value in settings.items():
+        made.insert_json5(key, json.dumps(value))
+    return made
+
+
+def _check_form(endpoint: str) -> None:
+    protocol, slash, address = endpoint.partition("/")
+    if not (protocol and slash and address):
+        raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
+
+
+def _check_loopback(endpoint: str) -> None:
+    """Refuses to listen where others could connect: there is no authentication yet."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol == "unixsock-stream":
+        return
+    host = address.partition("#")[0].partition("?")[0].rpartition(":")[0].strip("[]")
+    try:
+        loopback = host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        loopback = False
+    if not loopback:
+        raise EndpointError(
+            f"will not listen on {endpoint}: whoever reaches it could command the robots. Listen on "
+            f"{DEFAULT_ENDPOINT} and let other machines in through an SSH tunnel (ssh -R 7447:127.0.0.1:7447 HOST)"
+        )
+
+
+def open_session(
+    endpoints: Sequence[str], *, name: str, wait_s: float = 10.0, stop: threading.Event | None = None
+) -> zenoh.Session:
+    """A client session on the first router that answers; use it in a `with`.
+
+    Args:
+        endpoints: Routers, best first.
+        name: Who this is, as `zenpark keys` shows it.
+        wait_s: How long to try [s].
+        stop: Ends the wait when it is set.
+
+    Raises:
+        EndpointError: If an endpoint is malformed.
+        Unreachable: If no router answered in time, or `stop` was set before one did.
+    """
+    settings = config("client", connect=endpoints, name=name)
+    gone = stop or threading.Event()
+    deadline = time.monotonic() + wait_s
+    while True:
+        try:
+            return zenoh.open(settings)
+        except zenoh.ZError:
+            if time.monotonic() >= deadline or gone.wait(RETRY_S):
+                raise Unreachable(
+                    f"no router answers at {', '.join(endpoints) or 'no endpoint'}: "
+                    "`zenpark router` starts one, --connect names another"
+                ) from None
+
+
+def serve_router(endpoints: Sequence[str], stop: threading.Event, ready: Callable[[], None] | None = None) -> None:
+    """Runs a router on loopback endpoints until `stop` is set; `ready` is called as soon as clients can connect.
+
+    Raises:
+        EndpointError: If an endpoint is malformed, not on loopback, or taken.
+    """
+    settings = config("router", listen=endpoints, name="router")
+    try:
+        session = zenoh.open(settings)
+    except zenoh.ZError as error:
+        raise EndpointError(
+            f"cannot listen on {', '.join(endpoints)}: {_reason(error)}. If a router runs there already, use it; "
+            "else choose another port with --listen"
+        ) from None
+    with session:
+        if ready is not None:
+            ready()
+        stop.wait()
+
+
+def free_endpoint(preferred_port: int = DEFAULT_PORT) -> str:
+    """A loopback endpoint to listen on: of the preferred port, or of any free one when that is taken."""
+    for port in (preferred_port, 0):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port in TIME_WAIT is free
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    raise EndpointError("no free TCP port on 127.0.0.1: end some of the processes that listen there")
+
+
+def connected(session: zenoh.Session) -> bool:
+    """Whether the session has a router now. Costs 0.6 µs: poll it in the control loop."""
+    return bool(session.info.routers_zid())
+
+
+def pose_publisher(session: zenoh.Session, key: str, mime: str) -> AdvancedPublisher:
+    """A publisher whose last value is never lost, however rarely it speaks.
+
+    Late joiners ask for the last value (cache), subscribers that were cut off ask again when they see the publisher
+    reappear (detection), and a value lost before a silence is noticed by the heartbeat.
+    """
+    return declare_advanced_publisher(
+        session,
+        key,
+        encoding=mime,
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=zenoh.Priority.DATA_HIGH,
+        cache=CacheConfig(1),
+        sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S),
+        publisher_detection=True,
+    )
+
+
+def pose_subscriber(session: zenoh.Session, key: str, depth: int = 16) -> AdvancedSubscriber[Handler[zenoh.Sample]]:
+    """The other end of `pose_publisher`: the newest `depth` samples wait in `.handler`.
+
+    The history is limited to one sample: without a limit a single frozen publisher stalls a wildcard for 10 s.
+    """
+    return declare_advanced_subscriber(
+        session,
+        key,
+        RingChannel(depth),
+        history=HistoryConfig(max_samples=1, detect_late_publishers=True),
+        recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
+    )
+
+
+def publisher(session: zenoh.Session, key: str, mime: str) -> zenoh.Publisher:
+    """A plain publisher for what comes again soon (telemetry): dropped when the link is congested."""
+    return session.declare_publisher(
+        key, encoding=mime, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.DATA
+    )
+
+
+def subscriber(session: zenoh.Session, key: str, depth: int = 256) -> zenoh.Subscriber[Handler[zenoh.Sample]]:
+    """The other end of `publisher`: the newest `depth` samples wait in `.handler`."""
+    return session.declare_subscriber(key, RingChannel(depth))
+
+
+class LastValue:
+    """Answers a plain `get` (z_get, REST) on a key with its last value, which the cache of an advanced publisher does
+    not: call `answer` from the control loop."""
+
+    def __init__(self, session: zenoh.Session, key: str, mime: str) -> None:
+        self.key = key
+        self.mime = mime
+        self._payload: bytes | None = None
+        self._queryable = session.declare_queryable(key, RingChannel(8))
+
+    def hold(self, payload: bytes) -> None:
+        """Remembers the value to answer with."""
+        self._payload = payload
+
+    def answer(self) -> int:
+        """Replies to whoever asked since the last call, with nothing if there is no value yet; says to how many."""
+        asked = 0
+        for query in received(self._queryable.handler):
+            with query:
+                if self._payload is not None:
+                    query.reply(self.key, self._payload, encoding=self.mime)
+            asked += 1
+        return asked
+
+    def close(self) -> None:
+        """Takes no more questions."""
+        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def last_value(session: zenoh.Session, key: str, mime: str) -> LastValue:
+    """Makes the last value of a key visible to a plain `get`; polled, so it costs no thread."""
+    return LastValue(session, key, mime)
+
+
+def orders(session: zenoh.Session, key: str) -> zenoh.Queryable[Handler[zenoh.Query]]:
+    """A queryable whose orders wait in `.handler`; reply inside `with query:` and on `key`, or the asker waits.
+
+    Declare it before the liveliness token: whoever sees the token can then give orders.
+    """
+    return session.declare_queryable(key, RingChannel(8), complete=True)
+
+
+def alive_token(session: zenoh.Session, key: str) -> zenoh.LivelinessToken:
+    """Says that the owner of this session is there, until the token is undeclared or the session is gone."""
+    return session.liveliness().declare_token(key)
+
+
+def alive_watch(session: zenoh.Session, keyexpr: str) -> zenoh.Subscriber[Handler[zenoh.Sample]]:
+    """Who comes (PUT) and goes (DELETE), those already there first.
+
+    When the router dies every token goes at once and comes back after the reconnection: ask `connected` before
+    holding a robot for lost.
+    """
+    return session.liveliness().declare_subscriber(keyexpr, RingChannel(256), history=True)
+
+
+def received(handler: Polled[T_co]) -> Iterator[T_co]:
+    """What waits in a handler, oldest first, without blocking."""
+    while (item := handler.try_recv()) is not None:
+        yield item
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """The innermost reason in a message of Zenoh, without the place in its source."""
+    return str(error).partition(" at /")[0].rpartition(": ")[2]

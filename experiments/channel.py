@@ -1,0 +1,85 @@
+"""The network of a run in virtual time: delay, jitter and loss on each link."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.graph import Links
+from agents.rows import Array, Index
+from experiments.experiment import Channel as Parameters
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Poses on their way (M): link, arrival time, sample time [s], number, position and velocity (M, 3)."""
+
+    link: Index
+    arrival: Array
+    stamp: Array
+    seq: Index
+    position: Array
+    velocity: Array
+
+    def take(self, which: Array | Index) -> Samples:
+        """Some of them."""
+        return Samples(
+            self.link[which],
+            self.arrival[which],
+            self.stamp[which],
+            self.seq[which],
+            self.position[which],
+            self.velocity[which],
+        )
+
+
+class Channel:
+    """Carries what rows say to whoever listens; each repetition has a random stream of its own."""
+
+    def __init__(self, links: Links, parameters: Parameters, seeds: Sequence[int]) -> None:
+        """`links` of all repetitions, those of the first seed first."""
+        self._links = links
+        self._delay, self._jitter, self._loss = parameters.delay_s, parameters.jitter_s, parameters.loss
+        self._generators = [np.random.default_rng([seed, 0x636861]) for seed in seeds]
+        self._per_copy = len(links) // len(seeds)
+        self._flying: list[Samples] = []
+        self.lost = np.zeros(len(links), dtype=np.intp)
+
+    def send(self, t: float, rows: Index, seq: Index, position: Array, velocity: Array) -> None:
+        """Rows say where they are: `position`, `velocity` (N, 3) and `seq` (N,) of all rows, of which `rows` speak."""
+        spoke = np.zeros(len(position), dtype=bool)
+        spoke[rows] = True
+        speaker = self._links.speaker
+        at = np.flatnonzero(spoke[speaker])
+        delay = np.full(len(at), self._delay)
+        if self._loss or self._jitter:
+            chance = np.concatenate([g.random((2, self._per_copy)) for g in self._generators], axis=1)[:, at]
+            delay -= self._jitter * np.log1p(-chance[1])
+            arrives = chance[0] >= self._loss
+            self.lost[at[~arrives]] += 1
+            at, delay = at[arrives], delay[arrives]
+        if len(at):
+            who = speaker[at]
+            stamp = np.full(len(at), t)
+            self._flying.append(Samples(at, t + delay, stamp, seq[who], position[who], velocity[who]))
+
+    def due(self, t: float) -> Samples | None:
+        """What has arrived by `t` [s], in order of arrival."""
+        if not self._flying:
+            return None
+        if len(self._flying) == 1:
+            pool = self._flying[0]
+        else:
+            columns = ("link", "arrival", "stamp", "seq", "position", "velocity")
+            pool = Samples(*(np.concatenate([getattr(s, c) for s in self._flying]) for c in columns))
+        here = pool.arrival <= t
+        if here.all():
+            self._flying = []
+            return pool if not self._jitter else pool.take(np.argsort(pool.arrival, kind="stable"))
+        self._flying = [pool.take(~here)]
+        if not here.any():
+            return None
+        arrived = pool.take(here)
+        return arrived.take(np.argsort(arrived.arrival, kind="stable"))

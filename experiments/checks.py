@@ -1,0 +1,140 @@
+"""Does an experiment make sense: what no single field of it can tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+from agents import plugins
+from agents.kinds import KINDS
+from agents.plugins import did_you_mean
+from experiments.experiment import Experiment, Robot
+from experiments.links import FORM, pairs
+from experiments.problem import Fault
+
+_RESERVED: Final = ("all", "estop", "run", *KINDS)  # they mean something in keys and in [disturbance]
+
+
+def faults(experiment: Experiment) -> Iterator[Fault]:
+    """Everything that contradicts something else, with its path in the file."""
+    yield from _rates(experiment)
+    for name, robot in experiment.robots.items():
+        yield from _robot(experiment, name, robot)
+    yield from _formation(experiment)
+    yield from _timeline(experiment)
+    for name in experiment.disturbance:
+        known = ("all", *KINDS, *experiment.robots)
+        if name not in known:
+            message = f"'{name}' is neither a robot nor a kind of robots"
+            yield Fault(("disturbance", name), message, did_you_mean(name, known), on_key=True)
+
+
+def _rates(experiment: Experiment) -> Iterator[Fault]:
+    body = experiment.rates.body_hz
+    for name in ("pose_hz", "coordination_hz", "state_hz"):
+        ratio = body / getattr(experiment.rates, name)
+        if abs(ratio - max(1, round(ratio))) > 1e-9 * ratio:
+            yield Fault(
+                ("rates", name),
+                f"{name} = {body / ratio:g} does not divide body_hz = {body:g}",
+                f"the nearest that does: {name} = {_divisor(body, body / ratio):g}",
+            )
+
+
+def _divisor(body: float, wanted: float) -> float:
+    """The nearest rate that divides `body` and can be written in a few digits."""
+    written = (float(f"{body / times:g}") for times in range(1, 1001))
+    exact = [rate for times, rate in enumerate(written, 1) if rate * times == body]
+    return min(exact, key=lambda rate: abs(rate - wanted), default=body)
+
+
+def _robot(experiment: Experiment, name: str, robot: Robot) -> Iterator[Fault]:
+    path = ("robots", name)
+    if name in _RESERVED:
+        yield Fault(
+            path, f"a robot cannot be called '{name}', which has a meaning of its own", "rename it", on_key=True
+        )
+    body = plugins.body_name(robot.body)
+    bodies = plugins.names(plugins.BODIES)
+    if body not in bodies:
+        yield Fault((*path, "body"), f"no {body!r} among the bodies", did_you_mean(body, bodies))
+    if robot.kind in KINDS:
+        yield from _hover(experiment, name, robot)
+    else:
+        yield Fault((*path, "kind"), f"no {robot.kind!r} among the kinds of robots", did_you_mean(robot.kind, KINDS))
+    for axis, size in enumerate(experiment.arena.size[:2]):
+        if abs(robot.start[axis]) > size / 2:
+            yield Fault(
+                (*path, "start", axis),
+                f"'{name}' starts outside of the arena",
+                f"{'xy'[axis]} lies between {-size / 2:g} and {size / 2:g}; or enlarge size in [arena]",
+            )
+    if len(robot.start) == 3 and abs(robot.start[2]) > 2 * math.pi:
+        radians = math.remainder(math.radians(robot.start[2]), 2 * math.pi)
+        yield Fault((*path, "start", 2), "the yaw is in radians", f"{robot.start[2]:g} degrees are {radians:.4f}")
+
+
+def _hover(experiment: Experiment, name: str, robot: Robot) -> Iterator[Fault]:
+    path, top, margin = ("robots", name), experiment.arena.size[2], experiment.safety.margin
+    if not KINDS[robot.kind].flies:
+        if robot.hover is not None:
+            yield Fault(
+                (*path, "hover"), f"'{name}' is a {robot.kind}, which does not fly", "leave hover out", on_key=True
+            )
+    elif robot.hover is None:
+        message = f"'{name}' is a {robot.kind}, which flies: it needs a height to hold"
+        yield Fault(path, message, f"add hover = {min(0.8, top / 2):g}, in metres")
+    elif robot.hover > top - margin:
+        yield Fault(
+            (*path, "hover"),
+            f"'{name}' cannot hover at {robot.hover:g} m: the arena is {top:g} m high, less a margin of {margin:g} m",
+            f"use a hover of at most {max(0.0, top - margin):g}, or enlarge size in [arena]",
+        )
+
+
+def _formation(experiment: Experiment) -> Iterator[Fault]:
+    robots = experiment.robots
+    leader = experiment.formation.leader
+    if leader is not None and leader not in robots:
+        yield Fault(("formation", "leader"), f"no robot is called '{leader}'", did_you_mean(leader, robots))
+    said: dict[tuple[str, str], str] = {}
+    for text in experiment.formation.links:
+        path = ("formation", "links", text)
+        try:
+            both = pairs(text)
+        except ValueError as error:
+            hint = str(error)
+            yield Fault(path, f"{text!r} is no link", hint if hint == FORM else f"{hint}; {FORM}", on_key=True)
+            continue
+        for name in dict.fromkeys(reversed(both[0])):
+            if name not in robots:
+                yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, robots), on_key=True)
+        if both[0][0] == both[0][1]:
+            yield Fault(path, f"'{both[0][0]}' cannot listen to itself", "name two robots", on_key=True)
+            continue
+        again = [pair for pair in both if pair in said]
+        if again:
+            listener, speaker = again[0]
+            message = f"that {listener} listens to {speaker} is already said by '{said[again[0]]}'"
+            yield Fault(path, message, "keep one of the two", on_key=True)
+        said.update(dict.fromkeys(both, text))
+
+
+def _timeline(experiment: Experiment) -> Iterator[Fault]:
+    before: dict[str, float] = {}
+    for number, leg in enumerate(experiment.timeline):
+        path = ("timeline", number)
+        if leg.robot not in experiment.robots:
+            yield Fault(
+                (*path, "robot"), f"no robot is called '{leg.robot}'", did_you_mean(leg.robot, experiment.robots)
+            )
+        if leg.at_s >= experiment.duration_s:
+            message = f"this leg begins at {leg.at_s:g} s, when the run of {experiment.duration_s:g} s is over"
+            yield Fault((*path, "at_s"), message, "begin earlier, or give a longer duration_s")
+        if leg.at_s <= before.get(leg.robot, -1.0):
+            message = f"this leg of '{leg.robot}' begins at {leg.at_s:g} s, not after the one before it"
+            yield Fault(
+                (*path, "at_s"), message, f"sort its legs by time; the one before begins at {before[leg.robot]:g} s"
+            )
+        before[leg.robot] = max(leg.at_s, before.get(leg.robot, -1.0))

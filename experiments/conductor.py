@@ -1,0 +1,362 @@
+"""The conductor of one case in real time: starts the processes, gives the common start, walks the phases, lands.
+
+It decides nothing that a robot needs: if it dies, the robots land by themselves and the recorder finishes its file.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, TypeVar
+
+import zenoh
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from experiments import orders
+from experiments.experiment import Experiment
+from experiments.launcher import Launcher, Process
+
+POLL_S: Final = 0.05
+LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then
+CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
+LAND_S: Final = 15.0
+ROUTER_S: Final = 10.0
+FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
+LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
+
+M = TypeVar("M", wire.Status, wire.State)
+
+ORDER: Final = ("idle", "ready", "airborne", "running", "landing", "done")
+
+
+class RunFailed(RuntimeError):
+    """A run that could not begin, with what is missing and what to do."""
+
+
+@dataclass
+class Seen:
+    """What the conductor knows of a robot.
+
+    Attributes:
+        status: Its last status.
+        error: Formation error as the robot itself sees it [m].
+        sent: Poses that it sent, and `rate` of them over the last second [1/s].
+        alive: Whether its liveliness token stands.
+        gone: Whether its process has ended or its token has vanished in mid-run.
+    """
+
+    status: wire.Status | None = None
+    error: float = 0.0
+    rate: float = 0.0
+    alive: bool = False
+    gone: bool = False
+    counted: tuple[float, int] = (0.0, 0)
+
+    @property
+    def phase(self) -> str:
+        return self.status.phase if self.status is not None else "starting"
+
+    def reached(self, phase: str) -> bool:
+        """Whether it is in this phase or beyond."""
+        return self.status is not None and ORDER.index(self.status.phase) >= ORDER.index(phase)
+
+
+@dataclass
+class Progress:
+    """What there is to show of a run."""
+
+    case: str
+    phase: str
+    elapsed: float | None
+    duration: float
+    robots: dict[str, Seen]
+    events: list[wire.Event] = field(default_factory=list)
+
+
+Show = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a case ended."""
+
+    recording: Path
+    interrupted: bool
+    start: float | None
+    ready_s: float | None
+    lost: tuple[str, ...]
+
+
+class Conductor:
+    """Runs one case."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        case: str,
+        *,
+        file: Path,
+        source: Path,
+        folder: Path,
+        endpoints: Sequence[str],
+        launcher: Launcher,
+        show: Show,
+        interrupted: Callable[[], bool],
+    ) -> None:
+        """Prepares a case; nothing is started yet.
+
+        Args:
+            experiment: The case, overrides applied.
+            case: Its name.
+            file: The same as a file, for the processes.
+            source: The experiment file as it was written, for the recording.
+            folder: Where the recording goes.
+            endpoints: Routers.
+            launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
+            show: Called with the progress, about ten times a second.
+            interrupted: Asked whether the user wants to end it.
+        """
+        self._experiment, self._case = experiment, case
+        self._file, self._source = file, source
+        self._recording = folder / f"{case}.mcap"
+        self._endpoints, self._launcher = list(endpoints), launcher
+        self._show, self._interrupted = show, interrupted
+        self._keys = Keys(experiment.network.realm)
+        self._robots = {name: Seen() for name in experiment.robots}
+        self._groups: dict[str, list[str]] = {}
+        for name, robot in experiment.robots.items():
+            self._groups.setdefault(robot.process or name, []).append(name)
+        self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
+        self._recorder_lost = False
+
+    def run(self) -> Result:
+        """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
+
+        Raises:
+            RunFailed: If robots are not ready in time and the file says that the run must not go on without them.
+        """
+        began = time.monotonic()
+        connect = [part for endpoint in self._endpoints for part in ("--connect", endpoint)]
+        self._connect = connect
+        self._launcher.start(
+            f"{self._case}-recorder",
+            "experiments.recorder",
+            str(self._file),
+            str(self._recording),
+            "--case",
+            self._case,
+            "--source",
+            str(self._source),
+            *connect,
+        )
+        for group, names in self._groups.items():
+            process = self._process(group)
+            self._launcher.start(process, "experiments.robot", str(self._file), *names, *connect, "--lifeline")
+        start = ready = None
+        try:
+            with ExitStack() as stack:
+                self._join(stack)
+                if self._until("ready", self._experiment.start.deadline_s, recorder=True):
+                    ready = time.monotonic() - began
+                    self._say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
+                    self._order(wire.Order("takeoff"))
+                    if self._until("airborne", CLIMB_S):
+                        start = self._start()
+                        self._walk(start)
+                self._land()
+        finally:
+            self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
+            self._launcher.end([f"{self._case}-recorder"], grace_s=5.0)
+        gone = tuple(name for name, seen in self._robots.items() if seen.gone)
+        return Result(self._recording, self._interrupted(), start, ready, gone)
+
+    # ------------------------------------------------------------------ phases
+
+    def _until(self, phase: str, limit_s: float, *, recorder: bool = False) -> bool:
+        """Waits until every robot that is left has reached a phase; False if the user interrupted.
+
+        Raises:
+            RunFailed: If they have not in time, unless the file says to go on without them.
+        """
+        self._progress.phase = f"waiting until all are {phase}"
+        deadline = time.monotonic() + limit_s
+        while True:
+            self._look()
+            if self._interrupted():
+                return False
+            late = [name for name, seen in self._robots.items() if not (seen.reached(phase) or seen.gone)]
+            gone = [name for name, seen in self._robots.items() if seen.gone]
+            if gone and self._experiment.start.missing == "abort":
+                raise RunFailed(self._excuse(gone, "could not start"))
+            if not late and (not recorder or self._recording_begun):
+                return True
+            if time.monotonic() > deadline:
+                if late and self._experiment.start.missing == "abort":
+                    raise RunFailed(self._excuse(late, f"not {phase} after {limit_s:g} s"))
+                for name in late:
+                    self._say("late", name, f"not {phase} after {limit_s:g} s: {self._why(name)}")
+                return True
+            time.sleep(POLL_S)
+
+    def _start(self) -> float:
+        """One start time for all, in UTC; returns it."""
+        at = time.time() + LEAD_S
+        self._say("start", "conductor", "common start", stamp=at)
+        self._order(wire.Order("start", at=at), only="airborne")
+        return at
+
+    def _walk(self, start: float) -> None:
+        """Follows the run to its end."""
+        legs = sorted(self._experiment.timeline, key=lambda leg: leg.at_s)
+        names = ["formation", *(f"{leg.robot} under way" for leg in legs)]
+        times = [0.0, *(leg.at_s for leg in legs)]
+        reached = -1
+        end = start + self._experiment.duration_s
+        self._progress.phase = "starting together"
+        while (now := time.time()) < end + LAND_S and not self._interrupted():
+            self._look()
+            self._progress.elapsed = now - start
+            while reached + 1 < len(times) and now - start >= times[reached + 1]:
+                reached += 1
+                self._progress.phase = names[reached]
+                self._say("phase", "conductor", names[reached], stamp=start + times[reached])
+            left = [seen for seen in self._robots.values() if not seen.gone]
+            if all(seen.reached("landing") for seen in left):
+                return
+            time.sleep(POLL_S)
+
+    def _land(self) -> None:
+        """Everybody down."""
+        self._progress.phase = "landing"
+        self._say("phase", "conductor", "landing" + (" (interrupted)" if self._interrupted() else ""))
+        if any(not (seen.gone or seen.reached("landing")) for seen in self._robots.values()):
+            self._order(wire.Order("land"))
+        deadline = time.monotonic() + LAND_S
+        while time.monotonic() < deadline:
+            self._look()
+            if all(seen.gone or seen.reached("done") or seen.phase in ("starting", "idle") for seen in self._robots.values()):
+                break
+            time.sleep(POLL_S)
+        self._progress.phase = "done"
+        self._show(self._progress)
+
+    # ------------------------------------------------------------------ the network
+
+    def _join(self, stack: ExitStack) -> None:
+        keys = self._keys
+        self._session = stack.enter_context(network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S))
+        self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
+        self._statuses = network.pose_subscriber(self._session, keys.status("*"), 4096)
+        self._states = network.subscriber(self._session, keys.state("*"), 4096)
+        self._watch = network.alive_watch(self._session, keys.alive("*"))
+        self._recorder_watch = network.alive_watch(self._session, keys.recorder)
+        self._recording_begun = False
+
+    def _look(self) -> None:
+        """Takes in what has happened since the last look."""
+        now = time.time()
+        for sample in network.received(self._recorder_watch.handler):
+            self._recording_begun |= sample.kind == zenoh.SampleKind.PUT
+        for status in self._messages(self._statuses.handler, wire.Status):
+            self._heed(status)
+        for state in self._messages(self._states.handler, wire.State):
+            self._robots[state.robot].error = state.error
+        for sample in network.received(self._watch.handler):
+            seen = self._robots.get(self._keys.robot(str(sample.key_expr)))
+            if seen is not None:
+                seen.alive = sample.kind == zenoh.SampleKind.PUT
+        for process in self._launcher.died():
+            self._mourn(process)
+        for name, seen in self._robots.items():
+            if seen.gone and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
+                seen.gone = False  # somebody started it again
+                self._say("back", name, "alive again")
+        self._show(self._progress)
+
+    def _messages(
+        self, handler: network.Polled[zenoh.Sample], kind: type[M]
+    ) -> Iterator[M]:
+        for sample in network.received(handler):
+            try:
+                message = wire.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
+            except wire.Malformed:
+                continue
+            if message.robot in self._robots and str(sample.key_expr).split("/")[-2] == message.robot:
+                yield message
+
+    def _heed(self, status: wire.Status) -> None:
+        seen = self._robots[status.robot]
+        if status.phase not in ORDER:
+            return
+        if seen.status is not None and (seen.status.phase, seen.status.reason) != (status.phase, status.reason):
+            self._say("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
+        since, sent = seen.counted
+        if status.stamp - since >= 0.9:
+            seen.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0
+            seen.counted = (status.stamp, status.sent)
+        seen.status = status
+
+    def _mourn(self, process: Process) -> None:
+        """A process has ended that should not have."""
+        if process.name == "router":
+            self._say("router", "conductor", f"the router ended ({process.exit}); started again")
+            start_router(self._launcher, self._endpoints)
+            return
+        if process.name == f"{self._case}-recorder":
+            self._say("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
+            self._recording_begun = True  # nothing to wait for
+            return
+        for name in self._groups.get(process.name.removeprefix(f"{self._case}-"), []):
+            self._robots[name].gone = True
+            self._robots[name].alive = False
+            last = process.tail().strip().splitlines()[-1:]
+            self._say("lost", name, f"its process ended ({process.exit})" + (f": {last[0]}" if last else ""))
+
+    def _order(self, order: wire.Order, only: str | None = None) -> None:
+        """Gives an order to every robot that is left; what is refused is said."""
+        for name, seen in self._robots.items():
+            if seen.gone or seen.status is None or (only is not None and not seen.reached(only)):
+                continue
+            reply = orders.give(self._session, self._keys, name, order)
+            if not reply.ok:
+                self._say("refused", name, f"{order.order}: {reply.reason}")
+
+    def _say(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
+        event = wire.Event(time.time() if stamp is None else stamp, kind, source, text)
+        self._progress.events.append(event)
+        self._events.put(wire.encode(event))
+
+    # ------------------------------------------------------------------ words
+
+    def _process(self, group: str) -> str:
+        return f"{self._case}-{group}"
+
+    def _count(self, phase: str) -> int:
+        return sum(seen.reached(phase) for seen in self._robots.values())
+
+    def _why(self, name: str) -> str:
+        status = self._robots[name].status
+        if status is None:
+            return "its process says nothing yet"
+        return status.reason or f"it is {status.phase}"
+
+    def _excuse(self, names: Sequence[str], what: str) -> str:
+        lines = [f"{', '.join(names)}: {what}; nothing has moved or all have landed"]
+        for name in names:
+            group = next(group for group, members in self._groups.items() if name in members)
+            log = self._recording.parent / "logs" / f"{self._process(group)}.log"
+            text = log.read_text(errors="replace").strip() if log.exists() else ""
+            lines.append(f"  {name}: {self._why(name)}" + (f"\n    {text.splitlines()[-1]}" if text else ""))
+        lines.append("  give them more time with start.deadline_s, or go on without them with start.missing = 'go-on'")
+        return "\n".join(lines)
+
+
+def start_router(launcher: Launcher, endpoints: Sequence[str]) -> None:
+    """A router of our own, which outlives a killed launcher by as long as robots take to land."""
+    listen = [part for endpoint in endpoints for part in ("--listen", endpoint)]
+    launcher.start("router", "agents.router", *listen, "--lifeline", "--linger", str(LINGER_S))

@@ -1,0 +1,303 @@
+"""Reads an experiment file, with its cases and the changes of the command line, and says all that is wrong with it.
+
+document = read("robotic-park", ["robots.CF01.hover=0.7"])
+for name, experiment in document.cases().items(): ...
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from agents.plugins import did_you_mean
+from experiments import catalogue, checks, shape
+from experiments.experiment import Experiment
+from experiments.links import parse_links
+from experiments.locate import Path as Keys
+from experiments.locate import Place, nearest, places
+from experiments.overrides import Override, OverrideError, assign, merged, parse, used
+from experiments.problem import DocumentError, Fault, Problem, at_offset
+from experiments.schema import schema, write_schema
+from experiments.syntax import decoded, parsed
+
+__all__ = [
+    "Document", "DocumentError", "Problem", "catalogue_path", "copy", "names", "parse_links", "read", "schema",
+    "write_json", "write_schema",
+]  # fmt: skip
+
+LARGEST: Final = 4_000_000  # bytes; a hundred robots take ten thousand
+
+
+@dataclass(frozen=True)
+class Document:
+    """An experiment file that holds no error.
+
+    Attributes:
+        path: The file that was read.
+        text: As it stands there.
+        experiment: What it says, before any case changes it; `--set` is in it.
+    """
+
+    path: Path
+    text: str
+    experiment: Experiment
+    resolved: Mapping[str, Experiment]
+
+    def cases(self) -> dict[str, Experiment]:
+        """Each case as an experiment of its own, in the order of the file; one called "default" if it has none."""
+        return dict(self.resolved)
+
+
+def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
+    """Reads and checks an experiment.
+
+    Args:
+        path: A .toml file, a .json file as `write_json` makes it, or a name of the catalogue.
+        overrides: `path=value` each, as behind `--set`; a later one wins, and all win over the cases, but for those
+            that address one (`cases.event.trigger.threshold=0.02`).
+
+    Raises:
+        DocumentError: With everything that is wrong and where, whatever is in the file.
+    """
+    file = _file(path)
+    label = str(path) if file == Path(path) else str(file)
+    text = decoded(_content(file, label), label)
+    is_json = file.suffix.lower() == ".json"
+    try:
+        return _Reading(file, label, text, is_json, parsed(text, label, json=is_json), tuple(overrides)).document()
+    except RecursionError:
+        raise DocumentError([Problem(label, 0, 0, "tables or lists are nested too deeply", "flatten them")]) from None
+
+
+def write_json(experiment: Experiment) -> bytes:
+    """The experiment as JSON that `read` takes; what has its default is left out."""
+    return msgspec.json.format(msgspec.json.encode(experiment), indent=2) + b"\n"
+
+
+def names() -> list[tuple[str, str]]:
+    """Name and title of every experiment of the catalogue, by name."""
+    return [(name, str(tomllib.loads(_entry(name).read_text("utf-8"))["title"])) for name in catalogue.names()]
+
+
+def catalogue_path(name: str) -> Path:
+    """The file of a catalogue entry.
+
+    Raises:
+        DocumentError: If there is none of that name.
+    """
+    if name not in catalogue.names():
+        raise DocumentError([_no_entry(name)])
+    return _entry(name)
+
+
+def copy(name: str, target: Path) -> Path:
+    """Copies a catalogue entry, and beside it the schema that its first line shows to editors.
+
+    Args:
+        name: Of the entry.
+        target: The new file, or a folder for it.
+
+    Returns:
+        The file that was written.
+
+    Raises:
+        DocumentError: If there is no such entry, or the target exists or cannot be written.
+    """
+    source = catalogue_path(name)
+    target = target / source.name if target.is_dir() else target
+    try:
+        with target.open("x", encoding="utf-8") as new:
+            new.write(source.read_text("utf-8"))
+        if not (target.parent / catalogue.SCHEMA).exists():
+            write_schema(target.parent / catalogue.SCHEMA)
+    except FileExistsError:
+        hint = "choose another name; nothing was changed"
+        raise DocumentError([Problem(str(target), 0, 0, "exists already", hint)]) from None
+    except (OSError, ValueError) as error:
+        hint = "choose a place that exists and may be written to"
+        raise DocumentError([Problem(str(target), 0, 0, f"cannot be written: {_reason(error)}", hint)]) from error
+    return target
+
+
+def _entry(name: str) -> Path:
+    return catalogue.FOLDER / f"{name}.toml"
+
+
+def _no_entry(name: str) -> Problem:
+    hint = did_you_mean(name, catalogue.names())
+    return Problem(name, 0, 0, "neither a file nor an experiment of the catalogue", f"{hint} (zenpark new copies one)")
+
+
+def _file(path: str | Path) -> Path:
+    """The file itself, or that of the catalogue entry; a folder of the same name does not hide an entry."""
+    file = Path(path)
+    known = str(path) in catalogue.names()
+    try:
+        return _entry(str(path)) if known and not file.is_file() else file
+    except (OSError, ValueError):  # a name too long, or with a character that no name has
+        return file
+
+
+def _content(file: Path, label: str) -> bytes:
+    try:
+        with file.open("rb") as stream:
+            content = stream.read(LARGEST + 1)
+    except FileNotFoundError:
+        raise DocumentError([_no_entry(label)]) from None
+    except IsADirectoryError:
+        toml = sorted(each.name for each in file.glob("*.toml"))[:5]
+        hint = f"name a file in it: {', '.join(toml)}" if toml else "name an experiment file"
+        raise DocumentError([Problem(label, 0, 0, "is a folder", hint)]) from None
+    except (OSError, ValueError) as error:
+        hint = "check the name and who may read it"
+        raise DocumentError([Problem(label, 0, 0, f"cannot be read: {_reason(error)}", hint)]) from error
+    if len(content) > LARGEST:
+        hint = "name the experiment file, not a recording"
+        raise DocumentError([Problem(label, 0, 0, f"is longer than {LARGEST // 1_000_000} MB", hint)])
+    return content
+
+
+def _reason(error: OSError | ValueError) -> str:
+    return str(error.strerror) if isinstance(error, OSError) and error.strerror else str(error)
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """One reading of one file: what is at hand when something must be located."""
+
+    file: Path
+    label: str
+    text: str
+    is_json: bool
+    content: dict[str, Any]
+    flags: tuple[str, ...]
+
+    def document(self) -> Document:
+        """See `read`."""
+        overrides = self._overrides()
+        general = [override for override in overrides if override.case is None]
+        base, unused = deepcopy(self.content), set(general)
+        self._refuse(shape.storable(base), overrides)
+        tables = base.get("cases")
+        tables = tables if isinstance(tables, dict) else {}
+        for override in overrides:
+            if override.case is not None:
+                self._assigned(tables[override.case], override, part=True)
+            elif self._assigned(base, override):
+                unused.discard(override)
+        whole = {name: table for name, table in tables.items() if isinstance(table, dict)}
+        cases = {}
+        plain = {key: value for key, value in base.items() if key != "cases"}
+        for name, table in whole.items():
+            cases[name] = deepcopy(merged(plain, {key: value for key, value in table.items() if key != "cases"}))
+            for override in [*general, *(each for each in overrides if each.case == name)]:
+                if self._assigned(cases[name], override):
+                    unused.discard(override)
+        if unused:
+            raise DocumentError(
+                [_nowhere(override, [base, *cases.values()]) for override in general if override in unused]
+            )
+
+        nested = [Fault(("cases", name, "cases"), "a case cannot hold cases", "leave them out", on_key=True)
+                  for name, table in whole.items() if "cases" in table]  # fmt: skip
+        first = shape.faults(base)
+        self._refuse(
+            [*nested, *first, *self._of_cases(whole, {n: shape.faults(c) for n, c in cases.items()}, first)], overrides
+        )
+
+        experiment = msgspec.convert(base, Experiment)
+        resolved = {name: msgspec.convert(case, Experiment) for name, case in cases.items()}
+        first = list(checks.faults(experiment))
+        found = {name: list(checks.faults(case)) for name, case in resolved.items()}
+        self._refuse([*first, *self._of_cases(whole, found, first)], overrides)
+        return Document(self.file, self.text, experiment, resolved or {"default": experiment})
+
+    def _overrides(self) -> list[Override]:
+        overrides, problems = [], []
+        for flag in self.flags:
+            try:
+                override = parse(flag, self.content)
+            except OverrideError as error:
+                problems.append(_of_flag(flag, str(error), error.hint))
+                continue
+            overrides.append(override)
+            problems += [
+                _of_flag(flag, fault.message, fault.hint) for fault in shape.storable(override.value, override.path)
+            ]
+        if problems:
+            raise DocumentError(problems)
+        return overrides
+
+    def _assigned(self, document: dict[str, Any], override: Override, *, part: bool = False) -> bool:
+        try:
+            return assign(document, override, part=part)
+        except OverrideError as error:
+            raise DocumentError([_of_flag(override.flag, str(error), error.hint)]) from None
+
+    def _of_cases(
+        self, tables: Mapping[str, Mapping[str, Any]], found: Mapping[str, Sequence[Fault]], first: Sequence[Fault]
+    ) -> Iterator[Fault]:
+        """Faults of the cases that the file without cases does not have, where the case's own table causes them."""
+        for name, faults in found.items():
+            for fault in faults:
+                if fault in first:
+                    continue
+                own = _beginning(tables[name], fault.path)
+                message = fault.message
+                if own != fault.path:
+                    message = f"in case '{name}', {'.'.join(map(str, fault.path))}: {message}"
+                yield Fault(("cases", name, *own), message, fault.hint, fault.on_key and own == fault.path)
+
+    def _refuse(self, faults: Iterator[Fault] | Sequence[Fault], overrides: Sequence[Override]) -> None:
+        """Raises if there is any fault, all in the order of the file."""
+        problems = dict.fromkeys(self._located(fault, overrides) for fault in faults)
+        if problems:
+            raise DocumentError(sorted(problems, key=lambda problem: (problem.line, problem.column)))
+
+    def _located(self, fault: Fault, overrides: Sequence[Override]) -> Problem:
+        path = fault.path
+        inside = path[2:] if path[:1] == ("cases",) else path
+        for override in reversed(overrides):
+            whole = override.whole
+            if path[: len(whole)] == whole or (override.case is None and inside[: len(whole)] == whole):
+                return _of_flag(override.flag, fault.message, fault.hint)
+            if whole[: len(path)] == path and path not in self._places:
+                return _of_flag(override.flag, fault.message, fault.hint)
+        stands, place = nearest(self._places, path)
+        offset = place.key if fault.on_key and stands == path else place.value
+        return at_offset(self.label, self.text, offset, fault.message, fault.hint)
+
+    @cached_property
+    def _places(self) -> dict[Keys, Place]:
+        return places(self.text, json=self.is_json)
+
+
+def _of_flag(flag: str, message: str, hint: str) -> Problem:
+    return Problem(f"--set {flag}", 0, 0, message, hint)
+
+
+def _nowhere(override: Override, documents: Sequence[Mapping[str, Any]]) -> Problem:
+    """A parameter that no trigger, law or plan of the experiment has."""
+    end = next(end for end in range(1, len(override.path)) if shape.group_of(override.path[:end]))
+    known = dict.fromkeys(name for document in documents for name in used(document, override.path[:end]))
+    parameter = str(override.path[end])
+    message = f"no {override.path[end - 1]} of this experiment has a parameter '{parameter}'"
+    return _of_flag(override.flag, message, did_you_mean(parameter, known))
+
+
+def _beginning(table: object, path: Keys) -> Keys:
+    """The longest beginning of a path that leads somewhere in a table."""
+    at: Any = table
+    for length, step in enumerate(path):
+        try:
+            at = at[step]
+        except (KeyError, IndexError, TypeError):
+            return path[:length]
+    return path

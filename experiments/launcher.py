@@ -1,0 +1,148 @@
+"""Starts, watches and ends processes on this machine; whatever happens to the launcher, none of them outlives it long.
+
+Each process holds its standard input as a lifeline (`agents.lifeline`): the launcher writes a byte to it now and then,
+and closing it is the order to end. A killed launcher closes it too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from agents.lifeline import BEAT_S
+
+TAIL: Final = 12  # lines of a dead process's output that are worth showing
+POLL_S: Final = 0.02
+
+
+@dataclass
+class Process:
+    """A started process: its name, its handle, and the file that its output goes to."""
+
+    name: str
+    handle: subprocess.Popen[bytes]
+    log: Path
+
+    @property
+    def alive(self) -> bool:
+        return self.handle.poll() is None
+
+    @property
+    def exit(self) -> str:
+        """How it ended, in words."""
+        code = self.handle.poll()
+        if code is None:
+            return "still running"
+        return f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
+
+    def tail(self) -> str:
+        """The end of its output."""
+        try:
+            lines = self.log.read_text(errors="replace").splitlines()
+        except OSError:
+            return ""
+        return "\n".join(lines[-TAIL:])
+
+
+class Launcher:
+    """Processes of one run; a context manager that leaves none behind."""
+
+    def __init__(self, logs: Path) -> None:
+        """Output of each process goes to a file in the folder `logs`."""
+        self._logs = logs
+        self._processes: dict[str, Process] = {}
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._beat = threading.Thread(target=self._beats, name="heartbeat", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._logs.mkdir(parents=True, exist_ok=True)
+        self._beat.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end(list(self._processes), grace_s=10.0)
+        self._over.set()
+        self._beat.join()
+
+    def start(self, name: str, module: str, *arguments: str) -> Process:
+        """Starts a module of this project in a process and session of its own; one thread per numeric library."""
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        log = self._logs / f"{name}.log"
+        with log.open("ab") as output:
+            handle = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C is the launcher's: it lands the robots first
+                env=environment,
+            )
+        assert handle.stdin is not None
+        os.set_blocking(handle.stdin.fileno(), False)  # a stopped process must not stop the heartbeat of the others
+        process = Process(name, handle, log)
+        with self._lock:
+            self._processes[name] = process
+        return process
+
+    def get(self, name: str) -> Process:
+        """The process of that name."""
+        return self._processes[name]
+
+    def died(self) -> list[Process]:
+        """Processes that have ended by themselves since the last call; they are forgotten."""
+        with self._lock:
+            dead = [process for process in self._processes.values() if not process.alive]
+            for process in dead:
+                del self._processes[process.name]
+        for process in dead:
+            self._close(process)
+        return dead
+
+    def end(self, names: Iterable[str], grace_s: float) -> list[Process]:
+        """Ends processes: end of file on the lifeline, after `grace_s` SIGTERM, then SIGKILL; returns those killed."""
+        with self._lock:
+            ending = [self._processes.pop(name) for name in names if name in self._processes]
+        for process in ending:
+            self._close(process)
+        self._wait(ending, grace_s)
+        for number, wait_s in ((signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0)):
+            stubborn = [process for process in ending if process.alive]
+            for process in stubborn:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.handle.pid, number)
+            self._wait(stubborn, wait_s)
+        return [process for process in ending if (process.handle.returncode or 0) == -signal.SIGKILL]
+
+    @staticmethod
+    def _wait(processes: Sequence[Process], limit_s: float) -> None:
+        deadline = time.monotonic() + limit_s
+        for process in processes:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.handle.wait(max(0.0, deadline - time.monotonic()))
+
+    @staticmethod
+    def _close(process: Process) -> None:
+        if process.handle.stdin is not None:
+            with contextlib.suppress(OSError):
+                process.handle.stdin.close()
+
+    def _beats(self) -> None:
+        while not self._over.wait(BEAT_S):
+            with self._lock:
+                for process in self._processes.values():
+                    if process.handle.stdin is not None:
+                        with contextlib.suppress(OSError, ValueError):  # dead, or frozen with a full pipe
+                            os.write(process.handle.stdin.fileno(), b"\n")

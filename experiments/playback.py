@@ -1,0 +1,335 @@
+"""Reads a recording back into the arrays of a trace, finished or not."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, TypeVar
+
+import msgspec
+import numpy as np
+
+from agents.rows import Array, Index, Mask
+from agents.wire import Event, State, Status
+from experiments.cdr import Undecodable, codec
+from experiments.experiment import Experiment
+from experiments.recording import JSON, METADATA, SentPose
+from experiments.records import RecordingError, Records
+from experiments.trace import HeardPoses, Sent, Trace
+
+ROUNDING_S: Final = 1e-6  # UTC seconds in a float are exact to a quarter of a microsecond
+HOLD_PERIODS: Final = 2.0  # for so many state periods a robot is where it last said; then nobody knows
+HOLE_S: Final = 1.0  # telemetry that is silent for longer is not interpolated over
+STATUS_S: Final = 1.0  # what happened in the run is counted by a status at most this much after its end
+NOWHERE: Final = (math.nan, math.nan, math.nan)
+NO_SETPOINT: Final = (*NOWHERE, math.nan)
+
+S = TypeVar("S", bound=msgspec.Struct)
+M = TypeVar("M", State, SentPose, Status)
+
+
+@dataclass(frozen=True)
+class Playback:
+    """A recording, read.
+
+    Attributes:
+        trace: What happened.
+        complete: The recorder finished the file and nothing in it is damaged.
+        messages: How many the file holds, those of other programs included.
+    """
+
+    trace: Trace
+    complete: bool
+    messages: int
+
+
+def read(path: Path) -> Playback:
+    """Reads a recording.
+
+    Positions and yaw are interpolated onto the grid, goals and setpoints are the last at or before. A robot that never
+    reported is NaN; one that fell silent is NaN from two state periods after its last sample, and inside holes of more
+    than a second.
+
+    `lost` of a robot adds up what its sequence numbers prove: (1) gaps among its poses recorded in the run, where a
+    number that goes back is a publisher that began anew at 1; (2) what its last status of the run counts as sent beyond
+    the last pose recorded until then; (3) what the last status of each listener counts as lost from it, less what the
+    same process counted before the common start. A pose that two listeners and the recorder missed counts three times:
+    each of them was owed it.
+
+    Raises:
+        RecordingError: If the file is no recording of zenpark, of another version, or of a run that never started.
+    """
+    content = _Content(Records(path))
+    messages = content.fill()
+    records = content.records
+    about = next((record.metadata for record in records.metadata if record.name == METADATA), {})
+    attached = next((record.data for record in records.attachments if record.name == JSON), b"")
+    try:
+        case, seed, clock = about["case"], int(about["seed"]), about["clock"]
+        experiment = msgspec.json.decode(attached, type=Experiment)
+    except (KeyError, ValueError) as error:
+        raise RecordingError(f"{path}: holds no experiment that this version of zenpark can read ({error})") from None
+    start = content.start()
+    if start is None:
+        raise RecordingError(f"{path}: no robot had started when the recording ended; there is nothing to show")
+    return Playback(_trace(content, experiment, start, (case, seed, clock)), records.complete, messages)
+
+
+@dataclass
+class _Content:
+    """The messages of a recording, by kind."""
+
+    records: Records
+    states: list[State] = field(default_factory=list)
+    poses: list[SentPose] = field(default_factory=list)
+    statuses: list[Status] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+
+    def fill(self) -> int:
+        """Reads all messages and counts them; those of other types are passed over."""
+        known = dict(
+            [
+                _reader(State, self.states),
+                _reader(SentPose, self.poses),
+                _reader(Status, self.statuses),
+                _reader(Event, self.events),
+            ]
+        )
+        readers: dict[int, Callable[[bytes], None] | None] = {}
+        count = 0
+        for message in self.records.messages():
+            count += 1
+            if message.channel not in readers:
+                readers[message.channel] = self._choose(message.channel, known)
+            take = readers[message.channel]
+            if take is not None:
+                try:
+                    take(message.data)
+                except Undecodable as error:
+                    raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
+        return count
+
+    def start(self) -> float | None:
+        """UTC time of the common start [s]: as the conductor says, else the earliest that a robot says."""
+        said = [event.stamp for event in self.events if event.kind == "start" and math.isfinite(event.stamp)]
+        return (
+            said[0] if said else min((status.started for status in self.statuses if status.started > 0), default=None)
+        )
+
+    def _choose(self, channel: int, known: dict[str, _Reader]) -> Callable[[bytes], None] | None:
+        about = self.records.channels[channel]
+        schema = self.records.schemas.get(about.schema_id)
+        if schema is None or schema.name not in known:
+            return None
+        text, take = known[schema.name]
+        if schema.data.decode(errors="replace") != text:
+            raise RecordingError(
+                f"{self.records.path}: {about.topic} was recorded by a version of zenpark with other fields of "
+                f"{schema.name}; read it with that version"
+            )
+        return take
+
+
+_Reader = tuple[str, Callable[[bytes], None]]
+
+
+def _reader(kind: type[S], sink: list[S]) -> tuple[str, _Reader]:
+    made = codec(kind)
+    decode, append = made.decode, sink.append
+    return made.name, (made.schema, lambda data: append(decode(data)))
+
+
+def _trace(content: _Content, experiment: Experiment, start: float, about: tuple[str, int, str]) -> Trace:
+    robots = tuple(experiment.robots)
+    rate, duration = experiment.rates.state_hz, experiment.duration_s
+    time = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
+    states = _by_robot(content.states, robots)
+    poses = [list({(pose.stamp, pose.seq): pose for pose in own}.values()) for own in _by_robot(content.poses, robots)]
+    statuses = _by_robot(content.statuses, robots)
+    last = [own[-1] if own else None for own in statuses]
+    sampled = [_sampled(own, start, time, HOLD_PERIODS / rate) for own in states]
+    position, yaw, true_position, goal, setpoint = (np.stack(columns, axis=1) for columns in zip(*sampled, strict=True))
+    return Trace(
+        case=about[0],
+        experiment=experiment,
+        seed=about[1],
+        robots=robots,
+        clock=about[2],
+        time=time,
+        position=position,
+        yaw=yaw[:, :, 0],
+        true_position=true_position,
+        goal=goal,
+        setpoint=setpoint,
+        sent=_sent(poses, start, duration),
+        heard=_heard(states, robots, start, duration),
+        lost=_lost(robots, poses, statuses, (start, start + duration)),
+        missed_deadlines=np.array([status.missed if status else 0 for status in last], dtype=np.intp),
+        ticks=np.array([status.ticks if status else 0 for status in last], dtype=np.intp),
+        decisions=np.array([status.decisions if status else 0 for status in last], dtype=np.intp),
+        events=tuple(
+            msgspec.structs.replace(event, stamp=event.stamp - start)
+            for event in sorted(content.events, key=lambda event: event.stamp)
+        ),
+    )
+
+
+def _by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:
+    """For each robot its messages in order of time."""
+    found: dict[str, list[M]] = {robot: [] for robot in robots}
+    for message in messages:
+        if message.robot in found and math.isfinite(message.stamp):
+            found[message.robot].append(message)
+    return [sorted(own, key=lambda message: message.stamp) for own in found.values()]
+
+
+def _sampled(states: list[State], start: float, time: Array, hold: float) -> tuple[Array, Array, Array, Array, Array]:
+    """Position, yaw, true position, goal and setpoint of one robot on the grid, each (T, k)."""
+    t = np.array([state.stamp for state in states]) - start
+    measured = np.array([state.position for state in states]).reshape(-1, 3)
+    truth = np.array([state.true_position or NOWHERE for state in states]).reshape(-1, 3)
+    goal = np.array([state.goal or NOWHERE for state in states]).reshape(-1, 3)
+    setpoint = np.array([state.setpoint or NO_SETPOINT for state in states]).reshape(-1, 4)
+    yaw = np.array([state.yaw for state in states]).reshape(-1, 1)
+    return (
+        _line(t, measured, time, hold),
+        _turn(t, yaw, time, hold),
+        _line(t, np.where(np.isfinite(truth), truth, measured), time, hold),
+        _step(t, goal, time, hold),
+        _step(t, setpoint, time, hold),
+    )
+
+
+def _line(t: Array, values: Array, time: Array, hold: float) -> Array:
+    """Samples (K, k) at times (K,), interpolated linearly onto the grid (T, k); one that is not finite is none."""
+    whole = np.isfinite(values).all(axis=1)
+    t, values = t[whole], values[whole]
+    if not len(t):
+        return np.full((len(time), values.shape[1]), np.nan)
+    line = np.column_stack([np.interp(time, t, column) for column in values.T])
+    line[~_known(t, time, hold)] = np.nan
+    return line
+
+
+def _turn(t: Array, yaw: Array, time: Array, hold: float) -> Array:
+    """Like `_line` for angles [rad]: the short way round, and on the branch of the sample before."""
+    whole = np.isfinite(yaw[:, 0])
+    t, yaw = t[whole], yaw[whole]
+    turned = _line(t, np.unwrap(yaw, axis=0), time, hold)
+    return turned + 2.0 * np.pi * np.round((_step(t, yaw, time, hold) - turned) / (2.0 * np.pi))
+
+
+def _step(t: Array, values: Array, time: Array, hold: float) -> Array:
+    """Samples (K, k) at times (K,), the last at or before each time of the grid (T, k)."""
+    if not len(t):
+        return np.full((len(time), values.shape[1]), np.nan)
+    before = np.searchsorted(t, time + ROUNDING_S, side="right") - 1
+    step = values[np.maximum(before, 0)]
+    step[~_known(t, time, hold)] = np.nan
+    return step
+
+
+def _known(t: Array, time: Array, hold: float) -> Mask:
+    """Where on the grid the samples say something: close to one, or between two that are not far apart."""
+    after = np.searchsorted(t, time)
+    padded = np.concatenate([[-np.inf], t, [np.inf]])
+    since, until = time - padded[after], padded[after + 1] - time
+    return np.asarray((np.minimum(since, until) <= hold + ROUNDING_S) | (since + until <= HOLE_S + ROUNDING_S))
+
+
+def _sent(poses: list[list[SentPose]], start: float, duration: float) -> Sent:
+    table = _in_run(
+        [
+            (pose.stamp, row, pose.seq, *pose.position, *pose.velocity, pose.yaw, pose.size)
+            for row, own in enumerate(poses)
+            for pose in own
+        ],
+        (11, start, duration),
+    )
+    return Sent(
+        time=table[:, 0],
+        robot=table[:, 1].astype(np.intp),
+        seq=table[:, 2].astype(np.intp),
+        position=table[:, 3:6],
+        velocity=table[:, 6:9],
+        yaw=table[:, 9],
+        bytes=table[:, 10].astype(np.intp),
+    )
+
+
+def _heard(states: list[list[State]], robots: tuple[str, ...], start: float, duration: float) -> HeardPoses:
+    row = {robot: index for index, robot in enumerate(robots)}
+    table = _in_run(
+        [
+            (heard.arrived, listener, row[heard.speaker], heard.seq, heard.stamp - start, *heard.position)
+            for listener, own in enumerate(states)
+            for state in own
+            for heard in state.heard
+            if heard.speaker in row
+        ],
+        (8, start, duration),
+    )
+    return HeardPoses(
+        time=table[:, 0],
+        listener=table[:, 1].astype(np.intp),
+        speaker=table[:, 2].astype(np.intp),
+        seq=table[:, 3].astype(np.intp),
+        stamp=table[:, 4],
+        position=table[:, 5:8],
+    )
+
+
+def _in_run(rows: list[tuple[float, ...]], shape: tuple[int, float, float]) -> Array:
+    """The rows whose first column, a UTC time, lies in the run: in order of time, which then counts from the start."""
+    width, start, duration = shape
+    table = np.array(rows, dtype=np.float64).reshape(-1, width)
+    table[:, 0] -= start
+    table = table[(table[:, 0] >= -ROUNDING_S) & (table[:, 0] <= duration + ROUNDING_S)]
+    np.clip(table[:, 0], 0.0, duration, out=table[:, 0])
+    return table[np.argsort(table[:, 0], kind="stable")]
+
+
+def _lost(
+    robots: tuple[str, ...], poses: list[list[SentPose]], statuses: list[list[Status]], run: tuple[float, float]
+) -> Index:
+    """(N,) what was lost of each robot, as `read` defines it; `run` is its beginning and end in UTC [s]."""
+    missed: Counter[str] = Counter()
+    for robot, own, said in zip(robots, poses, statuses, strict=True):
+        missed[robot] += _gaps(own, run) + _tail(own, said, run)
+        missed.update(_unheard(said, run))
+    return np.array([missed[robot] for robot in robots], dtype=np.intp)
+
+
+def _gaps(poses: list[SentPose], run: tuple[float, float]) -> int:
+    begin, end = run[0] - ROUNDING_S, run[1] + ROUNDING_S
+    seq = np.array([pose.seq for pose in poses if begin <= pose.stamp <= end], dtype=np.intp)
+    step = np.diff(seq)
+    anew = seq[1:][step < 0]
+    return int((step[step > 0] - 1).sum() + (anew - 1).sum())
+
+
+def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float]) -> int:
+    said = [status for status in statuses if run[0] < status.stamp <= run[1] + STATUS_S]
+    if not said:
+        return 0
+    last = said[-1]
+    recorded = [pose.seq for pose in poses if pose.stamp <= last.stamp + ROUNDING_S]
+    before = [status.sent for status in statuses if status.stamp <= run[0] and status.pid == last.pid]
+    return max(0, last.sent - max(recorded[-1:] + before[-1:], default=0))
+
+
+def _unheard(statuses: list[Status], run: tuple[float, float]) -> Counter[str]:
+    """What one listener's process, or several after each other, counted as lost in the run, by speaker."""
+    total: Counter[str] = Counter()
+    before: dict[str, int] = {}
+    process = None
+    for status in statuses:
+        if status.pid != process:
+            before, process = {}, status.pid
+        if run[0] < status.stamp <= run[1] + STATUS_S:
+            total.update({speaker: max(0, count - before.get(speaker, 0)) for speaker, count in status.lost.items()})
+        before = status.lost
+    return total

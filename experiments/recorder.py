@@ -1,0 +1,162 @@
+"""The recorder process: `python -m experiments.recorder EXPERIMENT.json TARGET ...`.
+
+A process of its own, so that the death of the conductor costs no recording: it goes on until every robot is gone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+import zenoh
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from agents.lifeline import Lifeline
+from experiments import document
+from experiments.problem import DocumentError
+from experiments.recording import Recording
+from experiments.records import RecordingError
+
+POLL_S: Final = 0.02
+FLUSH_S: Final = 1.0
+AFTER_S: Final = 12.0  # how long robots may take to land after the conductor is gone
+DEPTH: Final = 20_000  # samples that may wait while the disk does
+
+
+class Recorder:
+    """Takes down what robots and conductor say."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, recording: Recording) -> None:
+        self._keys, self._recording = keys, recording
+        self._connected = True
+        self._session = session
+        self.malformed = 0
+        self._alive: set[str] = set()
+        self._poses = network.pose_subscriber(session, keys.pose("*"), DEPTH)
+        self._statuses = network.pose_subscriber(session, keys.status("*"), DEPTH)
+        self._states = network.subscriber(session, keys.state("*"), DEPTH)
+        self._events = network.subscriber(session, keys.event, DEPTH)
+        self._watch = network.alive_watch(session, keys.alive("*"))
+        self._token = network.alive_token(session, keys.recorder)
+
+    @property
+    def alone(self) -> bool:
+        """Whether no robot is left."""
+        return not self._alive
+
+    def take(self) -> None:
+        """Writes what has arrived.
+
+        Raises:
+            RecordingError: If it cannot be written.
+        """
+        for sample in network.received(self._watch.handler):
+            robot = str(sample.key_expr)
+            (self._alive.discard if sample.kind == zenoh.SampleKind.DELETE else self._alive.add)(robot)
+        for handler, what in (
+            (self._states.handler, self._state),
+            (self._poses.handler, self._pose),
+            (self._statuses.handler, self._status),
+            (self._events.handler, self._event),
+        ):
+            for sample in network.received(handler):
+                try:
+                    what(sample)
+                except ValueError:  # malformed, or on a key that is nobody's
+                    self.malformed += 1
+
+    def _pose(self, sample: zenoh.Sample) -> None:
+        payload = sample.payload.to_bytes()
+        pose = wire.decode(payload, str(sample.encoding), wire.Pose)
+        self._own(sample, pose.robot)
+        self._recording.pose(pose, time.time(), len(payload))
+
+    def _state(self, sample: zenoh.Sample) -> None:
+        state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
+        self._own(sample, state.robot)
+        self._recording.state(state)
+
+    def _status(self, sample: zenoh.Sample) -> None:
+        status = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Status)
+        self._own(sample, status.robot)
+        self._recording.status(status)
+
+    def _event(self, sample: zenoh.Sample) -> None:
+        self._recording.event(wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Event))
+
+    def _own(self, sample: zenoh.Sample, robot: str) -> None:
+        if self._keys.robot(str(sample.key_expr)) != robot:
+            raise wire.Malformed(f"a message of '{robot}' on {sample.key_expr}")
+
+
+def record(file: str, target: Path, *, case: str, source: Path, connect: Sequence[str]) -> None:
+    """Records one case until its lifeline is lost and the robots are gone, or until SIGTERM.
+
+    Args:
+        file: The resolved case.
+        target: The recording.
+        case: Its name.
+        source: The experiment file as it was written, to be attached.
+        connect: Routers.
+
+    Raises:
+        RecordingError: If the recording cannot be written.
+    """
+    experiment = document.read(file).experiment
+    lost, asked = threading.Event(), threading.Event()
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        asked.set()
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    Lifeline(lost).start()
+    text = source.read_text("utf-8")
+    with (
+        network.open_session(connect, name="recorder", stop=asked) as session,
+        Recording(target, experiment, text, case=case, seed=experiment.seed, clock="real") as recording,
+    ):
+        recorder = Recorder(session, Keys(experiment.network.realm), recording)
+        flush_at = time.monotonic() + FLUSH_S
+        last = float("inf")
+        while not asked.wait(POLL_S):
+            recorder.take()
+            now = time.monotonic()
+            if now > flush_at:
+                recording.flush()
+                flush_at = now + FLUSH_S
+            if lost.is_set():
+                last = min(last, now + AFTER_S)
+                if recorder.alone or now > last or not network.connected(session):
+                    break
+        recorder.take()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line of the process."""
+    parser = argparse.ArgumentParser(prog="zenpark recorder", description="Records one case of an experiment.")
+    parser.add_argument("file", help="the resolved case")
+    parser.add_argument("target", type=Path)
+    parser.add_argument("--case", required=True)
+    parser.add_argument("--source", type=Path, required=True, help="the experiment file to attach")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[])
+    chosen = parser.parse_args(arguments)
+    try:
+        record(chosen.file, chosen.target, case=chosen.case, source=chosen.source, connect=chosen.connect)
+    except (DocumentError, RecordingError, network.Unreachable, OSError) as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

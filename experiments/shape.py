@@ -1,0 +1,235 @@
+"""Does a document have the shape of an experiment: known keys, nothing missing, values of the right type and range.
+
+`msgspec.convert` stops at the first error and does not tell which entry of a table it is in. The walk here goes down
+the same annotations and lets msgspec judge one value at a time, so that everything is found, each with its path.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import types
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
+
+import msgspec
+
+from agents import plugins
+from agents.plugins import did_you_mean
+from experiments.experiment import Experiment
+from experiments.locate import Path
+from experiments.problem import Fault, shown
+
+_REMEDY: Final = {  # of what is missing
+    "title": 'add title = "what this experiment shows"',
+    "duration_s": "add duration_s = 30.0",
+    "robots": 'add at least one: [robots.KH01] with kind = "khepera4" and start = [0.0, 0.0]',
+    "start": "add start = [0.0, 0.0], in metres",
+    "at_s": "add at_s = 0.0, in seconds after the common start",
+    "robot": 'add robot = "..." with the name of one of the robots',
+    "plan": 'add plan = { kind = "line", move_by = [0.5, 0.0], speed = 0.1 }',
+}
+_WORDS: Final = {
+    "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false", "array": "a list",
+    "object": "a table",
+}  # fmt: skip
+_FIELDS: Final = frozenset(Experiment.__struct_fields__)
+
+
+def storable(value: object, path: Path = ()) -> Iterator[Fault]:
+    """Numbers that no experiment can hold, though TOML can write them."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from storable(each, (*path, key))
+    elif isinstance(value, list):
+        for number, each in enumerate(value):
+            yield from storable(each, (*path, number))
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield Fault(path, f"'{_name(path)}' is {value}, which is no quantity", "give a finite number")
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        yield Fault(path, f"'{_name(path)}' has more digits than a 64-bit integer holds", "give a smaller number")
+
+
+def faults(document: Mapping[str, Any]) -> list[Fault]:
+    """Everything by which a document is not an `Experiment`; empty if `msgspec.convert` takes it."""
+    return _table(document, Experiment, ())
+
+
+def group_of(path: Path) -> str | None:
+    """The entry-point group that the choice at this path is made from, if a choice stands there."""
+    match path:
+        case ("trigger",):
+            return plugins.TRIGGERS
+        case ("formation", "law"):
+            return plugins.LAWS
+        case ("timeline", int(), "plan"):
+            return plugins.PLANNERS
+    return None
+
+
+def parameters(group: str, kind: str) -> list[str]:
+    """Names of the parameters of a plug-in, none if it cannot be used."""
+    try:
+        return [field.encode_name for field in msgspec.structs.fields(plugins.struct(group, kind))]
+    except plugins.PluginError:
+        return []
+
+
+def _value(value: object, annotation: object, path: Path, note: str) -> list[Fault]:
+    group = group_of(path)
+    if group is not None and isinstance(value, str | dict):
+        return _choice(value, group, path)
+    plain, note = _plain(annotation, note)
+    inner: list[Fault] = []
+    if _is_struct(plain):
+        return _table(value, plain, path) if isinstance(value, dict) else [_no_table(value, path)]
+    if get_origin(plain) is dict:
+        if not isinstance(value, dict):
+            return [_no_table(value, path)]
+        of_key, of_value = get_args(plain)
+        for key, each in value.items():
+            inner += _key(key, of_key, (*path, key)) or _value(each, of_value, (*path, key), note)
+    elif get_origin(plain) is list and isinstance(value, list):
+        for number, each in enumerate(value):
+            inner += _value(each, get_args(plain)[0], (*path, number), note)
+    elif get_origin(plain) in (Union, types.UnionType) and isinstance(value, dict):
+        tables = [each for each in get_args(plain) if _is_struct(each)]
+        if len(tables) == 1:
+            return _table(value, tables[0], path)
+    return inner or _judged(value, annotation, path, note)
+
+
+def _table(value: Mapping[str, Any], struct: type[msgspec.Struct], path: Path) -> list[Fault]:
+    """A table against a struct: unknown keys, missing keys, then each value, then the struct's own checks."""
+    fields = {field.encode_name: field for field in msgspec.structs.fields(struct)}
+    found, meant = [], set()
+    for key in value:
+        if key not in fields:
+            hint = did_you_mean(key, fields)
+            meant |= {name for name in fields if hint == f"did you mean '{name}'?"}
+            if path and key in _FIELDS:
+                hint = f"'{key}' belongs at the top of the file, above the first [table]"
+            found.append(Fault((*path, key), f"unknown key '{key}'{_in(path)}", hint, on_key=True))
+    for name, field in fields.items():
+        if name in value:
+            found += _value(value[name], field.type, (*path, name), "")
+        elif field.required and name not in meant:
+            _, note = _plain(field.type, "")
+            found.append(
+                Fault(path, f"'{name}' is missing{_in(path)}", _REMEDY.get(name) or f"add {name} = ... ({note})")
+            )
+    return found or _judged(value, struct, path, "", fields)
+
+
+def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
+    """A plug-in and its parameters."""
+    known, what = plugins.names(group), group.rpartition(".")[2]
+    if isinstance(value, dict) and not isinstance(value.get("kind"), str):
+        hint = f'add kind = "..."; {did_you_mean("", known)}'
+        return [Fault((*path, "kind"), f"'{_name(path)}' must say its kind, as text", hint)]
+    kind, given = plugins.split(value)
+    where = path if isinstance(value, str) else (*path, "kind")
+    if kind not in known:
+        return [Fault(where, f"no {kind!r} among the {what}", did_you_mean(kind, known))]
+    try:
+        struct = plugins.struct(group, kind)
+    except plugins.PluginError as error:
+        return [Fault(where, str(error), f"repair or uninstall it, or choose another of the {what}")]
+    own = parameters(group, kind)
+    found = [
+        Fault(
+            (*path, key),
+            f"unknown parameter '{key}' of {kind!r}",
+            next((f"'{other}' has it" for other in known if key in parameters(group, other)), did_you_mean(key, own)),
+            on_key=True,
+        )
+        for key in given
+        if key not in own
+    ]
+    return found + _table({key: each for key, each in given.items() if key in own}, struct, path)
+
+
+def _judged(
+    value: object,
+    annotation: object,
+    path: Path,
+    note: str,
+    fields: Mapping[str, msgspec.structs.FieldInfo] | None = None,
+) -> list[Fault]:
+    """What msgspec says of a value, in words."""
+    try:
+        msgspec.convert(value, annotation)
+    except msgspec.ValidationError as error:
+        text, _, where = str(error).partition(" - at `")
+        for step in re.findall(r"\[(\d+)\]", where):
+            path, value = (*path, int(step)), _item(value, int(step))
+        if fields is not None:  # a struct's own check can only name its field in words
+            named = next(
+                (
+                    name
+                    for name in fields
+                    if isinstance(value, dict) and name in value and re.search(rf"\b{re.escape(name)}\b", text)
+                ),
+                None,
+            )
+            return [Fault(path if named is None else (*path, named), text, note)]
+        return [_in_words(text, value, annotation, path, note)]
+    return []
+
+
+def _in_words(text: str, value: object, annotation: object, path: Path, note: str) -> Fault:
+    name = _name(path)
+    plain, _ = _plain(annotation, note)
+    if get_origin(plain) is Literal:
+        return Fault(path, f"'{name}' cannot be {shown(value)}", did_you_mean(str(value), map(str, get_args(plain))))
+    match = re.fullmatch(r"Expected `([^`]+)`(.*?)(?:, got `.*`)?", text)
+    if match is None:
+        return Fault(path, f"'{name}': {text}", note)
+    wanted = [_WORDS.get(word, word) for word in match[1].split(" | ") if word != "null"]
+    limit = re.sub(r"\.0$", "", match[2])
+    if "matching regex" in limit:
+        limit = " of letters, digits and _ that begins with a letter"
+    if isinstance(value, bool) or not isinstance(value, list | dict):
+        limit += f", not {shown(value)}"
+    return Fault(path, f"'{name}' must be {' or '.join(wanted)}{limit}", note)
+
+
+def _key(key: str, annotation: object, path: Path) -> list[Fault]:
+    if _judged(key, annotation, path, "") or "\n" in key:  # `$` of a pattern lets a last line end pass
+        what = "letters, digits and _ . -" if path[0] == "cases" else "letters, digits and _, beginning with a letter"
+        return [Fault(path, f"{shown(key)} cannot be a name", f"use {what}", on_key=True)]
+    return []
+
+
+def _no_table(value: object, path: Path) -> Fault:
+    header = ".".join(map(str, path))
+    if isinstance(value, list) and path == ("robots",):
+        return Fault(path, "'robots' must be tables with names", "write [robots.KH01], one header for each robot")
+    return Fault(path, f"'{_name(path)}' must be a table, not {shown(value)}", f"write [{header}] above its keys")
+
+
+def _plain(annotation: object, note: str) -> tuple[Any, str]:
+    """An annotation without its constraints, and its description; that of the innermost wins."""
+    while get_origin(annotation) is Annotated:
+        for meta in get_args(annotation)[1:]:
+            note = getattr(meta, "description", None) or note
+        annotation = get_args(annotation)[0]
+    return annotation, note
+
+
+def _item(value: object, number: int) -> object:
+    return value[number] if isinstance(value, list) else None
+
+
+def _is_struct(annotation: object) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, msgspec.Struct)
+
+
+def _name(path: Path) -> str:
+    """How the user knows a path: the last key, with its indices."""
+    first = max((number for number, step in enumerate(path) if isinstance(step, str)), default=0)
+    return "".join(f"[{step}]" if isinstance(step, int) else str(step) for step in path[first:])
+
+
+def _in(path: Path) -> str:
+    return f" in '{_name(path)}'" if path else ""

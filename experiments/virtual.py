@@ -1,0 +1,198 @@
+"""The virtual clock: the whole experiment in one process, without sleeping, reproducible to the bit from its seed.
+
+The decision is `agents.Agent` with all rows, the bodies are the twins, the network is `experiments.channel`; this file
+is only the loop. Several seeds run side by side as more rows, each with the result that it would have alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.agent import Agent
+from agents.body import BodyState
+from agents.lifecycle import Phase
+from agents.rows import Array, Index
+from experiments import assign
+from experiments.channel import Channel
+from experiments.experiment import Experiment
+from twins.body import TwinBody
+
+LEAD_S = 0.5  # from the order to the common start
+PATIENCE_S = 60.0  # an experiment whose robots are not ready, up or down after this long never will be
+
+
+class Stuck(RuntimeError):
+    """Robots that do not become ready, airborne or done."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """What happened, in the time of the experiment [s]; arrays over samples (K) and rows (R).
+
+    Attributes:
+        names: Of the rows of one repetition (N).
+        seeds: One for each repetition; R = N × repetitions, the rows of the first seed first.
+        time: (K,) at state_hz, from before take-off (negative) to the end.
+        phase: (K, R) `agents.lifecycle.Phase`.
+        position: (K, R, 3), `velocity` (K, R, 3), `yaw` (K, R): measured.
+        true_position: (K, R, 3), `true_yaw` (K, R).
+        goal: (K, R, 3), `setpoint` (K, R, 4), `error` (K, R).
+        sent: Columns time, row, seq, position, velocity, yaw.
+        heard: Columns time, link, seq, stamp, position.
+        lost: (E,) samples lost on each link of all repetitions.
+        decisions: Coordination decisions of each row.
+        interventions: (R,) ticks on which safety changed what was decided.
+        ticks: Ticks from the common start to the end.
+        airborne: When all robots were up (negative), and `ended` when all were done.
+        ended: See `airborne`.
+    """
+
+    names: tuple[str, ...]
+    seeds: tuple[int, ...]
+    time: Array
+    phase: Index
+    position: Array
+    velocity: Array
+    yaw: Array
+    true_position: Array
+    true_yaw: Array
+    goal: Array
+    setpoint: Array
+    error: Array
+    sent: tuple[Array, Index, Index, Array, Array, Array]
+    heard: tuple[Array, Index, Index, Array, Array]
+    lost: Index
+    decisions: int
+    interventions: Index
+    ticks: int
+    airborne: float
+    ended: float
+
+
+class _Samples:
+    """Rows of a log while it grows."""
+
+    def __init__(self) -> None:
+        self._columns: list[tuple[object, ...]] = []
+
+    def add(self, *values: object) -> None:
+        self._columns.append(values)
+
+    def stacked(self) -> tuple[Array, ...]:
+        return tuple(np.array(column) for column in zip(*self._columns, strict=True))
+
+    def joined(self, *empty: tuple[int, ...]) -> tuple[Array, ...]:
+        """Concatenated; `empty` gives the shapes of columns when nothing was added."""
+        if not self._columns:
+            return tuple(np.zeros(shape) for shape in empty)
+        return tuple(np.concatenate(column) for column in zip(*self._columns, strict=True))  # type: ignore[arg-type]
+
+
+def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
+    """Flies one case of an experiment once for each seed.
+
+    Raises:
+        Stuck: If robots do not become ready, airborne or done.
+    """
+    names = tuple(experiment.robots)
+    assignment = assign.assign(experiment, names, copies=len(seeds))
+    agent = Agent(assignment)
+    body = TwinBody(assign.request(experiment, names, seeds))
+    channel = Channel(assignment.links, experiment.channel, seeds)
+    rows = len(assignment.names)
+    dt = 1.0 / assignment.body_hz
+    log_every = round(assignment.body_hz / experiment.rates.state_hz)
+    seq = np.zeros(rows, dtype=np.intp)
+    interventions = np.zeros(rows, dtype=np.intp)
+    states, sent, heard = _Samples(), _Samples(), _Samples()
+    conductor = _Conductor(agent, names)
+    tick = 0
+    while not conductor.over:
+        t = tick * dt
+        state = body.read(t)
+        arrived = channel.due(t)
+        if arrived is not None:
+            agent.hear(arrived.link, arrived.position, arrived.velocity, arrived.stamp, arrived.arrival)
+            heard.add(arrived.arrival, arrived.link, arrived.seq, arrived.stamp, arrived.position)
+        actions = agent.step(t, state)
+        if actions.duties is not None:
+            body.takeoff(actions.duties.takeoff, assignment.hover[actions.duties.takeoff])
+            body.land(actions.duties.land)
+            body.stop(actions.duties.stop)
+        body.command(actions.setpoint)
+        interventions += actions.changed
+        if tick % log_every == 0:
+            states.add(t, agent.life.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
+        if len(speak := actions.speak):
+            seq[speak] += 1
+            sent.add(
+                np.full(len(speak), t), speak, seq[speak], state.position[speak], state.velocity[speak], state.yaw[speak]
+            )
+            channel.send(t, speak, seq, state.position, state.velocity)
+        conductor.look(t, dt)
+        tick += 1
+    begin = conductor.start_at
+    time, phase, *arrays = states.stacked()
+    said = sent.joined((0,), (0,), (0,), (0, 3), (0, 3), (0,))
+    got = heard.joined((0,), (0,), (0,), (0,), (0, 3))
+    return Log(
+        names,
+        tuple(seeds),
+        time - begin,
+        phase.astype(np.intp),
+        *arrays,
+        sent=(said[0] - begin, said[1].astype(np.intp), said[2].astype(np.intp), *said[3:]),  # type: ignore[arg-type]
+        heard=(got[0] - begin, got[1].astype(np.intp), got[2].astype(np.intp), got[3] - begin, got[4]),
+        lost=channel.lost,
+        decisions=agent.decisions,
+        interventions=interventions,
+        ticks=round(experiment.duration_s / dt),
+        airborne=conductor.airborne_at - begin,
+        ended=tick * dt - begin,
+    )
+
+
+def _measured(state: BodyState) -> tuple[Array, ...]:
+    return state.position, state.velocity, state.yaw, state.true_position, state.true_yaw
+
+
+class _Conductor:
+    """Gives the orders that the conductor of a real run gives, at the same moments of the robots' lives."""
+
+    def __init__(self, agent: Agent, names: tuple[str, ...]) -> None:
+        self._agent, self._names = agent, names
+        self._stage = Phase.READY
+        self._since = 0.0
+        self.airborne_at = self.start_at = np.nan
+        self.over = False
+
+    def look(self, t: float, dt: float) -> None:
+        """After each tick."""
+        phase = self._agent.life.phase
+        if self._stage == Phase.RUNNING:
+            if phase.min() >= Phase.LANDING:
+                self._since, self._stage = t, Phase.DONE
+            return
+        if phase.min() < self._stage:
+            if t - self._since > PATIENCE_S:
+                late = np.flatnonzero(phase < self._stage)[: len(self._names)]
+                names = ", ".join(sorted({self._names[row % len(self._names)] for row in late}))
+                raise Stuck(f"not {self._stage.word} after {PATIENCE_S:g} s: {names} ({self._agent.life.reason[late[0]]})")
+            return
+        self._since = t
+        life = self._agent.life
+        if self._stage == Phase.READY:
+            for row in range(len(phase)):
+                life.takeoff(row)
+            self._stage = Phase.AIRBORNE
+        elif self._stage == Phase.AIRBORNE:
+            self.airborne_at = t
+            self.start_at = t + round(LEAD_S / dt) * dt
+            for row in np.flatnonzero(phase == Phase.AIRBORNE):
+                life.start(int(row), self.start_at)
+            self._stage = Phase.RUNNING
+        else:
+            self.over = True

@@ -1,0 +1,236 @@
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from agents.session import (
+    EndpointError,
+    Unreachable,
+    alive_token,
+    alive_watch,
+    config,
+    connected,
+    free_endpoint,
+    last_value,
+    open_session,
+    orders,
+    pose_publisher,
+    pose_subscriber,
+    publisher,
+    received,
+    serve_router,
+    subscriber,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+JSON = "application/json"
+POSE = "park/CF01/pose"
+
+
+def payloads(handler):
+    return [sample.payload.to_bytes() for sample in received(handler)]
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp/0.0.0.0:7447",
+        "tcp/[::]:7447",
+        "tcp/192.168.1.2:7447",
+        "udp/0.0.0.0:7447",
+        "tcp/host.example:7447",
+        "tcp/:1",
+    ],
+)
+def test_refuses_to_listen_beyond_loopback(endpoint):
+    with pytest.raises(EndpointError, match="SSH tunnel"):
+        config("router", listen=[endpoint])
+
+
+@pytest.mark.parametrize("endpoint", ["127.0.0.1:7447", "tcp/", "/127.0.0.1:7447", ""])
+def test_refuses_what_is_no_endpoint(endpoint):
+    with pytest.raises(EndpointError, match=r"write it like tcp/127\.0\.0\.1:7447"):
+        config("client", connect=[endpoint])
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:0", "tcp/127.3.2.1:7447", "tcp/[::1]:7447", "tcp/localhost:7447"])
+def test_listens_on_loopback(endpoint):
+    made = config("router", listen=[endpoint], name="router", lease_s=1.5)
+    assert made.get_json("listen/endpoints") == f'["{endpoint}"]'
+    assert made.get_json("scouting/multicast/enabled") == "false"
+    assert made.get_json("scouting/gossip/enabled") == "false"
+    assert made.get_json("transport/shared_memory/enabled") == "false"
+    assert made.get_json("transport/link/tx/lease") == "1500"
+
+
+def test_free_endpoint_avoids_a_taken_port():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert free_endpoint(port) != f"tcp/127.0.0.1:{port}"
+    assert free_endpoint(port) == f"tcp/127.0.0.1:{port}"
+
+
+def test_unreachable_names_endpoints_and_remedy():
+    endpoint = free_endpoint(preferred_port=0)
+    with pytest.raises(Unreachable, match=rf"{endpoint}.*`zenpark router`"):
+        open_session([endpoint], name="test", wait_s=0.0)
+
+
+def test_stop_ends_the_wait_for_a_router():
+    stop = threading.Event()
+    stop.set()
+    with pytest.raises(Unreachable):
+        open_session([free_endpoint(preferred_port=0)], name="test", wait_s=1e6, stop=stop)
+
+
+@pytest.mark.system
+def test_router_says_when_its_port_is_taken(router):
+    with pytest.raises(EndpointError, match=rf"{router.endpoint}.*in use"):
+        serve_router([router.endpoint], threading.Event())
+
+
+@pytest.mark.system
+def test_late_joiner_hears_the_last_pose(router, eventually):
+    with open_session([router.endpoint], name="CF01") as speaker:
+        pose = pose_publisher(speaker, POSE, JSON)
+        for value in (b"1", b"2", b"3"):
+            pose.put(value)
+        with open_session([router.endpoint], name="CF02") as listener:
+            poses = pose_subscriber(listener, "park/*/pose")
+            heard = []
+            eventually(lambda: heard.extend(payloads(poses.handler)) or heard)
+            pose.put(b"4")
+            eventually(lambda: heard.extend(payloads(poses.handler)) or len(heard) == 2)
+            assert heard == [b"3", b"4"]
+
+
+@pytest.mark.system
+def test_pose_said_while_the_router_was_down_arrives(router, eventually):
+    with (
+        open_session([router.endpoint], name="CF01") as speaker,
+        open_session([router.endpoint], name="CF02") as listener,
+    ):
+        pose, poses = pose_publisher(speaker, POSE, JSON), pose_subscriber(listener, POSE)
+        heard = []
+        pose.put(b"before")
+        eventually(lambda: heard.extend(payloads(poses.handler)) or heard == [b"before"])
+        router.kill()
+        eventually(lambda: not connected(speaker) and not connected(listener))
+        pose.put(b"while down")
+        router.start()
+        eventually(lambda: heard.extend(payloads(poses.handler)) or b"while down" in heard)
+        assert connected(speaker)
+        assert heard[-1] == b"while down"
+
+
+@pytest.mark.system
+def test_client_fails_over_to_the_second_router(router, eventually):
+    second = type(router)()
+    with open_session([router.endpoint, second.endpoint], name="CF01") as session:
+        first = session.info.routers_zid()
+        router.kill()
+        eventually(lambda: connected(session) and session.info.routers_zid() != first)
+    assert second.stop() == 0
+
+
+@pytest.mark.system
+def test_last_value_answers_a_plain_get(router, eventually):
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
+        asker = ui.declare_querier(POSE, timeout=5.0)  # a wildcard is never told that it matches
+        with last_value(robot, POSE, JSON) as last:
+            eventually(lambda: asker.matching_status.matching)
+            empty = ui.get("park/*/pose", timeout=5.0)
+            eventually(last.answer)
+            assert list(empty) == []
+            last.hold(b"1")
+            last.hold(b"2")
+            asked = ui.get("park/*/pose", timeout=5.0)
+            eventually(last.answer)
+            replies = [reply.ok for reply in asked]
+            assert [(str(reply.key_expr), reply.payload.to_bytes(), str(reply.encoding)) for reply in replies] == [
+                (POSE, b"2", JSON)
+            ]
+        eventually(lambda: not asker.matching_status.matching)
+
+
+@pytest.mark.system
+def test_orders_wait_until_they_are_polled(router, eventually):
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
+        taken = orders(robot, "park/CF01/order")
+        asker = ui.declare_querier("park/CF01/order")
+        eventually(lambda: asker.matching_status.matching)
+        asked = ui.get("park/*/order", payload=b"land", timeout=5.0)
+        waiting = []
+        eventually(lambda: waiting.extend(received(taken.handler)) or waiting)
+        with waiting[0] as order:
+            assert order.payload.to_bytes() == b"land"
+            order.reply("park/CF01/order", b"ok")
+        assert [reply.ok.payload.to_bytes() for reply in asked] == [b"ok"]
+
+
+@pytest.mark.system
+def test_telemetry_keeps_the_newest(router, eventually):
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="recorder") as ui:
+        states, control = subscriber(ui, "park/*/state", depth=3), subscriber(ui, "park/control")
+        state = publisher(robot, "park/CF01/state", JSON)
+        eventually(lambda: state.matching_status.matching)
+        for value in range(10):
+            state.put(str(value))
+        publisher(robot, "park/control", JSON).put(b"behind")
+        eventually(lambda: payloads(control.handler))
+        assert payloads(states.handler) == [b"7", b"8", b"9"]
+
+
+ROBOT = """
+import sys
+from agents.session import alive_token, open_session, orders, pose_publisher, pose_subscriber
+session = open_session([sys.argv[1]], name="CF01")
+held = [
+    alive_token(session, "park/CF01/alive"),
+    pose_publisher(session, "park/CF01/pose", "application/json"),
+    pose_subscriber(session, "park/CF02/pose"),
+    orders(session, "park/CF01/order"),
+]
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.system
+def test_interpreter_exits_although_a_session_was_left_open(router):
+    done = subprocess.run(
+        [sys.executable, "-c", ROBOT, router.endpoint],
+        cwd=ROOT,
+        input="",
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "ready\n", "")
+
+
+@pytest.mark.system
+def test_a_killed_robot_is_noticed(router, eventually):
+    robot = subprocess.Popen(
+        [sys.executable, "-c", ROBOT, router.endpoint], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    with robot, open_session([router.endpoint], name="CF02") as session:
+        assert robot.stdout.readline() == b"ready\n"
+        own = alive_token(session, "park/CF02/alive")
+        watch = alive_watch(session, "park/*/alive")
+        seen = []
+        eventually(lambda: seen.extend(received(watch.handler)) or len(seen) == 2)
+        assert {str(sample.key_expr) for sample in seen} == {"park/CF01/alive", "park/CF02/alive"}
+        assert all(sample.kind == zenoh.SampleKind.PUT for sample in seen)
+        robot.kill()
+        seen.clear()
+        eventually(lambda: seen.extend(received(watch.handler)) or seen)
+        assert [str(sample.key_expr) for sample in seen] == ["park/CF01/alive"]
+        assert seen[0].kind == zenoh.SampleKind.DELETE
+        assert connected(session)
+        own.undeclare()

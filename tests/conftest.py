@@ -1,0 +1,100 @@
+"""What tests that start processes share: a real router, patience, and the proof that nothing is left."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from agents.session import free_endpoint
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Under xdist the system tests run one after the other: two routers and their robots on two cores only wait."""
+    for item in items:
+        if item.get_closest_marker("system") is not None:
+            item.add_marker(pytest.mark.xdist_group("system"))
+
+
+class RouterProcess:
+    """A router in a process of its own, on a free loopback port that it keeps over restarts."""
+
+    def __init__(self) -> None:
+        self.endpoint = free_endpoint(preferred_port=0)
+        self.process: subprocess.Popen[str]
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "agents.router", "--listen", self.endpoint],
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == f"router ready on {self.endpoint}\n"
+
+    def kill(self) -> None:
+        self.process.kill()
+        self._reap()
+
+    def stop(self) -> int:
+        self.process.terminate()
+        return self._reap()
+
+    def _reap(self) -> int:
+        code = self.process.wait(10)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        return code
+
+
+@pytest.fixture
+def router() -> Iterator[RouterProcess]:
+    """A real router process; its `endpoint` is where clients connect."""
+    made = RouterProcess()
+    yield made
+    assert made.process.returncode is not None or made.stop() == 0
+    assert not psutil.pid_exists(made.process.pid)
+
+
+@pytest.fixture
+def eventually() -> Callable[[Callable[[], object]], None]:
+    """Waits until something is true, and fails when it is not after 10 s."""
+
+    def wait(true: Callable[[], object]) -> None:
+        deadline = time.monotonic() + 10.0
+        pause = threading.Event()
+        while not true():
+            assert time.monotonic() < deadline, "it did not become true in 10 s"
+            pause.wait(0.005)
+
+    return wait
+
+
+@pytest.fixture(autouse=True)
+def no_orphans(request: pytest.FixtureRequest) -> Iterator[None]:
+    """After a system test no process and no thread that it started is left."""
+    if request.node.get_closest_marker("system") is None:
+        yield
+        return
+    threads = set(threading.enumerate())
+    processes = set(psutil.Process().children(recursive=True))
+    yield
+    _, left = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - processes, timeout=2.0)
+    what = [f"{process.pid}: {' '.join(process.cmdline())}" for process in left]
+    for process in left:
+        process.kill()
+    assert not what, f"processes left behind: {what}"
+    for thread in set(threading.enumerate()) - threads:
+        thread.join(2.0)
+        assert not thread.is_alive(), f"thread left behind: {thread.name}"

@@ -1,0 +1,352 @@
+"""What is encoded must be what two other implementations of CDR read, and byte for byte what one of them writes."""
+
+import math
+import struct
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from agents.wire import Event, Heard, Pose, State, Status
+from experiments.cdr import (
+    POSE_STAMPED,
+    POSE_STAMPED_SCHEMA,
+    Codec,
+    Undecodable,
+    Unencodable,
+    codec,
+    pose_stamped,
+)
+from experiments.recording import SentPose
+
+
+class Inner(msgspec.Struct):
+    flag: bool
+    label: str
+    place: tuple[float, float]
+
+
+class Everything(msgspec.Struct):
+    first: bool
+    second: bool
+    count: int
+    third: bool
+    value: float
+    name: str
+    fourth: bool
+    fifth: int
+    inner: Inner
+    flags: list[bool]
+    counts: list[int]
+    values: list[float]
+    names: list[str]
+    inners: list[Inner]
+    table: dict[str, int]
+    maybe: float | None
+    perhaps: tuple[float, float, float] | None
+    index: int | None
+    last: str
+
+
+finite = st.floats(allow_nan=False)
+number = st.integers(-(2**63), 2**63 - 1)
+word = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
+vector = st.tuples(finite, finite, finite)
+inner = st.builds(Inner, st.booleans(), word, st.tuples(finite, finite))
+everything = st.builds(
+    Everything,
+    first=st.booleans(),
+    second=st.booleans(),
+    count=number,
+    third=st.booleans(),
+    value=finite,
+    name=word,
+    fourth=st.booleans(),
+    fifth=number,
+    inner=inner,
+    flags=st.lists(st.booleans(), max_size=5),
+    counts=st.lists(number, max_size=5),
+    values=st.lists(finite, max_size=5),
+    names=st.lists(word, max_size=5),
+    inners=st.lists(inner, max_size=4),
+    table=st.dictionaries(word, number, max_size=4),
+    maybe=st.none() | finite,
+    perhaps=st.none() | vector,
+    index=st.none() | st.integers(0, 2**63 - 1),
+    last=word,
+)
+heard = st.builds(Heard, word, number, finite, finite, vector)
+state = st.builds(
+    State,
+    robot=word,
+    seq=number,
+    stamp=finite,
+    phase=word,
+    position=vector,
+    velocity=vector,
+    yaw=finite,
+    goal=vector,
+    setpoint=st.tuples(finite, finite, finite, finite),
+    error=finite,
+    true_position=st.none() | vector,
+    true_yaw=st.none() | finite,
+    heard=st.lists(heard, max_size=5),
+)
+
+
+def ros(made: Codec):
+    """The type in rosbags' own system, and mcap-ros2's decoder."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(made.schema, made.name))
+    decoder = DecoderFactory().decoder_for("cdr", Schema(1, made.schema.encode(), "ros2msg", made.name))
+    assert decoder is not None
+    return store, decoder
+
+
+EVERYTHING = codec(Everything)
+STORE, DECODER = ros(EVERYTHING)
+
+
+def plain(value):
+    """A message of either library as lists and dictionaries, NaN as None."""
+    if isinstance(value, np.ndarray | list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return None if math.isnan(value) else float(value)
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, str):
+        return value
+    names = getattr(value, "__dataclass_fields__", None) or value.__slots__
+    return {name: plain(getattr(value, name)) for name in names if not name.startswith("__")}
+
+
+def expected(struct_):
+    """The same of one of ours."""
+    if isinstance(struct_, msgspec.Struct):
+        pairs = {}
+        for name in struct_.__struct_fields__:
+            value = getattr(struct_, name)
+            if isinstance(value, dict):
+                pairs |= {f"{name}_keys": list(value), f"{name}_values": list(value.values())}
+            else:
+                pairs[name] = expected(value)
+        return pairs
+    if isinstance(struct_, list | tuple):
+        return [expected(item) for item in struct_]
+    return struct_
+
+
+@given(everything)
+def test_both_libraries_read_what_was_meant(message):
+    data = EVERYTHING.encode(message)
+    wanted = expected(message)
+    wanted["index"] = -1 if message.index is None else message.index
+    if message.perhaps is None:
+        wanted["perhaps"] = [None] * 3
+    theirs = STORE.deserialize_cdr(data, EVERYTHING.name)
+    assert plain(theirs) == wanted
+    assert plain(DECODER(data)) == wanted
+    assert bytes(STORE.serialize_cdr(theirs, EVERYTHING.name)) == data
+    assert EVERYTHING.decode(data) == message
+
+
+@given(state)
+def test_a_state_survives(message):
+    made = codec(State)
+    data = made.encode(message)
+    assert made.decode(data) == message
+    store, decoder = STATE
+    assert decoder(data).setpoint == pytest.approx(message.setpoint, rel=0, abs=0)
+    assert bytes(store.serialize_cdr(store.deserialize_cdr(data, made.name), made.name)) == data
+
+
+STATE = ros(codec(State))
+
+
+@pytest.mark.parametrize("battery", [None, 0.7])
+def test_a_status_survives(battery):
+    made = codec(Status)
+    status = Status(
+        robot="CF01",
+        stamp=1.76e9,
+        phase="run",
+        reason="",
+        battery=battery,
+        sent=3,
+        heard=4,
+        lost={"TB01": 2, "KH01": 0},
+        malformed=0,
+        refused=1,
+        ticks=10,
+        missed=1,
+        decisions=2,
+        interventions=0,
+        late_s=0.001,
+        started=1.7e9,
+        missing=["KH02"],
+        pid=77,
+        cpu_s=0.5,
+        rss_mb=40.0,
+    )
+    data = made.encode(status)
+    assert made.decode(data) == status
+    store, decoder = ros(made)
+    assert plain(store.deserialize_cdr(data, made.name))["lost_values"] == [2, 0]
+    assert decoder(data).missing == ["KH02"]
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Pose("CF01", 7, 1.76e9, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), 0.4),
+        SentPose("CF01", 7, 1.76e9, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), 0.4, 1.76e9 + 0.002, 143),
+        Event(1.76e9, "start", "conductor", "µ: 3 > 2"),
+    ],
+)
+def test_other_structs_survive(message):
+    made = codec(type(message))
+    data = made.encode(message)
+    assert made.decode(data) == message
+    store, decoder = ros(made)
+    assert plain(store.deserialize_cdr(data, made.name)) == plain(decoder(data)) == expected(message)
+
+
+def test_the_schema_is_ros2msg():
+    assert codec(State).name == "zenpark_msgs/msg/State"
+    text = codec(State).schema
+    assert text.startswith("string robot\nint64 seq\nfloat64 stamp\n")
+    assert "float64[4] setpoint\n" in text
+    assert f"zenpark_msgs/Heard[] heard\n{'=' * 80}\nMSG: zenpark_msgs/Heard\nstring speaker\n" in text
+
+
+def test_definitions_stand_once_however_often_they_are_used():
+    class Pair(msgspec.Struct):
+        one: Inner
+        two: list[Inner]
+
+    class Nest(msgspec.Struct):
+        pair: Pair
+        more: Inner
+
+    made = codec(Nest)
+    assert made.schema.count("MSG: zenpark_msgs/Inner\n") == 1
+    a, b = Inner(True, "a", (1.0, 2.0)), Inner(False, "", (3.0, math.inf))
+    nest = Nest(Pair(a, [b, a]), b)
+    data = made.encode(nest)
+    assert made.decode(data) == nest
+    store, decoder = ros(made)
+    assert plain(store.deserialize_cdr(data, made.name)) == plain(decoder(data)) == expected(nest)
+
+
+def test_nan_stands_for_what_is_unknown():
+    made = codec(State)
+    message = State("a", 1, 2.0, "run", *[(0.0,) * 3] * 2, 0.0, (0.0,) * 3, (0.0,) * 4, 0.0, None, None)
+    assert math.isnan(ros(made)[1](made.encode(message)).true_yaw)
+    part = msgspec.structs.replace(message, true_position=(1.0, math.nan, 2.0), true_yaw=math.nan)
+    back = made.decode(made.encode(part))
+    assert back.true_position is not None
+    assert back.true_position[0] == 1.0
+    assert math.isnan(back.true_position[1])
+    assert back.true_yaw is None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Event("now", "k", "s", "t"),
+        Event(None, "k", "s", "t"),
+        Event(10**400, "k", "s", "t"),
+        Event(1.0, "k", "s", "\ud800"),
+        Pose("a", 2**63, 1.0, (0.0,) * 3, (0.0,) * 3, 0.0),
+        Pose("a", 1, 1.0, (0.0,) * 2, (0.0,) * 3, 0.0),
+        Pose("a", 1, 1.0, None, (0.0,) * 3, 0.0),
+    ],
+    ids=str,
+)
+def test_what_the_annotations_exclude_is_refused(wrong):
+    with pytest.raises(Unencodable, match=type(wrong).__name__):
+        codec(type(wrong)).encode(wrong)
+
+
+@given(state, st.data())
+def test_a_message_cut_short_is_refused(message, data):
+    made = codec(State)
+    whole = made.encode(message)
+    cut = data.draw(st.integers(0, len(whole) - 1))
+    with pytest.raises(Undecodable):
+        made.decode(whole[:cut])
+
+
+@pytest.mark.parametrize("item", [bool, int, float, str, Inner])
+def test_a_count_that_lies_is_refused(item):
+    made = codec(struct_of(list[item]))
+    data = bytearray(made.encode(made.decode(b"\0\1\0\0\0\0\0\0")))
+    struct.pack_into("<I", data, 4, 0xFFFFFFF0)
+    with pytest.raises(Undecodable):
+        made.decode(bytes(data))
+
+
+def test_big_endian_is_refused():
+    with pytest.raises(Undecodable, match="little-endian"):
+        codec(Event).decode(b"\0\0\0\0" + codec(Event).encode(Event(1.0, "k", "s", "t"))[4:])
+
+
+def struct_of(annotation, name="field"):
+    return msgspec.defstruct("Made", [(name, annotation)])
+
+
+@pytest.mark.parametrize(
+    "annotation",
+    [bytes, tuple[int, int], list[tuple[float, float]], dict[str, float], bool | None, list[float | None], set[int]],
+)
+def test_types_that_ros_cannot_hold_are_named(annotation):
+    with pytest.raises(TypeError, match=r"Made\.field: no ROS message"):
+        codec(struct_of(annotation))
+
+
+@pytest.mark.parametrize("name", ["Upper", "a__b", "end_", "_begin"])
+def test_names_that_ros_does_not_allow_are_named(name):
+    with pytest.raises(TypeError, match=rf"Made\.{name}"):
+        codec(struct_of(int, name))
+
+
+def test_an_empty_struct_is_no_message():
+    with pytest.raises(TypeError, match="no fields"):
+        codec(msgspec.defstruct("Nothing", []))
+
+
+@given(st.floats(0, 2**31 - 1), vector, st.floats(-10, 10), st.text("abcdefgh/", max_size=9))
+def test_pose_stamped_is_what_rosbags_writes(stamp, position, yaw, frame):
+    data = pose_stamped(frame)(stamp, position, yaw)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    theirs = store.deserialize_cdr(data, POSE_STAMPED)
+    assert theirs.header.stamp.sec * 10**9 + theirs.header.stamp.nanosec == round(stamp * 1e9)
+    assert theirs.header.frame_id == frame
+    assert (theirs.pose.position.x, theirs.pose.position.y, theirs.pose.position.z) == position
+    turn = theirs.pose.orientation
+    assert (turn.x, turn.y) == (0.0, 0.0)
+    assert math.remainder(2.0 * math.atan2(turn.z, turn.w) - yaw, 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
+    assert bytes(store.serialize_cdr(theirs, POSE_STAMPED)) == data
+
+
+def test_the_schema_of_pose_stamped_is_the_standard_one():
+    own = get_types_from_msg(POSE_STAMPED_SCHEMA, POSE_STAMPED)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    empty = get_typestore(Stores.EMPTY)
+    empty.register(own)
+    for name in own:
+        assert empty.hash_rihs01(name) == store.hash_rihs01(name)
+
+
+@pytest.mark.parametrize("stamp", [math.nan, math.inf, 2.0**31, -(2.0**32)])
+def test_a_stamp_that_ros_cannot_hold_is_refused(stamp):
+    with pytest.raises(Unencodable, match="PoseStamped"):
+        pose_stamped("park")(stamp, (0.0, 0.0, 0.0), 0.0)

@@ -1,0 +1,197 @@
+"""Traces for tests: motions with known integrals, and a small simulated formation for figures and reports."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from agents.graph import links
+from agents.rows import Array, norm
+from agents.wire import Event
+from experiments.experiment import Arena, Experiment, Formation, Leg, Robot
+from experiments.links import parse_links
+from experiments.trace import HeardPoses, Sent, Trace
+
+STEP = 0.02
+
+
+def experiment(
+    robots: Mapping[str, str], formation: Mapping[str, float], *, legs: Sequence[float] = (), **rest: object
+) -> Experiment:
+    """`robots`: kind by name; `formation`: distance by link; a leg of the first robot at each of `legs`."""
+    leader = str(rest.pop("leader", "")) or None
+    return Experiment(
+        title=str(rest.pop("title", "A test")),
+        source="Nobody, Nowhere 2020",
+        robots={name: Robot(kind=kind, start=[0.0, 0.0]) for name, kind in robots.items()},
+        duration_s=45.0,
+        arena=rest.pop("arena", Arena(size=(4.0, 4.0, 2.5))),
+        formation=Formation(links=dict(formation), leader=leader),
+        timeline=[Leg(at_s=at, robot=next(iter(robots)), plan="hold") for at in legs],
+    )
+
+
+def trace(
+    what: Experiment,
+    position: Array,
+    *,
+    step: float = STEP,
+    sent: Mapping[str, Sequence[float]] | None = None,
+    delay: float = 0.0,
+    case: str = "only",
+    seed: int = 1,
+    events: Sequence[Event] = (),
+) -> Trace:
+    """A trace of given positions (T, N, 3); each robot in `sent` sends its pose at those times, heard by all listeners."""
+    names = tuple(what.robots)
+    count = len(position)
+    row = {name: i for i, name in enumerate(names)}
+    time = np.arange(count) * step
+    sends = sorted((at, row[name], k) for name, times in (sent or {}).items() for k, at in enumerate(times, start=1))
+    when = np.array([at for at, _, _ in sends])
+    who = np.array([i for _, i, _ in sends], dtype=np.intp)
+    number = np.array([k for _, _, k in sends], dtype=np.intp)
+    place = position[np.clip(np.round(when / step).astype(int), 0, count - 1), who].reshape(-1, 3)
+    listeners: dict[int, list[int]] = {}
+    for listener, speaker, _, _ in parse_links(what):
+        listeners.setdefault(row[speaker], []).append(row[listener])
+    pairs = [(k, i) for k, j in enumerate(who) for i in listeners.get(int(j), [])]
+    take = np.array([k for k, _ in pairs], dtype=np.intp)
+    rows = len(names)
+    return Trace(
+        case=case,
+        experiment=what,
+        seed=seed,
+        robots=names,
+        clock="virtual",
+        time=time,
+        position=position,
+        yaw=np.zeros((count, rows)),
+        true_position=position,
+        goal=position,
+        setpoint=np.zeros((count, rows, 4)),
+        sent=Sent(when, who, number, place, np.zeros_like(place), np.zeros(len(when)), np.full(len(when), 100)),
+        heard=HeardPoses(
+            when[take] + delay,
+            np.array([i for _, i in pairs], dtype=np.intp),
+            who[take],
+            number[take],
+            when[take],
+            place[take],
+        ),
+        lost=np.zeros(rows, dtype=np.intp),
+        missed_deadlines=np.zeros(rows, dtype=np.intp),
+        ticks=np.full(rows, count),
+        decisions=np.full(rows, count // 5),
+        events=tuple(events),
+    )
+
+
+def pair(distance: Array, *, legs: Sequence[float] = (), target: float = 1.0, **rest: object) -> Trace:
+    """A leader at the origin and one follower whose distance over time is given; the follower should keep `target`."""
+    position = np.zeros((len(distance), 2, 3))
+    position[:, 1, 0] = distance
+    what = experiment({"L": "turtlebot3", "F": "khepera4"}, {"L > F": target}, legs=legs)
+    return trace(what, position, **rest)
+
+
+ROBOTIC_PARK = {
+    "TB01 > KH01": 0.60,
+    "TB01 > KH03": 0.60,
+    "KH01 - KH02": 0.60,
+    "KH02 - KH03": 0.60,
+    "KH01 - KH03": 0.8485281374,
+    "TB01 > CF01": 0.86,
+    "KH01 - CF01": 0.86,
+    "KH02 - CF02": 0.86,
+    "KH03 - CF02": 0.86,
+    "CF01 - CF02": 0.60,
+    "CF01 - CF03": 0.60,
+    "CF02 - CF03": 0.60,
+}
+STARTS = {
+    "TB01": (-0.6, 0.8, 0.0),
+    "KH01": (-0.6, -0.8, 0.0),
+    "KH02": (0.6, -0.8, 0.0),
+    "KH03": (0.6, 0.8, 0.0),
+    "CF01": (-0.2, 0.4, 0.8),
+    "CF02": (0.4, -0.4, 0.8),
+    "CF03": (-0.2, -0.4, 0.8),
+}
+KINDS = {"TB": "turtlebot3", "KH": "khepera4", "CF": "crazyflie"}
+
+
+def park(case: str = "periodic", threshold: float = 0.0, *, seed: int = 1, duration: float = 45.0) -> Trace:
+    """The reference formation with first-order robots; send-on-delta if there is a threshold [m]."""
+    what = experiment(
+        {name: KINDS[name[:2]] for name in STARTS},
+        ROBOTIC_PARK,
+        legs=[21.0] if duration > 21.0 else [],
+        leader="TB01",
+        title="Robotic Park: six robots hold a rigid formation behind a leader",
+        arena=Arena(size=(2.0, 2.0, 2.5)),
+    )
+    return simulate(what, np.array(list(STARTS.values())), case, threshold, seed=seed, duration=duration)
+
+
+def crowd(rows: int, case: str = "periodic", threshold: float = 0.0, *, seed: int = 1, duration: float = 20.0) -> Trace:
+    """Any number of robots on a hemisphere, each linked to its nearest ones, starting off their places."""
+    rng = np.random.default_rng(rows)
+    height = np.linspace(0.15, 0.95, rows)
+    angle = np.arange(rows) * np.pi * (3.0 - np.sqrt(5.0))
+    ring = np.sqrt(1.0 - height**2)
+    place = 1.4 * np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
+    gap = norm(place[:, None] - place)
+    near = {tuple(sorted((i, int(j)))) for i in range(rows) for j in np.argsort(gap[i])[1:5]}
+    names = [f"CF{i + 1:02d}" for i in range(rows)]
+    formation = {f"{names[i]} - {names[j]}": float(gap[i, j]) for i, j in near}
+    what = experiment(dict.fromkeys(names, "crazyflie"), formation, title=f"{rows} robots on a hemisphere")
+    start = place + rng.normal(0.0, 0.15, place.shape) * [1.0, 1.0, 0.0]
+    return simulate(what, start, case, threshold, seed=seed, duration=duration)
+
+
+def simulate(
+    what: Experiment, start: Array, case: str, threshold: float, *, seed: int, duration: float
+) -> Trace:
+    """The distance law on first-order robots, decided at 10 Hz; what neighbours hold is what the trigger sent."""
+    rng = np.random.default_rng(seed)
+    names, rows = list(what.robots), len(what.robots)
+    flies = np.array([what.robots[name].kind == "crazyflie" for name in names])
+    row = {name: i for i, name in enumerate(names)}
+    parsed = parse_links(what)
+    net = links([(row[i], row[j]) for i, j, _, _ in parsed], [d for *_, d, _ in parsed], [3.0] * len(parsed))
+    moves = np.isin(np.arange(rows), net.listener)
+    place, held, goal = start.copy(), start.copy(), start.copy()
+    wobble = np.zeros((rows, 3))
+    count = round(duration / STEP) + 1
+    record = np.zeros((count, rows, 3))
+    sent: dict[str, list[float]] = {name: [] for name in names}
+    for k in range(count):
+        t = k * STEP
+        seen = place + wobble
+        record[k] = seen
+        speaks = norm(seen - held) > (threshold if k and threshold else -1.0)
+        held[speaks] = seen[speaks]
+        for i in np.flatnonzero(speaks & (k < count - 1)):
+            sent[names[i]].append(t)
+        if k % 5 == 0:
+            away = seen[net.listener] - held[net.speaker]
+            pull = 0.5 * net.gain * (net.distance**2 - norm(away) ** 2)
+            step = np.clip(net.onto_listeners(pull[:, None] * away, rows), -0.1, 0.1) * [1.0, 1.0, 0.0]
+            goal = np.where(moves[:, None], seen + step, place)
+        place = place + STEP * 1.5 * (goal - seen) * moves[:, None]
+        if what.timeline and what.timeline[0].at_s <= t < what.timeline[0].at_s + 5.0:
+            place[0, 0] += 0.15 * STEP
+        kick = rng.normal(0.0, 0.010 * np.sqrt(2.0 * STEP / 0.5), (rows, 2))
+        wobble[:, :2] = np.where(flies[:, None], wobble[:, :2] * (1.0 - STEP / 0.5) + kick, 0.0)
+    events = [Event(0.0, "start", "conductor", "all robots are ready")]
+    events += [Event(leg.at_s, "phase", leg.robot, "begins to follow its plan") for leg in what.timeline]
+    return trace(what, record, sent=sent, delay=0.001, case=case, seed=seed, events=events)
+
+
+def chain(rows: int) -> dict[str, float]:
+    """Links of a chain behind the first robot, for experiments of any size."""
+    names = [f"R{i}" for i in range(rows)]
+    return {f"{a} > {b}": 1.0 for a, b in itertools.pairwise(names)}

@@ -1,0 +1,99 @@
+import importlib.util
+import re
+import tomllib
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def bootstrap(tmp_path, monkeypatch):
+    """The script as a module, for a checkout that has its three files only."""
+    loader = SourceFileLoader("bootstrap", str(ROOT / "zenpark"))
+    module = importlib.util.module_from_spec(importlib.util.spec_from_loader("bootstrap", loader))
+    loader.exec_module(module)
+    for name in ("pyproject.toml", "requirements.lock", "requirements-dev.lock"):
+        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
+    (tmp_path / ".venv" / "bin").mkdir(parents=True)
+    (tmp_path / ".venv" / "bin" / "python").touch()
+    monkeypatch.setattr(module, "ROOT", tmp_path)
+    monkeypatch.setattr(module, "PYTHON", tmp_path / ".venv" / "bin" / "python")
+    monkeypatch.setattr(module, "STAMP", tmp_path / ".venv" / "zenpark.stamp")
+    monkeypatch.setattr(module, "LOCKS", {level: tmp_path / path.name for level, path in module.LOCKS.items()})
+    return module
+
+
+def locked(name):
+    return dict(re.findall(r"^([a-z0-9.-]+)==(\S+)", (ROOT / name).read_text(), re.MULTILINE))
+
+
+def test_locks_name_no_address():
+    for name in ("requirements.lock", "requirements-dev.lock"):
+        assert not re.search(r"https?:|--index|--extra-index|--find-links", (ROOT / name).read_text())
+
+
+def test_every_locked_package_has_hashes():
+    for name in ("requirements.lock", "requirements-dev.lock"):
+        text = re.sub(r"\\\n", "", (ROOT / name).read_text())
+        assert all("--hash=sha256:" in line for line in text.splitlines() if not line.startswith("#"))
+
+
+def test_locks_hold_every_requirement():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    core, dev = locked("requirements.lock"), locked("requirements-dev.lock")
+    wanted = {re.match(r"[a-z0-9-]+", line)[0] for line in project["project"]["dependencies"]}
+    assert wanted <= core.keys()
+    assert {re.match(r"[a-z0-9-]+", line)[0] for line in project["dependency-groups"]["dev"]} <= dev.keys()
+    assert core.items() <= dev.items()
+
+
+def test_ready_only_for_what_was_installed(bootstrap):
+    assert not bootstrap.ready("core")
+    bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} core\n")
+    assert bootstrap.ready("core")
+    assert not bootstrap.ready("dev")
+    bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} dev\n")
+    assert bootstrap.ready("core")
+    assert bootstrap.ready("dev")
+
+
+@pytest.mark.parametrize("changed", ["pyproject.toml", "requirements.lock", "requirements-dev.lock"])
+def test_a_changed_file_makes_it_stale(bootstrap, changed):
+    bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} dev\n")
+    with (bootstrap.ROOT / changed).open("a") as file:
+        file.write("\n")
+    assert not bootstrap.ready("core")
+
+
+@pytest.mark.parametrize("stamp", ["", "core", "a b c", "0000 core"])
+def test_a_broken_stamp_makes_it_stale(bootstrap, stamp):
+    bootstrap.STAMP.write_text(stamp)
+    assert not bootstrap.ready("core")
+
+
+def test_settings_for_other_projects_are_left_out(bootstrap, monkeypatch):
+    for name in ("PIP_TARGET", "PIP_CONSTRAINT", "UV_PYTHON", "UV_CONSTRAINT", "VIRTUAL_ENV", "PYTHONPATH"):
+        monkeypatch.setenv(name, "/elsewhere")
+    kept = ("PIP_CERT", "SSL_CERT_FILE", "UV_INDEX_LAB_USERNAME", "UV_DEFAULT_INDEX", "HTTPS_PROXY")
+    for name in kept:
+        monkeypatch.setenv(name, "kept")
+    made = bootstrap.pip_environment()
+    assert "/elsewhere" not in made.values()
+    assert {made[name] for name in kept} == {"kept"}
+        "kept"
+    ] * 4
+    assert made["PIP_USER"] == "0"
+
+
+def test_trouble_ends_with_2_and_a_message(bootstrap, monkeypatch, capsys):
+    monkeypatch.setattr(bootstrap, "install", lambda level: (_ for _ in ()).throw(bootstrap.Trouble(f"no {level}")))
+    assert bootstrap.main(["--version"]) == 2
+    assert capsys.readouterr().err == "zenpark: no core\n"
+
+
+def test_a_failing_command_is_told_with_its_last_lines(bootstrap):
+    with pytest.raises(bootstrap.Trouble, match="getting it failed:\n  why\ndo this"):
+        bootstrap.call(["sh", "-c", "echo why; exit 3"], {}, "getting it", "do this")

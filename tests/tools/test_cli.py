@@ -1,0 +1,126 @@
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer.main
+from typer.testing import CliRunner
+
+from agents.session import free_endpoint
+from tools.cli import EXPLAINED, app
+
+ROOT = Path(__file__).resolve().parents[2]
+COMMANDS = sorted(typer.main.get_command(app).commands)
+
+
+def zenpark(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "tools.guard", *arguments],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+
+
+def test_commands():
+    assert (
+        sorted(
+            [
+                "run",
+                "agent",
+                "router",
+                "check",
+                "report",
+                "recover",
+                "new",
+                "list",
+                "schema",
+                "bench",
+                "keys",
+                "echo",
+                "hz",
+            ]
+        )
+        == COMMANDS
+    )
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command):
+    said = CliRunner().invoke(app, [command, "--help"])
+    assert said.exit_code == 0
+    assert said.stdout.startswith(f"Usage: zenpark {command} ")
+
+
+def test_help_is_light():
+    program = """
+import sys
+sys.argv = ["zenpark", "--help"]
+from tools.guard import main
+try:
+    main()
+finally:
+    print(*sys.modules, file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("Usage: zenpark ")
+    heavy = {"numpy", "zenoh", "matplotlib", "msgspec", "pymunk", "rich", "asyncio", "jinja2", "mcap", "pydantic"}
+    assert not heavy & set(done.stderr.split())
+
+
+def test_version():
+    done = zenpark("--version")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "zenpark 0.1.0\n", "")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "robotic-park", "--seed", "-1"],
+        ["run", "robotic-park", "--seeds", "0"],
+        ["run", "robotic-park", "--fly"],
+        ["run"],
+        ["agent", "robotic-park"],
+        ["echo", "park/**", "-n", "0"],
+        ["hz", "park/**", "--seconds", "soon"],
+        ["fly"],
+    ],
+)
+def test_bad_flags_end_with_2(arguments):
+    said = CliRunner().invoke(app, arguments)
+    assert said.exit_code == 2
+    assert "Error: " in said.stderr
+
+
+@pytest.mark.parametrize("command", [["keys"], ["echo", "park/**"], ["hz", "park/**"]])
+def test_no_router_is_explained(command):
+    endpoint = free_endpoint(preferred_port=0)
+    done = zenpark(*command, "--connect", endpoint)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        f"zenpark: no router answers at {endpoint}: `zenpark router` starts one, --connect names another\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["echo", "park//pose"], "'park//pose' is not a key expression"),
+        (["keys", "--connect", "localhost"], "'localhost' is not an endpoint"),
+        (["router", "--listen", "tcp/0.0.0.0:7447"], "will not listen on tcp/0.0.0.0:7447"),
+    ],
+)
+def test_bad_input_is_explained(arguments, why):
+    done = zenpark(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"zenpark: {why}")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(("module", "name"), EXPLAINED)
+def test_explained_errors_exist(module, name):
+    assert issubclass(getattr(importlib.import_module(module), name), Exception)

@@ -1,0 +1,59 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from tools.guard import PACKAGES, intruders
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def start(folder, *path):
+    """The command line, started in a folder and with these first on the import path."""
+    return subprocess.run(
+        [sys.executable, "-c", "from tools.guard import main; main()", "--version"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_this_checkout_is_whole():
+    assert intruders(ROOT) == {}
+
+
+def test_elsewhere_everything_is_an_intruder(tmp_path):
+    assert intruders(tmp_path) == {name: ROOT / name for name in PACKAGES}
+
+
+def test_passes_when_the_packages_are_ours(tmp_path):
+    done = start(tmp_path, ROOT)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("zenpark ")
+
+
+def test_names_the_package_in_the_way_and_the_remedy(tmp_path):
+    for name in ("agents", "twins"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise RuntimeError('must not be imported')")
+    done = start(ROOT.parent, tmp_path, ROOT)
+    assert (done.returncode, done.stdout) == (2, "")
+    first, agents, twins, remedy = done.stderr.splitlines()
+    assert first == "zenpark: another package is in the way of ours"
+    assert f"'agents' comes from {tmp_path / 'agents'}" in agents
+    assert f"not from {ROOT / 'twins'}" in twins
+    assert str(ROOT / "zenpark") in remedy
+
+
+def test_imports_nothing_of_ours_and_nothing_heavy():
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys, tools.guard; print(*sys.modules)"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    loaded = set(done.stdout.split())
+    assert not loaded & {"agents", "bridges", "twins", "experiments", "tools.cli", "typer", "numpy", "zenoh"}

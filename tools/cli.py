@@ -1,0 +1,228 @@
+"""The command line: signatures and help only. What a command does is imported when it runs, so that help is quick."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Final
+
+import typer
+
+app: Final = typer.Typer(
+    name="zenpark",
+    help="Distributed experiments with several robots, on Zenoh.",
+    no_args_is_help=True,
+    rich_markup_mode=None,  # rich help costs 100 ms at every start
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+# The errors that explain themselves, by the module that defines them: one that was raised has its module loaded,
+# so that nothing needs to be imported to recognise it.
+EXPLAINED: Final = (
+    ("agents.session", "EndpointError"),
+    ("agents.session", "Unreachable"),
+    ("agents.body", "BodyError"),
+    ("agents.plugins", "PluginError"),
+    ("experiments.problem", "DocumentError"),
+    ("experiments.recording", "RecordingError"),
+    ("tools.network", "KeyExpressionError"),
+)
+
+File = Annotated[str, typer.Argument(metavar="FILE", help="Experiment file, or the name of a ready-made one.")]
+Connect = Annotated[
+    list[str] | None, typer.Option(metavar="ENDPOINT", help="A router; may be repeated. [tcp/127.0.0.1:7447]")
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="PATH=VALUE", help="Changes a value of the file; may be repeated."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="For programs.")]
+KeyExpression = Annotated[str, typer.Argument(metavar="KEY", help="Key expression, such as park/*/pose.")]
+Seconds = Annotated[float | None, typer.Option(min=0.0, help="End after this time [s].")]
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version  # noqa: PLC0415
+
+        typer.echo(f"zenpark {version('zenpark')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _zenpark(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")] = False,
+) -> None: ...
+
+
+@app.command()
+def run(
+    file: File,
+    *,
+    virtual: Annotated[
+        bool, typer.Option("--virtual", help="In virtual time, in this process, as fast as it goes.")
+    ] = False,
+    case: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Only this case; may be repeated.")] = None,
+    out: Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all randomness, instead of the file's.")] = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs so many seeds: mean and spread (virtual only).")] = 1,
+    report: Annotated[bool, typer.Option(help="Writes the report.")] = True,
+    open_report: Annotated[bool, typer.Option("--open", help="Opens the report in the browser.")] = False,
+) -> None:
+    """Run an experiment: one process per robot, or in virtual time."""
+    from experiments.run import command  # noqa: PLC0415
+
+    raise typer.Exit(
+        command(
+            file,
+            virtual=virtual,
+            cases=case or [],
+            out=out,
+            seed=seed,
+            settings=settings or [],
+            as_json=as_json,
+            seeds=seeds,
+            report=report,
+            open_report=open_report,
+        )
+    )
+
+
+@app.command()
+def agent(
+    file: File,
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="The robots of this process.")],
+    connect: Connect = None,
+    lifeline: Annotated[
+        bool, typer.Option("--lifeline", help="Land and end when standard input ends or falls silent.")
+    ] = False,
+) -> None:
+    """Be one robot of an experiment, or several that share a device."""
+    from experiments.robot import main as robot  # noqa: PLC0415
+
+    raise typer.Exit(robot(file, names, connect=connect or [], lifeline=lifeline))
+
+
+@app.command()
+def router(
+    listen: Annotated[
+        list[str] | None, typer.Option(metavar="ENDPOINT", help="On loopback; may be repeated. [tcp/127.0.0.1:7447]")
+    ] = None,
+    lifeline: Annotated[
+        bool, typer.Option("--lifeline", help="End when standard input ends or is silent for 3 s.")
+    ] = False,
+) -> None:
+    """Run the Zenoh router that the robots meet at."""
+    from agents.router import serve  # noqa: PLC0415
+    from agents.session import DEFAULT_ENDPOINT  # noqa: PLC0415
+
+    raise typer.Exit(serve(listen or [DEFAULT_ENDPOINT], lifeline=lifeline))
+
+
+@app.command()
+def check(file: File, settings: Settings = None, as_json: AsJson = False) -> None:
+    """Check an experiment file and say what theory says of it."""
+    from experiments.check import command  # noqa: PLC0415
+
+    raise typer.Exit(command(file, settings=settings or [], as_json=as_json))
+
+
+@app.command()
+def report(
+    runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs.")],
+    out: Annotated[str | None, typer.Option(metavar="FILE", help="Where the report goes. [the run's folder]")] = None,
+) -> None:
+    """Write the report of one run, or compare several."""
+    from experiments.run import report_command  # noqa: PLC0415
+
+    raise typer.Exit(report_command(runs, out=out))
+
+
+@app.command()
+def recover(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording that was cut off.")],
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Where the whole one goes.")] = None,
+) -> None:
+    """Repair a recording whose writer was killed."""
+    from experiments.recording import recover_command  # noqa: PLC0415
+
+    raise typer.Exit(recover_command(file, target))
+
+
+@app.command()
+def new(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A ready-made experiment; `zenpark list` shows them.")],
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
+) -> None:
+    """Begin an experiment file from a ready-made one."""
+    from experiments.run import new_command  # noqa: PLC0415
+
+    raise typer.Exit(new_command(name, target))
+
+
+@app.command(name="list")
+def list_() -> None:
+    """List the ready-made experiments and the plugins."""
+    from experiments.run import list_command  # noqa: PLC0415
+
+    raise typer.Exit(list_command())
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of the experiment file."""
+    from experiments.check import schema_command  # noqa: PLC0415
+
+    raise typer.Exit(schema_command())
+
+
+@app.command()
+def bench(as_json: AsJson = False) -> None:
+    """Measure what this machine can do."""
+    from tools.bench import command  # noqa: PLC0415
+
+    raise typer.Exit(command(as_json=as_json))
+
+
+@app.command()
+def keys(connect: Connect = None, as_json: AsJson = False) -> None:
+    """Show who is on the network and which keys they hold."""
+    from tools.network import keys as show  # noqa: PLC0415
+
+    show(connect or [], as_json=as_json)
+
+
+@app.command()
+def echo(
+    key: KeyExpression,
+    connect: Connect = None,
+    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after so many samples.")] = None,
+    seconds: Seconds = None,
+) -> None:
+    """Print what is said on a key, the last poses first."""
+    from tools.network import echo as listen  # noqa: PLC0415
+
+    listen(key, connect or [], count=count, seconds=seconds)
+
+
+@app.command()
+def hz(key: KeyExpression, connect: Connect = None, seconds: Seconds = None) -> None:
+    """Print how often something is said on a key."""
+    from tools.network import hz as measure  # noqa: PLC0415
+
+    measure(key, connect or [], seconds=seconds)
+
+
+def _explained() -> tuple[type[BaseException], ...]:
+    return tuple(getattr(sys.modules[module], name) for module, name in EXPLAINED if module in sys.modules)
+
+
+def main() -> None:
+    """Runs a command. Exit codes: its own, 2 for what the user can mend, 130 for Ctrl-C."""
+    try:
+        app()
+    except _explained() as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,61 @@
+"""The console entry: refuses to start when another package hides one of ours, for our top-level names are common words.
+
+Only the standard library, and nothing of ours, is imported before the check.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Final
+
+PACKAGES: Final = ("agents", "bridges", "twins", "experiments", "tools")
+
+
+def intruders(root: Path) -> dict[str, Path | None]:
+    """Which of our packages would be imported from elsewhere than `root`, and from where (None: from nowhere)."""
+    found: dict[str, Path | None] = {}
+    for name in PACKAGES:
+        spec = importlib.util.find_spec(name)
+        places = list(spec.submodule_search_locations or [spec.origin or ""]) if spec else []
+        first = Path(places[0]).resolve() if places else None
+        if first != root / name:
+            found[name] = first
+    return found
+
+
+def explanation(found: dict[str, Path | None], root: Path) -> str:
+    """What is in the way, whose it is, and what to do."""
+    from importlib.metadata import packages_distributions  # noqa: PLC0415 (slow, and needed in trouble only)
+
+    owners = packages_distributions()
+    lines = ["zenpark: another package is in the way of ours"]
+    for name, place in found.items():
+        others = sorted(set(owners.get(name, [])) - {"zenpark"})
+        owner = f" (of {', '.join(others)})" if others else ""
+        lines.append(f"  '{name}' comes from {place or 'nowhere'}{owner}, not from {root / name}")
+    lines.append(
+        f"Start {root / 'zenpark'}, which has an environment of its own; or uninstall the other, unset PYTHONPATH, "
+        "and start from another folder."
+    )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Checks the packages, then hands over to the command line."""
+    root = Path(__file__).resolve().parent.parent
+    found = intruders(root)
+    if found:
+        print(explanation(found, root), file=sys.stderr)
+        sys.exit(2)
+    try:
+        from tools.cli import main as command_line  # noqa: PLC0415 (not before the check)
+
+        command_line()
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""Differential robots: a unicycle on two wheels with limits of speed and acceleration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from agents.kinds import Kind
+from agents.rows import Array, Index, clamp
+
+COMMAND_TIMEOUT_S: Final = 0.5  # without a new command the wheels stop, as the robots' own firmware does it
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A pair of driven wheels: distance between them [m], largest rim speed [m/s] and acceleration [m/s²]."""
+
+    base: float
+    speed: float
+    acceleration: float
+
+
+DRIVES: Final[dict[str, Drive]] = {
+    "khepera4": Drive(base=0.1054, speed=0.8137, acceleration=130.0 * 0.021),  # 130 rad/s² on a wheel of 42 mm
+    "turtlebot3": Drive(base=0.160, speed=0.22 + 2.84 * 0.080, acceleration=2.0),  # acceleration: our choice
+}
+
+
+class Differential:
+    """Rows of differential robots.
+
+    Attributes:
+        position: (n, 3) [m]; z stays 0.
+        yaw: (n,) [rad].
+        velocity: (n, 3) [m/s].
+    """
+
+    def __init__(self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float) -> None:
+        drives = [DRIVES[kind.name] for kind in kinds]
+        self._dt = dt
+        self._base = np.array([d.base for d in drives])
+        self._limit = np.array([d.speed for d in drives])[:, None]
+        self._change = np.array([d.acceleration * dt for d in drives])[:, None]
+        self._wheels = np.zeros((len(drives), 2))  # rim speeds, left and right [m/s]
+        self._wanted = np.zeros((len(drives), 2))
+        self._patience = np.full(len(drives), np.inf)
+        self.position = np.array(start, dtype=float)
+        self.yaw = np.array(yaw, dtype=float)
+        self.velocity = np.zeros_like(self.position)
+
+    def command(self, twist: Array) -> None:
+        """Sets v [m/s] and ω [rad/s], (n, 2); rows of NaN keep theirs."""
+        half = 0.5 * self._base * twist[:, 1]
+        given = np.isfinite(half)
+        wanted = np.empty_like(self._wanted)
+        wanted[:, 0], wanted[:, 1] = twist[:, 0] - half, twist[:, 0] + half
+        self._wanted = np.where(given[:, None], wanted, self._wanted)
+        self._patience[given] = COMMAND_TIMEOUT_S
+
+    def halt(self, rows: Index) -> None:
+        """Wheels to zero speed."""
+        self._wanted[rows] = 0.0
+
+    def advance(self) -> None:
+        """One step of dt, along an arc: no side-slip (paper, eq. (1))."""
+        self._patience -= self._dt
+        wanted = self._wanted * (self._patience >= 0.0)[:, None]
+        # both wheels are slowed by the same factor, so that a curve stays that curve
+        over = np.maximum(np.abs(wanted[:, :1]), np.abs(wanted[:, 1:])) / self._limit
+        wanted = wanted / np.maximum(over, 1.0)
+        self._wheels += clamp(wanted - self._wheels, -self._change, self._change)
+        left, right = self._wheels[:, 0], self._wheels[:, 1]
+        v = 0.5 * (left + right)
+        turn = (right - left) / self._base * self._dt
+        middle = self.yaw + 0.5 * turn
+        self.velocity[:, 0], self.velocity[:, 1] = v * np.cos(middle), v * np.sin(middle)
+        self.position += self._dt * self.velocity
+        self.yaw += turn
