@@ -16,9 +16,9 @@ from agents.body import BodyState
 from agents.graph import Links
 from agents.individual import Individual
 from agents.kinds import Kind
-from agents.lifecycle import AIRBORNE, IDLE, RUNNING, Duties, Lifecycle, Phase
+from agents.lifecycle import AIRBORNE, RUNNING, Duties, Lifecycle, Phase
 from agents.planning import Itinerary, Leg
-from agents.rows import Array, Index, Mask
+from agents.rows import Array, Index, Mask, every, some
 from agents.safety import Limits, Safety
 from agents.triggers import Told, Trigger, View
 
@@ -156,32 +156,33 @@ class Agent:
         if len(rest):  # nobody tells it anything: it stays where it is
             itineraries.append(Itinerary(rest, (), holds_before=True))
         self._itineraries = tuple(itineraries)
-        self._refresh_links()
+        self._choose_links(0.0)
 
     # ------------------------------------------------------------------ what the outside tells
 
     def hear(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
         """Poses that arrived on links `at` (H,), in order of arrival; older samples than known are left out."""
+        if some(stamp[1:] < stamp[:-1]):  # of several on one link the newest stays, whichever came last
+            order = np.argsort(stamp, kind="stable")
+            at, position, velocity = at[order], position[order], velocity[order]
+            stamp, arrived = stamp[order], arrived[order]
         newer = stamp > self.heard.stamp[at]
-        if not newer.all():
+        if not every(newer):
             at, position, velocity = at[newer], position[newer], velocity[newer]
             stamp, arrived = stamp[newer], arrived[newer]
-        fresh = not np.isfinite(self.heard.stamp[at]).all() or bool(np.isfinite(self.heard.gone[at]).any())
         self.heard.position[at], self.heard.velocity[at] = position, velocity
         self.heard.stamp[at], self.heard.arrived[at] = stamp, arrived
-        if fresh:
+        if self._unsettled:
             self.heard.gone[at] = np.inf
-            self._refresh_links()
 
     def lose(self, at: Index, t: float) -> None:
         """The speakers of links `at` are gone since `t` [s]; heard again, they are back."""
         self.heard.gone[at] = np.minimum(self.heard.gone[at], t)
+        self._unsettled = True
 
     def find(self, at: Index) -> None:
         """The speakers of links `at` are back, whether or not they have something new to say."""
-        if np.isfinite(self.heard.gone[at]).any():
-            self.heard.gone[at] = np.inf
-            self._refresh_links()
+        self.heard.gone[at] = np.inf
 
     def hold(self, row: int) -> str:
         """Order to stay where it is; an empty answer means yes, else why not."""
@@ -207,6 +208,8 @@ class Agent:
 
     def step(self, t: float, state: BodyState) -> Actions:
         """One tick at time `t` [s] of the process's clock."""
+        if self._unsettled:
+            self._choose_links(t)
         duties = self.life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
         assignment = self.assignment
         if self.life.moved and not self._begun and (self.life.phase == RUNNING).any():
@@ -218,8 +221,8 @@ class Agent:
         if decision != self._decided:
             self._decided = decision
             self._decide(t, state)
-        elif self.life.moved:  # a row that has just arrived at its height needs a place to stay before the next decision
-            self._stay(self.life.phase == AIRBORNE, state.position)
+        elif self.life.moved:  # a row that has just arrived at its height needs a place to stay until the next decision
+            self._stay(self._held | (self.life.phase == AIRBORNE), state.position)
         speak = NOBODY
         if question != self._asked:
             self._asked = question
@@ -227,7 +230,9 @@ class Agent:
             view = View(t, state.position, state.velocity, self.told, self.error)
             speak = self.trigger.speaks(view, self._memory)
             if len(speak):
-                speak = speak[np.isfinite(state.position[speak]).all(axis=1)]
+                seen = np.isfinite(state.position)
+                if not every(seen):
+                    speak = speak[seen[speak].all(axis=1)]
                 self.told.tell(speak, t, state.position, state.velocity)
         setpoint = self._individual.setpoint(self.goal, self.toward, state.position, state.yaw)
         verdict = self._safety.check(setpoint, state.position, state.yaw, t - state.time)
@@ -249,26 +254,27 @@ class Agent:
         lacks[self.assignment.links.listener[~np.isfinite(self.heard.stamp)]] = True
         patience = self.assignment.patience_s
         ready = seen & (~lacks | (patience is not None and t > patience))
-        for row in np.flatnonzero(~ready):
-            self.life.wait(row, "never heard " + ", ".join(self.missing(row)) if seen[row] else "no position of its own")
+        for row in np.flatnonzero(~ready).tolist():
+            lacking = "never heard " + ", ".join(self.missing(row)) if seen[row] else "no position of its own"
+            self.life.wait(row, lacking)
         return ready
 
     def _decide(self, t: float, state: BodyState) -> None:
         """A new goal for every row that is in the air or under way."""
         phase = self.life.phase
         running = phase == RUNNING
-        if running.any():
+        if some(running):
             self.decisions += 1
             self._formation_goal(t, state, running)
         self._stay(self._holds(t, running) | (phase == AIRBORNE), state.position)
 
     def _stay(self, held: Mask, position: Array) -> None:
         """Rows that are held keep the place where that began."""
-        if not held.any():
+        if not some(held):
             self._held = held
             return
         entered = held & ~self._held
-        if entered.any():
+        if some(entered):
             self._hold_at[entered] = position[entered]
             self._hold_at[entered, 2] = self._ground[entered]
         self._held = held
@@ -281,10 +287,6 @@ class Agent:
         held = running & self._ordered
         if t - self.offline_since > limits.link_silence_s:
             held = held | running
-        if np.isfinite(self.heard.gone).any():
-            silent = t - self.heard.gone > limits.link_silence_s
-            if silent.sum() != len(self.assignment.links) - len(self._live):
-                self._refresh_links(silent)
         if len(self._live) < len(self.assignment.links):
             hears = np.zeros(len(held), dtype=bool)
             hears[self._live_links.listener] = True
@@ -317,25 +319,24 @@ class Agent:
 
     def _escalate(self, blind: Mask, escaped: Mask) -> None:
         """A flying robot that does not know where it is lands; one that left the arena lands or halts."""
-        if not (blind.any() or escaped.any()):
+        if not (some(blind) or some(escaped)):
             return
-        active = (self.life.phase == AIRBORNE) | (self.life.phase == RUNNING)
-        for row in np.flatnonzero(active & blind & self._flies):
+        active = self.life.active
+        for row in np.flatnonzero(active & blind & self._flies).tolist():
             self.life.land(row, "its own position is lost")
-        for row in np.flatnonzero(active & escaped):
+        for row in np.flatnonzero(active & escaped).tolist():
             self.life.land(row, "it left the arena")
 
-    def _refresh_links(self, silent: Mask | None = None) -> None:
-        """Which links take part in the law: heard once, and the speaker is not gone."""
-        links = self.assignment.links
-        live = np.isfinite(self.heard.stamp)
-        if silent is not None:
-            live &= ~silent
+    def _choose_links(self, t: float) -> None:
+        """Which links take part in the law: heard once, and the speaker is not gone for long."""
+        links, heard = self.assignment.links, self.heard
+        known, here = np.isfinite(heard.stamp), np.isinf(heard.gone)
+        self._unsettled = not (known & here).all()
+        live = known & (t - heard.gone <= self.assignment.limits.link_silence_s)
         self._live = np.flatnonzero(live)
-        everything = len(self._live) == len(links)
         self._live_links = (
             links
-            if everything
+            if live.all()
             else Links(links.listener[live], links.speaker[live], links.distance[live], links.gain[live])
         )
 

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from agents.graph import Links
-from agents.rows import Array, clamp
+from agents.rows import Array, clamp, norm
 
 
 class Law(Protocol):
@@ -32,19 +32,19 @@ class Distance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def offset(self, position: Array, heard: Array, links: Links) -> Array:
         """u_i = ½ Σ_j μ_ij (d_ij² − ‖p_i − p_j‖²)(p_i − p_j), see `Law.offset`."""
         offset = position[links.listener] - heard
-        error = links.distance**2 - np.einsum("ek,ek->e", offset, offset)
+        error = links.distance**2 - np.vecdot(offset, offset)
         return links.onto_listeners((0.5 * links.gain * error)[:, None] * offset, len(position))
 
     def error(self, position: Array, heard: Array, links: Links) -> Array:
         """|d_ij − ‖p_i − p_j‖|, see `Law.error`."""
         offset = position[links.listener] - heard
-        return np.abs(links.distance - np.sqrt(np.einsum("ek,ek->e", offset, offset)))
+        return np.abs(links.distance - norm(offset))
 
 
 def tracking(position: Array, target: Array, gain: float | Array) -> Array:
     """u_i^t = −½ k_i ‖p_i − q_i‖² (p_i − q_i) (N, 3) (paper, eq. (7)); zero where the target is NaN."""
     offset = position - target
-    pull = -0.5 * gain * np.einsum("nk,nk->n", offset, offset)[:, None] * offset
+    pull = (-0.5 * gain * np.vecdot(offset, offset))[:, None] * offset
     return np.where(np.isnan(pull), 0.0, pull)
 
 

@@ -132,13 +132,13 @@ def rigidity_matrix(position: Array, pairs: Index, moves: Mask | None = None) ->
     matrix = np.zeros((len(pairs), rows, 3))
     matrix[edge, i] = offset
     matrix[edge, j] = -offset
-    matrix = matrix.reshape(len(pairs), rows * 3)
-    return matrix if moves is None else matrix[:, moves.ravel()]
+    flat = matrix.reshape(len(pairs), rows * 3)
+    return flat if moves is None else flat[:, moves.ravel()]
 
 
 @dataclass(frozen=True)
 class Rigidity:
-    """Rank of the rigidity matrix, the rank that infinitesimal rigidity needs, and the smallest singular value of it."""
+    """Rank of the rigidity matrix, the rank that infinitesimal rigidity needs, and its smallest singular value."""
 
     rank: int
     needed: int
@@ -181,7 +181,7 @@ def _rigid_motions(position: Array, free: Mask) -> int:
     ).transpose(0, 2, 1)  # (6, N, 3)
     held = motions[:, ~free]
     kept = _null_space(held.T) if held.size else np.eye(6)
-    moving = np.tensordot(kept.T, motions, axes=1).reshape(kept.shape[1], -1)
+    moving = np.tensordot(kept.T, motions, axes=1).reshape(kept.shape[1], position.size)
     return int(np.linalg.matrix_rank(moving, tol=1e-9)) if moving.size else 0
 
 

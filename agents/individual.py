@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from agents.kinds import Kind
-from agents.rows import Array, clamp, norm
+from agents.rows import Array, clamp, norm, some, span
 
 REACHED = 0.005  # [m] nearer than this a ground robot stands; half of what a 1 cm trigger lets its neighbours know
 TURNED = math.radians(2.0)  # [rad] nearer than this to the yaw wanted it stands
@@ -24,13 +24,13 @@ class Individual:
 
     def __init__(self, kinds: Sequence[Kind]) -> None:
         takes = np.array([kind.takes for kind in kinds])
-        self._position = np.flatnonzero(takes == "position")
-        self._velocity = np.flatnonzero(takes == "velocity")
-        self._twist = np.flatnonzero(takes == "twist")
+        position, velocity, twist = (np.flatnonzero(takes == what) for what in ("position", "velocity", "twist"))
+        self._position, self._velocity, self._twist = span(position), span(velocity), span(twist)
+        self._any_position, self._any_velocity, self._any_twist = len(position), len(velocity), len(twist)
         self._speed = np.array([kind.speed for kind in kinds])
         self._response = np.array([kind.response for kind in kinds])
         self._turn_response = np.array([kind.turn_response for kind in kinds])
-        driven = [kinds[row] for row in self._twist]
+        driven = [kinds[row] for row in twist.tolist()]
         self._drive = {
             name: np.array([getattr(kind, name) for kind in driven])
             for name in ("response", "turn_response", "speed", "turn_rate")
@@ -46,15 +46,18 @@ class Individual:
             yaw: (N,) measured [rad].
         """
         setpoint = np.zeros((len(goal), 4))
-        if len(rows := self._position):
+        if self._any_position:
+            rows = self._position
             setpoint[rows, :3] = goal[rows]
             setpoint[rows, 3] = np.where(np.isnan(toward[rows]), 0.0, toward[rows])
-        if len(rows := self._velocity):
+        if self._any_velocity:
+            rows = self._velocity
             velocity = self._response[rows, None] * (goal[rows] - position[rows])
             setpoint[rows, :3] = clamp(velocity, -self._speed[rows, None], self._speed[rows, None])
             turn = self._turn_response[rows] * wrap(toward[rows] - yaw[rows])
             setpoint[rows, 3] = np.where(np.isnan(turn), 0.0, turn)
-        if len(rows := self._twist):
+        if self._any_twist:
+            rows = self._twist
             way = goal[rows, :2] - position[rows, :2]
             setpoint[rows, :2] = drive(way, yaw[rows], toward[rows], **self._drive)
         return setpoint
@@ -87,16 +90,19 @@ def drive(
     """
     distance = norm(way)
     cos, sin = np.cos(yaw), np.sin(yaw)
-    along, across = cos * way[:, 0] + sin * way[:, 1], cos * way[:, 1] - sin * way[:, 0]
-    ahead = np.where(along >= 0.0, 1.0, -1.0)
+    x, y = way[:, 0], way[:, 1]
+    along, across = cos * x + sin * y, cos * y - sin * x
+    ahead = np.copysign(1.0, along)
     alpha = np.arctan2(ahead * across, np.abs(along))
     twist = np.empty((len(way), 2))
     twist[:, 0] = ahead * np.minimum(response * distance * (1.0 - np.abs(alpha) / math.pi), speed)
     twist[:, 1] = turn_response * np.sin(alpha)
     there = distance <= REACHED
-    if there.any():
-        turn = wrap(toward - yaw)
-        settle = np.where(np.abs(turn) > TURNED, turn_response * turn, 0.0)  # NaN compares false: any yaw will do
-        twist[there, 0], twist[there, 1] = 0.0, settle[there]
+    if some(there):
+        twist[there] = 0.0
+        asked = there & ~np.isnan(toward)
+        if some(asked):
+            turn = wrap(toward[asked] - yaw[asked])
+            twist[asked, 1] = np.where(np.abs(turn) > TURNED, turn_response[asked] * turn, 0.0)
     twist[:, 1] = clamp(twist[:, 1], -turn_rate, turn_rate)
     return twist

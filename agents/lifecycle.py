@@ -85,19 +85,31 @@ class Lifecycle:
         """Go down, or roll out, whatever it was doing."""
         if self.phase[row] < LANDING:
             self.phase[row], self._climbing[row], self.reason[row] = LANDING, False, reason
+            self._forget("takeoff", row)
             self._due["land"].append(row)
             self._settled_until = -np.inf
 
     def stop(self, row: int, reason: str) -> None:
         """Motors off."""
         self.phase[row], self._climbing[row], self.reason[row] = DONE, False, reason
+        self._forget("takeoff", row)
         self._due["stop"].append(row)
         self._settled_until = -np.inf
+
+    def _forget(self, what: str, row: int) -> None:
+        """A duty that the body has not been told yet and must not be told any more."""
+        if row in self._due[what]:
+            self._due[what].remove(row)
 
     def wait(self, row: int, reason: str) -> None:
         """Says why an idle row is not ready."""
         if self.phase[row] == IDLE:
             self.reason[row] = reason
+
+    @property
+    def active(self) -> Mask:
+        """Rows (N,) that climb, wait in the air, or run."""
+        return np.asarray(self._climbing | (self.phase == AIRBORNE) | (self.phase == RUNNING))
 
     @property
     def waiting(self) -> bool:
@@ -140,9 +152,9 @@ class Lifecycle:
         if highest >= RUNNING:
             over = (phase == RUNNING) & (t - self.start_at >= self._duration - 1e-6)
             for row in np.flatnonzero(over) if over.any() else ():
-                self.land(row, "finished")
+                self.land(int(row), "finished")
         if highest >= LANDING:
-            slow = (velocity * velocity).sum(axis=1) < SETTLED**2
+            slow = ~((velocity * velocity).sum(axis=1) >= SETTLED**2)  # what is not known cannot be waited for
             down = (phase == LANDING) & np.where(self._flies, ~flying, slow)
             down[self._due["land"]] = False  # the body has not been told yet
             phase[down] = DONE

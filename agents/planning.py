@@ -55,7 +55,7 @@ def _spatial(values: Sequence[float]) -> Array:
     return np.array([*values, 0.0][:3])
 
 
-class Hold(Parameters):
+class Hold(Parameters, frozen=True):
     """Stay where the robot is, or stand at `at`, and turn to `yaw` if given."""
 
     at: Annotated[Offset | None, Meta(description="x, y (, z) [m]")] = None
@@ -73,7 +73,7 @@ class Hold(Parameters):
         return 0.0
 
 
-class Line(Parameters):
+class Line(Parameters, frozen=True):
     """A straight line from where the robot is, at constant speed, then stay."""
 
     move_by: Annotated[Offset, Meta(description="x, y (, z) [m]")]
@@ -95,7 +95,7 @@ class Line(Parameters):
         return self.speed_
 
 
-class Waypoints(Parameters):
+class Waypoints(Parameters, frozen=True):
     """Straight lines through points of the arena, at constant speed; then stay, or begin again with `loop`."""
 
     points: Annotated[list[Offset], Meta(min_length=1, description="x, y (, z) [m]")]
@@ -137,7 +137,7 @@ def _along(route: Array, way: Array) -> Array:
     return np.asarray(route[:, 0] + np.einsum("rp,rpk->rk", share, step))
 
 
-class Circle(Parameters):
+class Circle(Parameters, frozen=True):
     """A circle that starts where the robot is, along its heading, to the left (to the right with a negative radius)."""
 
     radius: Annotated[float, Meta(description="[m]")]
@@ -164,7 +164,7 @@ class Circle(Parameters):
         return 2.0 * math.pi * abs(self.radius) / self.period_s
 
 
-class Lemniscate(Parameters):
+class Lemniscate(Parameters, frozen=True):
     """A figure of eight (Gerono's lemniscate) through where the robot is, leaving along its heading."""
 
     size: Annotated[Positive, Meta(description="half its length [m]")]

@@ -17,7 +17,6 @@ from math import floor, isfinite
 from types import FrameType
 from typing import Final
 
-import msgspec
 import numpy as np
 import zenoh
 
@@ -28,6 +27,7 @@ from agents.body import Body, BodyState
 from agents.keys import Keys
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
+from agents.orders import carry_out
 from agents.rows import Index
 
 STATUS_S: Final = 1.0
@@ -89,6 +89,7 @@ class Runtime:
         self._reported: list[tuple[object, ...]] = [()] * rows
         self._status_due = 0.0
         self._stopping: str | None = None
+        self._utc = self._now = self._next = 0.0
         limits = assignment.limits
         x, y, z = np.maximum(np.abs(limits.low), np.abs(limits.high)) + REACH_M
         self._reach = (float(x), float(y), float(z))
@@ -148,10 +149,7 @@ class Runtime:
     def _listen(self, t: float) -> None:
         """Takes in what has arrived since the last tick."""
         agent = self.agent
-        if network.connected(self._session):
-            agent.offline_since = np.inf
-        else:
-            agent.offline_since = min(agent.offline_since, t)
+        agent.offline_since = np.inf if network.connected(self._session) else min(agent.offline_since, t)
         for neighbour in self._neighbours:
             for sample in network.received(neighbour.poses):
                 self._hear(neighbour, sample, t)
@@ -161,18 +159,22 @@ class Runtime:
                 else:
                     agent.find(neighbour.links)
         for sample in network.received(self._estop.handler):
-            try:
-                stop = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
-            except wire.Malformed:
-                self._malformed += 1
-                continue
-            for row in range(len(self._names)):
-                agent.life.stop(row, f"emergency stop by {stop.who}: {stop.reason}")
+            self._stop(sample)
         for row, queryable in enumerate(self._orders):
             for query in network.received(queryable.handler):
                 self._obey(row, query, t)
         for last in self._last:
             last.answer()
+
+    def _stop(self, sample: zenoh.Sample) -> None:
+        """The emergency stop of everybody."""
+        try:
+            stop = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
+        except wire.Malformed:
+            self._malformed += 1
+            return
+        for row in range(len(self._names)):
+            self.agent.life.stop(row, f"emergency stop by {stop.who}: {stop.reason}")
 
     def _hear(self, neighbour: _Neighbour, sample: zenoh.Sample, t: float) -> None:
         """One pose of a neighbour: checked, counted, believed."""
@@ -213,61 +215,13 @@ class Runtime:
                 self._malformed += 1
                 query.reply_err(str(error).encode(), encoding="text/plain")
                 return
-            refusal, value = self._carry_out(row, order, t)
+            refusal, value = carry_out(self.agent, row, order, t, self._utc)
             self._refused += bool(refusal)
+            if order.order == "start" and order.at is not None and not refusal:
+                self._align(order.at - self._utc)
             phase = Phase(self.agent.life.phase[row]).word
             reply = wire.Reply(self._names[row], not refusal, phase, refusal, value)
             query.reply(key, wire.encode(reply, self._setup.encoding), encoding=self._mime)
-
-    def _carry_out(self, row: int, order: wire.Order, t: float) -> tuple[str, float | None]:
-        """Why an order is refused (empty: it is not), and the value of a parameter if it asked for one."""
-        agent, life = self.agent, self.agent.life
-        match order.order:
-            case "takeoff":
-                return life.takeoff(row), None
-            case "start":
-                if order.at is None or not np.isfinite(order.at):
-                    return "a start needs `at`, a UTC time in seconds", None
-                at = order.at - self._utc
-                if not t - self._assignment.duration < at < t + 3600.0:
-                    return f"start at {order.at} is not within this experiment; are the clocks set?", None
-                refusal = agent.start(row, at)
-                if not refusal:
-                    self._align(at)
-                return refusal, None
-            case "hold":
-                return agent.hold(row), None
-            case "land":
-                life.land(row, "ordered to land")
-                return "", None
-            case "stop":
-                life.stop(row, "ordered to stop")
-                return "", None
-            case "get" | "set":
-                return self._parameter(order)
-
-    def _parameter(self, order: wire.Order) -> tuple[str, float | None]:
-        """Reads or changes `clamp`, `tracking_gain` or a number of the trigger, for all robots of this process."""
-        agent = self.agent
-        of_trigger = {f"trigger.{field}" for field in agent.trigger.__struct_fields__}
-        name = order.name or ""
-        if name not in of_trigger | {"clamp", "tracking_gain"}:
-            return f"no parameter '{name}'; known: {', '.join(sorted(of_trigger | {'clamp', 'tracking_gain'}))}", None
-        owner, field = (agent.trigger, name.removeprefix("trigger.")) if name in of_trigger else (agent, name)
-        if order.order == "set":
-            if order.value is None or not np.isfinite(order.value) or order.value < 0.0:
-                return f"'{name}' needs a `value`, a number that is not negative", None
-            if owner is agent:
-                setattr(agent, field, order.value)
-            else:
-                try:
-                    changed = {**msgspec.structs.asdict(agent.trigger), field: order.value}
-                    agent.trigger = msgspec.convert(changed, type(agent.trigger))
-                except msgspec.ValidationError as error:
-                    return f"'{name}' cannot be {order.value}: {error}", None
-            owner = agent.trigger if name in of_trigger else agent
-        value = getattr(owner, field)
-        return ("", float(value)) if isinstance(value, int | float) else (f"'{name}' is not a number", None)
 
     # ------------------------------------------------------------------ the loop
 
@@ -280,7 +234,6 @@ class Runtime:
         gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
         zero = time.monotonic()
         self._utc = time.time()  # one reading: a step of the wall clock in mid-run does not move the experiment
-        self._now = self._next = 0.0
         farewell = np.inf
         while True:
             wait = zero + self._next - time.monotonic()
@@ -317,8 +270,9 @@ class Runtime:
         self._interventions += actions.changed
         for row in actions.speak:
             self._say(int(row), state, t)
-        if self.agent.tick // self._state_every != self._state_slot:
-            self._state_slot = self.agent.tick // self._state_every
+        slot = (self.agent.tick - 1) // self._state_every
+        if slot != self._state_slot:
+            self._state_slot = slot
             self._tell(state, actions, t)
         self._report(t, everything=t >= self._status_due, state=state)
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.kinds import Kind
-from agents.rows import Array, Index, Mask, clamp, norm
+from agents.rows import Array, Mask, Rows, clamp, every, norm, some, span
 
 ESCAPED = 0.25  # [m] this far outside the arena a robot is no longer under control
+ABSURD = 1e6  # [m, m/s, rad, rad/s] no place, speed or angle is that large; NaN is not smaller either
 ROUNDING = 1e-9  # smaller differences are arithmetic, not interventions
 
 
@@ -60,17 +61,21 @@ class Safety:
     def __init__(self, kinds: Sequence[Kind], limits: Limits) -> None:
         takes = np.array([kind.takes for kind in kinds])
         self.limits = limits
-        self._position = np.flatnonzero(takes == "position")
+        position, velocity, twist = (np.flatnonzero(takes == what) for what in ("position", "velocity", "twist"))
+        self._position, self._velocity, self._twist = span(position), span(velocity), span(twist)
+        self._any_position, self._any_velocity, self._any_twist = len(position), len(velocity), len(twist)
         self._takes_position = takes == "position"
-        self._velocity = np.flatnonzero(takes == "velocity")
-        self._twist = np.flatnonzero(takes == "twist")
         self._speed = np.minimum(np.array([kind.speed for kind in kinds]), limits.speed)
+        # a body that closes position errors by itself goes as fast as its goal is far
+        self._step = np.minimum(limits.goal_step, self._speed / np.array([kind.response for kind in kinds]))
         self._turn_rate = np.array([kind.turn_rate for kind in kinds])
         flies = np.array([kind.flies for kind in kinds])[:, None]
         inside = np.array([limits.margin, limits.margin, 0.0])
         floor, ceiling = np.array([0.0, 0.0, np.inf]), np.array([0.0, 0.0, limits.margin])
         self._low = limits.low + inside - np.where(flies, 0.0, floor)  # ground robots have no business with heights
         self._high = limits.high - inside - np.where(flies, ceiling, -floor)
+        self._centre = 0.5 * (limits.low + limits.high)
+        self._lost = 0.5 * (limits.high - limits.low) + ESCAPED
 
     def check(self, setpoint: Array, position: Array, yaw: Array, age: Array) -> Verdict:
         """The last word.
@@ -82,39 +87,48 @@ class Safety:
             age: (N,) of that measurement [s].
         """
         limits = self.limits
-        blind = ~(np.isfinite(position.sum(axis=1) + yaw) & (age <= limits.own_silence_s))
-        wild = ~np.isfinite(setpoint.sum(axis=1))
+        near = np.abs(position - self._centre) <= self._lost
+        known = (np.abs(yaw) < ABSURD) & (age <= limits.own_silence_s)
+        sane = np.abs(setpoint) < ABSURD
+        nobody: Mask = np.zeros(len(yaw), dtype=bool)
+        blind, wild, escaped = nobody, nobody, nobody
         safe, here = setpoint.copy(), position
-        if blind.any() or wild.any():
-            here = np.where(blind[:, None], 0.0, position)
+        troubled = not (every(near) and every(known) and every(sane))
+        if troubled:
+            blind = ~np.asarray(known & (np.abs(position) < ABSURD).all(axis=1))
+            wild, escaped = ~np.asarray(sane.all(axis=1)), ~np.asarray(near.all(axis=1) | blind)
+            here, yaw = np.where(blind[:, None], self._centre, position), np.where(blind, 0.0, yaw)
             safe[blind | wild] = 0.0
             stay = wild & self._takes_position
             safe[stay, :3] = here[stay]
-        if len(rows := self._position):
+        if self._any_position:
+            rows = self._position
             safe[rows, :3] = self._near(safe[rows, :3], here[rows], rows)
-        if len(rows := self._velocity):
+        if self._any_velocity:
+            rows = self._velocity
             safe[rows] = self._slow(safe[rows], here[rows], rows)
-        if len(rows := self._twist):
+        if self._any_twist:
+            rows = self._twist
             safe[rows, :2] = self._drive(safe[rows, :2], here[rows, :2], yaw[rows], rows)
-        changed = np.abs(safe - setpoint).max(axis=1) > ROUNDING
-        if blind.any() or wild.any():
+        other = np.abs(safe - setpoint) > ROUNDING
+        changed = np.asarray(other.any(axis=1)) if some(other) else nobody
+        if troubled:
             changed = (changed | wild) & ~blind
             # a body that controls its position on board keeps its last setpoint while the position is not known here
             safe[blind & self._takes_position] = np.nan
-        beyond = np.maximum(here - limits.high, limits.low - here).max(axis=1)
-        return Verdict(safe, changed, blind, (beyond > ESCAPED) & ~blind)
+        return Verdict(safe, changed, blind, escaped)
 
-    def _near(self, target: Array, here: Array, rows: Index) -> Array:
+    def _near(self, target: Array, here: Array, rows: Rows) -> Array:
         """Goals inside the arena and not too far ahead of the robot."""
         target = clamp(target, self._low[rows], self._high[rows])
         step = target - here
-        length = norm(step)
-        far = length > self.limits.goal_step
-        if far.any():
-            target[far] = here[far] + step[far] * (self.limits.goal_step / length[far])[:, None]
+        length, longest = norm(step), self._step[rows]
+        far = length > longest
+        if some(far):
+            target[far] = here[far] + step[far] * (longest[far] / length[far])[:, None]
         return target
 
-    def _slow(self, velocity: Array, here: Array, rows: Index) -> Array:
+    def _slow(self, velocity: Array, here: Array, rows: Rows) -> Array:
         """Velocities within the limits, and not out of the arena."""
         speed, turn = self._speed[rows, None], self._turn_rate[rows]
         linear = clamp(velocity[:, :3], -speed, speed)
@@ -123,12 +137,12 @@ class Safety:
         velocity[:, 3] = clamp(velocity[:, 3], -turn, turn)
         return velocity
 
-    def _drive(self, twist: Array, here: Array, yaw: Array, rows: Index) -> Array:
+    def _drive(self, twist: Array, here: Array, yaw: Array, rows: Rows) -> Array:
         """Twists within the limits, and not out of the arena: turning on the spot is always allowed."""
         speed, turn = self._speed[rows], self._turn_rate[rows]
         v = clamp(twist[:, 0], -speed, speed)
         low, high = self._low[rows, :2], self._high[rows, :2]
-        if ((here > high) | (here < low)).any():
+        if some((here > high) | (here < low)):
             heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * v[:, None]
             outward = ((here > high) & (heading > 0)) | ((here < low) & (heading < 0))
             v = np.where(outward.any(axis=1), 0.0, v)

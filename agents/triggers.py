@@ -76,7 +76,7 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         raise TypeError(f"{type(self).__name__} must say when it fires")
 
     def speaks(self, view: View, memory: Array) -> Index:
-        """Rows that speak now: those that fire, no sooner than the minimum interval, no later than the maximum silence."""
+        """Rows that speak now: what fires, no sooner than the minimum interval, no later than the maximum silence."""
         fired = self.fires(view, memory)
         if self.minimum_interval_s > 0.0 or self.maximum_silence_s is not None:
             quiet = view.t - view.told.time
@@ -86,7 +86,7 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return np.flatnonzero(fired)
 
 
-class Periodic(Trigger):
+class Periodic(Trigger, frozen=True):
     """Speak every `period_s`."""
 
     period_s: Annotated[Positive, Meta(description="[s]")] = 0.02
@@ -96,7 +96,7 @@ class Periodic(Trigger):
         return view.t - view.told.time >= self.period_s - ROUNDING_S
 
 
-class SendOnDelta(Trigger):
+class SendOnDelta(Trigger, frozen=True):
     """Speak when the neighbours hold a position that is off by more than `threshold` (Miskowicz, Sensors 2006)."""
 
     threshold: Annotated[Positive, Meta(description="δ [m]")] = 0.01

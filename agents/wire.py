@@ -21,8 +21,8 @@ JSON: Final = "application/json"  # plain, without a schema suffix: REST and com
 MSGPACK: Final = "application/msgpack"
 MIME: Final[dict[Encoding, str]] = {"json": JSON, "msgpack": MSGPACK}
 
-MAX_PAYLOAD: Final = 64 * 1024  # [bytes]; the largest honest message (a state of a robot with 100 neighbours) has 20 kB
-FUTURE_S: Final = 5.0  # a stamp further ahead than this is a broken clock or a forgery, and would silence honest samples
+MAX_PAYLOAD: Final = 64 * 1024  # [bytes]; the largest honest message (state of a robot with 100 neighbours) has 20 kB
+FUTURE_S: Final = 5.0  # a stamp further ahead is a broken clock or a forgery, and would silence honest samples
 MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
 
 
@@ -55,8 +55,9 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Telemetry of a body and its decision, for recorder and viewers.
 
     `setpoint` is x, y, z, yaw [m, rad] for a body that takes positions, v_x, v_y, v_z [m/s], yaw rate [rad/s] for
-    velocities, and v [m/s], ω [rad/s], 0, 0 for twists; goal and setpoint are None while a robot has none. `error` [m] is Σ|d − distance| over the robot's links as the
-    robot itself sees it. `true_position` and `true_yaw` are known of twins only.
+    velocities, and v [m/s], ω [rad/s], 0, 0 for twists; goal and setpoint are None while a robot has none. `error` [m]
+    is Σ|d − distance| over the robot's links as the robot itself sees it. `true_position` and `true_yaw` are known of
+    twins only.
     """
 
     robot: str
@@ -132,7 +133,7 @@ class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Something that happened in a run: `kind` is a word (`phase`, `start`, `lost`, `order`, ...), `source` who or what."""
+    """Something that happened in a run: `kind` is a word (`phase`, `start`, `lost`, ...), `source` who or what."""
 
     stamp: float
     kind: str
@@ -148,8 +149,8 @@ _msgpack = msgspec.msgpack.Encoder()
 _decoders: dict[tuple[type, bool], msgspec.json.Decoder[object] | msgspec.msgpack.Decoder[object]] = {}
 
 
-def pose(robot: str, seq: int, stamp: float, position: list[float], velocity: list[float], yaw: float) -> Pose:
-    """A pose to send, rounded to micrometres and microradians: a third fewer bytes, and far below any sensor's noise."""
+def pose(robot: str, seq: int, stamp: float, position: list[float], velocity: list[float], yaw: float) -> Pose:  # noqa: PLR0917
+    """A pose to send, rounded to micrometres and microradians: a third fewer bytes, far below any sensor's noise."""
     x, y, z = position
     u, v, w = velocity
     return Pose(

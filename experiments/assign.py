@@ -1,4 +1,4 @@
-"""From an experiment to what its robots are told (`Assignment`) and what their bodies are opened with (`BodyRequest`)."""
+"""From an experiment to what its robots are told (`Assignment`) and their bodies opened with (`BodyRequest`)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from agents.kinds import KINDS, Kind
 from agents.planning import Leg
 from agents.rows import Array, Index
 from agents.safety import Limits
-from experiments.links import parse_links
 from experiments.experiment import Experiment
+from experiments.links import parse_links
 
 
 def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:

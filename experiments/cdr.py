@@ -385,7 +385,7 @@ def pose_stamped(frame_id: str) -> Callable[[float, Vector, float], bytes]:
             return layout.pack(
                 LITTLE_ENDIAN, seconds, nanoseconds, text, *position, 0.0, 0.0, math.sin(half), math.cos(half)
             )
-        except (struct.error, ValueError, OverflowError) as error:
+        except (struct.error, TypeError, ValueError, OverflowError) as error:
             raise Unencodable(f"{POSE_STAMPED}: {error}") from None
 
     return encode

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.graph import Links
-from agents.rows import Array, Index
+from agents.rows import Array, Index, Mask, every, some
 from experiments.experiment import Channel as Parameters
+
+ROUNDING_S = 1e-9  # sums of binary fractions miss the ticks by less than this
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,7 @@ class Samples:
     position: Array
     velocity: Array
 
-    def take(self, which: Array | Index) -> Samples:
+    def take(self, which: Index | Mask) -> Samples:
         """Some of them."""
         return Samples(
             self.link[which],
@@ -55,7 +57,11 @@ class Channel:
         at = np.flatnonzero(spoke[speaker])
         delay = np.full(len(at), self._delay)
         if self._loss or self._jitter:
-            chance = np.concatenate([g.random((2, self._per_copy)) for g in self._generators], axis=1)[:, at]
+            chance = np.zeros((2, len(speaker)))
+            for copy in np.unique(at // max(self._per_copy, 1)):  # only of those that speak: as if it were alone
+                mine = slice(copy * self._per_copy, (copy + 1) * self._per_copy)
+                chance[:, mine] = self._generators[copy].random((2, self._per_copy))
+            chance = chance[:, at]
             delay -= self._jitter * np.log1p(-chance[1])
             arrives = chance[0] >= self._loss
             self.lost[at[~arrives]] += 1
@@ -74,12 +80,12 @@ class Channel:
         else:
             columns = ("link", "arrival", "stamp", "seq", "position", "velocity")
             pool = Samples(*(np.concatenate([getattr(s, c) for s in self._flying]) for c in columns))
-        here = pool.arrival <= t
-        if here.all():
+        here = pool.arrival <= t + ROUNDING_S
+        if every(here):
             self._flying = []
             return pool if not self._jitter else pool.take(np.argsort(pool.arrival, kind="stable"))
         self._flying = [pool.take(~here)]
-        if not here.any():
+        if not some(here):
             return None
         arrived = pool.take(here)
         return arrived.take(np.argsort(arrived.arrival, kind="stable"))

@@ -19,15 +19,15 @@ from agents import wire
 from agents.keys import Keys
 from experiments import orders
 from experiments.experiment import Experiment
-from experiments.launcher import Launcher, Process
+from experiments.launcher import LAND_S, ROUTER, Launcher, Process
 
 POLL_S: Final = 0.05
 LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then
 CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
-LAND_S: Final = 15.0
 ROUTER_S: Final = 10.0
 FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
+ROUTERS: Final = 5  # a router that dies more often is not helped by starting it again
 
 M = TypeVar("M", wire.Status, wire.State)
 
@@ -132,7 +132,7 @@ class Conductor:
         for name, robot in experiment.robots.items():
             self._groups.setdefault(robot.process or name, []).append(name)
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
-        self._recorder_lost = False
+        self._routers = 1
 
     def run(self) -> Result:
         """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
@@ -239,7 +239,10 @@ class Conductor:
         deadline = time.monotonic() + LAND_S
         while time.monotonic() < deadline:
             self._look()
-            if all(seen.gone or seen.reached("done") or seen.phase in ("starting", "idle") for seen in self._robots.values()):
+            if all(
+                seen.gone or seen.reached("done") or seen.phase in ("starting", "idle")
+                for seen in self._robots.values()
+            ):
                 break
             time.sleep(POLL_S)
         self._progress.phase = "done"
@@ -251,6 +254,8 @@ class Conductor:
         keys = self._keys
         self._session = stack.enter_context(network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S))
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
+        self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
+        self._told.put(self._file.read_bytes())
         self._statuses = network.pose_subscriber(self._session, keys.status("*"), 4096)
         self._states = network.subscriber(self._session, keys.state("*"), 4096)
         self._watch = network.alive_watch(self._session, keys.alive("*"))
@@ -278,9 +283,7 @@ class Conductor:
                 self._say("back", name, "alive again")
         self._show(self._progress)
 
-    def _messages(
-        self, handler: network.Polled[zenoh.Sample], kind: type[M]
-    ) -> Iterator[M]:
+    def _messages(self, handler: network.Polled[zenoh.Sample], kind: type[M]) -> Iterator[M]:
         for sample in network.received(handler):
             try:
                 message = wire.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
@@ -303,9 +306,12 @@ class Conductor:
 
     def _mourn(self, process: Process) -> None:
         """A process has ended that should not have."""
-        if process.name == "router":
-            self._say("router", "conductor", f"the router ended ({process.exit}); started again")
-            start_router(self._launcher, self._endpoints)
+        if process.name == ROUTER:
+            self._routers += 1
+            if self._routers < ROUTERS:
+                start_router(self._launcher, self._endpoints)
+            what = "started again" if self._routers < ROUTERS else "given up: the robots hold, and land at the end"
+            self._say("router", "conductor", f"the router ended ({process.exit}); {what}")
             return
         if process.name == f"{self._case}-recorder":
             self._say("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
@@ -359,4 +365,4 @@ class Conductor:
 def start_router(launcher: Launcher, endpoints: Sequence[str]) -> None:
     """A router of our own, which outlives a killed launcher by as long as robots take to land."""
     listen = [part for endpoint in endpoints for part in ("--listen", endpoint)]
-    launcher.start("router", "agents.router", *listen, "--lifeline", "--linger", str(LINGER_S))
+    launcher.start(ROUTER, "agents.router", *listen, "--lifeline", "--linger", str(LINGER_S))

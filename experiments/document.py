@@ -32,6 +32,8 @@ __all__ = [
     "write_json", "write_schema",
 ]  # fmt: skip
 
+_Table = dict[str, Any]
+
 LARGEST: Final = 4_000_000  # bytes; a hundred robots take ten thousand
 
 
@@ -182,42 +184,43 @@ class _Reading:
     def document(self) -> Document:
         """See `read`."""
         overrides = self._overrides()
-        general = [override for override in overrides if override.case is None]
-        base, unused = deepcopy(self.content), set(general)
-        self._refuse(shape.storable(base), overrides)
-        tables = base.get("cases")
-        tables = tables if isinstance(tables, dict) else {}
-        for override in overrides:
-            if override.case is not None:
-                self._assigned(tables[override.case], override, part=True)
-            elif self._assigned(base, override):
-                unused.discard(override)
-        whole = {name: table for name, table in tables.items() if isinstance(table, dict)}
-        cases = {}
-        plain = {key: value for key, value in base.items() if key != "cases"}
-        for name, table in whole.items():
-            cases[name] = deepcopy(merged(plain, {key: value for key, value in table.items() if key != "cases"}))
-            for override in [*general, *(each for each in overrides if each.case == name)]:
-                if self._assigned(cases[name], override):
-                    unused.discard(override)
-        if unused:
-            raise DocumentError(
-                [_nowhere(override, [base, *cases.values()]) for override in general if override in unused]
-            )
-
-        nested = [Fault(("cases", name, "cases"), "a case cannot hold cases", "leave them out", on_key=True)
-                  for name, table in whole.items() if "cases" in table]  # fmt: skip
+        self._refuse(shape.storable(self.content), overrides)
+        base, tables, cases = self._changed(overrides)
+        nested = [
+            Fault(("cases", name, "cases"), "a case cannot hold cases", "leave them out", on_key=True)
+            for name, table in tables.items()
+            if "cases" in table
+        ]
         first = shape.faults(base)
-        self._refuse(
-            [*nested, *first, *self._of_cases(whole, {n: shape.faults(c) for n, c in cases.items()}, first)], overrides
-        )
+        found = {name: shape.faults(case) for name, case in cases.items()}
+        self._refuse([*nested, *first, *_of_cases(tables, found, first)], overrides)
 
         experiment = msgspec.convert(base, Experiment)
         resolved = {name: msgspec.convert(case, Experiment) for name, case in cases.items()}
         first = list(checks.faults(experiment))
         found = {name: list(checks.faults(case)) for name, case in resolved.items()}
-        self._refuse([*first, *self._of_cases(whole, found, first)], overrides)
+        self._refuse([*first, *_of_cases(tables, found, first)], overrides)
         return Document(self.file, self.text, experiment, resolved or {"default": experiment})
+
+    def _changed(self, overrides: Sequence[Override]) -> tuple[_Table, dict[str, _Table], dict[str, _Table]]:
+        """The document with `--set`, the tables of its cases, and each case merged into the document."""
+        base = deepcopy(self.content)
+        of_all = [override for override in overrides if override.path[0] != "cases" and override.case is None]
+        unused = set(of_all)
+        for override in overrides:
+            table = base if override.case is None else _tables(base).get(override.case, {})
+            if self._assigned(table, override, part=override.case is not None):
+                unused.discard(override)
+        tables, cases = _tables(base), {}
+        for name, table in tables.items():
+            cases[name] = deepcopy(merged(_without_cases(base), _without_cases(table)))
+            for override in [*of_all, *(each for each in overrides if each.case == name)]:
+                if self._assigned(cases[name], override):
+                    unused.discard(override)
+        if unused:
+            known = [base, *cases.values()]
+            raise DocumentError([_nowhere(override, known) for override in of_all if override in unused])
+        return base, tables, cases
 
     def _overrides(self) -> list[Override]:
         overrides, problems = [], []
@@ -240,20 +243,6 @@ class _Reading:
             return assign(document, override, part=part)
         except OverrideError as error:
             raise DocumentError([_of_flag(override.flag, str(error), error.hint)]) from None
-
-    def _of_cases(
-        self, tables: Mapping[str, Mapping[str, Any]], found: Mapping[str, Sequence[Fault]], first: Sequence[Fault]
-    ) -> Iterator[Fault]:
-        """Faults of the cases that the file without cases does not have, where the case's own table causes them."""
-        for name, faults in found.items():
-            for fault in faults:
-                if fault in first:
-                    continue
-                own = _beginning(tables[name], fault.path)
-                message = fault.message
-                if own != fault.path:
-                    message = f"in case '{name}', {'.'.join(map(str, fault.path))}: {message}"
-                yield Fault(("cases", name, *own), message, fault.hint, fault.on_key and own == fault.path)
 
     def _refuse(self, faults: Iterator[Fault] | Sequence[Fault], overrides: Sequence[Override]) -> None:
         """Raises if there is any fault, all in the order of the file."""
@@ -290,6 +279,31 @@ def _nowhere(override: Override, documents: Sequence[Mapping[str, Any]]) -> Prob
     parameter = str(override.path[end])
     message = f"no {override.path[end - 1]} of this experiment has a parameter '{parameter}'"
     return _of_flag(override.flag, message, did_you_mean(parameter, known))
+
+
+def _of_cases(
+    tables: Mapping[str, _Table], found: Mapping[str, Sequence[Fault]], first: Sequence[Fault]
+) -> Iterator[Fault]:
+    """Faults of the cases that the file without cases does not have, where the case's own table causes them."""
+    for name, faults in found.items():
+        for fault in faults:
+            if fault in first:
+                continue
+            own = _beginning(tables[name], fault.path)
+            message = fault.message
+            if own != fault.path:
+                message = f"in case '{name}', {'.'.join(map(str, fault.path))}: {message}"
+            yield Fault(("cases", name, *own), message, fault.hint, fault.on_key and own == fault.path)
+
+
+def _tables(document: _Table) -> dict[str, _Table]:
+    """What each case changes, as far as these are tables at all."""
+    cases = document.get("cases")
+    return {name: table for name, table in cases.items() if isinstance(table, dict)} if isinstance(cases, dict) else {}
+
+
+def _without_cases(table: _Table) -> _Table:
+    return {key: value for key, value in table.items() if key != "cases"}
 
 
 def _beginning(table: object, path: Keys) -> Keys:

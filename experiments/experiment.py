@@ -1,4 +1,4 @@
-"""An experiment: what its file says, as typed, frozen structs. SI units; a unit stands in the name where it is another's.
+"""An experiment: what its file says, as typed, frozen structs. SI units; the name says where a unit is another.
 
 `experiments.document` reads the file into these and says where it is wrong.
 """
@@ -25,13 +25,13 @@ class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """A table of the experiment file."""
 
 
-class Arena(Part):
+class Arena(Part, frozen=True):
     """The box that the robots must not leave: centred on the origin, floor at z = 0."""
 
     size: Annotated[Spatial, Meta(description="x, y, z [m]")] = (4.0, 4.0, 2.5)
 
 
-class Rates(Part):
+class Rates(Part, frozen=True):
     """How often things happen; pose_hz, coordination_hz and state_hz divide body_hz."""
 
     body_hz: Annotated[Positive, Meta(description="position control and body")] = 100.0
@@ -40,7 +40,7 @@ class Rates(Part):
     state_hz: Annotated[Positive, Meta(description="telemetry for recorder and viewers")] = 50.0
 
 
-class Robot(Part):
+class Robot(Part, frozen=True):
     """One robot."""
 
     kind: Annotated[str, Meta(description="crazyflie, tello, khepera4 or turtlebot3")]
@@ -50,14 +50,14 @@ class Robot(Part):
     process: Annotated[Name | None, Meta(description="robots of one name share one process")] = None
 
 
-class Link(Part):
+class Link(Part, frozen=True):
     """A link with a gain of its own."""
 
     distance: Annotated[Positive, Meta(description="[m]")]
     gain: Annotated[Positive | None, Meta(description="the formation's if left out")] = None
 
 
-class Formation(Part):
+class Formation(Part, frozen=True):
     """Which shape, by which law."""
 
     law: Annotated[Choice, Meta(description="a registered law")] = "distance"
@@ -70,7 +70,7 @@ class Formation(Part):
     ] = {}
 
 
-class Leg(Part):
+class Leg(Part, frozen=True):
     """From `at_s` on, a robot follows a plan."""
 
     at_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
@@ -78,7 +78,7 @@ class Leg(Part):
     plan: Annotated[Choice, Meta(description="a registered planner")]
 
 
-class Channel(Part):
+class Channel(Part, frozen=True):
     """The network of a run in virtual time."""
 
     delay_s: Annotated[NotNegative, Meta(description="from sender to listener [s]")] = 0.001
@@ -86,7 +86,7 @@ class Channel(Part):
     loss: Annotated[Share, Meta(description="share of samples that never arrive")] = 0.0
 
 
-class Network(Part):
+class Network(Part, frozen=True):
     """The network of a run in real time."""
 
     realm: Annotated[Name, Meta(description="first chunk of every key")] = "park"
@@ -96,7 +96,7 @@ class Network(Part):
     encoding: Annotated[Literal["json", "msgpack"], Meta(description="of the payloads")] = "json"
 
 
-class Safety(Part):
+class Safety(Part, frozen=True):
     """The last word before a body."""
 
     speed: Annotated[Positive | None, Meta(description="[m/s], if lower than the kind's own")] = None
@@ -106,14 +106,14 @@ class Safety(Part):
     link_silence_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
 
 
-class Start(Part):
+class Start(Part, frozen=True):
     """How a run begins."""
 
     deadline_s: Annotated[Positive, Meta(description="how long to wait for all robots to be ready [s]")] = 20.0
     missing: Annotated[Literal["abort", "go-on"], Meta(description="when one is not ready by then")] = "abort"
 
 
-class Experiment(Part):
+class Experiment(Part, frozen=True):
     """One experiment, or one case of it after `document.cases`."""
 
     title: str

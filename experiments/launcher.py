@@ -21,8 +21,9 @@ from typing import Final, Self
 
 from agents.lifeline import BEAT_S
 
+ROUTER: Final = "router"
+LAND_S: Final = 15.0  # what robots may take to come down after their lifeline was cut
 TAIL: Final = 12  # lines of a dead process's output that are worth showing
-POLL_S: Final = 0.02
 
 
 @dataclass
@@ -73,7 +74,8 @@ class Launcher:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.end(list(self._processes), grace_s=10.0)
+        self.end([name for name in self._processes if name != ROUTER], grace_s=LAND_S)
+        self.end([ROUTER], grace_s=0.0)  # everybody is down: nobody needs it any more
         self._over.set()
         self._beat.join()
 

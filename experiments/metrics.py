@@ -350,6 +350,22 @@ def ratio(value: float | None, reference: float | None) -> float | None:
     return None if value is None or not reference else value / reference
 
 
+def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index: str) -> list[float | None]:
+    """An index of each run over the reference: of the same seed if all seeds are the same, else over its mean."""
+    if sorted(run.seed for run in runs) == sorted(run.seed for run in reference):
+        of_seed = {run.seed: run.mean[index] for run in reference}
+        return [ratio(run.mean[index], of_seed[run.seed]) for run in runs]
+    mean = spread([run.mean[index] for run in reference]).mean
+    return [ratio(run.mean[index], mean) for run in runs]
+
+
+def by_case(cases: Sequence[CaseMetrics]) -> dict[str, list[CaseMetrics]]:
+    grouped: dict[str, list[CaseMetrics]] = {}
+    for case in cases:
+        grouped.setdefault(case.case, []).append(case)
+    return grouped
+
+
 def across_seeds(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Mean, standard deviation and 95 % confidence half-width of each index and ratio over runs of several seeds.
 
@@ -363,7 +379,9 @@ def across_seeds(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "cases": {
             case: {
                 group: {
-                    index: spread([each["cases"][case][group][index] for each in documents if case in each["cases"]])
+                    index: msgspec.structs.asdict(
+                        spread([each["cases"][case][group][index] for each in documents if case in each["cases"]])
+                    )
                     for index in INDICES
                 }
                 for group in ("mean", "ratio")
@@ -373,17 +391,26 @@ def across_seeds(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def spread(values: Sequence[float | None]) -> dict[str, float | int | None]:
-    """Mean, standard deviation and 95 % confidence half-width of what is known, and how many that are."""
+class Spread(msgspec.Struct, frozen=True):
+    """Mean, standard deviation and 95 % confidence half-width (Student's, None for fewer than two) of `n` values."""
+
+    mean: float | None
+    std: float | None
+    ci95: float | None
+    n: int
+
+
+def spread(values: Sequence[float | None]) -> Spread:
+    """Of what is known among the values."""
     known = [value for value in values if value is not None]
     n = len(known)
     deviation = statistics.stdev(known) if n > 1 else None
-    return {
-        "mean": statistics.fmean(known) if known else None,
-        "std": deviation,
-        "ci95": None if deviation is None else student_95(n - 1) * deviation / math.sqrt(n),
-        "n": n,
-    }
+    return Spread(
+        mean=statistics.fmean(known) if known else None,
+        std=deviation,
+        ci95=None if deviation is None else student_95(n - 1) * deviation / math.sqrt(n),
+        n=n,
+    )
 
 
 def student_95(freedom: int) -> float:

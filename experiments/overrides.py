@@ -32,7 +32,7 @@ class OverrideError(ValueError):
         self.hint = hint
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Override:
     """One `--set`.
 

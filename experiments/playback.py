@@ -69,10 +69,11 @@ def read(path: Path) -> Playback:
     attached = next((record.data for record in records.attachments if record.name == JSON), b"")
     try:
         case, seed, clock = about["case"], int(about["seed"]), about["clock"]
+        announced = float(about["started"]) if "started" in about else None
         experiment = msgspec.json.decode(attached, type=Experiment)
     except (KeyError, ValueError) as error:
         raise RecordingError(f"{path}: holds no experiment that this version of zenpark can read ({error})") from None
-    start = content.start()
+    start = content.start(announced)
     if start is None:
         raise RecordingError(f"{path}: no robot had started when the recording ended; there is nothing to show")
     return Playback(_trace(content, experiment, start, (case, seed, clock)), records.complete, messages)
@@ -112,12 +113,13 @@ class _Content:
                     raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
         return count
 
-    def start(self) -> float | None:
-        """UTC time of the common start [s]: as the conductor says, else the earliest that a robot says."""
+    def start(self, announced: float | None) -> float | None:
+        """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
         said = [event.stamp for event in self.events if event.kind == "start" and math.isfinite(event.stamp)]
-        return (
-            said[0] if said else min((status.started for status in self.statuses if status.started > 0), default=None)
-        )
+        began = [status.started for status in self.statuses if status.started > 0.0]
+        if said or announced is not None:
+            return said[0] if said else announced
+        return min(began, default=None)
 
     def _choose(self, channel: int, known: dict[str, _Reader]) -> Callable[[bytes], None] | None:
         about = self.records.channels[channel]

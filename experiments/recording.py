@@ -128,8 +128,8 @@ class Recording:
         Raises:
             RecordingError: If it cannot be written; what was written before stays.
         """
-        self._record(self._state, state.robot, state, state.stamp, state.stamp, seq=state.seq)
-        self._record(self._drawn, state.robot, state, state.stamp, state.stamp, seq=state.seq)
+        if self._record(self._state, state.robot, state, state.stamp, state.stamp, seq=state.seq):
+            self._record(self._drawn, state.robot, state, state.stamp, state.stamp, seq=state.seq)
 
     def status(self, status: Status) -> None:
         """Records lifecycle and counters.
@@ -185,15 +185,17 @@ class Recording:
 
     def _record(
         self, topic: _Topic, robot: str, message: msgspec.Struct, logged: float, published: float, *, seq: int = 0
-    ) -> None:
+    ) -> bool:
+        """Whether the message was whole, and is written."""
         try:
             data = topic.encode(message)
         except Unencodable:
             self.refused += 1
-            return
+            return False
         channel = self._channels.get((robot, topic.what)) or self._register(topic, robot)
         times = self._nanoseconds(logged), self._nanoseconds(published)
         self._guarded(self._writer.add_message, channel, times[0], data, times[1], seq & 0xFFFFFFFF)
+        return True
 
     def _register(self, topic: _Topic, robot: str) -> int:
         if topic.name not in self._schemas:

@@ -25,7 +25,7 @@ _CASE: Final = "InCase"
 
 def schema() -> dict[str, Any]:
     """The schema, with every plug-in that is installed."""
-    (top,), definitions = msgspec.json.schema_components([Experiment], ref_template="#/definitions/{name}")
+    _, definitions = msgspec.json.schema_components([Experiment], ref_template="#/definitions/{name}")
     definitions = {name: _draft7(each) for name, each in definitions.items()}
     for owner, name, group in _CHOICES:
         field = definitions[owner]["properties"][name]
@@ -37,12 +37,11 @@ def schema() -> dict[str, Any]:
     definitions["Experiment"]["properties"]["cases"]["additionalProperties"] = {
         "$ref": f"#/definitions/Experiment{_CASE}"
     }
-    return {
-        "$schema": "http://json-schema.org/draft-07/schema#",
-        "title": "Zenpark experiment",
-        **top,
-        "definitions": definitions | partial,
-    }
+    top = definitions.pop(
+        "Experiment"
+    )  # in full: a reference at the top would hide its neighbours from draft-7 readers
+    whole = {"$schema": "http://json-schema.org/draft-07/schema#", **top, "definitions": definitions | partial}
+    return dict(msgspec.json.decode(msgspec.json.encode(whole)))  # plain lists and tables, defaults included
 
 
 def write_schema(path: Path) -> None:

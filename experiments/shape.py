@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
@@ -52,7 +52,11 @@ def storable(value: object, path: Path = ()) -> Iterator[Fault]:
 
 def faults(document: Mapping[str, Any]) -> list[Fault]:
     """Everything by which a document is not an `Experiment`; empty if `msgspec.convert` takes it."""
-    return _table(document, Experiment, ())
+    found = _table(document, Experiment, ())
+    strayed = {str(fault.path[-1]) for fault in found if "belongs at the top" in fault.hint}
+    return [
+        fault for fault in found if fault.path or not any(f"'{key}' is missing" == fault.message for key in strayed)
+    ]
 
 
 def group_of(path: Path) -> str | None:
@@ -89,6 +93,9 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
         of_key, of_value = get_args(plain)
         for key, each in value.items():
             inner += _key(key, of_key, (*path, key)) or _value(each, of_value, (*path, key), note)
+    elif get_origin(plain) is list and isinstance(value, dict):
+        header = ".".join(map(str, path))
+        return [Fault(path, f"'{_name(path)}' must be a list, not a table", f"write [[{header}]], with two brackets")]
     elif get_origin(plain) is list and isinstance(value, list):
         for number, each in enumerate(value):
             inner += _value(each, get_args(plain)[0], (*path, number), note)
@@ -99,54 +106,67 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
     return inner or _judged(value, annotation, path, note)
 
 
-def _table(value: Mapping[str, Any], struct: type[msgspec.Struct], path: Path) -> list[Fault]:
-    """A table against a struct: unknown keys, missing keys, then each value, then the struct's own checks."""
+def _table(
+    value: Mapping[str, Any], struct: type[msgspec.Struct], path: Path, plugin: tuple[str, str] | None = None
+) -> list[Fault]:
+    """A table against a struct: unknown keys, missing keys, then each value, then the struct's own checks.
+
+    Args:
+        value: The table, without the `kind` of a plug-in.
+        struct: What it should be.
+        path: Where it stands.
+        plugin: Group and kind, if these are a plug-in's parameters.
+    """
     fields = {field.encode_name: field for field in msgspec.structs.fields(struct)}
     found, meant = [], set()
     for key in value:
         if key not in fields:
             hint = did_you_mean(key, fields)
             meant |= {name for name in fields if hint == f"did you mean '{name}'?"}
-            if path and key in _FIELDS:
-                hint = f"'{key}' belongs at the top of the file, above the first [table]"
-            found.append(Fault((*path, key), f"unknown key '{key}'{_in(path)}", hint, on_key=True))
+            found.append(_unknown(key, hint, path, plugin))
     for name, field in fields.items():
         if name in value:
             found += _value(value[name], field.type, (*path, name), "")
         elif field.required and name not in meant:
             _, note = _plain(field.type, "")
-            found.append(
-                Fault(path, f"'{name}' is missing{_in(path)}", _REMEDY.get(name) or f"add {name} = ... ({note})")
-            )
+            hint = _REMEDY.get(name) or f"add {name} = ... ({note})"
+            found.append(Fault(path, f"'{name}' is missing{_in(path)}", hint))
     return found or _judged(value, struct, path, "", fields)
+
+
+def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) -> Fault:
+    """A key that its table does not have; perhaps another one does."""
+    if plugin is not None:
+        group, kind = plugin
+        other = _kind_with(group, [key])
+        hint = f"'{other}' has it" if other else hint
+        return Fault((*path, key), f"unknown parameter '{key}' of {kind!r}", hint, on_key=True)
+    if path and key in _FIELDS:
+        hint = f"'{key}' belongs at the top of the file, above the first [table]"
+    return Fault((*path, key), f"unknown key '{key}'{_in(path)}", hint, on_key=True)
 
 
 def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
     """A plug-in and its parameters."""
     known, what = plugins.names(group), group.rpartition(".")[2]
     if isinstance(value, dict) and not isinstance(value.get("kind"), str):
-        hint = f'add kind = "..."; {did_you_mean("", known)}'
+        likely = _kind_with(group, [key for key in value if key != "kind"])
+        hint = f'add kind = "{likely}"' if likely else f'add kind = "..."; known: {", ".join(known)}'
         return [Fault((*path, "kind"), f"'{_name(path)}' must say its kind, as text", hint)]
     kind, given = plugins.split(value)
     where = path if isinstance(value, str) else (*path, "kind")
     if kind not in known:
-        return [Fault(where, f"no {kind!r} among the {what}", did_you_mean(kind, known))]
+        return [Fault(where, f"no {shown(kind)} among the {what}", did_you_mean(kind, known))]
     try:
         struct = plugins.struct(group, kind)
     except plugins.PluginError as error:
         return [Fault(where, str(error), f"repair or uninstall it, or choose another of the {what}")]
-    own = parameters(group, kind)
-    found = [
-        Fault(
-            (*path, key),
-            f"unknown parameter '{key}' of {kind!r}",
-            next((f"'{other}' has it" for other in known if key in parameters(group, other)), did_you_mean(key, own)),
-            on_key=True,
-        )
-        for key in given
-        if key not in own
-    ]
-    return found + _table({key: each for key, each in given.items() if key in own}, struct, path)
+    return _table(given, struct, path, (group, kind))
+
+
+def _kind_with(group: str, keys: Sequence[str]) -> str | None:
+    """The first plug-in that has all these parameters."""
+    return next((kind for kind in plugins.names(group) if set(keys) <= set(parameters(group, kind))), None)
 
 
 def _judged(

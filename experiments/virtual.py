@@ -13,8 +13,8 @@ import numpy as np
 
 from agents.agent import Agent
 from agents.body import BodyState
-from agents.lifecycle import Phase
-from agents.rows import Array, Index
+from agents.lifecycle import LANDING, Phase
+from agents.rows import Array, Index, some
 from experiments import assign
 from experiments.channel import Channel
 from experiments.experiment import Experiment
@@ -42,7 +42,7 @@ class Log:
         goal: (K, R, 3), `setpoint` (K, R, 4), `error` (K, R).
         sent: Columns time, row, seq, position, velocity, yaw.
         heard: Columns time, link, seq, stamp, position.
-        lost: (E,) samples lost on each link of all repetitions.
+        lost: (E,) samples lost on each link of all repetitions, from the common start to the landing.
         decisions: Coordination decisions of each row.
         interventions: (R,) ticks on which safety changed what was decided.
         ticks: Ticks from the common start to the end.
@@ -108,6 +108,7 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
     seq = np.zeros(rows, dtype=np.intp)
     interventions = np.zeros(rows, dtype=np.intp)
     states, sent, heard = _Samples(), _Samples(), _Samples()
+    lost_before = lost_after = channel.lost
     conductor = _Conductor(agent, names)
     tick = 0
     while not conductor.over:
@@ -118,13 +119,18 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
             agent.hear(arrived.link, arrived.position, arrived.velocity, arrived.stamp, arrived.arrival)
             heard.add(arrived.arrival, arrived.link, arrived.seq, arrived.stamp, arrived.position)
         actions = agent.step(t, state)
+        if agent.life.moved:
+            begun, ended = agent.decisions == 1, (agent.life.phase >= LANDING).all()
+            lost_before = channel.lost.copy() if begun else lost_before
+            lost_after = channel.lost.copy() if ended else lost_after
         if actions.duties is not None:
             body.takeoff(actions.duties.takeoff, assignment.hover[actions.duties.takeoff])
             body.land(actions.duties.land)
             body.stop(actions.duties.stop)
         body.command(actions.setpoint)
-        interventions += actions.changed
-        if tick % log_every == 0:
+        if some(actions.changed):
+            interventions += actions.changed
+        if (agent.tick - 1) % log_every == 0:  # the agent's count begins anew at the common start
             states.add(t, agent.life.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
         if len(speak := actions.speak):
             seq[speak] += 1
@@ -146,7 +152,7 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
         *arrays,
         sent=(said[0] - begin, said[1].astype(np.intp), said[2].astype(np.intp), *said[3:]),  # type: ignore[arg-type]
         heard=(got[0] - begin, got[1].astype(np.intp), got[2].astype(np.intp), got[3] - begin, got[4]),
-        lost=channel.lost,
+        lost=lost_after - lost_before,
         decisions=agent.decisions,
         interventions=interventions,
         ticks=round(experiment.duration_s / dt),
@@ -171,6 +177,8 @@ class _Conductor:
 
     def look(self, t: float, dt: float) -> None:
         """After each tick."""
+        if self._agent.life.all_running:
+            return
         phase = self._agent.life.phase
         if self._stage == Phase.RUNNING:
             if phase.min() >= Phase.LANDING:

@@ -17,6 +17,7 @@ from agents.session import free_endpoint
 ROOT = Path(__file__).resolve().parent.parent
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Under xdist the system tests run one after the other: two routers and their robots on two cores only wait."""
     for item in items:

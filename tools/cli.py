@@ -24,7 +24,9 @@ EXPLAINED: Final = (
     ("agents.body", "BodyError"),
     ("agents.plugins", "PluginError"),
     ("experiments.problem", "DocumentError"),
-    ("experiments.recording", "RecordingError"),
+    ("experiments.records", "RecordingError"),
+    ("experiments.conductor", "RunFailed"),
+    ("experiments.virtual", "Stuck"),
     ("tools.network", "KeyExpressionError"),
 )
 
@@ -72,7 +74,7 @@ def run(
     open_report: Annotated[bool, typer.Option("--open", help="Opens the report in the browser.")] = False,
 ) -> None:
     """Run an experiment: one process per robot, or in virtual time."""
-    from experiments.run import command  # noqa: PLC0415
+    from experiments.commands import run as command  # noqa: PLC0415
 
     raise typer.Exit(
         command(
@@ -94,15 +96,17 @@ def run(
 def agent(
     file: File,
     names: Annotated[list[str], typer.Argument(metavar="NAME...", help="The robots of this process.")],
+    *,
+    case: Annotated[str | None, typer.Option(metavar="NAME", help="A case of the file. [the first]")] = None,
     connect: Connect = None,
     lifeline: Annotated[
         bool, typer.Option("--lifeline", help="Land and end when standard input ends or falls silent.")
     ] = False,
 ) -> None:
     """Be one robot of an experiment, or several that share a device."""
-    from experiments.robot import main as robot  # noqa: PLC0415
+    from experiments.robot import fly  # noqa: PLC0415
 
-    raise typer.Exit(robot(file, names, connect=connect or [], lifeline=lifeline))
+    raise typer.Exit(fly(file, names, case=case, connect=connect or [], lifeline=lifeline))
 
 
 @app.command()
@@ -135,9 +139,9 @@ def report(
     out: Annotated[str | None, typer.Option(metavar="FILE", help="Where the report goes. [the run's folder]")] = None,
 ) -> None:
     """Write the report of one run, or compare several."""
-    from experiments.run import report_command  # noqa: PLC0415
+    from experiments.commands import report as command  # noqa: PLC0415
 
-    raise typer.Exit(report_command(runs, out=out))
+    raise typer.Exit(command(runs, out=out))
 
 
 @app.command()
@@ -146,7 +150,7 @@ def recover(
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Where the whole one goes.")] = None,
 ) -> None:
     """Repair a recording whose writer was killed."""
-    from experiments.recording import recover_command  # noqa: PLC0415
+    from experiments.recover import recover_command  # noqa: PLC0415
 
     raise typer.Exit(recover_command(file, target))
 
@@ -157,33 +161,40 @@ def new(
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
 ) -> None:
     """Begin an experiment file from a ready-made one."""
-    from experiments.run import new_command  # noqa: PLC0415
+    from experiments.commands import new as command  # noqa: PLC0415
 
-    raise typer.Exit(new_command(name, target))
+    raise typer.Exit(command(name, target))
 
 
 @app.command(name="list")
 def list_() -> None:
     """List the ready-made experiments and the plugins."""
-    from experiments.run import list_command  # noqa: PLC0415
+    from experiments.commands import list_all  # noqa: PLC0415
 
-    raise typer.Exit(list_command())
+    raise typer.Exit(list_all())
 
 
 @app.command()
 def schema() -> None:
     """Print the JSON schema of the experiment file."""
-    from experiments.check import schema_command  # noqa: PLC0415
+    import json  # noqa: PLC0415
 
-    raise typer.Exit(schema_command())
+    from experiments.schema import schema as made  # noqa: PLC0415
+
+    typer.echo(json.dumps(made(), indent=2))
 
 
 @app.command()
-def bench(as_json: AsJson = False) -> None:
-    """Measure what this machine can do."""
+def bench(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME...]", help="start, codec, virtual, process.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what this machine can do, each figure beside a baseline."""
     from tools.bench import command  # noqa: PLC0415
 
-    raise typer.Exit(command(as_json=as_json))
+    raise typer.Exit(command(names or [], as_json=as_json))
 
 
 @app.command()

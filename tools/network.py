@@ -23,6 +23,11 @@ DEPTH: Final = 8192  # samples between two polls
 Printer = Callable[[str], None]
 
 
+def at_once(line: str) -> None:
+    """Prints a line without delay, into a pipe too."""
+    print(line, flush=True)
+
+
 class KeyExpressionError(ValueError):
     """Not a key expression of Zenoh."""
 
@@ -91,7 +96,7 @@ def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[
                 continue  # somebody else's idea of JSON
 
 
-def keys(connect: Sequence[str] = (), *, as_json: bool = False, out: Printer = print) -> None:
+def keys(connect: Sequence[str] = (), *, as_json: bool = False, out: Printer = at_once) -> None:
     """Prints who is on the network now.
 
     Raises:
@@ -137,7 +142,7 @@ def echo(
     *,
     count: int | None = None,
     seconds: float | None = None,
-    out: Printer = print,
+    out: Printer = at_once,
 ) -> None:
     """Prints `key payload` for each sample, the last value of every pose first.
 
@@ -234,7 +239,7 @@ def hz(
     *,
     seconds: float | None = None,
     window_s: float = 1.0,
-    out: Printer = print,
+    out: Printer = at_once,
 ) -> None:
     """Prints rate, bytes and intervals of each key, window by window.
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from agents.body import BodyError, BodyRequest, BodyState
 from agents.kinds import Kind
-from agents.rows import Array, Index
+from agents.rows import Array, Index, span
 from twins.differential import DRIVES, Differential
 from twins.disturbance import Drift, HoverJitter, Latency, Measurement
 from twins.noise import Noise
@@ -28,12 +28,14 @@ class TwinBody:
         self._dt = 1.0 / request.rate_hz
         self._t = 0.0
         flies = np.array([k.flies for k in kinds])
-        self._air, self._floor = np.flatnonzero(flies), np.flatnonzero(~flies)
-        self._quadrotor = Quadrotor(*self._part(request, self._air), self._dt)
-        self._differential = Differential(*self._part(request, self._floor), self._dt)
+        air, floor = np.flatnonzero(flies), np.flatnonzero(~flies)
+        self._in_air, self._on_floor = air, floor
+        self._air, self._floor = span(air), span(floor)
+        self._quadrotor = Quadrotor(*self._part(request, air), self._dt)
+        self._differential = Differential(*self._part(request, floor), self._dt)
         names, seeds, nature = request.names, request.seeds, request.disturbance
-        aloft = [nature[i] for i in self._air]
-        air_names, air_seeds = [names[i] for i in self._air], [seeds[i] for i in self._air]
+        aloft = [nature[i] for i in air]
+        air_names, air_seeds = [names[i] for i in air], [seeds[i] for i in air]
         self._jitter = HoverJitter(aloft, Noise(air_names, air_seeds, "hover jitter", 2), self._dt)
         axes = np.where(flies[:, None], 1.0, [1.0, 1.0, 0.0])
         self._measurement = Measurement(nature, axes, Noise(names, seeds, "measurement", 4))
@@ -66,24 +68,25 @@ class TwinBody:
 
     def command(self, setpoint: Array) -> None:
         """See `Body.command`."""
-        self._command = np.where(np.isnan(setpoint), self._command, setpoint) if self._latency.present else setpoint
-        if not self._latency.present:
+        if self._latency.present:
+            self._command = np.where(np.isnan(setpoint), self._command, setpoint)
+        else:
             self._apply(setpoint)
 
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Body.takeoff`."""
-        flies = np.isin(rows, self._air)
-        self._quadrotor.takeoff(np.searchsorted(self._air, rows[flies]), height[flies])
+        flies = np.isin(rows, self._in_air)
+        self._quadrotor.takeoff(np.searchsorted(self._in_air, rows[flies]), height[flies])
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
-        self._quadrotor.land(self._among(self._air, rows))
-        self._differential.halt(self._among(self._floor, rows))
+        self._quadrotor.land(self._among(self._in_air, rows))
+        self._differential.halt(self._among(self._on_floor, rows))
 
     def stop(self, rows: Index) -> None:
         """See `Body.stop`."""
-        self._quadrotor.stop(self._among(self._air, rows))
-        self._differential.halt(self._among(self._floor, rows))
+        self._quadrotor.stop(self._among(self._in_air, rows))
+        self._differential.halt(self._among(self._on_floor, rows))
 
     @staticmethod
     def _among(part: Index, rows: Index) -> Index:
@@ -94,29 +97,30 @@ class TwinBody:
         """See `Body.close`."""
 
     def _apply(self, setpoint: Array) -> None:
-        if len(self._air):
+        if len(self._in_air):
             self._quadrotor.command(setpoint[self._air])
-        if len(self._floor):
+        if len(self._on_floor):
             self._differential.command(setpoint[self._floor, :2])
 
     def _advance(self) -> None:
         if self._latency.present:
             self._apply(self._latency.pass_on(self._command))
+            self._command = np.full_like(self._command, np.nan)  # one command moves a body once: silence must show
         before = self._truth[:, :2].copy() if self._drift.present else None
-        if len(self._floor):
+        if len(self._on_floor):
             self._differential.advance()
             self._truth[self._floor] = self._differential.position
-        if len(self._air):
+            self._used[self._floor] += self._dt
+        if len(self._in_air):
             self._quadrotor.advance()
             self._truth[self._air] = self._quadrotor.position
+            self._used[self._air] += self._dt * self._quadrotor.flying
             if self._jitter.present:
                 self._jitter.advance()
                 share = np.minimum(self._quadrotor.position[:, 2] / FULL_WOBBLE, 1.0)
                 self._truth[self._air, :2] += share[:, None] * self._jitter.displacement
         if before is not None:
             self._drift.advance(self._truth[:, :2] - before)
-        self._used[self._floor] += self._dt
-        self._used[self._air] += np.where(self._quadrotor.flying, self._dt, 0.0)
 
     def _measure(self) -> BodyState:
         rows = len(self._truth)

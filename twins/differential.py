@@ -41,11 +41,12 @@ class Differential:
     def __init__(self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float) -> None:
         drives = [DRIVES[kind.name] for kind in kinds]
         self._dt = dt
-        self._base = np.array([d.base for d in drives])
-        self._limit = np.array([d.speed for d in drives])[:, None]
-        self._change = np.array([d.acceleration * dt for d in drives])[:, None]
-        self._wheels = np.zeros((len(drives), 2))  # rim speeds, left and right [m/s]
-        self._wanted = np.zeros((len(drives), 2))
+        self._half_base = np.array([0.5 * d.base for d in drives])
+        self._turn = np.array([dt / d.base for d in drives])  # yaw of a step, per difference of the rim speeds
+        self._limit = np.array([d.speed for d in drives])
+        self._change = np.array([d.acceleration * dt for d in drives])
+        self._wheels = np.zeros((2, len(drives)))  # rim speeds, left and right [m/s]
+        self._wanted = np.zeros((2, len(drives)))
         self._patience = np.full(len(drives), np.inf)
         self.position = np.array(start, dtype=float)
         self.yaw = np.array(yaw, dtype=float)
@@ -53,28 +54,28 @@ class Differential:
 
     def command(self, twist: Array) -> None:
         """Sets v [m/s] and ω [rad/s], (n, 2); rows of NaN keep theirs."""
-        half = 0.5 * self._base * twist[:, 1]
-        given = np.isfinite(half)
+        v, half = twist[:, 0], self._half_base * twist[:, 1]
         wanted = np.empty_like(self._wanted)
-        wanted[:, 0], wanted[:, 1] = twist[:, 0] - half, twist[:, 0] + half
-        self._wanted = np.where(given[:, None], wanted, self._wanted)
+        wanted[0], wanted[1] = v - half, v + half
+        given = np.isfinite(wanted[0])
+        np.copyto(self._wanted, wanted, where=given)
         self._patience[given] = COMMAND_TIMEOUT_S
 
     def halt(self, rows: Index) -> None:
         """Wheels to zero speed."""
-        self._wanted[rows] = 0.0
+        self._wanted[:, rows] = 0.0
 
     def advance(self) -> None:
         """One step of dt, along an arc: no side-slip (paper, eq. (1))."""
         self._patience -= self._dt
-        wanted = self._wanted * (self._patience >= 0.0)[:, None]
+        wanted = self._wanted * (self._patience >= 0.0)
         # both wheels are slowed by the same factor, so that a curve stays that curve
-        over = np.maximum(np.abs(wanted[:, :1]), np.abs(wanted[:, 1:])) / self._limit
-        wanted = wanted / np.maximum(over, 1.0)
+        over = np.maximum(np.abs(wanted[0]), np.abs(wanted[1])) / self._limit
+        wanted /= np.maximum(over, 1.0)
         self._wheels += clamp(wanted - self._wheels, -self._change, self._change)
-        left, right = self._wheels[:, 0], self._wheels[:, 1]
+        left, right = self._wheels
         v = 0.5 * (left + right)
-        turn = (right - left) / self._base * self._dt
+        turn = (right - left) * self._turn
         middle = self.yaw + 0.5 * turn
         self.velocity[:, 0], self.velocity[:, 1] = v * np.cos(middle), v * np.sin(middle)
         self.position += self._dt * self.velocity

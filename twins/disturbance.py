@@ -19,8 +19,8 @@ class HoverJitter:
         jitter = [d.hover_jitter for d in disturbance]
         sigma = np.array([0.0 if j is None else j.sigma for j in jitter])
         keep = np.array([1.0 if j is None else math.exp(-dt / j.correlation_s) for j in jitter])
-        self._keep = keep[:, None]
-        self._push = (sigma * np.sqrt(1.0 - keep**2))[:, None]
+        self._keep = np.repeat(keep[:, None], 2, axis=1)
+        self._push = np.repeat((sigma * np.sqrt(1.0 - keep**2))[:, None], 2, axis=1)
         self._noise = noise
         self.present = bool(sigma.any())
         self.displacement = np.zeros((len(disturbance), 2))

@@ -1,4 +1,4 @@
-"""Random numbers for rows: each row has streams of its own, so that a robot's noise is the same alone and in a swarm."""
+"""Random numbers for rows: each row has streams of its own, so its noise is the same alone and in a swarm."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from agents.kinds import Kind
-from agents.rows import Array, Index, Mask, clamp
+from agents.rows import Array, Index, Mask, clamp, every, some
 
 GRAVITY: Final = 9.81  # [m/s²]
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs and landings
@@ -18,7 +18,7 @@ TOUCHDOWN: Final = 0.02  # [m] lower than this a landing robot is down
 
 @dataclass(frozen=True)
 class Response:
-    """Closed loop on board: position gain (x, y, z) [1/s], velocity gain (x, y, z) [1/s], speed limit per axis [m/s]."""
+    """Closed loop on board: position and velocity gains (x, y, z) [1/s], speed limit per axis [m/s]."""
 
     position: tuple[float, float, float]
     velocity: tuple[float, float, float]
@@ -48,9 +48,10 @@ class Quadrotor:
         rows = len(responses)
         self._dt = dt
         self._kp = np.array([r.position for r in responses])
-        self._kv = np.array([r.velocity for r in responses])
-        self._speed = np.array([r.speed for r in responses])[:, None]
-        self._by_velocity = np.array([kind.takes == "velocity" for kind in kinds])
+        self._gain = dt * np.array([r.velocity for r in responses])  # of a step: k_v dt
+        self._speed = np.array([[r.speed] * 3 for r in responses]).reshape(rows, 3)
+        self._by_velocity = np.array([kind.takes == "velocity" for kind in kinds], dtype=bool)
+        self._any_by_velocity = some(self._by_velocity)
         self._turn = np.array([kind.turn_response for kind in kinds])
         self.position = np.array(start, dtype=float)
         self.velocity = np.zeros_like(self.position)
@@ -68,14 +69,15 @@ class Quadrotor:
 
     def command(self, setpoint: Array) -> None:
         """Position and yaw, or velocity and yaw rate (n, 4); rows of NaN, on the ground or landing keep theirs."""
-        given = ~np.isnan(setpoint[:, 0]) & self.flying & ~self._landing
-        position, velocity = given & ~self._by_velocity, given & self._by_velocity
-        self._target = np.where(position[:, None], setpoint[:, :3], self._target)
-        self._heading = np.where(position, setpoint[:, 3], self._heading)
-        self._elapsed = np.where(given, np.inf, self._elapsed)
-        if velocity.any():
-            self._wanted = np.where(velocity[:, None], setpoint[:, :3], self._wanted)
-            self._yaw_rate = np.where(velocity, setpoint[:, 3], self._yaw_rate)
+        given = self.flying & ~(np.isnan(setpoint[:, 0]) | self._landing)
+        position = given & ~self._by_velocity
+        np.copyto(self._target, setpoint[:, :3], where=position[:, None])
+        np.copyto(self._heading, setpoint[:, 3], where=position)
+        self._elapsed[given] = np.inf
+        if self._any_by_velocity:
+            velocity = given & self._by_velocity
+            np.copyto(self._wanted, setpoint[:, :3], where=velocity[:, None])
+            np.copyto(self._yaw_rate, setpoint[:, 3], where=velocity)
 
     def takeoff(self, rows: Index, height: Array) -> None:
         """Motors on, and up to `height` (len(rows),) [m] over the present place."""
@@ -97,23 +99,23 @@ class Quadrotor:
     def advance(self) -> None:
         """One step of dt: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v)."""
         climbing = np.isfinite(self._elapsed)
-        if climbing.any():
+        if some(climbing):
             self._ramp(climbing)
         wanted = self._kp * (self._target - self.position)
         turn = self._turn * (self._heading - self.yaw)
-        if self._by_velocity.any():
+        if self._any_by_velocity:
             wanted = np.where((self._by_velocity & ~climbing)[:, None], self._wanted, wanted)
             turn = np.where(self._by_velocity, self._yaw_rate, turn)
         wanted = clamp(wanted, -self._speed, self._speed)
-        velocity = self.velocity + self._dt * self._kv * (wanted - self.velocity)
-        aloft = self.flying.all()
+        velocity = self.velocity + self._gain * (wanted - self.velocity)
+        aloft = every(self.flying)
         if not aloft:
             velocity = np.where(self.flying[:, None], velocity, self._falling())
             turn = np.where(self.flying, turn, 0.0)
         self.velocity = velocity
         self.position += self._dt * velocity
         self.yaw += self._dt * turn
-        if not aloft or self._landing.any():
+        if not aloft or some(self._landing):
             self._touch_down()
 
     def _climb(self, rows: Index, height: Array) -> None:
@@ -123,7 +125,7 @@ class Quadrotor:
         self._span[rows] = np.maximum(np.abs(height - self.position[rows, 2]) / CLIMB, 0.5)
 
     def _ramp(self, climbing: Mask) -> None:
-        """Vertical target of rows that climb or sink by themselves: a polynomial at rest, without jerk, at both ends."""
+        """Vertical target of rows that climb or sink by themselves: a polynomial, without jerk at both ends."""
         self._elapsed += self._dt
         s = np.clip(self._elapsed[climbing] / self._span[climbing], 0.0, 1.0)
         share = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -44,7 +43,7 @@ def trace(
     seed: int = 1,
     events: Sequence[Event] = (),
 ) -> Trace:
-    """A trace of given positions (T, N, 3); each robot in `sent` sends its pose at those times, heard by all listeners."""
+    """A trace of given positions (T, N, 3); robots in `sent` send their pose at those times, heard by all listeners."""
     names = tuple(what.robots)
     count = len(position)
     row = {name: i for i, name in enumerate(names)}
@@ -152,9 +151,7 @@ def crowd(rows: int, case: str = "periodic", threshold: float = 0.0, *, seed: in
     return simulate(what, start, case, threshold, seed=seed, duration=duration)
 
 
-def simulate(
-    what: Experiment, start: Array, case: str, threshold: float, *, seed: int, duration: float
-) -> Trace:
+def simulate(what: Experiment, start: Array, case: str, threshold: float, *, seed: int, duration: float) -> Trace:
     """The distance law on first-order robots, decided at 10 Hz; what neighbours hold is what the trigger sent."""
     rng = np.random.default_rng(seed)
     names, rows = list(what.robots), len(what.robots)
@@ -189,9 +186,3 @@ def simulate(
     events = [Event(0.0, "start", "conductor", "all robots are ready")]
     events += [Event(leg.at_s, "phase", leg.robot, "begins to follow its plan") for leg in what.timeline]
     return trace(what, record, sent=sent, delay=0.001, case=case, seed=seed, events=events)
-
-
-def chain(rows: int) -> dict[str, float]:
-    """Links of a chain behind the first robot, for experiments of any size."""
-    names = [f"R{i}" for i in range(rows)]
-    return {f"{a} > {b}": 1.0 for a, b in itertools.pairwise(names)}

@@ -127,7 +127,7 @@ def test_echo_prints_the_last_pose_and_then_what_comes(router):
     with open_session([router.endpoint], name="CF01") as robot:
         pose = pose_publisher(robot, "park/CF01/pose", JSON)
         pose.put(b'{"x": 1}')
-        listening = zenpark("echo", "park/*/pose", "--connect", router.endpoint, "-n", "2")
+        listening = zenpark("echo", "park/*/pose", "--connect", router.endpoint, "-n", "2", "--seconds", "30")
         with listening:
             assert listening.stdout.readline() == 'park/CF01/pose {"x":1}\n'
             pose.put(msgspec.msgpack.encode({"x": 2.5}), encoding=MSGPACK)
@@ -146,10 +146,9 @@ def test_echo_ends_after_its_time(router):
 @pytest.mark.system
 def test_ctrl_c_ends_echo_quietly(router):
     with open_session([router.endpoint], name="CF01") as robot:
-        pose_publisher(robot, "park/CF01/pose", JSON).put(b"1")
         pose = pose_publisher(robot, "park/CF01/pose", JSON)
         pose.put(b"2")
-        listening = zenpark("echo", "park/*/pose", "--connect", router.endpoint)
+        listening = zenpark("echo", "park/*/pose", "--connect", router.endpoint, "--seconds", "30")
         assert listening.stdout.readline() == "park/CF01/pose 2\n"
         listening.send_signal(signal.SIGINT)
         _, err = listening.communicate(timeout=30)

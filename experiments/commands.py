@@ -1,0 +1,142 @@
+"""What `zenpark run`, `report`, `new` and `list` do and print."""
+
+from __future__ import annotations
+
+import json
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from agents import plugins
+from experiments import document, metrics
+from experiments.problem import DocumentError, Problem
+from experiments.progress import shown
+from experiments.run import SOURCE, Interrupts, Run, fly, load, new_folder, reopen, simulate_seeds
+
+
+def run(
+    file: str,
+    *,
+    virtual: bool,
+    cases: Sequence[str],
+    out: str | None,
+    seed: int | None,
+    settings: Sequence[str],
+    as_json: bool,
+    seeds: int,
+    report: bool,
+    open_report: bool,
+) -> int:
+    """`zenpark run`; returns the exit code: 0, or 130 after Ctrl-C."""
+    changes = [*settings, *([] if seed is None else [f"seed={seed}"])]
+    read = load(file, *changes)
+    if seeds > 1 and not virtual:
+        raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
+    folder = new_folder(read, out)
+    (folder / SOURCE).write_text(read.text, encoding="utf-8")
+    interrupted = Interrupts()
+    if virtual:
+        first = read.experiment.seed
+        runs = simulate_seeds(read, range(first, first + seeds), cases=cases, folder=folder)
+    else:
+        with interrupted:
+            runs = [fly(read, folder, cases=cases, show=shown(quiet=as_json), interrupted=interrupted)]
+    page = (
+        _keep(runs, folder, _command(file, virtual=virtual, changes=changes, cases=cases, seeds=seeds))
+        if report
+        else None
+    )
+    summary: dict[str, Any] = runs[0].summary()
+    if seeds > 1:
+        summary["across"] = metrics.across_seeds([each.summary() for each in runs])
+    if as_json:
+        print(json.dumps(summary))
+    else:
+        _tell(runs, summary, page)
+    if open_report and page is not None:
+        webbrowser.open(page.resolve().as_uri())
+    return 130 if interrupted.asked else 0
+
+
+def report(folders: Sequence[str], *, out: str | None) -> int:
+    """`zenpark report`: of one run again, or of several beside each other."""
+    from experiments import report as pages  # noqa: PLC0415 - matplotlib takes 0.6 s
+
+    runs = [reopen(Path(folder)) for folder in folders]
+    if len(runs) == 1:
+        assert runs[0].folder is not None
+        print(_keep(runs, Path(out) if out else runs[0].folder, f"zenpark report {folders[0]}"))
+    else:
+        target = Path(out or "comparison.html")
+        print(
+            pages.compare(target, [(Path(f).name, list(r.traces.values())) for f, r in zip(folders, runs, strict=True)])
+        )
+    return 0
+
+
+def new(name: str, target: str | None) -> int:
+    """`zenpark new`: copies a catalogue entry to begin from."""
+    path = document.copy(name, Path(target) if target else Path(f"{name}.toml"))
+    print(f"{path}: a copy of {name}; change it, then `zenpark check {path}` and `zenpark run {path}`")
+    return 0
+
+
+def list_all() -> int:
+    """`zenpark list`: the catalogue, and the plug-ins that are installed."""
+    width = max(len(name) for name, _ in document.names())
+    print("Experiments (zenpark run NAME, zenpark new NAME):")
+    for name, title in document.names():
+        print(f"  {name:<{width}}  {title}")
+    for what, group in (
+        ("Bodies", plugins.BODIES),
+        ("Triggers", plugins.TRIGGERS),
+        ("Laws", plugins.LAWS),
+        ("Planners", plugins.PLANNERS),
+    ):
+        print(f"{what}: {', '.join(plugins.names(group))}")
+    return 0
+
+
+def _command(file: str, *, virtual: bool, changes: Sequence[str], cases: Sequence[str], seeds: int) -> str:
+    parts = ["zenpark", "run", file, *(["--virtual"] if virtual else [])]
+    parts += [part for case in cases for part in ("--case", case)]
+    parts += [part for change in changes for part in ("--set", f"'{change}'")]
+    return " ".join(parts + (["--seeds", str(seeds)] if seeds > 1 else []))
+
+
+def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
+    """Writes tables, figures and report of a run into its folder; returns the report."""
+    from experiments import report as pages  # noqa: PLC0415
+
+    every = [case for each in runs for case in each.metrics.values()]
+    metrics.write_csv(folder / "metrics.csv", every)
+    metrics.write_json(folder / "metrics.json", every)
+    traces = [trace for each in runs for trace in each.traces.values()]
+    return pages.write(folder, traces, command=command, text=runs[0].source, measured=every)
+
+
+def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> None:
+    """The result in a few lines."""
+    across = summary.get("across")
+    for name, case in summary["cases"].items():
+        mean, ratio = case["mean"], case["ratio"]
+        if across is not None:
+            means = across["cases"][name]
+            mean, ratio = ({k: v["mean"] for k, v in means[what].items()} for what in ("mean", "ratio"))
+        acquired = "never" if mean["acquired_s"] is None else f"{mean['acquired_s']:.1f} s"
+        line = f"{name:>12}: {_figure(mean['f_hz'])} messages/s, IAE {_figure(mean['iae'])}"
+        line += f", RMSE {_figure(mean['rmse'])} m"
+        line += f", acquired {acquired}, lost {mean['lost']:g}"
+        if name != next(iter(summary["cases"])):
+            line += f"   (ratios: f {_figure(ratio['f_hz'])}, IAE {_figure(ratio['iae'])})"
+        print(line)
+    for note in runs[0].notes:
+        print(f"note: {note}")
+    print(f"run: {runs[0].folder}")
+    if page is not None:
+        print(f"report: {page}")
+
+
+def _figure(value: float | None) -> str:
+    return "?" if value is None else f"{value:.3g}"

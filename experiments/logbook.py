@@ -1,0 +1,226 @@
+"""What a virtual run logged, as traces and as recordings: the same that a real run leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from agents import wire
+from agents.graph import Links
+from agents.lifecycle import Phase
+from agents.rows import Array, Index, Mask
+from experiments import assign
+from experiments.experiment import Experiment
+from experiments.recording import Recording
+from experiments.trace import HeardPoses, Sent, Trace
+from experiments.virtual import Log
+
+EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
+ROUNDING_S: Final = 1e-6
+
+
+class Logbook:
+    """One repetition of a virtual run."""
+
+    def __init__(self, log: Log, experiment: Experiment, case: str, copy: int = 0) -> None:
+        """The repetition of `log.seeds[copy]`."""
+        rows = len(log.names)
+        self._log, self._experiment, self._case = log, experiment, case
+        self._mine = slice(copy * rows, (copy + 1) * rows)
+        self._seed = log.seeds[copy]
+        self._links: Links = assign.all_links(experiment)
+        time, row, seq, position, velocity, yaw = log.sent
+        own = (row >= copy * rows) & (row < (copy + 1) * rows)
+        self._sent = (time[own], row[own] - copy * rows, seq[own], position[own], velocity[own], yaw[own])
+        per_copy = len(self._links)
+        time, link, seq, stamp, position = log.heard
+        own = (link >= copy * per_copy) & (link < (copy + 1) * per_copy)
+        self._heard = (time[own], link[own] - copy * per_copy, seq[own], stamp[own], position[own])
+        lost = np.zeros(rows, dtype=np.intp)
+        np.add.at(lost, self._links.speaker, log.lost[copy * per_copy : (copy + 1) * per_copy])
+        self._lost = lost
+
+    def trace(self) -> Trace:
+        """The run from the common start on, as arrays."""
+        log, mine, duration = self._log, self._mine, self._experiment.duration_s
+        run = self._within(log.time)
+        sent = self._within(self._sent[0])
+        time, row, seq, position, velocity, yaw = self._sent
+        sizes = np.array([len(wire.encode(pose, self._encoding)) for pose in self._poses(sent)], dtype=np.intp)
+        got = self._within(self._heard[0])
+        heard_time, link, heard_seq, stamp, heard_position = self._heard
+        link = link[got]
+        rows = len(log.names)
+        return Trace(
+            case=self._case,
+            experiment=self._experiment,
+            seed=self._seed,
+            robots=log.names,
+            clock="virtual",
+            time=np.round(log.time[run], 9),
+            position=log.position[run, mine],
+            yaw=log.yaw[run, mine],
+            true_position=log.true_position[run, mine],
+            goal=log.goal[run, mine],
+            setpoint=log.setpoint[run, mine],
+            sent=Sent(time[sent], row[sent], seq[sent], position[sent], velocity[sent], yaw[sent], sizes),
+            heard=HeardPoses(
+                heard_time[got],
+                self._links.listener[link],
+                self._links.speaker[link],
+                heard_seq[got],
+                stamp[got],
+                heard_position[got],
+            ),
+            lost=self._lost,
+            missed_deadlines=np.zeros(rows, dtype=np.intp),
+            ticks=np.full(rows, log.ticks, dtype=np.intp),
+            decisions=np.full(rows, log.decisions, dtype=np.intp),
+            events=tuple(
+                wire.Event(t, kind, source, text) for t, kind, source, text in self._events() if t <= duration
+            ),
+        )
+
+    def record(self, path: Path, document: str) -> None:
+        """Writes a recording of the whole run, take-off and landing included.
+
+        Args:
+            path: A file that does not exist yet.
+            document: The experiment file, as it was written.
+
+        Raises:
+            RecordingError: If it cannot be written.
+        """
+        with Recording(
+            path,
+            self._experiment,
+            document,
+            case=self._case,
+            seed=self._seed,
+            clock="virtual",
+            started=EPOCH,
+        ) as recording:
+            for t, kind, source, text in self._events():
+                recording.event(wire.Event(EPOCH + t, kind, source, text))
+            every = np.ones(len(self._sent[0]), dtype=bool)
+            said = zip(self._sent[0].tolist(), self._poses(every), strict=True)
+            pending = next(said, None)
+            for t, states in self._states():
+                while pending is not None and pending[0] <= t + ROUNDING_S:
+                    size = len(wire.encode(pending[1], self._encoding))
+                    recording.pose(pending[1], pending[1].stamp, size)
+                    pending = next(said, None)
+                for state in states:
+                    recording.state(state)
+            for status in self._statuses():
+                recording.status(status)
+
+    @property
+    def _encoding(self) -> wire.Encoding:
+        return self._experiment.network.encoding
+
+    def _within(self, time: Array) -> Mask:
+        return (time >= -ROUNDING_S) & (time <= self._experiment.duration_s + ROUNDING_S)
+
+    def _poses(self, which: Mask) -> Iterator[wire.Pose]:
+        names = self._log.names
+        columns = (column[which].tolist() for column in self._sent)
+        for t, row, seq, position, velocity, yaw in zip(*columns, strict=True):
+            yield wire.pose(names[row], seq, EPOCH + t, position, velocity, yaw)
+
+    def _states(self) -> Iterator[tuple[float, list[wire.State]]]:
+        """Telemetry, sample by sample, with the poses that each robot heard since the sample before."""
+        log, mine = self._log, self._mine
+        words = [phase.word for phase in Phase]
+        columns = (log.phase, log.position, log.velocity, log.yaw, log.goal, log.setpoint, log.error)
+        samples = zip(
+            log.time.tolist(),
+            *(column[:, mine].tolist() for column in (*columns, log.true_position, log.true_yaw)),
+            strict=True,
+        )
+        heard = self._heard_by_sample()
+        for k, (t, phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw) in enumerate(samples):
+            yield (
+                t,
+                [
+                    wire.State(
+                        name,
+                        k + 1,
+                        EPOCH + t,
+                        words[phase[row]],
+                        tuple(position[row]),
+                        tuple(velocity[row]),
+                        yaw[row],
+                        None if goal[row][0] != goal[row][0] else tuple(goal[row]),
+                        None if setpoint[row][0] != setpoint[row][0] else tuple(setpoint[row]),
+                        error[row],
+                        tuple(truth[row]),
+                        true_yaw[row],
+                        heard.get((k, row), []),
+                    )
+                    for row, name in enumerate(log.names)
+                ],
+            )
+
+    def _heard_by_sample(self) -> dict[tuple[int, int], list[wire.Heard]]:
+        time, link, seq, stamp, position = self._heard
+        names = self._log.names
+        sample = np.searchsorted(self._log.time, time - ROUNDING_S)
+        listener, speaker = self._links.listener[link], self._links.speaker[link]
+        found: dict[tuple[int, int], list[wire.Heard]] = {}
+        columns = (sample, listener, speaker, seq, stamp, time, position)
+        for k, row, whose, number, taken, arrived, where in zip(*(c.tolist() for c in columns), strict=True):
+            news = wire.Heard(names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where))
+            found.setdefault((k, row), []).append(news)
+        return found
+
+    def _statuses(self) -> Iterator[wire.Status]:
+        """The counters at the end of the run and at the end of everything."""
+        log = self._log
+        sent = self._counts(self._sent[1], self._sent[0])
+        heard = self._counts(self._links.listener[self._heard[1]], self._heard[0])
+        for end, phase, done in ((self._experiment.duration_s, "landing", 0), (log.ended, "done", 1)):
+            for row, name in enumerate(log.names):
+                mine = self._links.listener == row
+                speakers = self._links.speaker[mine]
+                copy = self._mine.start // len(log.names)
+                lost = log.lost[copy * len(self._links) :][: len(self._links)][mine]
+                yield wire.Status(
+                    robot=name,
+                    stamp=EPOCH + end,
+                    phase=phase,
+                    reason="finished",
+                    battery=None,
+                    sent=int(sent[done][row]),
+                    heard=int(heard[done][row]),
+                    lost={log.names[s]: int(n) for s, n in zip(speakers, lost, strict=True)},
+                    malformed=0,
+                    refused=0,
+                    ticks=log.ticks,
+                    missed=0,
+                    decisions=log.decisions,
+                    interventions=int(log.interventions[self._mine][row]),
+                    late_s=0.0,
+                    started=EPOCH,
+                    missing=[],
+                    pid=0,
+                    cpu_s=0.0,
+                    rss_mb=0.0,
+                )
+
+    def _counts(self, row: Index, time: Array) -> tuple[Index, Index]:
+        """How often each row occurs until the end of the run, and until the end of everything."""
+        rows = len(self._log.names)
+        within = time <= self._experiment.duration_s + ROUNDING_S
+        return np.bincount(row[within], minlength=rows), np.bincount(row, minlength=rows)
+
+    def _events(self) -> Iterator[tuple[float, str, str, str]]:
+        yield self._log.airborne, "phase", "conductor", "airborne"
+        yield 0.0, "start", "conductor", "common start"
+        yield 0.0, "phase", "conductor", "formation"
+        for leg in sorted(self._experiment.timeline, key=lambda leg: leg.at_s):
+            yield leg.at_s, "phase", "conductor", f"{leg.robot} under way"
+        yield self._experiment.duration_s, "phase", "conductor", "landing"

@@ -1,0 +1,301 @@
+"""The report of a run, and of several runs side by side: one HTML file that needs nothing else, now or in ten years."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from matplotlib.figure import Figure
+
+from experiments import figures
+from experiments.metrics import CaseMetrics, by_case, measure
+from experiments.report_tables import (
+    DEFINITIONS,
+    Table,
+    events_table,
+    gaps_table,
+    links_table,
+    proof_tables,
+    robot_tables,
+    summary_table,
+    whole_table,
+)
+from experiments.trace import Trace
+from experiments.verdict import findings, left_out
+
+TEMPLATE: Final = "report.html.jinja"
+PROOF: Final = (
+    "Every pose carries a running number, so a gap proves a loss. Heard is counted over all listeners together; a pose "
+    "sent in the last instant of the run may still be under way."
+)
+MOST_LINKS: Final = 60  # longer tables are folded
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An SVG drawing to stand in the page, with its number and caption."""
+
+    svg: str
+    number: int
+    caption: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page; whatever it has is shown in this order. `folded` is the text on which to click, if folded."""
+
+    title: str
+    prose: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    listing: str = ""
+    terms: tuple[tuple[str, str], ...] = ()
+    folded: str = ""
+
+
+def write(
+    folder: Path,
+    traces: Sequence[Trace],
+    *,
+    command: str = "",
+    text: str = "",
+    date: str = "",
+    name: str = "report.html",
+    measured: Sequence[CaseMetrics] | None = None,
+) -> Path:
+    """Writes the report of one run.
+
+    Args:
+        folder: Where to; made if it does not exist.
+        traces: The cases of the run, the reference first; several seeds of a case become means with 95 % intervals,
+            and the figures of motions show the first seed.
+        command: How to do the run again.
+        text: The experiment file; the experiment of the first trace as JSON if left out.
+        date: When the run was; now if left out.
+        name: Of the file.
+        measured: `measure` of each trace, if that was done already.
+
+    Raises:
+        ValueError: If there is no trace, or one of less than two samples.
+    """
+    if not traces:
+        raise ValueError("there is no case to report")
+    cases = [measure(trace) for trace in traces] if measured is None else measured
+    first = _first_seed(traces)
+    experiment = traces[0].experiment
+    seeds = sorted({trace.seed for trace in traces})
+    facts = [
+        ("Date", date or f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
+        ("Clock", _words(trace.clock for trace in traces)),
+        ("Seed" if len(seeds) == 1 else "Seeds", _seeds(seeds)),
+        ("Duration", f"{cases[0].duration_s:g} s"),
+        ("Robots", str(len(traces[0].robots))),
+        ("Cases", ", ".join(by_case(cases))),
+    ]
+    listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
+    sections = [
+        Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
+        Section("Figures", pictures=_pictures(cases, first)),
+        Section("Each robot", tables=robot_tables(cases)),
+        Section(
+            "Was anything lost?",
+            (PROOF,),
+            proof_tables(cases),
+        ),
+        Section("Time between transmissions", tables=(gaps_table(cases),)),
+        Section(
+            "What neighbours hold",
+            ("How far the last pose heard on each link is from where its robot really is.",),
+            (links_table(cases),),
+            folded="Show all links" if len(cases[0].belief) > MOST_LINKS else "",
+        ),
+        Section("What happened", tables=(events_table(first),)),
+        Section("The experiment", listing=listing, folded="Show the file"),
+        Section("Definitions", terms=DEFINITIONS),
+    ]
+    folder.mkdir(parents=True, exist_ok=True)
+    return _render(
+        folder / name,
+        title=experiment.title,
+        source=experiment.source,
+        facts=facts,
+        command=command,
+        cases=cases,
+        sections=sections,
+    )
+
+
+def compare(
+    target: Path,
+    runs: Sequence[tuple[str, Sequence[Trace]]],
+    *,
+    title: str = "Comparison of runs",
+    command: str = "",
+    date: str = "",
+) -> Path:
+    """Writes several runs side by side: a column for each case of each run, the first one as the reference.
+
+    Args:
+        target: The file.
+        runs: Name and traces of each run; several seeds of a case become means with 95 % intervals.
+        title: Of the page.
+        command: How to do it again.
+        date: Now if left out.
+
+    Raises:
+        ValueError: If there is no trace, or one of less than two samples.
+    """
+    cases = [
+        msgspec.structs.replace(measure(trace), case=_label(name, trace, traces))
+        for name, traces in runs
+        for trace in traces
+    ]
+    if not cases:
+        raise ValueError("there is no run to compare")
+    drawn = [figures.global_bars(cases), figures.robot_bars(cases)]
+    captions = (
+        f"Mean transmission rate and errors, relative to {cases[0].case}." + _interval_note(cases),
+        "Each robot; those in brackets are left out of the means." + _interval_note(cases),
+    )
+    facts = [
+        ("Date", date or f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
+        ("Runs", ", ".join(name for name, _ in runs)),
+        ("Reference", cases[0].case),
+    ]
+    experiments = dict.fromkeys(trace.experiment.title for _, traces in runs for trace in traces)
+    sections = [
+        Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
+        Section("Figures", pictures=_numbered(zip(drawn, captions, strict=True))),
+        Section("Each robot", tables=robot_tables(cases), folded="Show all tables"),
+        Section("Was anything lost?", tables=proof_tables(cases), folded="Show all tables"),
+        Section("Definitions", terms=DEFINITIONS),
+    ]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    source = "; ".join(experiments)
+    return _render(target, title=title, source=source, facts=facts, command=command, cases=cases, sections=sections)
+
+
+def _render(
+    target: Path,
+    *,
+    title: str,
+    source: str,
+    facts: Sequence[tuple[str, str]],
+    command: str,
+    cases: Sequence[CaseMetrics],
+    sections: Sequence[Section],
+) -> Path:
+    pages = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = pages.get_template(TEMPLATE).render(
+        title=title, source=source, facts=facts, command=command, findings=findings(cases), sections=sections
+    )
+    target.write_text(page, encoding="utf-8")
+    return target
+
+
+def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Picture, ...]:
+    legs = len(cases[0].starts_s) > 1
+    reference = cases[0].case
+    seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
+    moved = "the first leg of the timeline" if legs else "the end"
+    plan: list[tuple[Callable[[], Figure], str]] = [
+        (
+            lambda: figures.global_bars(cases),
+            f"Mean transmission rate and errors, relative to {reference}." + _interval_note(cases),
+        ),
+        (
+            lambda: figures.formation_before(traces),
+            f"From the start to {moved}: links at the start thin, at the end magenta.{seed}",
+        ),
+        (
+            lambda: figures.formation_after(traces),
+            f"From the first leg of the timeline to the end: links at the start thin, at the end magenta.{seed}",
+        ),
+        (
+            lambda: figures.robot_bars(cases),
+            "Each robot; those in brackets are left out of the means." + _interval_note(cases),
+        ),
+        (
+            lambda: figures.errors(traces),
+            "Formation error of each robot" + ("; legs of the timeline dashed." if legs else ".") + seed,
+        ),
+        (lambda: figures.events(traces), f"When each robot transmitted.{seed}"),
+        (
+            lambda: figures.intervals(traces),
+            f"Share of the times between transmissions up to a length; single robots thin.{seed}",
+        ),
+        (lambda: figures.plan_view(traces), f"From above: start hollow, end full, links of the end grey.{seed}"),
+    ]
+    if not legs:
+        del plan[2]  # it would show the same as the one before
+    return _numbered((draw(), caption) for draw, caption in plan)
+
+
+def _numbered(drawn: Iterable[tuple[Figure, str]]) -> tuple[Picture, ...]:
+    return tuple(
+        Picture(inline(figures.svg(figure), f"f{number}-", caption), number, caption)
+        for number, (figure, caption) in enumerate(drawn, start=1)
+    )
+
+
+def inline(svg: str, prefix: str, label: str) -> str:
+    """An SVG file as an element of a page: ids of its own, black and white as the page's ink and paper.
+
+    Args:
+        svg: As `figures.svg` gives it.
+        prefix: For every id and every reference to one.
+        label: What it shows, for those who cannot see it; plain words without markup.
+    """
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<style.*?</style>|<metadata.*?</metadata>|<!--.*?-->", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\bid="', f'id="{prefix}', svg)
+    svg = re.sub(r'\b(?:xlink:)?href="#', f'href="#{prefix}', svg)
+    svg = svg.replace("url(#", f"url(#{prefix}")
+    svg = (
+        svg.replace("stroke: #000000", "stroke: currentColor")
+        .replace("#ffffff", "var(--paper)")
+        .replace("#c0c0c0", "var(--line)")
+    )
+    box = re.search(r'viewBox="[^"]*"', svg)
+    words = label.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+    head = f'<svg {box[0] if box else ""} role="img" aria-label="{words}">'
+    return re.sub(r"\n\s*", "\n", head + svg[svg.index(">") + 1 :]).strip()
+
+
+def _label(name: str, trace: Trace, traces: Sequence[Trace]) -> str:
+    return name if len({each.case for each in traces}) == 1 else f"{name} · {trace.case}"
+
+
+def _interval_note(cases: Sequence[CaseMetrics]) -> str:
+    most = max(len(runs) for runs in by_case(cases).values())
+    return f" Whiskers: 95 % confidence over {most} seeds." if most > 1 else ""
+
+
+def _first_seed(traces: Sequence[Trace]) -> list[Trace]:
+    """The first trace of each case."""
+    found: dict[str, Trace] = {}
+    for trace in traces:
+        found.setdefault(trace.case, trace)
+    return list(found.values())
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
+        return f"{seeds[0]} to {seeds[-1]}"
+    return ", ".join(str(seed) for seed in seeds)
+
+
+def _words(words: Iterable[str]) -> str:
+    return " and ".join(dict.fromkeys(words))

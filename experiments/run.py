@@ -1,0 +1,258 @@
+"""Runs experiments: from Python and from the command line, in real and in virtual time, by the same functions.
+
+In a notebook:
+
+    from experiments.run import load, simulate
+    run = simulate(load("robotic-park", "cases.event.trigger.threshold=0.02"))
+    run.traces["event"].true_position      # (T, N, 3) [m]
+    run.metrics["event"].mean["iae"]
+    run.figures()["errors"].savefig("errors.pdf")
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Final
+
+from agents.session import free_endpoint
+from experiments import document, metrics, playback, virtual
+from experiments.conductor import Conductor, Result, start_router
+from experiments.document import Document
+from experiments.experiment import Experiment
+from experiments.launcher import Launcher
+from experiments.logbook import Logbook
+from experiments.metrics import CaseMetrics
+from experiments.problem import DocumentError, Problem
+from experiments.progress import Shown
+from experiments.trace import Trace
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RUNS: Final = Path("runs")
+SOURCE: Final = "experiment.toml"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run leaves.
+
+    Attributes:
+        title: Of the experiment.
+        seed: Of its noise.
+        traces: What happened, per case.
+        metrics: What it comes to, per case.
+        folder: Where the recordings are; None if none were made.
+        source: The experiment file.
+        notes: What the reader should know: interrupted, robots lost, a damaged recording.
+    """
+
+    title: str
+    seed: int
+    traces: dict[str, Trace]
+    metrics: dict[str, CaseMetrics]
+    folder: Path | None = None
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def figures(self) -> dict[str, Figure]:
+        """The figures of the report, by name."""
+        from experiments import figures  # noqa: PLC0415 - matplotlib takes 0.6 s
+
+        return figures.every(list(self.metrics.values()), list(self.traces.values()))
+
+    def summary(self) -> dict[str, Any]:
+        """The figures for scripts, as `zenpark run --json` prints them."""
+        return metrics.document(str(self.folder or ""), self.seed, list(self.metrics.values()))
+
+
+def load(file: str | Path, *changes: str) -> Document:
+    """An experiment by its file or its name in the catalogue, with fields changed as behind `--set`.
+
+    Raises:
+        DocumentError: With everything that is wrong and where.
+    """
+    return document.read(file, changes)
+
+
+def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Experiment]:
+    """The cases of an experiment, all or those named, in the order of the file.
+
+    Raises:
+        DocumentError: If it has no case of that name.
+    """
+    cases = read.cases()
+    for name in names:
+        if name not in cases:
+            hint = f"its cases: {', '.join(cases)}"
+            raise DocumentError([Problem(f"--case {name}", 0, 0, "no such case in this experiment", hint)])
+    return {name: case for name, case in cases.items() if not names or name in names}
+
+
+def simulate(read: Document, *, cases: Sequence[str] = (), seed: int | None = None, folder: Path | None = None) -> Run:
+    """Runs an experiment in virtual time.
+
+    Args:
+        read: The experiment.
+        cases: Which of its cases; all if none is named.
+        seed: Of the noise; the file's if left out.
+        folder: Where recordings go; None: none are made.
+
+    Raises:
+        Stuck: If robots do not become ready, airborne or done.
+        RecordingError: If a recording cannot be written.
+    """
+    return simulate_seeds(read, [read.experiment.seed if seed is None else seed], cases=cases, folder=folder)[0]
+
+
+def simulate_seeds(
+    read: Document, seeds: Sequence[int], *, cases: Sequence[str] = (), folder: Path | None = None
+) -> list[Run]:
+    """As `simulate`, once for each seed, side by side; recordings are made of the first seed only."""
+    traces: list[dict[str, Trace]] = [{} for _ in seeds]
+    for name, experiment in chosen(read, cases).items():
+        log = virtual.simulate(experiment, seeds)
+        for copy in range(len(seeds)):
+            logbook = Logbook(log, experiment, name, copy)
+            traces[copy][name] = logbook.trace()
+            if folder is not None and copy == 0:
+                logbook.record(folder / f"{name}.mcap", read.text)
+    return [_measured(read.experiment.title, mine, folder, read.text) for mine in traces]
+
+
+def fly(
+    read: Document,
+    folder: Path,
+    *,
+    cases: Sequence[str] = (),
+    show: Shown,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Run:
+    """Runs an experiment in real time: a router, a process per robot, a recorder.
+
+    Args:
+        read: The experiment.
+        folder: Where recordings and logs go; it exists.
+        cases: Which of its cases; all if none is named.
+        show: Shows the progress.
+        interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
+
+    Raises:
+        RunFailed: If robots are not ready in time, unless the file says to go on without them.
+        Unreachable: If the routers of the file do not answer.
+    """
+    results: dict[str, Result] = {}
+    (folder / SOURCE).write_text(read.text, encoding="utf-8")
+    with Launcher(folder / "logs") as launcher:
+        endpoints = read.experiment.network.connect
+        if endpoints is None:
+            endpoints = [free_endpoint()]
+            start_router(launcher, endpoints)
+        with show:
+            for name, experiment in chosen(read, cases).items():
+                if interrupted():
+                    break
+                file = folder / f"{name}.json"
+                file.write_bytes(document.write_json(experiment))
+                results[name] = Conductor(
+                    experiment,
+                    name,
+                    file=file,
+                    source=folder / SOURCE,
+                    folder=folder,
+                    endpoints=endpoints,
+                    launcher=launcher,
+                    show=show,
+                    interrupted=interrupted,
+                ).run()
+    notes = [f"{case}: interrupted" for case, result in results.items() if result.interrupted]
+    notes += [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost]
+    begun = {case: result.recording for case, result in results.items() if result.start is not None}
+    return _read_back(folder, begun, notes)
+
+
+def reopen(folder: Path) -> Run:
+    """The run in a folder, read back from its recordings.
+
+    Raises:
+        RecordingError: If there is no recording, or one cannot be read.
+    """
+    from experiments.records import RecordingError  # noqa: PLC0415
+
+    if not folder.is_dir():
+        raise RecordingError(f"{folder}: is no folder of a run; `zenpark run` prints the folder that it makes")
+    files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
+    if not files:
+        raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
+    return _read_back(folder, {file.stem: file for file in files}, [])
+
+
+def _read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]) -> Run:
+    """Traces from recordings; those of killed recorders too, as far as they go."""
+    traces, remarks = {}, list(notes)
+    for case, file in recordings.items():
+        played = playback.read(file)
+        traces[played.trace.case] = played.trace
+        if not played.complete:
+            remarks.append(f"{case}: the recording was cut off; `zenpark recover {file}` mends it")
+    source = folder / SOURCE
+    text = source.read_text("utf-8") if source.exists() else ""
+    title = next((trace.experiment.title for trace in traces.values()), "")
+    return _measured(title, traces, folder, text, remarks)
+
+
+def _measured(
+    title: str, traces: Mapping[str, Trace], folder: Path | None, source: str, notes: Sequence[str] = ()
+) -> Run:
+    measured = {case: metrics.measure(trace) for case, trace in traces.items()}
+    seed = next((trace.seed for trace in traces.values()), 0)
+    return Run(title, seed, dict(traces), measured, folder, source, tuple(notes))
+
+
+def new_folder(read: Document, out: str | None) -> Path:
+    """Makes the folder of a run: `out`, or one below `runs` that tells experiment and time.
+
+    Raises:
+        DocumentError: If it holds something already, or cannot be made.
+    """
+    stamp = datetime.now().astimezone().strftime("%Y-%m-%dT%H-%M-%S")
+    folder = Path(out) if out is not None else RUNS / f"{read.path.stem}-{stamp}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        taken = any(folder.iterdir())
+    except OSError as error:
+        hint = "choose a place that may be written to with --out"
+        raise DocumentError([Problem(str(folder), 0, 0, f"cannot be made: {error.strerror}", hint)]) from None
+    if taken:
+        raise DocumentError([Problem(str(folder), 0, 0, "holds something already", "name a new folder with --out")])
+    return folder
+
+
+class Interrupts:
+    """Ctrl-C, SIGTERM and SIGHUP as a question: the first asks to land, the second ends at once."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Interrupts:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            self._before[number] = signal.signal(number, self._ask)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        return self.asked
+
+    def _ask(self, _signal: int, _frame: FrameType | None) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True

@@ -1,0 +1,484 @@
+import itertools
+import json
+import math
+import re
+import tomllib
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.graph import edges, links, rigidity
+from agents.kinds import KINDS
+from experiments import catalogue, document
+from experiments.document import DocumentError, parse_links, read
+
+MALFORMED = Path(__file__).parent / "malformed"
+PARK = catalogue.FOLDER / "robotic-park.toml"
+MINIMAL = 'title = "One"\nduration_s = 10.0\n[robots.KH01]\nkind = "khepera4"\nstart = [0.0, 0.0]\n'
+
+# file, line, column, part of the message, part of the remedy; a file may have several
+EXPECTED = [
+    ("bad-name", 4, 9, "'KH 01' cannot be a name", "letters, digits and _, beginning with a letter"),
+    ("case-contradiction", 13, 1, "in case 'low', robots.CF01.hover: 'CF01' cannot hover at 0.8 m", "at most 0.45"),
+    ("case-in-case", 8, 14, "a case cannot hold cases", "leave them out"),
+    ("case-key", 9, 1, "unknown key 'gian' in 'formation'", "did you mean 'gain'?"),
+    ("case-parameter", 12, 37, "unknown parameter 'treshold' of 'send-on-delta'", "did you mean 'threshold'?"),
+    ("disturbance-of-nobody", 8, 14, "'kephera4' is neither a robot nor a kind", "did you mean 'khepera4'?"),
+    ("disturbance-own-check", 14, 26, "hover_jitter needs 0 <= sigma < 1 m", ""),
+    ("empty", 0, 0, "is empty", "zenpark new"),
+    ("hover-above-arena", 11, 9, "'CF01' cannot hover at 2.6 m: the arena is 2.5 m high", "a hover of at most 2.45"),
+    ("hover-missing", 8, 1, "'CF01' is a crazyflie, which flies", "add hover = 0.8"),
+    ("hover-on-the-ground", 7, 1, "'KH01' is a khepera4, which does not fly", "leave hover out"),
+    ("infinite-arena", 9, 14, "'size[1]' is inf", "give a finite number"),
+    ("key-twice", 7, 1, "kind stands here a second time, first in line 5", "rename or remove"),
+    ("leg-after-the-end", 9, 8, "begins at 11 s, when the run of 10 s is over", "a longer duration_s"),
+    ("leg-unknown-robot", 10, 9, "no robot is called 'KH02'", "did you mean 'KH01'?"),
+    ("legs-out-of-order", 14, 8, "this leg of 'KH01' begins at 2 s", "the one before begins at 5 s"),
+    ("link-arrow", 14, 1, "'KH01 -> CF01' is no link", 'write "KH01 > CF01" when CF01 listens to KH01'),
+    ("link-negative", 14, 17, "'KH01 - CF01' must be a number > 0, not -0.9", "distance [m]"),
+    ("link-table", 14, 35, "unknown key 'gian' in 'KH01 - CF01'", "did you mean 'gain'?"),
+    ("link-to-itself", 15, 1, "'KH01' cannot listen to itself", "name two robots"),
+    ("link-twice", 15, 1, "that KH01 listens to CF01 is already said by 'KH01 - CF01'", "keep one"),
+    ("link-unknown-robot", 14, 1, "no robot is called 'CF10'", "did you mean 'CF01'?"),
+    ("misplaced-key", 5, 1, "unknown key 'duration_s' in 'arena'", "above the first [table]"),
+    ("missing-duration", 1, 1, "'duration_s' is missing", "add duration_s = 30.0"),
+    ("missing-start", 4, 1, "'start' is missing in 'KH01'", "add start = [0.0, 0.0]"),
+    ("misspelt-required", 2, 1, "unknown key 'duratoin_s'", "did you mean 'duration_s'?"),
+    ("negative-hover", 11, 9, "'hover' must be a number > 0, not -0.8", "height that a flying robot holds"),
+    ("no-robots", 1, 1, "'robots' is missing", "[robots.KH01] with kind"),
+    ("not-a-number", 2, 14, "'duration_s' is nan", "give a finite number"),
+    ("only-comments", 0, 0, "nothing but comments", "zenpark new"),
+    ("parameter-of-another", 3, 32, "unknown parameter 'threshold' of 'periodic'", "has it"),
+    ("plan-missing", 11, 8, "'radius' is missing in 'plan'", "add radius ="),
+    ("plan-own-check", 11, 52, "`radius` must be a number other than 0", ""),
+    ("rate-not-dividing", 10, 11, "pose_hz = 40 does not divide body_hz = 100", "pose_hz = 50"),
+    ("reserved-name", 4, 9, "a robot cannot be called 'run'", "rename it"),
+    ("robot-twice", 13, 1, "[robots.KH01] stands here a second time, first in line 4", "rename or remove"),
+    ("robots-as-list", 4, 1, "'robots' must be tables with names", "write [robots.KH01]"),
+    ("start-outside", 6, 10, "'KH01' starts outside of the arena", "x lies between -2 and 2"),
+    ("start-too-short", 6, 9, "'start' must be a list of length >= 2", "x, y [m]"),
+    ("syntax-no-equals", 2, 12, "Expected '='", "a line is key = value"),
+    ("syntax-no-quotes", 5, 8, "Invalid value", "text stands in quotes"),
+    ("syntax-open-header", 4, 13, "Expected ']'", "a header is [table]"),
+    ("syntax-open-list", 7, 1, "Unclosed array", "lacks its ]"),
+    ("syntax-open-text", 1, 13, "Illegal character", "closing quotes"),
+    ("text-for-number", 6, 16, "'start[1]' must be a number, not 'zero'", "x, y [m]"),
+    ("timeline-one-bracket", 8, 1, "'timeline' must be a list", "write [[timeline]]"),
+    ("trigger-parameter", 11, 1, "unknown parameter 'treshold'", "did you mean 'threshold'?"),
+    ("trigger-value", 10, 13, "'threshold' must be a number > 0, not 0.0", "[m]"),
+    ("trigger-without-kind", 3, 11, "'trigger' must say its kind", 'add kind = "'),
+    ("unknown-body", 7, 8, "no 'twn' among the bodies", "did you mean 'twin'?"),
+    ("unknown-key", 14, 1, "unknown key 'gian' in 'formation'", "did you mean 'gain'?"),
+    ("unknown-key", 15, 1, "unknown key 'clmap' in 'formation'", "did you mean 'clamp'?"),
+    ("unknown-kind", 5, 8, "no 'kephera4' among the kinds of robots", "did you mean 'khepera4'?"),
+    ("unknown-leader", 14, 10, "no robot is called 'kh01'", "did you mean 'KH01'?"),
+    ("unknown-trigger", 3, 20, "no 'periodc' among the triggers", "did you mean 'periodic'?"),
+    ("wrong-word", 9, 11, "'missing' cannot be 'goon'", "did you mean 'go-on'?"),
+    ("yaw-in-degrees", 6, 21, "the yaw is in radians", "90 degrees are 1.5708"),
+]
+
+
+def refused(path, *overrides):
+    with pytest.raises(DocumentError) as caught:
+        read(path, overrides)
+    return caught.value
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a file and gives its path."""
+
+    def written(content, name="some.toml"):
+        file = tmp_path / name
+        file.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return file
+
+    return written
+
+
+@pytest.mark.parametrize("name", sorted({name for name, *_ in EXPECTED}))
+def test_a_malformed_file_is_refused_where_it_is_wrong_with_a_remedy(name):
+    error = refused(MALFORMED / f"{name}.toml")
+    expected = [row[1:] for row in EXPECTED if row[0] == name]
+    assert [(p.line, p.column) for p in error.problems] == [(line, column) for line, column, *_ in expected]
+    for problem, (_, _, message, remedy) in zip(error.problems, expected, strict=True):
+        assert message in problem.message
+        assert remedy in problem.hint
+        assert problem.message in str(error)
+        assert problem.hint in str(error)
+
+
+def test_every_malformed_file_is_expected_and_there():
+    assert {file.stem for file in MALFORMED.glob("*.toml")} == {name for name, *_ in EXPECTED}
+
+
+def test_a_problem_shows_the_line_and_points_to_the_column(write):
+    file = write(MINIMAL + "\n[formation]\n\tgian = 2.0\n")
+    assert str(refused(file)) == (
+        f"{file}:8:2: unknown key 'gian' in 'formation'\n"
+        "     8 | \tgian = 2.0\n"
+        "       | \t^\n"
+        "       = did you mean 'gain'?"
+    )
+
+
+def test_a_long_line_is_cut_around_the_place(write):
+    error = refused(write(f'title = "{"x" * 500}"\n' + MINIMAL[14:].replace("10.0", " " * 300 + '"no" # ' + "y" * 300)))
+    _, source, caret, _ = str(error).split("\n")
+    assert len(source) < 120
+    assert source[caret.index("^") :].startswith('"no"')
+
+
+def test_problems_of_the_file_and_of_its_cases_come_together_in_the_order_of_the_file(write):
+    text = (
+        MINIMAL
+        + "[channel]\nlos = 0.1\ndelay_s = -1.0\n[safety]\nmargin = true\n"
+        + "[cases.a]\nsed = 2\n[cases.b.channel]\nloss = 2\n"
+    )
+    assert [(p.line, p.message) for p in refused(write(text)).problems] == [
+        (7, "unknown key 'los' in 'channel'"),
+        (8, "'delay_s' must be a number >= 0, not -1.0"),
+        (10, "'margin' must be a number, not true"),
+        (12, "unknown key 'sed'"),
+        (14, "'loss' must be a number <= 1, not 2"),
+    ]
+
+
+def test_contradictions_come_all_at_once(write):
+    text = (
+        MINIMAL.replace("khepera4", "tank")
+        + '[formation.links]\n"A > KH01" = 1.0\n"KH01 > KH01" = 1.0\n[rates]\npose_hz = 33\n'
+    )
+    assert [p.line for p in refused(write(text)).problems] == [4, 7, 8, 10]
+
+
+def slips(text):
+    """Every line `key = value` of a file, with its key misspelt: the number of the line, and the text that results."""
+    lines = text.split("\n")
+    for number, line in enumerate(lines, 1):
+        if re.match("[a-z_]+ =", line):
+            yield number, "\n".join([*lines[: number - 1], f"x{line}", *lines[number:]])
+
+
+@pytest.mark.parametrize("name", catalogue.names())
+def test_every_misspelt_key_is_found_in_its_line(name, write):
+    found = list(slips(document.catalogue_path(name).read_text("utf-8")))
+    assert len(found) > 10
+    for number, text in found:
+        assert (number, 1) in [(problem.line, problem.column) for problem in refused(write(text)).problems]
+
+
+# Files that are not what they should be
+
+
+def test_a_file_that_is_not_there_names_the_nearest_of_the_catalogue():
+    (problem,) = refused("robotic-prk").problems
+    assert "neither a file nor an experiment of the catalogue" in problem.message
+    assert "did you mean 'robotic-park'?" in problem.hint
+
+
+def test_a_folder_names_the_experiments_in_it(write):
+    file = write(MINIMAL)
+    (problem,) = refused(file.parent).problems
+    assert (problem.message, problem.hint) == ("is a folder", "name a file in it: some.toml")
+
+
+@pytest.mark.parametrize(
+    ("content", "place", "message", "hint"),
+    [
+        (b"\x89PNG\0\0", (0, 0), "is binary", "name an experiment file"),
+        (b'title = "Ma\xf1as"\n', (1, 12), "byte 0xf1 is not UTF-8", "save the file as UTF-8"),
+        (b" \n\t\n", (0, 0), "is empty", "zenpark new"),
+        (b"\xef\xbb\xbf", (0, 0), "is empty", "zenpark new"),
+        (b"a = " + b"1" * 5000, (0, 0), "is no TOML", "smaller number"),
+        (b"a = " + b"[" * 5000 + b"]" * 5000, (0, 0), "nested too deeply", "flatten"),
+        (b"#" * (document.LARGEST + 1), (0, 0), "is longer than 4 MB", "not a recording"),
+    ],
+)
+def test_a_file_that_is_no_experiment(write, content, place, message, hint):
+    (problem,) = refused(write(content)).problems
+    assert (problem.line, problem.column) == place
+    assert message in problem.message
+    assert hint in problem.hint
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 5000, ""])
+def test_names_that_no_file_can_have(name):
+    assert len(refused(name).problems) == 1
+
+
+def test_line_ends_and_byte_order_mark_of_other_systems_are_read(write):
+    assert read(write("\ufeff" + MINIMAL.replace("\n", "\r\n"))).experiment.title == "One"
+
+
+# Cases
+
+
+def test_each_case_is_an_experiment_of_its_own_in_the_order_of_the_file():
+    cases = read("robotic-park").cases()
+    assert list(cases) == ["periodic", "event"]
+    assert cases["periodic"].trigger == {"kind": "periodic", "period_s": 0.02}
+    assert cases["event"].trigger == {"kind": "send-on-delta", "threshold": 0.01}
+    assert all(case.cases == {} and len(case.robots) == 7 for case in cases.values())
+
+
+def test_without_cases_there_is_one_called_default(write):
+    found = read(write(MINIMAL))
+    assert found.cases() == {"default": found.experiment}
+
+
+def test_a_case_merges_tables_and_replaces_a_choice_of_another_kind(write):
+    text = (
+        MINIMAL
+        + '[robots.KH02]\nkind = "khepera4"\nstart = [1.0, 0.0]\n[formation.links]\n"KH01 - KH02" = 1.0\n'
+        + '[trigger]\nkind = "send-on-delta"\nthreshold = 0.03\nmaximum_silence_s = 2.0\n'
+        + "[cases.same.trigger]\nthreshold = 0.05\n"
+        + '[cases.other]\ntrigger = { kind = "periodic", period_s = 0.1 }\n'
+        + '[cases.wide]\nrobots.KH02.start = [1.5, 0.0]\nformation.links."KH02-KH01" = { distance = 1.5, gain = 2.0 }\n'
+    )
+    cases = read(write(text)).cases()
+    assert cases["same"].trigger == {"kind": "send-on-delta", "threshold": 0.05, "maximum_silence_s": 2.0}
+    assert cases["other"].trigger == {"kind": "periodic", "period_s": 0.1}
+    assert cases["wide"].robots["KH02"].start == [1.5, 0.0]
+    assert cases["wide"].robots["KH02"].kind == "khepera4"
+    assert parse_links(cases["wide"]) == [("KH01", "KH02", 1.5, 2.0), ("KH02", "KH01", 1.5, 2.0)]
+    assert parse_links(cases["same"]) == [("KH01", "KH02", 1.0, 3.0), ("KH02", "KH01", 1.0, 3.0)]
+
+
+# --set
+
+
+def set_on_park(*overrides):
+    return read("robotic-park", overrides).cases()
+
+
+def test_set_changes_every_case():
+    assert [case.robots["CF01"].hover for case in set_on_park("robots.CF01.hover=0.7").values()] == [0.7, 0.7]
+    assert [case.title for case in set_on_park("title=Two words").values()] == ["Two words"] * 2
+    assert [case.title for case in set_on_park('title="12"').values()] == ["12"] * 2
+
+
+def test_set_of_a_parameter_reaches_the_cases_that_have_it():
+    cases = set_on_park("trigger.threshold=0.02")
+    assert cases["event"].trigger == {"kind": "send-on-delta", "threshold": 0.02}
+    assert cases["periodic"].trigger == {"kind": "periodic", "period_s": 0.02}
+
+
+def test_set_of_a_whole_choice_wins_over_the_cases():
+    cases = set_on_park("trigger.kind=periodic")
+    assert [case.trigger["kind"] for case in cases.values()] == ["periodic"] * 2
+
+
+def test_set_of_one_case_wins_over_set_of_all_whatever_their_order():
+    for flags in itertools.permutations(["cases.event.trigger.threshold=0.05", "trigger.threshold=0.02"]):
+        assert set_on_park(*flags)["event"].trigger["threshold"] == 0.05
+    assert set_on_park("cases.event.seed=9")["event"].seed == 9
+    assert set_on_park("cases.event.seed=9")["periodic"].seed == 1
+
+
+@pytest.mark.parametrize("key", ['"TB01 > KH01"', "TB01 > KH01", "'TB01>KH01'"])
+def test_set_of_a_link_however_it_is_written(key):
+    experiment = set_on_park(f"formation.links.{key}=0.5")["event"]
+    assert [d for listener, speaker, d, _ in parse_links(experiment) if (listener, speaker) == ("KH01", "TB01")] == [
+        0.5
+    ]
+    assert len(experiment.formation.links) == 12
+
+
+def test_set_gives_a_link_a_gain_and_keeps_its_distance():
+    assert ("KH01", "TB01", 0.6, 9.0) in parse_links(set_on_park("formation.links.TB01 > KH01.gain=9")["event"])
+
+
+def test_set_reaches_into_lists():
+    assert set_on_park("timeline.0.plan.speed=0.1")["event"].timeline[0].plan["speed"] == 0.1
+    assert set_on_park("robots.CF01.start.1=0.5")["event"].robots["CF01"].start == [-0.2, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("flag", "message", "hint"),
+    [
+        ("trigger.treshold=1", "no trigger of this experiment has a parameter 'treshold'", "did you mean 'threshold'?"),
+        ("cases.event.trigger.treshold=1", "unknown parameter 'treshold'", "did you mean 'threshold'?"),
+        ("trigger.threshold=-1", "'threshold' must be a number > 0, not -1", "[m]"),
+        ("cases.evnt.seed=1", "the file has no case 'evnt'", "did you mean 'event'?"),
+        ("robots.CF09.hover=1", "no robot is called 'CF09'", "did you mean 'CF0"),
+        ("robts.CF01.hover=1", "unknown key 'robts'", "did you mean 'robots'?"),
+        ("robots.CF01.hovr=1", "unknown key 'hovr' in 'CF01'", "did you mean 'hover'?"),
+        ("robots.CF01.hover=high", "'hover' must be a number, not 'high'", "height"),
+        ("robots.CF01.hover=5", "'CF01' cannot hover at 5 m", "at most 2.45"),
+        ("duration_s.x=1", "'duration_s' is no table", "set duration_s itself"),
+        ("timeline.3.at_s=1", "there is no '3' in 'timeline'", "0 to 0"),
+        ("timeline.0.at_s=50", "this leg begins at 50 s", "longer duration_s"),
+        ("rates.pose_hz=30", "pose_hz = 30 does not divide body_hz = 100", "pose_hz = 25"),
+        ("seed=nan", "'seed' is nan", "finite"),
+        ("trigger=periodc", "no 'periodc' among the triggers", "did you mean 'periodic'?"),
+        ("nonsense", "not of the form path=value", "--set formation.gain=2.5"),
+        ("=1", "not of the form path=value", "--set formation.gain=2.5"),
+        ("a..b=1", "not of the form path=value", "--set formation.gain=2.5"),
+        ("title=\udcff", "characters that are no text", "leave them out"),
+    ],
+)
+def test_a_wrong_set_names_the_flag(flag, message, hint):
+    (problem,) = refused("robotic-park", flag).problems
+    assert problem.file == f"--set {flag}"
+    assert message in problem.message
+    assert hint in problem.hint
+    assert str(problem).startswith("--set ")
+
+
+def test_set_does_not_hide_what_is_wrong_in_the_file(write):
+    file = write(MINIMAL + "[formation]\ngian = 2.0\n")
+    problems = refused(file, "formation.gain=x").problems
+    assert [(p.file, p.line) for p in problems] == [("--set formation.gain=x", 0), (str(file), 7)]
+
+
+# JSON
+
+
+@pytest.mark.parametrize("name", catalogue.names())
+def test_json_says_the_same(name, write):
+    found = read(name)
+    again = read(write(document.write_json(found.experiment), "resolved.json"))
+    assert again.experiment == found.experiment
+    assert again.cases() == found.cases()
+    for case in found.cases().values():
+        assert read(write(document.write_json(case), "case.json")).experiment == case
+
+
+@pytest.mark.parametrize(
+    ("content", "line", "column", "message"),
+    [
+        (b'{\n  "title": "x",\n  "duration_s": oops\n}', 3, 17, "invalid character"),
+        (b'{\n  "title": "x"', 2, 15, "truncated"),
+        (b"[1, 2]", 0, 0, "its top must be a table"),
+        (b'{"title": 1e999}', 1, 17, "out of range"),
+        (b"[" * 100_000, 0, 0, "nested too deeply"),
+    ],
+)
+def test_json_that_is_none(write, content, line, column, message):
+    (problem,) = refused(write(content, "some.json")).problems
+    assert (problem.line, problem.column) == (line, column)
+    assert message in problem.message
+
+
+def test_a_fault_in_json_is_located(write):
+    experiment = json.loads(document.write_json(read("triangle").experiment))
+    experiment["robots"]["KH02"]["start"][1] = 7.5
+    (problem,) = refused(write(json.dumps(experiment, indent=2), "some.json")).problems
+    assert problem.source.strip() == "7.5"
+    assert problem.column == problem.source.index("7.5") + 1
+
+
+# Links
+
+
+def test_links_come_in_the_order_of_the_robots():
+    experiment = read("convoy").experiment
+    assert parse_links(experiment) == [
+        ("KH01", "TB01", 0.45, 12.0),
+        ("KH02", "TB01", 0.83, 12.0),
+        ("KH02", "KH01", 0.45, 12.0),
+        ("KH03", "KH01", 0.83, 12.0),
+        ("KH03", "KH02", 0.45, 12.0),
+    ]
+
+
+# The catalogue
+
+
+def test_names_and_titles():
+    found = dict(document.names())
+    assert list(found) == sorted(found)
+    assert {"convoy", "robotic-park", "triangle"} <= set(found)
+    assert found["robotic-park"] == tomllib.loads(PARK.read_text("utf-8"))["title"]
+    assert document.catalogue_path("robotic-park") == PARK
+    with pytest.raises(DocumentError, match="did you mean 'convoy'"):
+        document.catalogue_path("convoi")
+
+
+@pytest.mark.parametrize("name", catalogue.names())
+def test_robots_of_the_catalogue_start_apart_and_inside(name):
+    experiment = read(name).experiment
+    half = np.array(experiment.arena.size[:2]) / 2 - experiment.safety.margin
+    for robot in experiment.robots.values():
+        assert (np.abs(robot.start[:2]) + KINDS[robot.kind].radius <= half).all()
+    for a, b in itertools.combinations(experiment.robots.values(), 2):
+        assert math.dist(a.start[:2], b.start[:2]) > 2 * (KINDS[a.kind].radius + KINDS[b.kind].radius)
+
+
+@pytest.mark.parametrize("name", ["convoy", "triangle"])
+def test_formations_of_the_catalogue_are_rigid(name):
+    experiment = read(name).experiment
+    row = {robot: number for number, robot in enumerate(experiment.robots)}
+    listener, speaker, distance, gain = zip(*parse_links(experiment), strict=True)
+    net = links([(row[a], row[b]) for a, b in zip(listener, speaker, strict=True)], distance, gain)
+    position = np.array([(*robot.start[:2], robot.hover or 0.0) for robot in experiment.robots.values()])
+    moves = np.tile([True, True, False], (len(row), 1))
+    found = rigidity(position, edges(net), moves)
+    assert found.rank == found.needed == 2 * len(row) - 3
+
+
+def test_the_triangle_can_be_reached():
+    experiment = read("triangle").experiment
+    hover = experiment.robots["CF01"].hover
+    reach = [math.sqrt(d**2 - hover**2) for a, b, d, _ in parse_links(experiment) if a == "CF01"]
+    (base,) = {d for a, b, d, _ in parse_links(experiment) if "CF01" not in (a, b)}
+    assert sum(reach) > base > abs(reach[0] - reach[1])
+
+
+def test_the_leader_of_the_convoy_stays_inside_and_below_its_top_speed():
+    experiment = read("convoy").experiment
+    plan, start = experiment.timeline[0].plan, experiment.robots["TB01"].start
+    assert 2 * math.pi * plan["radius"] / plan["period_s"] < 0.5 * KINDS["turtlebot3"].speed
+    centre = np.array([start[0], start[1] + plan["radius"]])  # it heads along x and turns to the left
+    assert np.linalg.norm(centre) < 1e-9
+    assert plan["radius"] < min(experiment.arena.size[:2]) / 2 - experiment.safety.margin
+
+
+def test_copy_gives_an_experiment_that_reads_and_never_overwrites(tmp_path):
+    target = document.copy("triangle", tmp_path / "mine.toml")
+    assert read(target).experiment == read("triangle").experiment
+    assert json.loads((tmp_path / catalogue.SCHEMA).read_bytes()) == document.schema()
+    with pytest.raises(DocumentError, match="exists already"):
+        document.copy("convoy", target)
+    assert read(target).experiment == read("triangle").experiment
+    assert document.copy("convoy", tmp_path) == tmp_path / "convoy.toml"
+    with pytest.raises(DocumentError, match="cannot be written: No such file"):
+        document.copy("convoy", tmp_path / "nowhere" / "x.toml")
+    with pytest.raises(DocumentError, match="neither a file nor"):
+        document.copy("convoi", tmp_path)
+
+
+# The schema
+
+
+def test_the_schema_beside_the_catalogue_is_the_one_that_is_generated(tmp_path):
+    document.write_schema(tmp_path / catalogue.SCHEMA)
+    fresh = (tmp_path / catalogue.SCHEMA).read_text("utf-8")
+    remedy = "call document.write_schema(catalogue.FOLDER / catalogue.SCHEMA) and look at what changed"
+    assert (catalogue.FOLDER / catalogue.SCHEMA).read_text("utf-8") == fresh, remedy
+
+
+def test_every_entry_of_the_catalogue_shows_the_schema_to_editors():
+    for name in catalogue.names():
+        assert document.catalogue_path(name).read_text("utf-8").startswith(f"#:schema ./{catalogue.SCHEMA}\n")
+
+
+def test_the_schema_is_draft_7_and_knows_the_plugins():
+    schema = document.schema()
+    text = msgspec.json.encode(schema).decode()
+    assert schema["$schema"] == "http://json-schema.org/draft-07/schema#"
+    assert "prefixItems" not in text
+    assert "$defs" not in text
+    by_name, *tables = schema["properties"]["trigger"]["anyOf"]
+    assert {"periodic", "send-on-delta"} <= set(by_name["enum"])
+    kinds = {table["properties"]["kind"]["const"]: table for table in tables}
+    assert kinds["send-on-delta"]["properties"]["threshold"]["exclusiveMinimum"] == 0
+    plans = schema["definitions"]["Leg"]["properties"]["plan"]["anyOf"]
+    assert "line" not in plans[0]["enum"]  # it cannot do without its parameters
+    assert schema["definitions"]["Robot"]["properties"]["kind"]["enum"] == list(KINDS)
+    case = schema["properties"]["cases"]["additionalProperties"]["$ref"].rpartition("/")[2]
+    assert "required" not in schema["definitions"][case]
+    assert "cases" not in schema["definitions"][case]["properties"]

@@ -1,0 +1,137 @@
+"""No input whatsoever ends in anything but a document or a `DocumentError` that can be printed."""
+
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments import catalogue
+from experiments.document import DocumentError, read, write_json
+
+PARK = (catalogue.FOLDER / "robotic-park.toml").read_text("utf-8")
+LINES = PARK.split("\n")
+RESOLVED = write_json(read("robotic-park").experiment).decode()
+TOKENS = st.sampled_from([
+    "nan", "inf", "-1", "0", "1e400", "true", '""', '"KH01"', "[]", "{}", "[[1]]", "1979-05-27", "07:32:00",
+    "'''x'''", '"\\u0000"', "=", ".", "]", "[", "#", "}", ",", "é", "kind", "robots", "9" * 30, "0x" + "f" * 30,
+    "{ kind = 3 }", "\x0b", "\u2028",
+])  # fmt: skip
+FLAGS = st.sampled_from([
+    "robots", "CF01", "trigger", "kind", "threshold", "formation", "links", "law", "timeline", "0", "plan",
+    "cases", "event", "start", "rates", "gain", "'", "99", "²", "[0]", "TB01 > KH01", '"', "",
+])  # fmt: skip
+
+
+def reads_or_refuses(content, suffix=".toml", overrides=()):
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"some{suffix}"
+        file.write_bytes(content)
+        try:
+            cases, refusal = read(file, overrides).cases(), None
+        except DocumentError as error:
+            cases, refusal = {}, error
+    if refusal is None:
+        assert cases
+        assert all(write_json(case) for case in cases.values())
+    else:
+        assert refusal.problems
+        assert all(problem.message and str(problem) in str(refusal) for problem in refusal.problems)
+        assert str(refusal).encode("utf-8")
+
+
+@st.composite
+def mutated(draw, lines):
+    """A good file after some slips of the hand."""
+    lines = list(lines)
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, len(lines) - 1))
+        match draw(st.sampled_from(["delete", "repeat", "swap", "token", "insert", "cut", "join"])):
+            case "delete":
+                lines[at] = ""
+            case "repeat":
+                lines.insert(draw(st.integers(0, len(lines))), lines[at])
+            case "swap":
+                other = draw(st.integers(0, len(lines) - 1))
+                lines[at], lines[other] = lines[other], lines[at]
+            case "token":
+                words = lines[at].split(" ")
+                words[draw(st.integers(0, len(words) - 1))] = draw(TOKENS)
+                lines[at] = " ".join(words)
+            case "insert":
+                column = draw(st.integers(0, len(lines[at])))
+                lines[at] = lines[at][:column] + draw(TOKENS) + lines[at][column:]
+            case "cut":
+                lines[at] = lines[at][: draw(st.integers(0, len(lines[at])))]
+            case "join":
+                lines[at : at + 2] = [" ".join(lines[at : at + 2])]
+    return "\n".join(lines)
+
+
+@settings(max_examples=300, deadline=None)
+@given(mutated(LINES))
+def test_mutations_of_a_good_file(text):
+    reads_or_refuses(text.encode())
+
+
+@settings(max_examples=150, deadline=None)
+@given(mutated(RESOLVED.split("\n")))
+def test_mutations_of_a_good_json_file(text):
+    reads_or_refuses(text.encode(), ".json")
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.text(max_size=200))
+def test_any_text(text):
+    reads_or_refuses(text.encode("utf-8", "surrogatepass"))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=200), st.sampled_from([".toml", ".json"]))
+def test_any_bytes(content, suffix):
+    reads_or_refuses(content, suffix)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.lists(FLAGS, min_size=1, max_size=5).map(".".join), st.one_of(TOKENS, st.text(max_size=10))).map(
+            "=".join
+        ),
+        max_size=3,
+    )
+)
+def test_any_override(overrides):
+    reads_or_refuses(PARK.encode(), overrides=overrides)
+
+
+VALUES = [
+    "nan",
+    "inf",
+    "9" * 30,
+    "1e400",
+    "true",
+    '"x"',
+    "[]",
+    "{}",
+    "[[]]",
+    "[{}]",
+    "{ kind = [] }",
+    "1979-05-27",
+    "-1",
+    '{"" = 1}',
+]
+
+
+@pytest.mark.parametrize(
+    "field", ["trigger", "robots", "cases", "timeline", "formation", "disturbance", "rates", "arena", "start"]
+)
+def test_any_value_for_any_field(field):
+    for value in VALUES:
+        for text in (f"{field} = {value}\n", f"cases.a.{field} = {value}\n"):
+            reads_or_refuses(
+                f'{text}title = "x"\nduration_s = 1.0\n[robots.K]\nkind = "khepera4"\nstart = [0, 0]\n'.encode()
+            )
+            reads_or_refuses(text.encode())
+        reads_or_refuses(PARK.encode(), overrides=[f"{field}={value}", f"cases.event.{field}={value}"])

@@ -1,0 +1,82 @@
+import tomllib
+
+import pytest
+
+from experiments import catalogue
+from experiments.locate import line_column, nearest, places
+
+FORMS = '''\
+# every form that TOML has
+a = 1 # = 2
+"b c".'d.e' = [ 1, # one ]
+  { x = "]}", y.z = 2 }, """three
+"quotes" \\""" and more""""", 4 ]
+when = 1979-05-27 07:32:00
+[t . "u\\u00e9"]
+k = \'\'\'it's
+[no.header]\'\'\'
+inline = { p = [ [ 1 ], [ ] ], q = {} }
+[[l]]
+n = 1
+[[l]]
+n = 2
+[l.sub]
+m = 'x'
+[[l.deep]]
+o = -0.5e3
+'''
+
+
+def paths_of(value, path=()):
+    yield path
+    entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, each in entries:
+        yield from paths_of(each, (*path, key))
+
+
+@pytest.mark.parametrize("text", [FORMS, *(f.read_text("utf-8") for f in sorted(catalogue.FOLDER.glob("*.toml")))])
+def test_every_path_of_a_document_has_its_place_and_no_other_has(text):
+    assert set(places(text)) == set(paths_of(tomllib.loads(text))) - {()}
+
+
+@pytest.mark.parametrize(
+    ("path", "key", "value"),
+    [
+        (("a",), (2, 1), (2, 5)),
+        (("b c",), (3, 1), (3, 15)),
+        (("b c", "d.e"), (3, 7), (3, 15)),
+        (("b c", "d.e", 0), (3, 17), (3, 17)),
+        (("b c", "d.e", 1, "x"), (4, 5), (4, 9)),
+        (("b c", "d.e", 1, "y", "z"), (4, 17), (4, 21)),
+        (("b c", "d.e", 2), (4, 26), (4, 26)),
+        (("b c", "d.e", 3), (5, 30), (5, 30)),
+        (("when",), (6, 1), (6, 8)),
+        (("t", "ué"), (7, 6), (7, 1)),
+        (("t", "ué", "inline", "p", 1), (10, 25), (10, 25)),
+        (("t", "ué", "inline", "q"), (10, 32), (10, 36)),
+        (("l",), (11, 3), (11, 1)),
+        (("l", 0, "n"), (12, 1), (12, 5)),
+        (("l", 1), (13, 1), (13, 1)),
+        (("l", 1, "n"), (14, 1), (14, 5)),
+        (("l", 1, "sub", "m"), (16, 1), (16, 5)),
+        (("l", 1, "deep", 0, "o"), (18, 1), (18, 5)),
+    ],
+)
+def test_places(path, key, value):
+    place = places(FORMS)[path]
+    assert line_column(FORMS, place.key) == key
+    assert line_column(FORMS, place.value) == value
+
+
+def test_json():
+    text = '{\n "a\\u00e9": {"b/": [1, {"c": null}]},\n "d": "x, {}"\n}'
+    found = places(text, json=True)
+    assert line_column(text, found["aé", "b/", 1, "c"].key) == (2, 25)
+    assert line_column(text, found[("d",)].value) == (3, 7)
+    assert len(found) == 6
+
+
+def test_the_nearest_place_of_a_path_that_is_not_there():
+    found = places(FORMS)
+    assert nearest(found, ("l", 1, "sub", "missing"))[0] == ("l", 1, "sub")
+    assert nearest(found, ("missing", "a")) == ((), nearest(found, ())[1])

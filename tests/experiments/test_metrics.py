@@ -1,0 +1,287 @@
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments import metrics
+from experiments.signals import formation_errors, net_rotation
+from experiments.trace import Trace
+from tests.experiments.traces import STEP, experiment, pair, park, trace
+
+T = np.arange(0.0, 20.0 + STEP / 2, STEP)
+
+
+def follower(measured: metrics.CaseMetrics) -> metrics.RobotMetrics:
+    return next(robot for robot in measured.robots if robot.robot == "F")
+
+
+def test_integrals_of_a_decaying_error():
+    measured = metrics.measure(pair(1.0 + np.exp(-T)))
+    end = math.exp(-20.0)
+    for robot in measured.robots:  # the leader listens to nobody: it has the error of the link that listens to it
+        assert robot.iae == pytest.approx(1.0 - end, rel=1e-4)
+        assert robot.itae == pytest.approx(1.0 - 21.0 * end, rel=1e-4)
+        assert robot.rmse == pytest.approx(math.sqrt((1.0 - end**2) / 40.0), rel=1e-2)
+    assert measured.leaders == ("L",)
+    assert measured.duration_s == pytest.approx(20.0)
+
+
+def test_error_is_the_sum_over_the_links_on_which_a_robot_listens():
+    what = experiment({"A": "tello", "B": "tello", "C": "tello"}, {"A > B": 1.0, "B - C": 1.0})
+    place = np.zeros((2, 3, 3))
+    place[:, 1, 0], place[:, 2, 1] = 1.25, 3.0
+    gap = math.hypot(1.25, 3.0) - 1.0
+    assert formation_errors(trace(what, place))[0] == pytest.approx([0.25, 0.25 + gap, gap])
+
+
+def test_acquired_when_the_one_second_mean_stays_inside():
+    measured = metrics.measure(pair(1.0 + np.maximum(1.0 - 0.0625 * T, 0.0)))
+    # a window of 50 samples lags 24.5 of them: 1 − 0.0625 (t − 0.49) = 0.05
+    assert follower(measured).acquired_s == pytest.approx(15.69, abs=STEP)
+    assert measured.acquired_s == (follower(measured).acquired_s,)
+
+
+def test_never_acquired_is_none_also_in_the_mean():
+    measured = metrics.measure(pair(np.full_like(T, 1.06)))
+    assert follower(measured).acquired_s is None
+    assert measured.mean["acquired_s"] is None
+    assert follower(measured).residual == pytest.approx(0.06)
+
+
+def test_an_error_that_jitters_about_zero_does_not_hide_in_its_mean():
+    measured = metrics.measure(pair(1.0 + 0.08 * np.where(np.arange(len(T)) % 2, 1.0, -1.0)))
+    assert follower(measured).acquired_s is None
+
+
+def test_each_phase_is_measured_from_its_leg():
+    off = np.where((T >= 10.0) & (T < 13.0), 0.5, 0.0) + np.where(T < 1e-9, 0.04, 0.0)
+    measured = metrics.measure(pair(1.0 + off, legs=[9.99, 10.0]))
+    assert measured.starts_s == (0.0, 9.99)  # legs that begin within one sample are one phase
+    robot = follower(measured)
+    assert robot.acquired_s == 0.0
+    assert len(robot.phases) == 1
+    assert robot.phases[0].acquired_s == pytest.approx(3.9, abs=2 * STEP)  # nine tenths of the window must be inside
+    assert robot.phases[0].residual == pytest.approx(0.0, abs=1e-9)
+    assert robot.by_the_end == (robot.phases[0].residual, "L")
+
+
+def test_legs_at_the_start_or_after_the_end_are_no_phases():
+    assert metrics.measure(pair(np.ones_like(T), legs=[0.0, 20.0, 30.0])).starts_s == (0.0,)
+
+
+def test_residual_is_the_last_second_of_each_phase_on_the_worst_link():
+    what = experiment({"A": "tello", "B": "tello", "C": "tello"}, {"A > C": 1.0, "B > C": 1.0}, legs=[10.0])
+    place = np.zeros((len(T), 3, 3))
+    place[:, 0, 0] = np.where(T < 9.0, -3.0, np.where(T < 10.0, -1.02, -1.3))
+    place[:, 1, 0] = 1.1
+    robot = metrics.measure(trace(what, place)).robots[2]
+    assert (robot.residual, robot.worst) == (pytest.approx(0.1), "B")
+    assert robot.by_the_end == (pytest.approx(0.3), "A")
+
+
+@settings(deadline=None, max_examples=40)
+@given(rate=st.floats(-0.5, 0.5), drift=st.floats(-0.3, 0.3), seed=st.integers(0, 1000))
+def test_net_rotation_finds_the_rate_whatever_else_moves(rate: float, drift: float, seed: int):
+    shape = np.random.default_rng(seed).normal(size=(5, 3))
+    turn = np.array([[np.cos(rate * T), -np.sin(rate * T)], [np.sin(rate * T), np.cos(rate * T)]])
+    place = np.tile(shape, (len(T), 1, 1))
+    place[..., :2] = np.einsum("abt,nb->tna", turn, shape[:, :2])
+    place += drift * T[:, None, None]
+    assert net_rotation(place, T) == pytest.approx(rate, abs=1e-9)
+
+
+def test_net_rotation_after_acquisition_counts_beyond_a_full_turn():
+    angle = 2.0 * np.pi * np.arange(3) / 3 + 0.5 * T[:, None]
+    place = np.zeros((len(T), 4, 3))
+    place[:, 1:, 0], place[:, 1:, 1] = np.cos(angle), np.sin(angle)
+    names = dict.fromkeys("LABC", "khepera4")
+    what = experiment(names, {"L > A": 1.0, "L > B": 1.0, "L > C": 1.0, "A - B": math.sqrt(3.0)})
+    assert metrics.measure(trace(what, place)).rotation_rad_s == (pytest.approx(0.5),)
+    wrong = experiment(names, {"L > A": 2.0})
+    assert metrics.measure(trace(wrong, place)).rotation_rad_s == (None,)  # nothing was formed that could turn
+
+
+def moving(**rest: object) -> Trace:
+    """The speaker moves at 0.1 m/s and says so once a second."""
+    place = np.zeros((len(T), 2, 3))
+    place[:, 0, 0] = 0.1 * T
+    what = experiment({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
+    return trace(what, place, sent={"L": np.arange(0.0, 20.0, 1.0).tolist()}, **rest)
+
+
+def test_belief_error_of_a_pose_held_for_a_second():
+    belief = metrics.measure(moving()).belief[0]
+    assert (belief.listener, belief.speaker) == ("F", "L")
+    assert belief.rms == pytest.approx(0.1 / math.sqrt(3.0), rel=0.03)
+    assert belief.max == pytest.approx(0.1, abs=0.1 * STEP + 1e-9)
+
+
+def test_an_overtaken_pose_is_not_believed():
+    known = moving()
+    order = np.arange(20)
+    order[[4, 5]] = 5, 4  # the sixth pose arrives first, at the time of the fifth
+    heard = dataclasses.replace(
+        known.heard, seq=known.heard.seq[order], stamp=known.heard.stamp[order], position=known.heard.position[order]
+    )
+    swapped = metrics.measure(dataclasses.replace(known, heard=heard)).belief[0]
+    assert swapped.max == pytest.approx(0.1, abs=0.003)  # ahead by as much, and never two seconds old
+
+
+def test_transmissions_rates_and_gaps():
+    measured = metrics.measure(moving())
+    leader, other = measured.robots
+    assert (leader.messages, leader.bytes, leader.listeners, leader.heard) == (20, 2000, 1, 20)
+    assert leader.f_hz == pytest.approx(1.0)
+    assert (leader.gap_min_s, leader.gap_median_s, leader.gap_max_s) == pytest.approx((1.0, 1.0, 1.0))
+    assert (other.messages, other.gap_median_s) == (0, None)
+
+
+def test_what_the_recorder_lost_is_counted_by_the_running_numbers():
+    known = moving()
+    keep = np.arange(20) % 3 == 0
+    fields = {field.name: getattr(known.sent, field.name)[keep] for field in dataclasses.fields(known.sent)}
+    leader = metrics.measure(dataclasses.replace(known, sent=type(known.sent)(**fields))).robots[0]
+    assert (leader.messages, leader.recorded) == (19, 7)
+
+
+def test_benchmark_cost_by_hand():
+    known = pair(1.0 + np.exp(-T), sent={"F": [0.0, 1.0, 2.0]})
+    settle = round(math.log(50.0) / STEP + 0.5) * STEP
+    robot = 0.3 * settle + 0.1 * 1.0 + 0.01 * 1.0 + 0.1 * (1001 // 5)
+    measured = metrics.measure(known)
+    assert measured.robots[1].settle_s == pytest.approx(settle)
+    assert measured.j2 == pytest.approx(2.0 * robot + 0.02 * 3, rel=1e-4)
+
+
+def test_closest_approach_and_excursion():
+    gap = 1.0 + 0.5 * np.cos(0.5 * T)  # closest at 2 π, farthest at the start
+    measured = metrics.measure(pair(gap + 1.0))
+    assert measured.closest == pytest.approx(1.5, abs=1e-4)
+    assert measured.closest_between == ("L", "F")
+    assert measured.closest_at_s == pytest.approx(2.0 * math.pi, abs=STEP)
+    assert (measured.excursion, measured.excursion_robot) == (pytest.approx(0.5), "F")
+    inside = metrics.measure(pair(gap))
+    assert (inside.excursion, inside.excursion_robot) == (0.0, "")
+
+
+def test_a_robot_that_died_does_not_poison_the_others():
+    whole = park(duration=20.0)
+    place = whole.true_position.copy()
+    place[500:, whole.robots.index("CF03")] = np.nan
+    before, after = metrics.measure(whole), metrics.measure(dataclasses.replace(whole, true_position=place))
+    dead = after.robots[whole.robots.index("CF03")]
+    assert after.died == ("CF03",)
+    assert dead.acquired_s is None
+    assert dead.coverage == pytest.approx(0.5, abs=0.01)
+    for old, new in zip(before.robots[:4], after.robots[:4], strict=True):  # those that have no link with it
+        assert new == old
+    five = [robot.iae for robot in after.robots[1:6]]
+    assert after.mean["iae"] == pytest.approx(np.mean(five))
+    assert after.acquired_s[0] is not None
+    assert after.rotation_rad_s[0] is not None
+    neighbour = after.robots[whole.robots.index("CF01")]
+    assert neighbour.coverage == pytest.approx(1.0 - 0.5 / 4.0, abs=0.01)
+    assert msgspec.json.encode(after).find(b"NaN") == -1
+
+
+def test_a_robot_that_was_never_seen_has_no_errors():
+    known = pair(np.full_like(T, np.nan))
+    robot = follower(metrics.measure(known))
+    assert (robot.iae, robot.rmse, robot.coverage, robot.known) == (None, None, 0.0, 0.0)
+    assert metrics.measure(known).closest is None
+
+
+def test_one_robot_without_links():
+    known = trace(experiment({"A": "tello"}, {}), np.zeros((100, 1, 3)))
+    measured = metrics.measure(known)
+    assert measured.leaders == ()  # nobody would be left
+    assert (measured.closest, measured.belief_rms, measured.acquired_s) == (None, None, (None,))
+    assert measured.robots[0].iae is None
+
+
+def test_a_trace_without_time_is_refused():
+    with pytest.raises(ValueError, match="fewer than two samples"):
+        metrics.measure(pair(np.ones(1)))
+
+
+def test_document_has_the_shape_for_scripts():
+    first, second = (metrics.measure(park("a", seed=4)), metrics.measure(park("b", 0.01, seed=4)))
+    found = metrics.document("runs/7", 4, [first, second])
+    assert (found["run"], found["seed"], list(found["cases"])) == ("runs/7", 4, ["a", "b"])
+    b = found["cases"]["b"]
+    assert set(b) == {"robots", "mean", "ratio"}
+    assert set(b["robots"]["TB01"]) == set(b["mean"]) == set(b["ratio"]) == set(metrics.INDICES)
+    followers = [b["robots"][name]["iae"] for name in b["robots"] if name != "TB01"]
+    assert b["mean"]["iae"] == pytest.approx(np.mean(followers))
+    assert b["ratio"]["f_hz"] == pytest.approx(b["mean"]["f_hz"] / 50.0)
+    assert found["cases"]["a"]["ratio"]["iae"] == 1.0
+    assert b["ratio"]["lost"] is None  # the reference lost nothing
+    assert msgspec.json.decode(msgspec.json.encode(found)) == found
+
+
+def test_spread_over_seeds():
+    documents = [
+        {"seed": k, "cases": {"a": {group: dict.fromkeys(metrics.INDICES, value) for group in ("mean", "ratio")}}}
+        for k, value in enumerate([1.0, 2.0, None, 3.0])
+    ]
+    found = metrics.across_seeds(documents)
+    assert found["seeds"] == [0, 1, 2, 3]
+    assert found["cases"]["a"]["mean"]["iae"] == {
+        "mean": 2.0,
+        "std": 1.0,
+        "ci95": pytest.approx(4.302653 / math.sqrt(3.0)),
+        "n": 3,
+    }
+    assert metrics.spread([None]) == metrics.Spread(None, None, None, 0)
+    assert metrics.spread([5.0]) == metrics.Spread(5.0, None, None, 1)
+
+
+@pytest.mark.parametrize(
+    ("freedom", "quantile"),
+    [(1, 12.7062), (2, 4.30265), (3, 3.18245), (4, 2.77645), (5, 2.57058), (9, 2.26216), (19, 2.09302), (99, 1.98422)],
+)
+def test_student_quantiles_against_the_printed_table(freedom: int, quantile: float):
+    assert metrics.student_95(freedom) == pytest.approx(quantile, rel=1.5e-3)
+
+
+def test_ratios_pair_seeds_or_divide_by_the_mean():
+    runs = [metrics.measure(park("a", seed=seed, duration=2.0)) for seed in (1, 2)]
+    assert metrics.ratios(runs, runs[::-1], "iae") == [1.0, 1.0]
+    iae = [run.mean["iae"] for run in runs]
+    assert metrics.ratios(runs, runs[:1], "iae") == [1.0, pytest.approx(iae[1] / iae[0])]
+
+
+def test_csv_has_a_row_per_robot_and_a_mean(tmp_path):
+    measured = metrics.measure(park())
+    metrics.write_csv(tmp_path / "metrics.csv", [measured])
+    with (tmp_path / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["robot"] for row in rows] == [*(robot.robot for robot in measured.robots), "mean"]
+    assert float(rows[2]["iae"]) == measured.robots[2].iae
+    assert float(rows[2]["phase2_acquired_s"]) == measured.robots[2].phases[0].acquired_s
+    assert float(rows[-1]["iae"]) == measured.mean["iae"]
+    assert [row["in_mean"] for row in rows] == ["0", *["1"] * 6, ""]
+
+
+def test_json_holds_everything(tmp_path):
+    measured = metrics.measure(park(duration=5.0))
+    metrics.write_json(tmp_path / "metrics.json", [measured])
+    assert msgspec.json.decode((tmp_path / "metrics.json").read_bytes(), type=list[metrics.CaseMetrics]) == [measured]
+
+
+@settings(deadline=None, max_examples=20)
+@given(turn=st.floats(-3.0, 3.0), x=st.floats(-5.0, 5.0), y=st.floats(-5.0, 5.0))
+def test_errors_do_not_depend_on_where_the_formation_stands(turn: float, x: float, y: float):
+    known = park(duration=3.0)
+    c, s = math.cos(turn), math.sin(turn)
+    place = known.true_position @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + [x, y, 0.0]
+    moved = metrics.measure(dataclasses.replace(known, true_position=place))
+    for index in ("iae", "itae", "rmse"):
+        assert moved.mean[index] == pytest.approx(metrics.measure(known).mean[index], rel=1e-9)

@@ -1,0 +1,654 @@
+"""A recording is read back as what was written, by zenpark and by others, also when its recorder was killed."""
+
+import math
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from agents.wire import Event, Heard, Pose, State, Status
+from experiments.experiment import Experiment, Rates, Robot
+from experiments.playback import read
+from experiments.recording import Recording
+from experiments.records import RecordingError
+from experiments.recover import Recovered, recover, recover_command
+
+START = 1_760_000_000.0
+DOCUMENT = 'title = "pair"  # as it was written\n'
+PAIR = Experiment(
+    title="pair",
+    robots={"TB01": Robot("turtlebot3", [0.0, 0.0]), "CF01": Robot("crazyflie", [1.0, 0.0], hover=0.8)},
+    duration_s=1.0,
+    rates=Rates(state_hz=10.0),
+)
+
+
+def state(robot="TB01", seq=1, at=0.0, x=0.0, **more):
+    known = {
+        "robot": robot,
+        "seq": seq,
+        "stamp": START + at,
+        "phase": "run",
+        "position": (x, 0.0, 0.0),
+        "velocity": (0.1, 0.2, 0.3),
+        "yaw": 0.0,
+        "goal": (x + 1.0, 2.0, 3.0),
+        "setpoint": (x, 0.0, 0.5, 0.25),
+        "error": 0.05,
+    }
+    return State(**known | more)
+
+
+def pose(robot="TB01", seq=1, at=0.0, x=0.0):
+    return Pose(robot, seq, START + at, (x, 0.5, 0.0), (0.1, 0.2, 0.3), 0.4)
+
+
+def status(robot="TB01", at=1.0, *, sent=0, lost=None, started=START, pid=7, ticks=0, missed=0, decisions=0):
+    return Status(
+        robot=robot,
+        stamp=START + at,
+        phase="run",
+        reason="",
+        battery=None,
+        sent=sent,
+        heard=0,
+        lost=lost or {},
+        malformed=0,
+        refused=0,
+        ticks=ticks,
+        missed=missed,
+        decisions=decisions,
+        interventions=0,
+        late_s=0.0,
+        started=started,
+        missing=[],
+        pid=pid,
+        cpu_s=0.0,
+        rss_mb=1.0,
+    )
+
+
+def begun(at=0.0):
+    return Event(START + at, "start", "conductor", "go")
+
+
+def write(path, *messages, experiment=PAIR, **more):
+    """Records messages as they come; a pose is received 2 ms after its stamp, with 150 bytes."""
+    with Recording(path, experiment, DOCUMENT, **{"case": "only", "seed": 4, "clock": "real"} | more) as recording:
+        put(recording, messages)
+        return recording
+
+
+def put(recording, messages):
+    for message in messages:
+        match message:
+            case Pose():
+                recording.pose(message, message.stamp + 0.002, 150)
+            case State():
+                recording.state(message)
+            case Status():
+                recording.status(message)
+            case Event():
+                recording.event(message)
+
+
+def whole_run():
+    """One second of two robots, the leader along x at 1 m/s."""
+    messages = [begun(), status("TB01", at=0.0), status("CF01", at=0.0)]
+    for k in range(11):
+        at = k / 10
+        heard = [Heard("TB01", k, START + at - 0.05, START + at - 0.04, (at - 0.05, 0.0, 0.0))] if k else []
+        messages += [
+            state("TB01", k + 1, at, at, true_position=(at, 0.0, 0.01), true_yaw=0.1),
+            state("CF01", k + 1, at, -at, heard=heard),
+            pose("TB01", k + 1, at, at),
+        ]
+    return [
+        *messages,
+        status("TB01", sent=11, ticks=100, missed=3, decisions=10),
+        status("CF01", sent=0, ticks=99, decisions=9, lost={"TB01": 1}),
+    ]
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run.mcap"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """The bytes of a finished recording."""
+    target = tmp_path_factory.mktemp("recorded") / "run.mcap"
+    write(target, *whole_run())
+    return target.read_bytes()
+
+
+def test_a_run_is_read_back(path):
+    write(path, *whole_run())
+    playback = read(path)
+    trace = playback.trace
+    assert playback.complete
+    assert playback.messages == 1 + 4 + 22 * 2 + 11
+    assert (trace.case, trace.seed, trace.clock, trace.robots) == ("only", 4, "real", ("TB01", "CF01"))
+    assert trace.experiment == PAIR
+    np.testing.assert_allclose(trace.time, np.arange(11) / 10, rtol=0, atol=1e-12)
+    along = np.arange(11) / 10
+    np.testing.assert_allclose(trace.position[:, 0, 0], along, atol=1e-6)
+    np.testing.assert_allclose(trace.position[:, 1, 0], -along, atol=1e-6)
+    np.testing.assert_allclose(trace.true_position[:, 0, 2], 0.01)
+    np.testing.assert_allclose(trace.true_position[:, 1], trace.position[:, 1])
+    np.testing.assert_allclose(trace.goal[:, 0], np.column_stack([along + 1, along * 0 + 2, along * 0 + 3]))
+    np.testing.assert_allclose(
+        trace.setpoint[:, 1], np.column_stack([-along, along * 0, along * 0 + 0.5, along * 0 + 0.25])
+    )
+    np.testing.assert_allclose(trace.sent.time, along, atol=1e-6)
+    assert trace.sent.seq.tolist() == list(range(1, 12))
+    assert trace.sent.bytes.tolist() == [150] * 11
+    np.testing.assert_allclose(trace.sent.position[:, :2], np.column_stack([along, along * 0 + 0.5]))
+    np.testing.assert_allclose(trace.sent.velocity, np.tile([0.1, 0.2, 0.3], (11, 1)))
+    np.testing.assert_allclose(trace.sent.yaw, 0.4)
+    np.testing.assert_allclose(trace.heard.time, along[1:] - 0.04, atol=1e-6)
+    np.testing.assert_allclose(trace.heard.stamp, along[1:] - 0.05, atol=1e-6)
+    assert set(zip(trace.heard.listener.tolist(), trace.heard.speaker.tolist(), strict=True)) == {(1, 0)}
+    assert trace.heard.seq.tolist() == list(range(1, 11))
+    np.testing.assert_allclose(trace.heard.position[:, 0], along[1:] - 0.05)
+    assert trace.lost.tolist() == [1, 0]
+    assert trace.ticks.tolist() == [100, 99]
+    assert trace.missed_deadlines.tolist() == [3, 0]
+    assert trace.decisions.tolist() == [10, 9]
+    assert trace.events == (Event(0.0, "start", "conductor", "go"),)
+
+
+def test_what_is_attached(path):
+    write(path, begun(), started=START)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        attached = {one.name: one.data for one in reader.iter_attachments()}
+        about = {one.name: one.metadata for one in reader.iter_metadata()}["zenpark"]
+    assert attached["experiment.toml"].decode() == DOCUMENT
+    assert msgspec.json.decode(attached["experiment.json"], type=Experiment) == PAIR
+    assert (about["case"], about["seed"], about["clock"], about["started"]) == ("only", "4", "real", repr(START))
+    assert about["version"]
+
+
+def test_others_read_it(path):
+    write(path, *whole_run())
+    with AnyReader([path]) as reader:
+        seen = [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
+    states = [message for topic, _, message in seen if topic == "/CF01/state"]
+    assert [message.seq for message in states] == list(range(1, 12))
+    assert states[5].heard[0].speaker == "TB01"
+    assert states[5].heard[0].position.tolist() == [0.45, 0.0, 0.0]
+    assert math.isnan(states[5].true_yaw)
+    drawn = [(t, message) for topic, t, message in seen if topic == "/TB01/true_pose"]
+    assert drawn[3][0] == round((START + 0.3) * 1e9)
+    assert (drawn[3][1].header.frame_id, drawn[3][1].pose.position.z) == ("park", 0.01)
+    measured = [message for topic, _, message in seen if topic == "/CF01/true_pose"]
+    assert measured[3].pose.position.x == -0.3
+
+    with path.open("rb") as file:
+        found = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    assert len(found) == len(seen)
+    sent = [one for one in found if one.channel.topic == "/TB01/pose"]
+    assert [one.decoded_message.seq for one in sent] == list(range(1, 12))
+    assert [one.message.sequence for one in sent] == list(range(1, 12))
+    assert sent[2].decoded_message.size == 150
+    assert sent[2].decoded_message.received == START + 0.2 + 0.002
+    assert sent[2].message.log_time == round((START + 0.2 + 0.002) * 1e9)
+    assert sent[2].message.publish_time == round((START + 0.2) * 1e9)
+    last = [one.decoded_message for one in found if one.channel.topic == "/CF01/status"][-1]
+    assert (last.lost_keys, last.lost_values, math.isnan(last.battery)) == (["TB01"], [1], True)
+    assert [one.decoded_message.kind for one in found if one.channel.topic == "/events"] == ["start"]
+
+
+def test_samples_between_the_grid_are_interpolated(path):
+    write(
+        path,
+        begun(),
+        *[state(at=k / 10 + 0.05, x=k / 10 + 0.05, yaw=math.remainder(k, math.tau)) for k in range(-1, 11)],
+    )
+    trace = read(path).trace
+    np.testing.assert_allclose(trace.position[:, 0, 0], np.arange(11) / 10, atol=1e-6)
+    np.testing.assert_allclose(trace.goal[:, 0, 0], np.arange(11) / 10 + 0.95, atol=1e-6)  # the last one before
+    turned = np.arctan2(np.sin(trace.yaw[:, 0]), np.cos(trace.yaw[:, 0]))
+    np.testing.assert_allclose(turned, [math.remainder(k - 0.5, math.tau) for k in range(11)], atol=1e-4)
+
+
+def test_yaw_keeps_the_branch_it_was_recorded_on(path):
+    yaw = [math.remainder(0.9 * k, math.tau) for k in range(11)]
+    write(path, begun(), *[state(at=k / 10, yaw=value) for k, value in enumerate(yaw)])
+    np.testing.assert_allclose(read(path).trace.yaw[:, 0], yaw, atol=1e-5)
+
+
+def test_silence_is_nan_and_never_extrapolated(path):
+    write(path, begun(), *[state(at=k / 10, x=k / 10) for k in range(6)])
+    trace = read(path).trace
+    np.testing.assert_allclose(trace.position[:8, 0, 0], [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.5], atol=1e-6)
+    for array in (trace.position, trace.yaw, trace.true_position, trace.goal, trace.setpoint):
+        assert np.isnan(array[8:, 0]).all()
+        assert np.isnan(array[:, 1]).all()  # never reported
+        assert np.isfinite(array[:8, 0]).all()
+
+
+def test_a_long_hole_is_not_interpolated_over(path):
+    times = [0.0, 0.1, 0.6, 0.7, 2.0, 2.1]
+    long = msgspec.structs.replace(PAIR, duration_s=2.0)
+    write(path, begun(), *[state(at=at, x=at) for at in times], experiment=long)
+    x = read(path).trace.position[:, 0, 0]
+    np.testing.assert_allclose(x[:8], np.arange(8) / 10, atol=1e-6)
+    assert np.flatnonzero(np.isnan(x)).tolist() == list(range(10, 18))
+
+
+def test_numbers_that_nobody_knows(path):
+    lost = [
+        state(at=k / 10, x=math.nan if k == 5 else k / 10, goal=None, setpoint=None, yaw=math.nan) for k in range(11)
+    ]
+    write(path, begun(), *lost)
+    trace = read(path).trace
+    np.testing.assert_allclose(trace.position[:, 0, 0], np.arange(11) / 10, atol=1e-6)
+    for array in (trace.goal, trace.setpoint, trace.yaw):
+        assert np.isnan(array).all()
+
+
+@pytest.mark.parametrize(
+    ("messages", "lost"),
+    [
+        ([pose(seq=k, at=k / 10) for k in (1, 2, 5, 6)], 2),  # a gap of two
+        ([pose(seq=s, at=a) for s, a in ((8, 0.1), (9, 0.2), (1, 0.3), (2, 0.4))], 0),  # began anew
+        ([pose(seq=s, at=a) for s, a in ((8, 0.1), (9, 0.2), (3, 0.3), (4, 0.4))], 2),  # anew, the first two lost
+        (
+            [pose(seq=4, at=0.1), pose(seq=4, at=0.1), pose(seq=5, at=0.2)],
+            0,
+        ),  # the same twice: said again to a late one
+        ([pose(seq=1, at=-2.0), pose(seq=9, at=0.1), pose(seq=10, at=0.2)], 0),  # a gap that began before the run
+        ([pose(seq=5, at=0.9), status(sent=8)], 3),  # the last three never came
+        ([pose(seq=5, at=0.9), pose(seq=6, at=1.2), status(sent=5)], 0),
+        ([pose(seq=9, at=0.5), status(sent=2, pid=8)], 0),  # a younger process counts from zero
+        ([status(at=-0.5, sent=4), status(sent=6)], 2),  # none of them recorded
+        ([pose(seq=3, at=-0.2), status(at=-1.0, sent=2), status(sent=4)], 1),
+        ([status("CF01", at=-0.5, lost={"TB01": 4}), status("CF01", lost={"TB01": 6})], 2),  # less what was before
+        ([status("CF01", at=a, lost={"TB01": n}) for a, n in ((0.2, 1), (0.6, 1), (1.0, 3))], 3),  # counters go up
+        (
+            [
+                status("CF01", at=-0.5, lost={"TB01": 4}),
+                status("CF01", at=0.2, lost={"TB01": 5}),
+                status("CF01", at=0.9, lost={"TB01": 2}, pid=8),
+            ],
+            3,  # one before its listener began anew, two after
+        ),
+        ([status("CF01", at=30.0, lost={"TB01": 4})], 0),  # long after the run
+    ],
+)
+def test_lost(path, messages, lost):
+    write(path, begun(), state(), *messages)
+    assert read(path).trace.lost.tolist() == [lost, 0]
+
+
+def test_only_poses_of_the_run_are_sent(path):
+    write(path, begun(), *[pose(seq=k + 5, at=k / 2) for k in range(-2, 5)], pose("XX99", at=0.5))
+    sent = read(path).trace.sent
+    assert sent.time.tolist() == [0.0, 0.5, 1.0]
+    assert sent.seq.tolist() == [5, 6, 7]
+
+
+def test_the_start_is_the_conductors_else_the_robots(path, tmp_path):
+    write(path, state(at=0.0), state(at=0.5), status(started=START + 0.5), status("CF01", started=0.0))
+    assert np.isfinite(read(path).trace.position[:, 0, 0]).tolist() == [True] * 3 + [False] * 8
+    both = tmp_path / "both.mcap"
+    write(both, state(at=0.0), begun(0.2), status(started=START + 0.5), state(at=0.5, x=1.0))
+    np.testing.assert_allclose(read(both).trace.position[3, 0, 0], 1.0)
+    assert read(both).trace.events[0].stamp == 0.0
+
+
+def test_a_run_that_never_started(path):
+    write(path, state(), status(started=0.0))
+    with pytest.raises(RecordingError, match="no robot had started"):
+        read(path)
+
+
+def test_a_run_without_any_message_of_a_robot(path):
+    write(path, begun())
+    trace = read(path).trace
+    assert trace.position.shape == (11, 2, 3)
+    assert np.isnan(trace.position).all()
+    assert (len(trace.sent.time), len(trace.heard.time), trace.lost.tolist()) == (0, 0, [0, 0])
+
+
+def test_what_cannot_be_a_message_is_counted_and_left_out(path):
+    wrong = [state(seq=2**63), state(position=None), state(phase="\ud800"), pose(seq=2**70), status(sent=2**64)]
+    recording = write(path, begun(), *wrong, Event(None, "k", "s", "t"))
+    assert recording.refused == 6
+    assert read(path).messages == 1
+
+
+@pytest.mark.parametrize("stamp", [math.nan, math.inf, -1.0, 1e19])
+def test_a_broken_clock_does_not_stretch_the_time_line(path, stamp):
+    write(path, begun(), msgspec.structs.replace(state(), stamp=stamp))
+    with path.open("rb") as file:
+        statistics = make_reader(file).get_summary().statistics
+    assert statistics.message_start_time == statistics.message_end_time == round(START * 1e9)
+    assert np.isnan(read(path).trace.position).all()
+
+
+def test_a_recording_is_never_overwritten(path):
+    path.write_text("precious")
+    with pytest.raises(RecordingError, match=r"run\.mcap: exists already; move it away"):
+        write(path)
+    assert path.read_text() == "precious"
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(RecordingError, match="cannot be created: No such file"):
+        write(tmp_path / "none" / "run.mcap")
+
+
+def test_closed_twice_and_used_after(path):
+    recording = write(path, begun())
+    recording.close()
+    with pytest.raises(RecordingError, match="closed"):
+        recording.state(state())
+
+
+def test_an_error_of_the_caller_leaves_a_finished_file(path):
+    def fails():
+        with Recording(path, PAIR, case="only", seed=4, clock="real") as recording:
+            put(recording, whole_run())
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fails()
+    assert read(path).complete
+
+
+@pytest.fixture
+def small_disk():
+    """Files of this process may not grow beyond 40 kB."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def scattered(count):
+    """States that do not compress."""
+    x = np.random.default_rng(1).normal(size=(count, 3)).tolist()
+    return [state(seq=k + 1, at=k / count, position=tuple(p), goal=tuple(p)) for k, p in enumerate(x)]
+
+
+@pytest.mark.usefixtures("small_disk")
+def test_a_full_disk_keeps_what_was_written(path):
+    messages = scattered(2000)
+    with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written: .*zenpark recover"):
+        write(path, begun(), *messages)
+    assert path.stat().st_size == 40_000
+    playback = read(path)
+    assert not playback.complete
+    assert playback.messages > 200
+    np.testing.assert_allclose(playback.trace.position[0, 0], messages[0].position, atol=1e-3)
+
+
+@pytest.mark.usefixtures("small_disk")
+def test_after_a_write_error_nothing_more_is_written(path):
+    recording = Recording(path, PAIR, case="only", seed=4, clock="real")
+    messages = scattered(2000)
+    with pytest.raises(RecordingError):
+        put(recording, messages)
+    with pytest.raises(RecordingError, match="make room"):
+        recording.state(messages[0])
+    recording.close()
+    assert path.stat().st_size == 40_000
+
+
+@pytest.mark.usefixtures("small_disk")
+def test_a_disk_too_full_for_the_first_record(path):
+    with pytest.raises(RecordingError, match="cannot be written"):
+        Recording(path, PAIR, "#" * 50_000, case="only", seed=4, clock="real")
+
+
+@pytest.mark.usefixtures("small_disk")
+def test_a_disk_too_full_to_recover_onto(path, tmp_path):
+    big = tmp_path / "big.mcap"
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.getrlimit(resource.RLIMIT_FSIZE)[1],) * 2)
+    write(big, begun(), *scattered(2000))
+    big.write_bytes(big.read_bytes()[:-20])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written"):
+        recover(big, path)
+    assert not path.exists()
+
+
+KILLED = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from test_recording import *
+recording = Recording(Path({path!r}), PAIR, DOCUMENT, case="only", seed=4, clock="real")
+put(recording, whole_run())
+recording.flush()
+print("flushed", flush=True)
+k = 0
+while True:
+    k += 1
+    recording.state(state("CF01", 100 + k, 5.0 + k / 1000, k * 0.37))
+"""
+
+
+@pytest.mark.system
+def test_a_killed_recorder_leaves_a_recording(path, tmp_path, recorded):
+    code = KILLED.format(tests=str(Path(__file__).parent), path=str(path))
+    root = Path(__file__).parents[2]
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=root) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "flushed\n"
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    before = path.read_bytes()
+    playback = read(path)
+    assert not playback.complete
+    assert playback.messages >= 60
+
+    target = tmp_path / "whole.mcap"
+    assert recover(path, target) == Recovered(playback.messages, ("TB01", "CF01"), complete=False)
+    assert path.read_bytes() == before
+    again = read(target)
+    assert again.complete
+    assert again.messages == playback.messages
+    whole = tmp_path / "finished.mcap"
+    whole.write_bytes(recorded)
+    wanted = read(whole).trace
+    for trace in (playback.trace, again.trace):
+        np.testing.assert_array_equal(trace.position[:, 0], wanted.position[:, 0])
+        np.testing.assert_array_equal(trace.sent.time, wanted.sent.time)
+        assert trace.lost.tolist() == wanted.lost.tolist()
+
+
+def test_recovery_keeps_everything(path, tmp_path):
+    write(path, *whole_run())
+    path.write_bytes(path.read_bytes()[:-1])
+    target = tmp_path / "whole.mcap"
+    assert recover(path, target) == Recovered(60, ("TB01", "CF01"), complete=False)
+    with target.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert (reader.get_header().profile, reader.get_header().library) == ("ros2", "zenpark")
+        assert {one.name: one.data for one in reader.iter_attachments()}["experiment.toml"].decode() == DOCUMENT
+        assert [one.metadata["case"] for one in reader.iter_metadata()] == ["only"]
+        summary = reader.get_summary()
+        assert {channel.topic for channel in summary.channels.values()} == {
+            "/events",
+            *(f"/{robot}/{what}" for robot in ("TB01", "CF01") for what in ("state", "true_pose", "status")),
+            "/TB01/pose",
+        }
+        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+        assert summary.statistics.message_count == 60
+    with AnyReader([target]) as reader:
+        assert len(list(reader.messages())) == 60
+
+
+def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
+    write(path, *whole_run())
+    target = tmp_path / "whole.mcap"
+    assert recover(path, target) == Recovered(60, ("TB01", "CF01"), complete=True)
+    assert recover_command(str(path), None) == 0
+    assert capsys.readouterr().out == f"{path} is whole already: 60 messages of TB01, CF01\n"
+    assert sorted(tmp_path.iterdir()) == [path]
+
+
+def test_the_command_writes_beside_the_source(path, capsys):
+    write(path, *whole_run())
+    path.write_bytes(path.read_bytes()[:-1])
+    assert recover_command(str(path), None) == 0
+    target = path.with_name("run-recovered.mcap")
+    assert capsys.readouterr().out == f"{target}: 60 messages of TB01, CF01\n"
+    assert read(target).complete
+
+
+def test_recovery_overwrites_nothing(path, tmp_path):
+    write(path, *whole_run())
+    path.write_bytes(path.read_bytes()[:-1])
+    target = tmp_path / "precious"
+    target.write_text("mine")
+    with pytest.raises(RecordingError, match="precious: exists already"):
+        recover(path, target)
+    with pytest.raises(RecordingError, match="exists already"):
+        recover(path, path)
+    assert target.read_text() == "mine"
+    assert not read(path).complete
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(b"", "nothing was recorded"), (b"\x89MCAP", "nothing was recorded"), (b"title = 'pair'", "not an MCAP file")],
+)
+def test_what_is_no_recording(path, tmp_path, content, says):
+    path.write_bytes(content)
+    for act in (read, lambda source: recover(source, tmp_path / "target.mcap")):
+        with pytest.raises(RecordingError, match=rf"run\.mcap: {says}"):
+            act(path)
+    assert not (tmp_path / "target.mcap").exists()
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    for wrong in (tmp_path / "none.mcap", tmp_path):
+        with pytest.raises(RecordingError, match="cannot be read"):
+            read(wrong)
+
+
+def survives(path, target):
+    """Reads and recovers; whatever the damage, the only error is the named one."""
+    target.unlink(missing_ok=True)
+    try:
+        found = recover(path, target)
+    except RecordingError:
+        return None
+    if not found.complete:
+        assert read_or_refuse(target) == read_or_refuse(path)
+    return read_or_refuse(path)
+
+
+def read_or_refuse(path):
+    try:
+        return read(path).messages
+    except RecordingError:
+        return None
+
+
+def test_a_file_cut_anywhere(path, tmp_path, recorded):
+    found = []
+    for size in range(0, len(recorded), 61):
+        path.write_bytes(recorded[:size])
+        found.append(survives(path, tmp_path / "target.mcap") or 0)
+    assert found == sorted(found)
+    assert found[0] == 0
+    assert found[-1] == 60
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_a_file_damaged_anywhere(tmp_path_factory, recorded, data):
+    folder = tmp_path_factory.mktemp("damaged")
+    damaged = bytearray(recorded)
+    for _ in range(data.draw(st.integers(1, 3))):
+        damaged[data.draw(st.integers(0, len(recorded) - 1))] = data.draw(st.integers(0, 255))
+    (folder / "run.mcap").write_bytes(damaged)
+    survives(folder / "run.mcap", folder / "target.mcap")
+
+
+def test_a_damaged_chunk_costs_only_itself(path):
+    write(path, begun(), *scattered(2000))
+    whole = read(path)
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    content = bytearray(path.read_bytes())
+    content[chunks[2].chunk_start_offset + chunks[2].chunk_length // 2] ^= 0xFF
+    path.write_bytes(content)
+    playback = read(path)
+    assert not playback.complete
+    assert whole.messages - 200 < playback.messages < whole.messages
+
+
+def foreign(path, *channels, metadata=None, attachment=None):
+    """A file of another program, with one message on each channel (topic, schema name, schema text, data)."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for topic, name, text, data in channels:
+            schema = writer.register_schema(name, "ros2msg", text) if name else 0
+            writer.add_message(writer.register_channel(topic, "cdr", schema), 1, data, 1)
+        if metadata is not None:
+            writer.add_metadata("zenpark", metadata)
+        if attachment is not None:
+            writer.add_attachment(0, 0, "experiment.json", "application/json", attachment)
+        writer.finish()
+
+
+ABOUT = {"case": "only", "seed": "4", "clock": "real"}
+
+
+def test_channels_of_others_are_passed_over(path, tmp_path):
+    channels = [("/image", "sensor_msgs/msg/Image", b"uint8 data", b"junk"), ("/raw", "", b"", b"more")]
+    foreign(path, *channels, metadata=ABOUT | {"started": repr(START)}, attachment=msgspec.json.encode(PAIR))
+    playback = read(path)
+    assert playback.messages == 2
+    assert np.isnan(playback.trace.position).all()
+    path.write_bytes(path.read_bytes()[:-1])
+    assert recover(path, tmp_path / "target.mcap").messages == 2
+    with (tmp_path / "target.mcap").open("rb") as file:
+        kept = [
+            (schema and schema.name, channel.topic, m.data) for schema, channel, m in make_reader(file).iter_messages()
+        ]
+    assert kept == [("sensor_msgs/msg/Image", "/image", b"junk"), (None, "/raw", b"more")]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "attachment"),
+    [
+        (None, None),
+        (ABOUT, None),
+        (ABOUT, b"{}"),
+        (ABOUT, b'{"title": "pair", "robots": {}, "duration_s": 1.0}'),
+        (ABOUT | {"seed": "four"}, msgspec.json.encode(PAIR)),
+        ({"case": "only"}, msgspec.json.encode(PAIR)),
+    ],
+)
+def test_a_file_without_an_experiment(path, metadata, attachment):
+    foreign(path, metadata=metadata, attachment=attachment)
+    with pytest.raises(RecordingError, match="holds no experiment"):
+        read(path)
+
+
+def test_a_file_of_another_version(path):
+    foreign(path, ("/TB01/state", "zenpark_msgs/msg/State", b"string robot\n", b"\0\1\0\0"))
+    with pytest.raises(RecordingError, match=r"/TB01/state was recorded by a version of zenpark with other fields"):
+        read(path)

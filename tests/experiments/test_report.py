@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+import dataclasses
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from agents.wire import Event
+from experiments import report
+from experiments.experiment import Experiment
+from experiments.metrics import measure, spread
+from experiments.report_tables import interval, number, proof_tables, robot_tables, summary_table
+from experiments.verdict import findings, left_out
+from tests.experiments.traces import crowd, experiment, park, trace
+
+VOID = {"meta", "link", "br", "hr", "img", "input"}
+
+
+class Page(HTMLParser):
+    """Checks that elements close, and collects ids, references and text."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.wanted: set[str] = set()
+        self.tags: set[str] = set()
+        self.text: list[str] = []
+        self.feed(html)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+        self._attributes(attrs)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.add(tag)
+        self._attributes(attrs)
+
+    def _attributes(self, attrs):
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value)
+            self.wanted |= set(re.findall(r"url\(#([^)]*)\)", value or ""))
+            if name in {"href", "xlink:href", "src", "aria-labelledby"}:
+                self.wanted.add(value.removeprefix("#"))
+            assert not name.startswith("on")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+    @property
+    def words(self) -> str:
+        return re.sub(r"[ \n]+", " ", " ".join(self.text))
+
+
+def checked(html: str) -> Page:
+    page = Page(html)
+    assert page.open == []
+    assert len(page.ids) == len(set(page.ids))
+    assert page.wanted <= set(page.ids)
+    assert not page.tags & {"script", "iframe", "img", "link", "object"}
+    assert not re.findall(r"https?://", re.sub(r'xmlns(:\w+)?="[^"]*"', "", html))
+    return page
+
+
+@pytest.fixture(scope="module")
+def run():
+    return [park(), park("event", 0.01)]
+
+
+def test_report_of_a_run_stands_alone(tmp_path, run):
+    path = report.write(tmp_path / "new" / "run", run, command="zenpark run <this> --seed 1", date="2030-01-02")
+    page = checked(path.read_text(encoding="utf-8"))
+    assert path == tmp_path / "new" / "run" / "report.html"
+    assert page.ids.count("f1-figure_1") == page.ids.count("f8-figure_1") == 1
+    for words in (
+        "Robotic Park: six robots hold a rigid formation behind a leader",
+        "Nobody, Nowhere 2020",
+        "2030-01-02",
+        "zenpark run <this> --seed 1",
+        "TB01 leads and is left out of the means.",
+        "Nothing was lost: 17\u202f",
+        "Figure 8.",
+        "all robots are ready",
+        "ITAE",
+    ):
+        assert words in page.words
+    assert path.stat().st_size < 1_500_000
+
+
+def test_report_is_the_same_every_time(tmp_path, run):
+    texts = [report.write(tmp_path, run, date="x", name=name).read_bytes() for name in ("a.html", "b.html")]
+    assert texts[0] == texts[1]
+
+
+def test_report_without_legs_leaves_out_the_figure_after_the_leg(tmp_path):
+    page = checked(
+        report.write(tmp_path, [crowd(3, duration=3.0)], text="[file]\nx = '<b>'").read_text(encoding="utf-8")
+    )
+    assert "Figure 7." in page.words
+    assert "Figure 8." not in page.words
+    assert "x = '<b>'" in page.words
+
+
+def test_markup_in_names_stays_text(tmp_path):
+    bad = '<script>alert("1")</script> & {{ 7 * 7 }}'
+    what = dataclasses.replace(crowd(3, duration=2.0), events=(Event(1.0, bad, bad, bad),))
+    what = dataclasses.replace(what, case=bad)
+    page = checked(report.write(tmp_path, [what], command=bad, date=bad).read_text(encoding="utf-8"))
+    assert page.words.count(bad) > 5
+
+
+def test_many_events_are_cut(tmp_path):
+    known = dataclasses.replace(crowd(3, duration=2.0), events=tuple(Event(0.0, "a", "b", "c") for _ in range(250)))
+    page = checked(report.write(tmp_path, [known]).read_text(encoding="utf-8"))
+    assert "50 more are in the recording." in page.words
+
+
+def test_report_over_seeds_gives_intervals(tmp_path):
+    runs = [park(name, size, seed=seed, duration=8.0) for name, size in (("a", 0.0), ("b", 0.02)) for seed in (1, 2, 3)]
+    page = checked(report.write(tmp_path, runs).read_text(encoding="utf-8"))
+    assert "Whiskers: 95 % confidence over 3 seeds." in page.words
+    assert "1 to 3" in page.words
+    cells = summary_table([measure(each) for each in runs]).rows[3].cells
+    assert re.fullmatch(r"\d\.\d+ ± 0\.\d+", cells[1])
+    assert re.fullmatch(r"× \d\.\d{3} ± 0\.\d{3}", cells[2][1])
+
+
+def test_report_of_a_run_in_which_a_robot_died_and_samples_were_lost(tmp_path):
+    known = park(duration=10.0)
+    place = known.true_position.copy()
+    place[100:, 6] = np.nan
+    lost = np.array([0, 3, 0, 0, 0, 0, 0])
+    known = dataclasses.replace(known, true_position=place, lost=lost, missed_deadlines=lost, clock="real")
+    page = checked(report.write(tmp_path, [known]).read_text(encoding="utf-8"))
+    assert "CF03 dropped out; the means leave it out." in page.words
+    assert "Samples were lost: 3 in periodic" in page.words
+    assert "Deadlines were missed: 3 in periodic" in page.words
+    assert "Known [%]" in page.words
+
+
+def test_comparison_has_a_column_per_run_and_case(tmp_path, run):
+    target = tmp_path / "there" / "compare.html"
+    page = checked(report.compare(target, [("monday", run), ("tuesday", [park("event", 0.02)])]).read_text())
+    for words in ("monday · periodic", "monday · event", "tuesday", "× is relative to monday · periodic."):
+        assert words in page.words
+
+
+def test_nothing_to_report():
+    with pytest.raises(ValueError, match="no case"):
+        report.write("x", [])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="no run"):
+        report.compare("x", [("a", [])])  # type: ignore[arg-type]
+
+
+def test_verdict_says_what_was_measured(run):
+    cases = [measure(each) for each in run]
+    said = {finding.text: finding.mark for finding in findings(cases)}
+    fewer = 100.0 * (1.0 - cases[1].mean["f_hz"] / cases[0].mean["f_hz"])
+    assert any(text.startswith(f"event needs {fewer:.1f} % fewer transmissions than periodic: 4.") for text in said)
+    ratio = cases[1].mean["iae"] / cases[0].mean["iae"]
+    assert [mark for text, mark in said.items() if f"IAE {ratio:.3f}" in text] == ["fair"]
+    first, again = cases[0].acquired_s
+    assert any(f"acquired to 5 cm after {first:.2f} s (periodic)" in text for text in said)
+    assert any(f"After the leg at 21 s it was acquired again after {again:.2f} s (periodic)" in text for text in said)
+
+
+def test_verdict_of_a_formation_that_never_came_to_be():
+    what = experiment({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
+    place = np.zeros((200, 2, 3))
+    place[:, 1, 0] = 1.5
+    place[:, 1, 1] = 2.1
+    said = {finding.text: finding.mark for finding in findings([measure(trace(what, place))])}
+    assert said["The formation never stayed within 5 cm in only."] == "bad"
+    assert said["F was 10.0 cm outside the arena in only."] == "bad"
+
+
+def test_left_out_of_the_means(run):
+    assert left_out([measure(run[0])]) == "TB01 leads and is left out of the means."
+    assert left_out([measure(crowd(3, duration=2.0))]) == "The means are over all robots."
+
+
+def test_proof_adds_up(run):
+    rows = proof_tables([measure(run[1])])[0].rows
+    counts = [[int(cell.replace("\u202f", "")) for cell in row.cells[2:]] for row in rows]
+    assert counts[-1] == [sum(column) for column in zip(*counts[:-1], strict=True)]
+    assert counts[-1][2] == counts[-1][3]
+    assert counts[-1][0] == len(run[1].sent.time)
+
+
+def test_robot_table_has_means_by_kind(run):
+    table = robot_tables([measure(run[0])])[0]
+    assert table.rows[0].cells[0] == ("(TB01)", "turtlebot3")
+    assert [row.cells[0] for row in table.rows if row.sum] == [
+        ("mean of 3", "khepera4"),
+        ("mean of 3", "crazyflie"),
+        ("mean of 6", ""),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (0.0, "0"), (2, "2"), (50.0, "50.0"), (0.2881, "0.288"), (-4.76, "−4.76"), (0.03271, "0.0327"),
+     (20517.4, "20\u202f517"), (0.0001234, "1.2e-04")],
+)  # fmt: skip
+def test_numbers_have_three_digits(value, text):
+    assert number(value) == text
+
+
+def test_intervals_show_the_digits_that_they_bear():
+    assert interval(spread([4.55, 4.57, 4.59])) == "4.57 ± 0.05"
+    assert interval(spread([50.0, 50.0])) == "50.0"
+    assert interval(spread([])) == "–"
+
+
+def test_inline_drawings_have_ids_of_their_own():
+    drawing = (
+        '<?xml version="1.0"?><svg width="9pt" viewBox="0 0 9 9" xmlns="a"><defs><path id="p"/></defs>'
+        '<use xlink:href="#p"/><g id="g" style="stroke: #000000" clip-path="url(#p)"/></svg>'
+    )
+    placed = report.inline(drawing, "f3-", 'A "b" & <c>')
+    assert placed == (
+        '<svg viewBox="0 0 9 9" role="img" aria-label="A &quot;b&quot; &amp; &lt;c>"><defs><path id="f3-p"/></defs>'
+        '<use href="#f3-p"/><g id="f3-g" style="stroke: currentColor" clip-path="url(#f3-p)"/></svg>'
+    )
+
+
+def test_experiment_is_shown_even_without_its_file(tmp_path):
+    known = crowd(3, duration=2.0)
+    assert isinstance(known.experiment, Experiment)
+    page = checked(report.write(tmp_path, [known]).read_text())
+    assert '"duration_s": 45.0' in page.words

@@ -1,0 +1,173 @@
+"""A run as a test sees it: real processes, a real router, and a session of the test's own to look and to order."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import psutil
+import zenoh
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from experiments import orders
+
+ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+PATIENCE_S = 30.0
+
+
+def until(true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
+    """Waits until something is true."""
+    deadline = time.monotonic() + limit_s
+    pause = threading.Event()
+    while not true():
+        assert time.monotonic() < deadline, f"not in {limit_s:g} s: {what}"
+        pause.wait(0.01)
+
+
+class Watcher:
+    """Everything that robots say, from a session of the test's own; poll with `look`."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.keys = Keys()
+        self.session = network.open_session([endpoint], name="test")
+        self._statuses = network.pose_subscriber(self.session, self.keys.status("*"), 4096)
+        self._states = network.subscriber(self.session, self.keys.state("*"), 8192)
+        self._alive = network.alive_watch(self.session, self.keys.alive("*"))
+        self.status: dict[str, wire.Status] = {}
+        self.state: dict[str, wire.State] = {}
+        self.alive: set[str] = set()
+
+    def look(self) -> None:
+        for sample in network.received(self._statuses.handler):
+            status = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Status)
+            self.status[status.robot] = status
+        for sample in network.received(self._states.handler):
+            with contextlib.suppress(wire.Malformed):  # a test may say nonsense on any key
+                state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
+                self.state[state.robot] = state
+        for sample in network.received(self._alive.handler):
+            robot = self.keys.robot(str(sample.key_expr))
+            (self.alive.discard if sample.kind == zenoh.SampleKind.DELETE else self.alive.add)(robot)
+
+    def until(self, true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
+        """Looks until something is true."""
+
+        def seen() -> object:
+            self.look()
+            return true()
+
+        until(seen, what, limit_s)
+
+    def phase(self, robot: str) -> str:
+        return self.status[robot].phase if robot in self.status else ""
+
+    def order(self, robot: str, order: wire.Order) -> wire.Reply:
+        return orders.give(self.session, self.keys, robot, order)
+
+    def close(self) -> None:
+        self.session.close()  # type: ignore[no-untyped-call]
+
+
+class RobotProcess:
+    """`zenpark agent`, started by hand as a user would, with its standard input held open."""
+
+    def __init__(self, endpoint: str, file: str | Path, *names: str, lifeline: bool = False) -> None:
+        command = [sys.executable, "-m", "experiments.robot", str(file), *names, "--connect", endpoint]
+        self.process = subprocess.Popen(
+            [*command, *(["--lifeline"] if lifeline else [])],
+            cwd=ROOT,
+            env=ENVIRONMENT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def end(self) -> int:
+        """SIGTERM: it lands and ends."""
+        self.process.terminate()
+        return self.wait()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.wait()
+
+    def wait(self, limit_s: float = 20.0) -> int:
+        code = self.process.wait(limit_s)
+        for stream in (self.process.stdin, self.process.stdout):
+            assert stream is not None
+            stream.close()
+        return code
+
+
+class Flight:
+    """`zenpark run` in a process of its own."""
+
+    def __init__(self, folder: Path, file: str, *arguments: str) -> None:
+        self.folder = folder
+        self._errors = (folder.parent / f"{folder.name}.stderr").open("w+")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "tools.cli", "run", file, "--out", str(folder), *arguments],
+            cwd=ROOT,
+            env=ENVIRONMENT,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            text=True,
+            start_new_session=True,
+        )
+
+    def children(self) -> dict[str, psutil.Process]:
+        """The processes that it started, by robot name, "router" and "recorder"."""
+        found = {}
+        for child in psutil.Process(self.process.pid).children(recursive=True):
+            try:
+                line = child.cmdline()
+            except (psutil.NoSuchProcess, psutil.ZombieProcess):
+                continue
+            if "experiments.robot" in line:
+                for name in line[line.index("experiments.robot") + 2 : line.index("--connect")]:
+                    found[name] = child
+            elif "agents.router" in line:
+                found["router"] = child
+            elif "experiments.recorder" in line:
+                found["recorder"] = child
+        return found
+
+    def endpoint(self) -> str:
+        """The router's."""
+        line = self.children()["router"].cmdline()
+        return line[line.index("--listen") + 1]
+
+    def said(self) -> str:
+        self._errors.flush()
+        return Path(self._errors.name).read_text()
+
+    def until_said(self, pattern: str, limit_s: float = PATIENCE_S) -> None:
+        until(lambda: re.search(pattern, self.said()), f"{pattern!r} in {self.said()!r}", limit_s)
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def finish(self, limit_s: float = 60.0) -> tuple[int, str]:
+        """Exit code and standard output."""
+        assert self.process.stdout is not None
+        out, _ = self.process.communicate(timeout=limit_s)
+        self._errors.close()
+        return self.process.returncode, out
+
+
+def gone(processes: Sequence[psutil.Process]) -> bool:
+    """Whether none of them runs any more; a zombie that nobody reaps counts as gone."""
+    return not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in processes)

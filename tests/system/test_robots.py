@@ -1,0 +1,230 @@
+"""Robot processes started by hand: whom they hear, what they survive."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+import zenoh
+
+from agents import wire
+from experiments import document
+from experiments.links import parse_links
+from tests.conftest import RouterProcess
+from tests.system.lab import RobotProcess, Watcher
+
+pytestmark = pytest.mark.system
+
+TRIANGLE = ("KH01", "KH02", "CF01")
+
+
+@pytest.fixture
+def watcher(router: RouterProcess) -> Iterator[Watcher]:
+    made = Watcher(router.endpoint)
+    yield made
+    made.close()
+
+
+def fly(stack: ExitStack, router: RouterProcess, file: str, *names: str) -> RobotProcess:
+    robot = RobotProcess(router.endpoint, file, *names)
+    stack.callback(lambda: robot.process.returncode is not None or robot.end())
+    return robot
+
+
+def subscriptions(session: zenoh.Session) -> dict[str, set[str]]:
+    """What each session subscribes to, by the names that it goes by in the router's admin space."""
+    found: dict[str, set[str]] = {}
+    for reply in session.get("@/*/router/subscriber/**", timeout=2.0):
+        assert reply.ok is not None
+        key = str(reply.ok.key_expr).partition("/subscriber/")[2]
+        sources = json.loads(reply.ok.payload.to_string())
+        for zid in {z for group in sources.values() for z in group}:
+            found.setdefault(zid, set()).add(key)
+    return found
+
+
+def zids(session: zenoh.Session) -> dict[str, str]:
+    """Name of a session -> its id, from each session's own admin space."""
+    named = {}
+    for reply in session.get("@/*/client", timeout=2.0):
+        if reply.ok is not None:
+            about = json.loads(reply.ok.payload.to_string())
+            named[about["metadata"]["name"]] = about["zid"]
+    return named
+
+
+def test_each_robot_hears_exactly_its_neighbours(router: RouterProcess, watcher: Watcher) -> None:
+    experiment = document.read("robotic-park").experiment
+    wanted = {
+        name: {s for listener, s, _, _ in parse_links(experiment) if listener == name} for name in experiment.robots
+    }
+    with ExitStack() as stack:
+        for name in experiment.robots:
+            fly(stack, router, "robotic-park", name)
+        watcher.until(
+            lambda: len(watcher.status) == 7 and all(s.phase == "ready" for s in watcher.status.values()), "all ready"
+        )
+        known = zids(watcher.session)
+        keys = subscriptions(watcher.session)
+        for name, neighbours in wanted.items():
+            poses = {key for key in keys.get(known[name], set()) if key.endswith("/pose") or "/pose/" in key}
+            plain = {key for key in poses if "@adv" not in key}
+            assert plain == {f"park/{neighbour}/pose" for neighbour in neighbours}, name
+            beyond = keys.get(known[name], set()) - poses
+            assert all("estop" in key or "@adv" in key for key in beyond), beyond
+
+
+def test_a_late_joiner_and_a_restarted_robot_hear_the_last_poses_at_once(
+    router: RouterProcess, watcher: Watcher
+) -> None:
+    with ExitStack() as stack:
+        fly(stack, router, "triangle", "KH01")
+        fly(stack, router, "triangle", "KH02")
+        for name in ("KH01", "KH02"):
+            watcher.until(lambda name=name: name in watcher.status, "it says something")
+            watcher.until(lambda name=name: watcher.status[name].missing == ["CF01"], "two hear each other")
+            assert (watcher.phase(name), watcher.status[name].reason) == ("idle", "never heard CF01")
+        late = fly(stack, router, "triangle", "CF01")
+        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
+        late.kill()
+        watcher.until(lambda: "CF01" not in watcher.alive, "the token is gone", 2.0)
+        watcher.until(lambda: watcher.status["KH01"].missing == ["CF01"], "its death is known")
+        before = watcher.status["CF01"].pid
+        again = fly(stack, router, "triangle", "CF01")
+        watcher.until(lambda: watcher.status["CF01"].pid not in (before,) and watcher.phase("CF01") == "ready", "back")
+        assert watcher.status["CF01"].heard >= 2
+        watcher.until(lambda: not watcher.status["KH01"].missing, "it is heard again")
+        assert again.process.poll() is None
+
+
+def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, watcher: Watcher) -> None:
+    with ExitStack() as stack:
+        fly(stack, router, "triangle", *TRIANGLE)
+        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
+        reply = watcher.order("CF01", wire.Order("start", at=time.time()))
+        assert (reply.ok, reply.reason) == (False, "cannot start while ready")
+        assert watcher.order("CF01", wire.Order("hold")).reason == "cannot hold while ready"
+        assert "needs `at`" in watcher.order("CF01", wire.Order("start")).reason
+        assert watcher.order("CF01", wire.Order("get", name="clamp")).value == pytest.approx(0.1)
+        assert watcher.order("CF01", wire.Order("set", name="clamp", value=0.05)).value == pytest.approx(0.05)
+        assert "known: clamp" in watcher.order("CF01", wire.Order("set", name="clmp", value=1.0)).reason
+        assert not watcher.order("CF01", wire.Order("set", name="trigger.period_s", value=0.0)).ok
+        assert watcher.order("nobody", wire.Order("land")).reason == "no answer"
+        for name in TRIANGLE:
+            assert watcher.order(name, wire.Order("takeoff")).ok
+        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in TRIANGLE), "all are up")
+        for name in TRIANGLE:
+            assert watcher.order(name, wire.Order("start", at=time.time() + 0.2)).ok
+        watcher.until(lambda: all(watcher.phase(name) == "running" for name in TRIANGLE), "all run")
+        assert watcher.order("CF01", wire.Order("hold")).ok
+        for name in TRIANGLE:
+            assert watcher.order(name, wire.Order("land")).ok
+        watcher.until(lambda: all(watcher.phase(name) == "done" for name in TRIANGLE), "all are down")
+
+
+def test_an_emergency_stop_cuts_all_motors(router: RouterProcess, watcher: Watcher) -> None:
+    with ExitStack() as stack:
+        fly(stack, router, "triangle", *TRIANGLE)
+        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
+        watcher.order("CF01", wire.Order("takeoff"))
+        watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
+        stop = wire.Stop("a test", "to see it fall")
+        watcher.session.put(watcher.keys.estop, wire.encode(stop), encoding=wire.JSON)
+        watcher.until(lambda: watcher.phase("CF01") == "done", "motors off", 2.0)
+        assert watcher.status["CF01"].reason == "emergency stop by a test: to see it fall"
+        watcher.until(lambda: watcher.state["CF01"].position[2] < 0.03, "it fell", 2.0)
+
+
+def nonsense() -> list[tuple[bytes, str]]:
+    honest = wire.Pose("KH02", 10**6, time.time(), (0.1, 0.1, 0.0), (0.0, 0.0, 0.0), 0.0)
+
+    def changed(**fields: object) -> bytes:
+        return wire.encode(
+            wire.Pose(**{**{f: getattr(honest, f) for f in honest.__struct_fields__}, **fields}), "msgpack"
+        )  # type: ignore[arg-type]
+
+    return [
+        (b"", wire.JSON),
+        (os.urandom(200), wire.JSON),
+        (os.urandom(200), wire.MSGPACK),
+        (b"[" * 50_000, wire.JSON),
+        (b'{"robot": 7}', wire.JSON),
+        (b'{"order": "dance"}', wire.JSON),
+        (b'"text"', wire.JSON),
+        (b"x" * 100_000, wire.JSON),
+        (b"\xff\xfe", "text/plain"),
+        (changed(position=(math.nan, 0.0, 0.0)), wire.MSGPACK),
+        (changed(position=(math.inf, 0.0, 0.0)), wire.MSGPACK),
+        (changed(position=(1e6, 0.0, 0.0)), wire.MSGPACK),
+        (changed(velocity=(math.nan, 0.0, 0.0)), wire.MSGPACK),
+        (changed(velocity=(1e9, 0.0, 0.0)), wire.MSGPACK),
+        (changed(yaw=math.nan), wire.MSGPACK),
+        (changed(stamp=math.nan), wire.MSGPACK),
+        (changed(stamp=1e300), wire.MSGPACK),
+        (changed(stamp=time.time() + 3600.0), wire.MSGPACK),
+        (changed(seq=-1), wire.MSGPACK),
+        (changed(robot="CF01"), wire.MSGPACK),
+    ]
+
+
+def test_nonsense_on_every_key_is_counted_and_moves_nobody(router: RouterProcess, watcher: Watcher) -> None:
+    with ExitStack() as stack:
+        fly(stack, router, "triangle", *TRIANGLE)
+        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
+        for name in TRIANGLE:
+            watcher.order(name, wire.Order("takeoff"))
+        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in TRIANGLE), "all are up")
+        expected = 0
+        for payload, mime in nonsense():
+            for key in (watcher.keys.pose("KH02"), watcher.keys.estop):
+                watcher.session.put(key, payload, encoding=mime)
+                expected += 1
+            for key in (watcher.keys.state("KH02"), watcher.keys.alive("KH02"), watcher.keys.event):
+                watcher.session.put(key, payload, encoding=mime)
+            for reply in watcher.session.get(watcher.keys.order("CF01"), payload=payload, encoding=mime, timeout=2.0):
+                assert reply.err is not None
+            expected += 1
+        watcher.session.put("park/*/pose", b"{}", encoding=wire.JSON)
+        watcher.session.delete(watcher.keys.pose("KH02"))
+        watcher.session.delete(watcher.keys.estop)
+        watcher.until(lambda: watcher.status["CF01"].malformed >= expected, f"{expected} are counted")
+        assert {watcher.phase(name) for name in TRIANGLE} == {"airborne"}
+        state = watcher.state["CF01"]
+        assert state.position[2] == pytest.approx(0.6, abs=0.05)
+        assert math.dist(state.position[:2], state.goal[:2] if state.goal else (9.0, 9.0)) < 0.1
+
+
+def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher: Watcher) -> None:
+    with ExitStack() as stack:
+        robot = RobotProcess(router.endpoint, "triangle", *TRIANGLE, lifeline=True)
+        stack.callback(lambda: robot.process.returncode is not None or robot.end())
+        assert robot.process.stdin is not None
+        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready", 2.9)
+        robot.process.stdin.write("\n")
+        robot.process.stdin.flush()
+        watcher.order("CF01", wire.Order("takeoff"))
+        watcher.until(
+            lambda: watcher.status["CF01"].reason.startswith("nothing from the starter"), "silence is noticed"
+        )
+        assert robot.wait() == 0
+        watcher.look()
+        assert watcher.phase("CF01") == "done"
+        assert watcher.state["CF01"].position[2] < 0.03
+
+
+def test_what_a_user_can_mend_is_said_without_a_traceback(router: RouterProcess) -> None:
+    for arguments, words in (
+        (("triangle", "KH9"), "no robot 'KH9' in this experiment"),
+        (("trangle", "KH01"), "did you mean 'triangle'"),
+        (("triangle", "KH01", "--case", "evnt"), "no case 'evnt'"),
+    ):
+        robot = RobotProcess(router.endpoint, *arguments)
+        out, _ = robot.process.communicate(timeout=20.0)
+        assert robot.process.returncode == 2
+        assert words in out
+        assert "Traceback" not in out

@@ -1,0 +1,180 @@
+"""A whole run in real time, through the command line."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from experiments import playback
+from experiments.recover import recover
+from tests.system.lab import Flight, Watcher, gone, until
+
+pytestmark = pytest.mark.system
+
+SHORT = ("--set", "duration_s=5")
+
+
+def typed(file: Path, topic: str) -> list[Any]:
+    """Messages of a topic, as another library decodes them from the schema in the file."""
+    with file.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return [message for *_, message in reader.iter_decoded_messages([topic])]
+
+
+def test_a_run_forms_up_loses_nothing_and_reports(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    flight = Flight(folder, "triangle", "--json", *SHORT)
+    code, out = flight.finish(90.0)
+    assert code == 0, flight.said
+    document = json.loads(out)
+    assert document["run"] == str(folder)
+    assert list(document["cases"]) == ["periodic", "event"]
+    for case in document["cases"].values():
+        for robot in case["robots"].values():
+            assert robot["lost"] == 0
+            assert set(robot) == {
+                "f_hz",
+                "messages",
+                "bytes",
+                "iae",
+                "itae",
+                "rmse",
+                "acquired_s",
+                "lost",
+                "missed_deadlines",
+            }
+            assert robot["acquired_s"] is not None
+    assert document["cases"]["periodic"]["mean"]["f_hz"] == pytest.approx(50.0, rel=0.02)
+    assert document["cases"]["event"]["ratio"]["f_hz"] < 0.3
+    for name in ("report.html", "metrics.json", "metrics.csv", "experiment.toml"):
+        assert (folder / name).stat().st_size > 100
+
+    for case in ("periodic", "event"):
+        read = playback.read(folder / f"{case}.mcap")
+        assert read.complete
+        assert not read.trace.lost.any()
+        finite = np.isfinite(read.trace.true_position).all(axis=(1, 2))
+        assert finite.mean() > 0.99
+
+
+def test_a_recording_opens_elsewhere_with_typed_messages(tmp_path: Path) -> None:
+    flight = Flight(tmp_path / "run", "triangle", "--case", "event", "--no-report", "--set", "duration_s=2")
+    assert flight.finish()[0] == 0
+    file = tmp_path / "run" / "event.mcap"
+    with AnyReader([file]) as bag:
+        types = {connection.topic: connection.msgtype for connection in bag.connections}
+        assert types["/CF01/true_pose"] == "geometry_msgs/msg/PoseStamped"
+        connection = next(c for c in bag.connections if c.topic == "/CF01/state")
+        heights = [
+            bag.deserialize(raw, connection.msgtype).true_position[2] for _, _, raw in bag.messages([connection])
+        ]
+    assert max(heights) == pytest.approx(0.6, abs=0.05)
+    poses = typed(file, "/KH01/true_pose")
+    assert poses[0].header.frame_id == "park"
+    assert abs(poses[-1].pose.position.x) < 2.0
+    with file.open("rb") as stream:
+        reader = make_reader(stream)
+        names = [attachment.name for attachment in reader.iter_attachments()]
+    assert {"experiment.toml", "experiment.json"} <= set(names)
+
+
+def test_ctrl_c_lands_everybody_and_leaves_a_valid_recording(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    flight = Flight(folder, "triangle", "--case", "event")
+    flight.until_said(r"phase conductor: formation")
+    robots = list(flight.children().values())
+    flight.signal(signal.SIGINT)
+    code, _ = flight.finish()
+    assert code == 130
+    assert gone(robots)
+    read = playback.read(folder / "event.mcap")
+    assert read.complete
+    with (folder / "event.mcap").open("rb") as stream:
+        assert make_reader(stream).get_summary() is not None
+    assert typed(folder / "event.mcap", "/CF01/status")[-1].phase == "done"
+
+
+def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    flight = Flight(folder, "triangle", "--case", "event", "--json", *SHORT)
+    flight.until_said(r"phase conductor: formation")
+    everyone = list(flight.children().values())
+    flight.children()["KH02"].kill()
+    flight.until_said(r"lost KH02: its process ended \(killed by SIGKILL\)", 3.0)
+    code, out = flight.finish()
+    assert code == 0
+    assert gone(everyone)
+    robots = json.loads(out)["cases"]["event"]["robots"]
+    assert robots["CF01"]["messages"] > 0
+    read = playback.read(folder / "event.mcap")
+    assert read.complete
+    end = {event.source: event.text for event in read.trace.events if event.kind == "robot"}
+    assert end["CF01"] == "done: finished"
+    assert end["KH01"] == "done: finished"
+    assert list(typed(folder / "event.mcap", "/KH01/status")[-1].missing) == ["KH02"]
+
+
+def test_a_killed_router_comes_back_and_the_formation_holds(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    flight = Flight(folder, "triangle", "--case", "event", "--json", "--set", "duration_s=8")
+    flight.until_said(r"phase conductor: formation")
+    everyone = list(flight.children().values())
+    flight.children()["router"].kill()
+    flight.until_said(r"the router ended \(killed by SIGKILL\); started again", 3.0)
+    code, _ = flight.finish()
+    assert code == 0
+    assert gone(everyone)
+    read = playback.read(folder / "event.mcap")
+    assert read.complete
+    trace = read.trace
+    late = trace.time > 7.0
+    p = trace.true_position[late]
+    sides = [np.linalg.norm(p[:, i] - p[:, j], axis=1) for i, j in ((0, 1), (0, 2), (1, 2))]
+    wanted = trace.experiment.formation.links.values()
+    for side, link in zip(sides, wanted, strict=True):
+        target = link if isinstance(link, float) else link.distance
+        assert np.abs(side - target).mean() < 0.05
+
+
+def test_a_killed_conductor_leaves_no_orphan_and_a_recording_that_opens(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    flight = Flight(folder, "triangle", "--case", "event")
+    flight.until_said(r"phase conductor: formation")
+    everyone = list(flight.children().values())
+    watcher = Watcher(flight.endpoint())
+    try:
+        watcher.until(lambda: {watcher.phase(n) for n in ("KH01", "KH02", "CF01")} == {"running"}, "all running")
+        flight.signal(signal.SIGKILL)
+        flight.finish()
+        watcher.until(lambda: {watcher.phase(n) for n in ("KH01", "KH02", "CF01")} == {"done"}, "all down")
+        assert watcher.status["CF01"].reason == "the starter is gone"
+        assert watcher.state["CF01"].true_position is not None
+        assert watcher.state["CF01"].true_position[2] == 0.0
+    finally:
+        watcher.close()
+    until(lambda: gone(everyone), "no orphan")
+    read = playback.read(folder / "event.mcap")
+    assert read.complete
+    assert len(read.trace.time) > 10
+
+
+def test_a_killed_recorder_costs_the_rest_of_the_recording_only(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    flight = Flight(folder, "triangle", "--case", "event", "--json", *SHORT)
+    flight.until_said(r"event: +\d+\.\d s, formation")
+    flight.children()["recorder"].kill()
+    code, out = flight.finish()
+    assert code == 0
+    assert json.loads(out)["cases"]["event"]["robots"]["CF01"]["messages"] > 0
+    assert not playback.read(folder / "event.mcap").complete
+    found = recover(folder / "event.mcap", tmp_path / "mended.mcap")
+    assert set(found.robots) == {"KH01", "KH02", "CF01"}
+    assert playback.read(tmp_path / "mended.mcap").complete

@@ -1,0 +1,197 @@
+"""What this machine can do: each figure with a ratio to a baseline that was measured in the same run.
+
+Machines are noisy and differ: a figure alone says little. CPU times are medians; the unit of work is a loop of small
+numpy operations, the kind of work that a tick is made of.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+REPEATS: Final = 5
+FLIGHT_S: Final = 20.0
+
+
+class Figure(msgspec.Struct, frozen=True):
+    """One measured figure, and its ratio to a baseline of the same run."""
+
+    benchmark: str
+    name: str
+    value: float
+    unit: str
+    ratio: float
+    baseline: str
+
+
+def unit_of_work() -> float:
+    """CPU time [s] of 10,000 small numpy operations: the yardstick."""
+    import numpy as np  # noqa: PLC0415
+
+    a, b = np.ones((7, 3)), np.full((7, 3), 0.5)
+    begin = time.process_time()
+    for _ in range(5000):
+        b = np.maximum(a - b, 0.1)
+    return time.process_time() - begin
+
+
+def _cpu(work: Callable[[], object], repeats: int = REPEATS) -> float:
+    """Median CPU time of a piece of work [s]."""
+    taken = []
+    for _ in range(repeats):
+        begin = time.process_time()
+        work()
+        taken.append(time.process_time() - begin)
+    return statistics.median(taken)
+
+
+def virtual() -> Iterator[Figure]:
+    """The reference experiment in virtual time, with and without a recording."""
+    from experiments.run import load, simulate, simulate_seeds  # noqa: PLC0415
+
+    read = load("robotic-park")
+    span = read.experiment.duration_s
+    yardstick = _cpu(unit_of_work)
+    yield Figure("virtual", "10,000 numpy operations", yardstick, "s CPU", 1.0, "yardstick")
+    for case in read.cases():
+        simulate(read, cases=[case])  # warm up
+        taken = _cpu(lambda case=case: simulate(read, cases=[case]))  # type: ignore[misc]
+        yield Figure("virtual", f"{case}, {span:g} s", taken, "s CPU", span / taken, "× real time")
+
+        def recorded(case: str = case) -> None:
+            with tempfile.TemporaryDirectory() as folder:
+                simulate(read, cases=[case], folder=Path(folder))
+
+        taken = _cpu(recorded)
+        yield Figure("virtual", f"{case}, {span:g} s, recorded", taken, "s CPU", span / taken, "× real time")
+    seeds = 20
+    taken = _cpu(lambda: simulate_seeds(read, range(seeds), cases=["event"]), 1)
+    yield Figure("virtual", f"event, {seeds} seeds side by side", taken, "s CPU", seeds * span / taken, "× real time")
+
+
+def codec() -> Iterator[Figure]:
+    """A pose on the wire."""
+    from agents import wire  # noqa: PLC0415
+
+    count = 20_000
+    pose = wire.pose("CF01", 123456, 1.7e9 + 0.123456, [0.123456, -0.5, 0.8], [0.01, 0.02, 0.0], 0.1)
+    encodings: tuple[wire.Encoding, ...] = ("json", "msgpack")
+    first = 0.0
+    for encoding in encodings:
+        payload = wire.encode(pose, encoding)
+        mime = wire.MIME[encoding]
+
+        def both(encoding: wire.Encoding = encoding, payload: bytes = payload, mime: str = mime) -> None:
+            for _ in range(count):
+                wire.encode(pose, encoding)
+                wire.decode(payload, mime, wire.Pose)
+
+        taken = _cpu(both) / count * 1e6
+        first = first or taken
+        yield Figure(
+            "codec", f"pose out and in, {encoding} ({len(payload)} B)", taken, "µs CPU", taken / first, "× JSON"
+        )
+
+
+def process() -> Iterator[Figure]:
+    """Robot processes of the reference experiment in flight: CPU, memory, punctuality, time until all are ready."""
+    from agents import wire  # noqa: PLC0415
+    from agents.session import free_endpoint  # noqa: PLC0415
+    from experiments import document  # noqa: PLC0415
+    from experiments.conductor import Conductor, Progress, start_router  # noqa: PLC0415
+    from experiments.launcher import Launcher  # noqa: PLC0415
+    from experiments.run import SOURCE, load  # noqa: PLC0415
+
+    read = load("robotic-park", f"duration_s={FLIGHT_S}", "timeline=[]", "trigger.period_s=0.02")
+    first: dict[str, wire.Status] = {}
+    last: dict[str, wire.Status] = {}
+
+    def look(progress: Progress) -> None:
+        for name, seen in progress.robots.items():
+            if seen.status is not None and seen.status.phase == "running":
+                first.setdefault(name, seen.status)
+                last[name] = seen.status
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / SOURCE).write_text(read.text, encoding="utf-8")
+        file = folder / "periodic.json"
+        experiment = read.cases()["periodic"]
+        file.write_bytes(document.write_json(experiment))
+        with Launcher(folder / "logs") as launcher:
+            endpoints = [free_endpoint()]
+            start_router(launcher, endpoints)
+            result = Conductor(
+                experiment,
+                "periodic",
+                file=file,
+                source=folder / SOURCE,
+                folder=folder,
+                endpoints=endpoints,
+                launcher=launcher,
+                show=look,
+                interrupted=lambda: False,
+            ).run()
+    assert result.ready_s is not None
+    yield Figure("process", "seven robots ready after", result.ready_s, "s", result.ready_s / 3.0, "× 3 s")
+    shares = [(last[n].cpu_s - first[n].cpu_s) / (last[n].stamp - first[n].stamp) for n in last]
+    share = 100.0 * statistics.median(shares)
+    yield Figure("process", "CPU of a robot (50 Hz pose, 100 Hz body)", share, "% of a core", share / 5.0, "× 5 %")
+    memory = max(status.rss_mb for status in last.values())
+    yield Figure("process", "largest resident memory of a robot", memory, "MB", memory / 60.0, "× 60 MB")
+    missed = 100.0 * sum(s.missed for s in last.values()) / sum(s.ticks for s in last.values())
+    yield Figure("process", "missed deadlines", missed, "%", missed / 1.0, "× 1 %")
+
+
+def start() -> Iterator[Figure]:
+    """How long a command takes to answer."""
+
+    def wall(*arguments: str) -> float:
+        taken = []
+        for _ in range(REPEATS):
+            begin = time.monotonic()
+            subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
+            taken.append(time.monotonic() - begin)
+        return 1e3 * statistics.median(taken)
+
+    bare = wall("-c", "pass")
+    yield Figure("start", "python that does nothing", bare, "ms", 1.0, "yardstick")
+    answer = wall("-m", "tools.guard", "--help")
+    yield Figure("start", "zenpark --help", answer, "ms", answer / bare, "× bare python")
+
+
+BENCHMARKS: Final[dict[str, Callable[[], Iterator[Figure]]]] = {
+    "start": start,
+    "codec": codec,
+    "virtual": virtual,
+    "process": process,
+}
+
+
+def command(names: Sequence[str], *, as_json: bool) -> int:
+    """`zenpark bench`: all benchmarks, or those named."""
+    unknown = [name for name in names if name not in BENCHMARKS]
+    if unknown:
+        print(f"zenpark: no benchmark '{unknown[0]}'; there are: {', '.join(BENCHMARKS)}", file=sys.stderr)
+        return 2
+    figures = []
+    for name in names or BENCHMARKS:
+        for figure in BENCHMARKS[name]():
+            figures.append(figure)
+            if not as_json:
+                value = f"{figure.value:10.3g} {figure.unit:<12}"
+                print(
+                    f"{figure.benchmark:<8} {figure.name:<42} {value} {figure.ratio:8.3g} {figure.baseline}", flush=True
+                )
+    if as_json:
+        print(json.dumps(msgspec.to_builtins(figures)))
+    return 0
