@@ -46,7 +46,7 @@ class Duties:
 
 
 class Lifecycle:
-    """Phases of N rows; `moved` says whether any changed on the last tick."""
+    """Phases of N rows; `moved` says whether any changed on the last tick, or by an order since the one before."""
 
     def __init__(self, flies: Mask, hover: Array, duration: float) -> None:
         """Rows that fly (N,), the heights that they hold (N,) [m], and how long the experiment is [s]."""
@@ -55,6 +55,7 @@ class Lifecycle:
         self.start_at = np.full(rows, np.inf)
         self.reason = [""] * rows
         self.moved = False
+        self._before = self.phase.tobytes()
         self._flies, self._hover, self._duration = flies, hover, duration
         self._climbing = np.zeros(rows, dtype=bool)
         self._due: dict[str, list[int]] = {"takeoff": [], "land": [], "stop": []}
@@ -135,7 +136,6 @@ class Lifecycle:
             self.moved = False
             return None
         phase = self.phase
-        before = phase.tobytes()
         lowest, highest = phase.min(), phase.max()
         if lowest == IDLE:
             for row in np.flatnonzero((phase == IDLE) & ready):
@@ -158,7 +158,8 @@ class Lifecycle:
             down = (phase == LANDING) & np.where(self._flies, ~flying, slow)
             down[self._due["land"]] = False  # the body has not been told yet
             phase[down] = DONE
-        self.moved = before != phase.tobytes()
+        now = phase.tobytes()
+        self.moved, self._before = now != self._before, now  # orders between ticks count as well
         if (phase == RUNNING).all():
             self._settled_until = float(self.start_at.min()) + self._duration - 1e-6
         return self._duties()

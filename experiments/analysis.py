@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from agents.agent import Assignment
-from agents.graph import Rigidity, components
+from agents.graph import Rigidity, components, edges
 from agents.planning import Planner
 from agents.rows import Array, Index, Mask
 from experiments import assign
@@ -29,7 +29,7 @@ from experiments.links import pairs
 from experiments.locate import Path
 from experiments.prediction import Prediction, closed, predict
 
-GUESSES: Final = 10  # random places from which a shape is sought
+GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,11 @@ class Analysis:
     @property
     def names(self) -> tuple[str, ...]:
         return self.assignment.names
+
+    @property
+    def edges(self) -> int:
+        """How many pairs are linked, directions ignored."""
+        return len(edges(self.assignment.links))
 
     @property
     def speed(self) -> Array:
@@ -188,7 +193,7 @@ def _shapes(
             flipped[:, :2] += (end[anchor] - flipped[anchor]).mean(axis=0)[:2]
             yield _rest(flipped, end, moves)
         yield _rest(aloft, end, moves)
-        for _ in range(GUESSES):
+        for _ in range(min(10, GUESSES // rows)):
             place = rng.uniform(-0.5, 0.5, (rows, 2)) * experiment.arena.size[:2]
             yield _rest(np.column_stack([place, aloft[:, 2]]), end, moves)
 

@@ -107,13 +107,18 @@ def _command(file: str, *, virtual: bool, changes: Sequence[str], cases: Sequenc
 
 def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
     """Writes tables, figures and report of a run into its folder; returns the report."""
+    from experiments import drawing as figures  # noqa: PLC0415 - matplotlib takes 0.6 s
     from experiments import report as pages  # noqa: PLC0415
 
     every = [case for each in runs for case in each.metrics.values()]
     metrics.write_csv(folder / "metrics.csv", every)
     metrics.write_json(folder / "metrics.json", every)
     traces = [trace for each in runs for trace in each.traces.values()]
-    return pages.write(folder, traces, command=command, text=runs[0].source, measured=every)
+    for name, figure in runs[0].figures().items():
+        figures.save(figure, folder / "figures", name)
+    return pages.write(
+        folder, traces, command=command, text=runs[0].source, measured=every, notes=[n for each in runs for n in each.notes]
+    )
 
 
 def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> None:
@@ -127,7 +132,7 @@ def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> No
         acquired = "never" if mean["acquired_s"] is None else f"{mean['acquired_s']:.1f} s"
         line = f"{name:>12}: {_figure(mean['f_hz'])} messages/s, IAE {_figure(mean['iae'])}"
         line += f", RMSE {_figure(mean['rmse'])} m"
-        line += f", acquired {acquired}, lost {mean['lost']:g}"
+        line += f", acquired {acquired}, lost {sum(r['lost'] for r in case['robots'].values())}"
         if name != next(iter(summary["cases"])):
             line += f"   (ratios: f {_figure(ratio['f_hz'])}, IAE {_figure(ratio['iae'])})"
         print(line)

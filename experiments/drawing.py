@@ -42,7 +42,7 @@ KINDS: Final = {"turtlebot3": "#000000", "khepera4": "#009E73", "crazyflie": "#0
 MANY: Final = 8  # robots that have a colour each; more are coloured by kind
 BARS: Final = (("f_hz", "$f$", "Hz"), ("iae", "IAE", "m s"), ("itae", "ITAE", "m s$^2$"), ("rmse", "RMSE", "m"))
 
-STYLE: Final[Mapping[str, Any]] = {
+STYLE: Final[Mapping[Any, Any]] = {
     "font.family": "serif",
     "font.serif": ["STIXGeneral", "DejaVu Serif"],  # both come with matplotlib: the same picture on every machine
     "mathtext.fontset": "stix",
@@ -81,6 +81,8 @@ STYLE: Final[Mapping[str, Any]] = {
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Draws in the style of this project, whatever the style of the process is."""
+
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with mpl.rc_context(dict(STYLE)):
@@ -112,7 +114,13 @@ def panel_height(panels: int, wanted: float) -> float:
     return min(wanted, (TALLEST - 1.0) / panels)
 
 
+def plain(name: str) -> str:
+    """A name that matplotlib shows as it is: a dollar sign would begin a formula."""
+    return name.replace("$", r"\$")
+
+
 def thinned(trace: Trace, panels: int) -> slice:
+    """Every how many samples of a trace are drawn, given how many panels there are."""
     points = min(POINTS, ALL_POINTS // (panels * len(trace.robots)))
     return slice(None, None, max(1, math.ceil(len(trace.time) / max(points, 100))))
 
@@ -127,6 +135,7 @@ def robot_lines(trace: Trace) -> list[Line]:
 
 
 def robot_legend(figure: Figure, traces: Sequence[Trace]) -> None:
+    """Which robot, or which kind of robots, has which line."""
     trace = max(traces, key=lambda each: len(each.robots))
     label = trace.robots
     if len(label) > MANY:
@@ -136,11 +145,13 @@ def robot_legend(figure: Figure, traces: Sequence[Trace]) -> None:
 
 
 def legend_above(figure: Figure, entries: tuple[Sequence[Any], Sequence[str]], columns: int) -> None:
+    """A legend above all panels; nothing if there is nothing to tell apart."""
     if entries[1]:
         figure.legend(*entries, loc="outside upper center", ncols=min(columns, len(entries[1])))
 
 
 def name_ticks(axes: Axes, names: Sequence[str]) -> None:
+    """Robots along the x axis, upright if there are many."""
     crowded = len(names) > MANY
     axes.set_xticks(
         range(len(names)),
@@ -152,11 +163,13 @@ def name_ticks(axes: Axes, names: Sequence[str]) -> None:
 
 
 def time_axis(axes: Axes, traces: Sequence[Trace]) -> None:
+    """The x axis as time, as long as the longest trace."""
     axes.set_xlim(min(float(trace.time[0]) for trace in traces), max(float(trace.time[-1]) for trace in traces))
     axes.set_xlabel("$t$ [s]")
 
 
 def mark_phases(axes: Axes, trace: Trace) -> None:
+    """A dashed line at each leg of the timeline."""
     for start in phase_starts(trace)[1:]:
         axes.axvline(start, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=0.5)
 
@@ -178,10 +191,11 @@ def boxes(begin: Array, end: Array, row: int) -> Outline:
 
 def last_known(trace: Trace) -> Array:
     """Where each robot was last known to be (N, 3)."""
-    alive = np.isfinite(trace.true_position).all(axis=2)
+    alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
     last = len(alive) - 1 - alive[::-1].argmax(axis=0)
-    return trace.true_position[last, np.arange(len(trace.robots))]
+    return np.asarray(trace.true_position[last, np.arange(len(trace.robots))])
 
 
 def edges(listener: Iterable[Any], speaker: Iterable[Any]) -> list[tuple[int, int]]:
+    """Each pair of linked rows once."""
     return sorted({(min(i, j), max(i, j)) for i, j in zip(listener, speaker, strict=True)})

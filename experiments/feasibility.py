@@ -77,6 +77,7 @@ def unfolded(links: Links, height: Array) -> Array:
     for over in range(rows):
         way = np.minimum(way, way[:, over, None] + way[None, over, :])
     way[~np.isfinite(way)] = way[np.isfinite(way)].max()
+    way = np.minimum(way, 1e6)  # its square must be a number
     centring = np.eye(rows) - 1.0 / rows
     values, axes = np.linalg.eigh(-0.5 * centring @ way**2 @ centring)
     plane = axes[:, -2:] * np.sqrt(np.maximum(values[-2:], 0.0))
@@ -103,12 +104,13 @@ def _fitted(links: Links, guess: Array, rows: Index) -> Array:
         tried = position.copy()
         tried[rows, :2] += step
         then = _lengths(links, tried)
-        if then[0] @ then[0] < error @ error:
+        before, after = float(error @ error), float(then[0] @ then[0])
+        if after < before:
             position, damping = tried, max(damping / 10.0, 1e-10)
             error, offset, length = then
         else:
             damping *= 10.0
-        if damping > 1e9 or np.abs(error).max() < EXACT / 100 or np.abs(step).max() < 1e-12:
+        if damping > 1e9 or before < (EXACT / 100) ** 2 or 0.0 <= before - after < 1e-9 * before:
             break
     return position
 
@@ -229,7 +231,10 @@ def modes(law: Law, links: Links, position: Array, closed: Array, hz: float) -> 
     places = moved.reshape(-1, 3)
     offset = law.offset(places, places[many.speaker], many).reshape(2 * count, 3 * rows)[:, free]
     slope = -(offset[:count] - offset[count:]).T / (2.0 * STEP)
-    values = np.linalg.eigvals(np.repeat(closed[listeners], 2)[:, None] * slope)
+    taken = np.repeat(closed[listeners], 2)[:, None] * slope
+    if not np.isfinite(taken).all():
+        return Modes(math.inf, math.inf, math.inf)
+    values = np.linalg.eigvals(taken)
     moving = values[np.abs(values) > STANDING * np.abs(values).max(initial=0.0)]
     left = np.abs(1.0 - moving)
     decaying = left[left < 1.0]

@@ -40,6 +40,7 @@ from experiments.drawing import (
     merged,
     name_ticks,
     panel_height,
+    plain,
     robot_legend,
     robot_lines,
     save,
@@ -53,9 +54,28 @@ from experiments.signals import formation_errors, gaps, leaders, links_of, phase
 from experiments.trace import Trace
 
 __all__ = [
-    "errors", "events", "formation_after", "formation_before", "global_bars", "intervals", "plan_view", "robot_bars",
-    "save", "svg",
+    "errors", "events", "every", "formation_after", "formation_before", "global_bars", "intervals", "plan_view",
+    "robot_bars", "save", "svg",
 ]  # fmt: skip
+
+
+def every(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> dict[str, Figure]:
+    """All figures of a run by name, in the order of the paper; motions of the first seed.
+
+    Without a leg in the timeline there is no `formation_after`: it would show the same as `formation_before`.
+    """
+    first = list({trace.case: trace for trace in reversed(traces)}.values())[::-1]
+    figures = {
+        "global_bars": global_bars(cases),
+        "formation_before": formation_before(first),
+        "formation_after": formation_after(first) if any(len(phase_starts(trace)) > 1 for trace in first) else None,
+        "robot_bars": robot_bars(cases),
+        "errors": errors(first),
+        "events": events(first),
+        "intervals": intervals(first),
+        "plan_view": plan_view(first),
+    }
+    return {name: figure for name, figure in figures.items() if figure is not None}
 
 
 @styled
@@ -73,7 +93,7 @@ def global_bars(cases: Sequence[CaseMetrics]) -> Figure:
     for k, (name, runs) in enumerate(grouped.items()):
         found = [spread(ratios(runs, first, index)) for index, _, _ in BARS]
         x = np.arange(len(BARS)) + (k - 0.5 * (len(grouped) - 1)) * width
-        height, error = _bars(axes, x, found, width=width, k=k, label=name)
+        height, error = _bars(axes, x, found, width=width, k=k, label=plain(name))
         for at, top, more in zip(x, height, error, strict=True):
             if math.isfinite(top):
                 size = 6.0 if len(grouped) <= 3 else 5.0
@@ -91,7 +111,7 @@ def global_bars(cases: Sequence[CaseMetrics]) -> Figure:
                 tops.append(top + more)
     axes.set_xticks(np.arange(len(BARS)), [label for _, label, _ in BARS])
     axes.tick_params(axis="x", length=0)
-    axes.set_ylabel(f"relative to {next(iter(grouped), '')}")
+    axes.set_ylabel(f"relative to {plain(next(iter(grouped), ''))}")
     axes.set_ylim(0.0, 1.14 * max(tops))
     axes.grid(axis="y")
     legend_above(figure, axes.get_legend_handles_labels(), columns=3)
@@ -111,7 +131,7 @@ def robot_bars(cases: Sequence[CaseMetrics]) -> Figure:
         for k, (name, runs) in enumerate(grouped.items()):
             found = [spread([getattr(robot, index) for robot in _same(runs, who)]) for who in names]
             x = np.arange(len(names)) + (k - 0.5 * (len(grouped) - 1)) * width
-            _bars(axes, x, found, width=width, k=k, label=name)
+            _bars(axes, x, found, width=width, k=k, label=plain(name))
         axes.set_ylabel(f"{label} [{unit}]")
         axes.tick_params(axis="x", length=0)
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
@@ -146,7 +166,7 @@ def errors(traces: Sequence[Trace]) -> Figure:
         for i, line in enumerate(robot_lines(trace)):
             axes.plot(trace.time[few], error[few, i], **line)
         mark_phases(axes, trace)
-        axes.set_title(trace.case, loc="right", pad=2.0)
+        axes.set_title(plain(trace.case), loc="right", pad=2.0)
         axes.grid()
     time_axis(panels[-1], traces)
     panels[-1].set_ylim(bottom=0.0)
@@ -174,7 +194,7 @@ def events(traces: Sequence[Trace]) -> Figure:
         axes.set_yticks(range(0, len(trace.robots), every), trace.robots[::every], fontsize=6)
         axes.set_ylim(len(trace.robots) - 0.4, -0.6)
         axes.tick_params(axis="y", length=0)
-        axes.set_title(trace.case, loc="right", pad=2.0)
+        axes.set_title(plain(trace.case), loc="right", pad=2.0)
         axes.grid(axis="x")
     time_axis(panels[-1], traces)
     return figure
@@ -195,7 +215,7 @@ def intervals(traces: Sequence[Trace]) -> Figure:
         if waits:
             line: Line = {"color": colour, "linewidth": 1.5, "linestyle": ("-", "--", "-.", ":")[k % 4]}
             axes.plot(*_steps(np.concatenate(waits)), drawstyle="steps-post", **line)
-            handles.setdefault(trace.case, Line2D([], [], **line))
+            handles.setdefault(plain(trace.case), Line2D([], [], **line))
     axes.set_xscale("log")
     axes.xaxis.set_minor_formatter(NullFormatter())
     if handles:
@@ -234,7 +254,7 @@ def plan_view(traces: Sequence[Trace]) -> Figure:
         axes.set_aspect("equal")
         axes.set_xlim(-0.53 * x, 0.53 * x)
         axes.set_ylim(-0.53 * y, 0.53 * y)
-        axes.set_title(trace.case, pad=3.0)
+        axes.set_title(plain(trace.case), pad=3.0)
         axes.spines[["left", "bottom"]].set_visible(False)
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.yaxis.set_major_locator(MaxNLocator(5))
@@ -301,7 +321,7 @@ def _spatial(traces: Sequence[Trace], span: Callable[[Trace], tuple[float, float
         begin, end = np.searchsorted(trace.time, np.array(span(trace)) - 1e-9)
         _draw_spatial(axes, trace, trace.true_position[begin : max(end, begin + 2)], columns)
         if len(traces) > 1:
-            axes.text2D(0.06, 0.93, trace.case, transform=axes.transAxes, fontsize=8)
+            axes.text2D(0.06, 0.93, plain(trace.case), transform=axes.transAxes, fontsize=8)
     black, magenta = to_rgb(INK), to_rgb(MAGENTA)
     handles = [
         Line2D([], [], color=black, linewidth=0.7),

@@ -46,7 +46,7 @@ class Logbook:
     def trace(self) -> Trace:
         """The run from the common start on, as arrays."""
         log, mine, duration = self._log, self._mine, self._experiment.duration_s
-        run = self._within(log.time)
+        run = (log.time >= -ROUNDING_S) & (log.time <= duration + ROUNDING_S)
         sent = self._within(self._sent[0])
         time, row, seq, position, velocity, yaw = self._sent
         sizes = np.array([len(wire.encode(pose, self._encoding)) for pose in self._poses(sent)], dtype=np.intp)
@@ -123,7 +123,8 @@ class Logbook:
         return self._experiment.network.encoding
 
     def _within(self, time: Array) -> Mask:
-        return (time >= -ROUNDING_S) & (time <= self._experiment.duration_s + ROUNDING_S)
+        """The end belongs to the landing: 50 Hz for 45 s are 2250 messages."""
+        return (time >= -ROUNDING_S) & (time < self._experiment.duration_s - ROUNDING_S)
 
     def _poses(self, which: Mask) -> Iterator[wire.Pose]:
         names = self._log.names

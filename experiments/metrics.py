@@ -360,6 +360,7 @@ def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index:
 
 
 def by_case(cases: Sequence[CaseMetrics]) -> dict[str, list[CaseMetrics]]:
+    """Runs of the same case together, cases in the order of their first run."""
     grouped: dict[str, list[CaseMetrics]] = {}
     for case in cases:
         grouped.setdefault(case.case, []).append(case)

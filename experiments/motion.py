@@ -1,4 +1,4 @@
-"""What the expected motion says: does the formation come together, in time, inside the arena, and without a collision."""
+"""What the expected motion says: does the formation come together, in time, inside the arena, without collisions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from agents.planning import Planner
 from agents.rows import Array, Mask, norm
 from experiments.analysis import Analysis
-from experiments.claim import FORGIVEN, SHOWN, Claim
+from experiments.claim import FORGIVEN, Claim
 from experiments.prediction import approaches
 from experiments.theory import FAR_OFF, OFF
 
@@ -48,12 +48,13 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
     """Does the formation come together, and is it there at the end."""
     experiment, prediction, shape = analysis.experiment, analysis.prediction, analysis.shape
     end = float(prediction.time[-1])
-    if end < experiment.duration_s - 1e-6:
+    cut = end < experiment.duration_s - 1.0 / experiment.rates.coordination_hz
+    if cut:
         message = f"the motion is predicted for the first {end:g} s of {experiment.duration_s:g} s only"
         yield Claim("note", "predicted-in-part", message, "", ("duration_s",))
-    if shape is None or shape.worst > FAR_OFF:
-        return
     last = analysis.error[-1]
+    if shape is None or shape.worst > FAR_OFF or (cut and last.max() > experiment.tolerance):
+        return
     worst = int(last.argmax())
     left = f"{analysis.link(worst)} is {1e3 * last[worst]:.0f} mm off after {end:g} s"
     allowed = f"(tolerance {1e3 * experiment.tolerance:g} mm)"
@@ -109,16 +110,14 @@ def encounters(analysis: Analysis) -> Iterator[Claim]:
         if norm(start[each.first] - start[each.second]) >= radius[each.first] + radius[each.second] - FORGIVEN
     ]
     near.sort(key=lambda each: each.distance)
-    for number, each in enumerate(near[:SHOWN], 1):
+    for each in near:
         first, second = names[each.first], names[each.second]
         touch = radius[each.first] + radius[each.second]
         message = (
             f"{first} and {second} come within {each.distance:.2f} m at {each.time:.1f} s; they touch at {touch:.2f} m"
         )
-        if number == SHOWN < len(near):
-            message += f"; pairs beside these three: {len(near) - SHOWN}"
         yield Claim("warning", "too-close", message, "move the start of one of them", ("robots", second, "start"))
-    if analysis.prediction.time[-1] < analysis.experiment.duration_s - 1e-6:
+    if analysis.prediction.time[-1] < analysis.experiment.duration_s - 1.0 / analysis.experiment.rates.coordination_hz:
         return
     final = analysis.prediction.position[-1]
     for row in np.flatnonzero([kind.flies for kind in kinds]):

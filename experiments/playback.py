@@ -289,8 +289,9 @@ def _in_run(rows: list[tuple[float, ...]], shape: tuple[int, float, float]) -> A
     width, start, duration = shape
     table = np.array(rows, dtype=np.float64).reshape(-1, width)
     table[:, 0] -= start
-    table = table[(table[:, 0] >= -ROUNDING_S) & (table[:, 0] <= duration + ROUNDING_S)]
-    np.clip(table[:, 0], 0.0, duration, out=table[:, 0])
+    # the end belongs to the landing: 50 Hz for 45 s are 2250 messages
+    table = table[(table[:, 0] >= -ROUNDING_S) & (table[:, 0] < duration - ROUNDING_S)]
+    np.maximum(table[:, 0], 0.0, out=table[:, 0])
     return table[np.argsort(table[:, 0], kind="stable")]
 
 

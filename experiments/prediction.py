@@ -17,9 +17,10 @@ from agents.body import BodyState, Disturbance
 from agents.coordination import Law
 from agents.graph import Links
 from agents.kinds import Kind
-from agents.rows import Array, Index, norm
+from agents.rows import Array, Index, clamp, norm
 from agents.triggers import Periodic, Told, Trigger, View
 
+FAR = 1e6  # [m] walls that nobody meets
 DECISIONS = 6000  # as many are predicted: ten minutes at the usual rate
 QUESTIONS = 6000  # as often the trigger is asked
 PAIRS = 1_000_000  # distances that are held in memory at once
@@ -49,7 +50,7 @@ def predict(assignment: Assignment, start: Array, yaw: Array, leads: Index, hz: 
         hz: Decisions per second.
     """
     count = min(DECISIONS, max(1, round(assignment.duration * hz)))
-    limits = replace(assignment.limits, low=np.full(3, -np.inf), high=np.full(3, np.inf))
+    limits = replace(assignment.limits, low=np.full(3, -FAR), high=np.full(3, FAR))
     agent = Agent(
         replace(
             assignment,
@@ -74,6 +75,7 @@ def predict(assignment: Assignment, start: Array, yaw: Array, leads: Index, hz: 
         length = np.where(flies, np.abs(step), norm(step)[:, None])  # the limit of a flying robot holds for each axis
         position = position + step * np.minimum(1.0, speed / np.maximum(length, 1e-300))
         position[leads] = agent.goal[leads]
+        position = np.nan_to_num(clamp(position, -FAR, FAR), nan=FAR)  # what overflowed is out of sight as well
     track[count] = position
     return Prediction(np.arange(count + 1) / hz, track)
 

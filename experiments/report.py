@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,7 +27,7 @@ from experiments.report_tables import (
     whole_table,
 )
 from experiments.trace import Trace
-from experiments.verdict import findings, left_out
+from experiments.verdict import Finding, findings, left_out
 
 TEMPLATE: Final = "report.html.jinja"
 PROOF: Final = (
@@ -68,6 +68,7 @@ def write(
     date: str = "",
     name: str = "report.html",
     measured: Sequence[CaseMetrics] | None = None,
+    notes: Sequence[str] = (),
 ) -> Path:
     """Writes the report of one run.
 
@@ -80,6 +81,7 @@ def write(
         date: When the run was; now if left out.
         name: Of the file.
         measured: `measure` of each trace, if that was done already.
+        notes: What the reader should know besides: interrupted, damaged recording.
 
     Raises:
         ValueError: If there is no trace, or one of less than two samples.
@@ -126,7 +128,7 @@ def write(
         source=experiment.source,
         facts=facts,
         command=command,
-        cases=cases,
+        verdict=[*(Finding("fair", note) for note in notes), *findings(cases)],
         sections=sections,
     )
 
@@ -159,10 +161,7 @@ def compare(
     if not cases:
         raise ValueError("there is no run to compare")
     drawn = [figures.global_bars(cases), figures.robot_bars(cases)]
-    captions = (
-        f"Mean transmission rate and errors, relative to {cases[0].case}." + _interval_note(cases),
-        "Each robot; those in brackets are left out of the means." + _interval_note(cases),
-    )
+    captions = (_global_caption(cases), _robot_caption(cases))
     facts = [
         ("Date", date or f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
         ("Runs", ", ".join(name for name, _ in runs)),
@@ -178,7 +177,15 @@ def compare(
     ]
     target.parent.mkdir(parents=True, exist_ok=True)
     source = "; ".join(experiments)
-    return _render(target, title=title, source=source, facts=facts, command=command, cases=cases, sections=sections)
+    return _render(
+        target,
+        title=title,
+        source=source,
+        facts=facts,
+        command=command,
+        verdict=findings(cases),
+        sections=sections,
+    )
 
 
 def _render(
@@ -188,7 +195,7 @@ def _render(
     source: str,
     facts: Sequence[tuple[str, str]],
     command: str,
-    cases: Sequence[CaseMetrics],
+    verdict: Sequence[Finding],
     sections: Sequence[Section],
 ) -> Path:
     pages = Environment(
@@ -199,48 +206,36 @@ def _render(
         lstrip_blocks=True,
     )
     page = pages.get_template(TEMPLATE).render(
-        title=title, source=source, facts=facts, command=command, findings=findings(cases), sections=sections
+        title=title, source=source, facts=facts, command=command, findings=verdict, sections=sections
     )
     target.write_text(page, encoding="utf-8")
     return target
 
 
 def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Picture, ...]:
-    legs = len(cases[0].starts_s) > 1
-    reference = cases[0].case
+    legs = any(len(case.starts_s) > 1 for case in cases)
     seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
-    moved = "the first leg of the timeline" if legs else "the end"
-    plan: list[tuple[Callable[[], Figure], str]] = [
-        (
-            lambda: figures.global_bars(cases),
-            f"Mean transmission rate and errors, relative to {reference}." + _interval_note(cases),
-        ),
-        (
-            lambda: figures.formation_before(traces),
-            f"From the start to {moved}: links at the start thin, at the end magenta.{seed}",
-        ),
-        (
-            lambda: figures.formation_after(traces),
-            f"From the first leg of the timeline to the end: links at the start thin, at the end magenta.{seed}",
-        ),
-        (
-            lambda: figures.robot_bars(cases),
-            "Each robot; those in brackets are left out of the means." + _interval_note(cases),
-        ),
-        (
-            lambda: figures.errors(traces),
-            "Formation error of each robot" + ("; legs of the timeline dashed." if legs else ".") + seed,
-        ),
-        (lambda: figures.events(traces), f"When each robot transmitted.{seed}"),
-        (
-            lambda: figures.intervals(traces),
-            f"Share of the times between transmissions up to a length; single robots thin.{seed}",
-        ),
-        (lambda: figures.plan_view(traces), f"From above: start hollow, end full, links of the end grey.{seed}"),
-    ]
-    if not legs:
-        del plan[2]  # it would show the same as the one before
-    return _numbered((draw(), caption) for draw, caption in plan)
+    links = "links at the start thin, at the end magenta." + seed
+    captions = {
+        "global_bars": _global_caption(cases),
+        "formation_before": f"From the start to {'the first leg of the timeline' if legs else 'the end'}: {links}",
+        "formation_after": f"From the first leg of the timeline to the end: {links}",
+        "robot_bars": _robot_caption(cases),
+        "errors": f"Formation error of each robot{'; legs of the timeline dashed' if legs else ''}.{seed}",
+        "events": f"When each robot transmitted.{seed}",
+        "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
+        "plan_view": f"From above: start hollow, end full, links of the end grey.{seed}",
+    }
+    drawn = figures.every(cases, traces)
+    return _numbered((figure, captions[name]) for name, figure in drawn.items())
+
+
+def _global_caption(cases: Sequence[CaseMetrics]) -> str:
+    return f"Mean transmission rate and errors, relative to {cases[0].case}. {left_out(cases)}{_interval_note(cases)}"
+
+
+def _robot_caption(cases: Sequence[CaseMetrics]) -> str:
+    return f"Each robot; those in brackets are left out of the means.{_interval_note(cases)}"
 
 
 def _numbered(drawn: Iterable[tuple[Figure, str]]) -> tuple[Picture, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -76,19 +77,20 @@ class _Samples:
     """Rows of a log while it grows."""
 
     def __init__(self) -> None:
-        self._columns: list[tuple[object, ...]] = []
+        self._columns: list[tuple[Any, ...]] = []
 
-    def add(self, *values: object) -> None:
+    def add(self, *values: Array | Index | float) -> None:
         self._columns.append(values)
 
-    def stacked(self) -> tuple[Array, ...]:
+    def stacked(self) -> tuple[Any, ...]:
+        """As arrays with the samples as first axis."""
         return tuple(np.array(column) for column in zip(*self._columns, strict=True))
 
-    def joined(self, *empty: tuple[int, ...]) -> tuple[Array, ...]:
+    def joined(self, *empty: tuple[int, ...]) -> tuple[Any, ...]:
         """Concatenated; `empty` gives the shapes of columns when nothing was added."""
         if not self._columns:
             return tuple(np.zeros(shape) for shape in empty)
-        return tuple(np.concatenate(column) for column in zip(*self._columns, strict=True))  # type: ignore[arg-type]
+        return tuple(np.concatenate(column) for column in zip(*self._columns, strict=True))
 
 
 def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
@@ -134,24 +136,30 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
             states.add(t, agent.life.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
         if len(speak := actions.speak):
             seq[speak] += 1
-            sent.add(
-                np.full(len(speak), t), speak, seq[speak], state.position[speak], state.velocity[speak], state.yaw[speak]
-            )
+            said = (state.position[speak], state.velocity[speak], state.yaw[speak])
+            sent.add(np.full(len(speak), t), speak, seq[speak], *said)
             channel.send(t, speak, seq, state.position, state.velocity)
         conductor.look(t, dt)
         tick += 1
     begin = conductor.start_at
-    time, phase, *arrays = states.stacked()
-    said = sent.joined((0,), (0,), (0,), (0, 3), (0, 3), (0,))
-    got = heard.joined((0,), (0,), (0,), (0,), (0, 3))
+    time, phase, position, velocity, yaw, true_position, true_yaw, goal, setpoint, error = states.stacked()
+    at, row, number, *pose = sent.joined((0,), (0,), (0,), (0, 3), (0, 3), (0,))
+    arrival, link, told, stamp, place = heard.joined((0,), (0,), (0,), (0,), (0, 3))
     return Log(
-        names,
-        tuple(seeds),
-        time - begin,
-        phase.astype(np.intp),
-        *arrays,
-        sent=(said[0] - begin, said[1].astype(np.intp), said[2].astype(np.intp), *said[3:]),  # type: ignore[arg-type]
-        heard=(got[0] - begin, got[1].astype(np.intp), got[2].astype(np.intp), got[3] - begin, got[4]),
+        names=names,
+        seeds=tuple(seeds),
+        time=time - begin,
+        phase=phase.astype(np.intp),
+        position=position,
+        velocity=velocity,
+        yaw=yaw,
+        true_position=true_position,
+        true_yaw=true_yaw,
+        goal=goal,
+        setpoint=setpoint,
+        error=error,
+        sent=(at - begin, row.astype(np.intp), number.astype(np.intp), pose[0], pose[1], pose[2]),
+        heard=(arrival - begin, link.astype(np.intp), told.astype(np.intp), stamp - begin, place),
         lost=lost_after - lost_before,
         decisions=agent.decisions,
         interventions=interventions,
@@ -188,7 +196,8 @@ class _Conductor:
             if t - self._since > PATIENCE_S:
                 late = np.flatnonzero(phase < self._stage)[: len(self._names)]
                 names = ", ".join(sorted({self._names[row % len(self._names)] for row in late}))
-                raise Stuck(f"not {self._stage.word} after {PATIENCE_S:g} s: {names} ({self._agent.life.reason[late[0]]})")
+                reason = self._agent.life.reason[late[0]]
+                raise Stuck(f"not {self._stage.word} after {PATIENCE_S:g} s: {names} ({reason})")
             return
         self._since = t
         life = self._agent.life
@@ -199,8 +208,8 @@ class _Conductor:
         elif self._stage == Phase.AIRBORNE:
             self.airborne_at = t
             self.start_at = t + round(LEAD_S / dt) * dt
-            for row in np.flatnonzero(phase == Phase.AIRBORNE):
-                life.start(int(row), self.start_at)
+            for row in np.flatnonzero(phase == Phase.AIRBORNE).tolist():
+                life.start(row, self.start_at)
             self._stage = Phase.RUNNING
         else:
             self.over = True

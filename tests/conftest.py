@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import subprocess
 import sys
 import threading
@@ -15,14 +17,6 @@ import pytest
 from agents.session import free_endpoint
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Under xdist the system tests run one after the other: two routers and their robots on two cores only wait."""
-    for item in items:
-        if item.get_closest_marker("system") is not None:
-            item.add_marker(pytest.mark.xdist_group("system"))
 
 
 class RouterProcess:
@@ -83,7 +77,18 @@ def eventually() -> Callable[[Callable[[], object]], None]:
 
 
 @pytest.fixture(autouse=True)
-def no_orphans(request: pytest.FixtureRequest) -> Iterator[None]:
+def one_at_a_time(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """System tests of parallel workers wait for each other: their processes want the cores for themselves."""
+    if request.node.get_closest_marker("system") is None or "PYTEST_XDIST_WORKER" not in os.environ:
+        yield
+        return
+    with (tmp_path_factory.getbasetemp().parent / "system.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def no_orphans(request: pytest.FixtureRequest, one_at_a_time: None) -> Iterator[None]:
     """After a system test no process and no thread that it started is left."""
     if request.node.get_closest_marker("system") is None:
         yield

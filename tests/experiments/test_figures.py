@@ -101,6 +101,18 @@ def test_intervals_reach_one_at_the_longest():
     assert y[np.searchsorted(x, 0.5, side="right") - 1] == pytest.approx(2.0 / 3.0)
 
 
+def test_every_figure_of_the_first_seed():
+    traces = [park("a", seed=seed, duration=22.0) for seed in (2, 1)]
+    drawn = figures.every([measure(each) for each in traces], traces)
+    names = ["global_bars", "formation_before", "formation_after", "robot_bars", "errors", "events", "intervals"]
+    assert list(drawn) == [*names, "plan_view"]
+    line = drawn["errors"].axes[0].lines[1].get_ydata()
+    assert line[0] == formation_errors(traces[0])[0, 1]
+    assert len(drawn["errors"].axes) == 1
+    small = crowd(3, duration=1.0)
+    assert "formation_after" not in figures.every([measure(small)], [small])
+
+
 def test_links_go_from_black_to_magenta():
     known = park()
     axes = figures.formation_before([known]).axes[0]

@@ -77,7 +77,9 @@ def run():
 
 
 def test_report_of_a_run_stands_alone(tmp_path, run):
-    path = report.write(tmp_path / "new" / "run", run, command="zenpark run <this> --seed 1", date="2030-01-02")
+    path = report.write(
+        tmp_path / "new" / "run", run, command="zenpark run <this> --seed 1", date="2030-01-02", notes=["It rained."]
+    )
     page = checked(path.read_text(encoding="utf-8"))
     assert path == tmp_path / "new" / "run" / "report.html"
     assert page.ids.count("f1-figure_1") == page.ids.count("f8-figure_1") == 1
@@ -85,6 +87,7 @@ def test_report_of_a_run_stands_alone(tmp_path, run):
         "Robotic Park: six robots hold a rigid formation behind a leader",
         "Nobody, Nowhere 2020",
         "2030-01-02",
+        "It rained.",
         "zenpark run <this> --seed 1",
         "TB01 leads and is left out of the means.",
         "Nothing was lost: 17\u202f",
@@ -111,7 +114,7 @@ def test_report_without_legs_leaves_out_the_figure_after_the_leg(tmp_path):
 
 
 def test_markup_in_names_stays_text(tmp_path):
-    bad = '<script>alert("1")</script> & {{ 7 * 7 }}'
+    bad = '<script>alert("1")</script> & {{ 7 * 7 }} $\\frac$'
     what = dataclasses.replace(crowd(3, duration=2.0), events=(Event(1.0, bad, bad, bad),))
     what = dataclasses.replace(what, case=bad)
     page = checked(report.write(tmp_path, [what], command=bad, date=bad).read_text(encoding="utf-8"))

@@ -118,7 +118,7 @@ class Flight:
         self.folder = folder
         self._errors = (folder.parent / f"{folder.name}.stderr").open("w+")
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tools.cli", "run", file, "--out", str(folder), *arguments],
+            [sys.executable, "-m", "tools.guard", "run", file, "--out", str(folder), *arguments],
             cwd=ROOT,
             env=ENVIRONMENT,
             stdin=subprocess.DEVNULL,

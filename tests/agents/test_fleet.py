@@ -1,0 +1,115 @@
+"""Several bodies in one process look like one."""
+
+import numpy as np
+import pytest
+
+from agents import fleet, plugins
+from agents.body import BodyError, BodyRequest, BodyState, Disturbance
+from agents.fleet import Fleet, assemble
+from agents.kinds import CRAZYFLIE, KHEPERA4
+from twins.body import TwinBody
+
+
+class Recorded:
+    """A body that writes down what it is told; its state tells its rows apart."""
+
+    def __init__(self, label, rows, *, broken=False):
+        self.label, self.rows, self.broken, self.told = label, rows, broken, []
+
+    def open(self):
+        if self.broken:
+            raise BodyError("plug it in")
+        self.told.append("open")
+
+    def read(self, t):
+        own = self.label + np.arange(self.rows, dtype=float)
+        vector = np.repeat(own[:, None], 3, axis=1)
+        return BodyState(own + t, vector, -vector, own, vector, own, own, own > self.label)
+
+    def command(self, setpoint):
+        self.told.append(("command", setpoint[:, 0].tolist()))
+
+    def takeoff(self, rows, height):
+        self.told.append(("takeoff", rows.tolist(), height.tolist()))
+
+    def land(self, rows):
+        self.told.append(("land", rows.tolist()))
+
+    def stop(self, rows):
+        self.told.append(("stop", rows.tolist()))
+
+    def close(self):
+        self.told.append("close")
+
+
+def interleaved():
+    a, b = Recorded(10.0, 2), Recorded(20.0, 3)
+    return Fleet(5, [(np.array([1, 3]), a), (np.array([0, 2, 4]), b)]), a, b
+
+
+def test_states_are_put_where_their_rows_are():
+    both, _, _ = interleaved()
+    state = both.read(0.5)
+    assert state.yaw.tolist() == [20, 10, 21, 11, 22]
+    assert state.time.tolist() == [20.5, 10.5, 21.5, 11.5, 22.5]
+    assert state.position[:, 2].tolist() == [20, 10, 21, 11, 22]
+    assert state.flying.tolist() == [False, False, True, True, True]
+    assert state.flying.dtype == bool
+
+
+def test_each_body_is_told_what_concerns_its_rows():
+    both, a, b = interleaved()
+    both.open()
+    both.command(np.arange(20.0).reshape(5, 4))
+    both.takeoff(np.array([0, 3]), np.array([0.5, 0.7]))
+    both.land(np.array([4, 2]))
+    both.stop(np.array([1]))
+    both.close()
+    assert a.told == ["open", ("command", [4, 12]), ("takeoff", [1], [0.7]), ("stop", [0]), "close"]
+    assert b.told == ["open", ("command", [0, 8, 16]), ("takeoff", [0], [0.5]), ("land", [2, 1]), "close"]
+
+
+def test_when_one_cannot_be_opened_the_others_are_closed_again():
+    a, b, c = Recorded(0.0, 1), Recorded(1.0, 1, broken=True), Recorded(2.0, 1)
+    with pytest.raises(BodyError, match="plug it in"):
+        Fleet(3, [(np.array([k]), body) for k, body in enumerate((a, b, c))]).open()
+    assert (a.told, b.told, c.told) == (["open", "close"], [], [])
+
+
+def request(*addresses):
+    rows = len(addresses)
+    return BodyRequest(
+        tuple(f"R{k}" for k in range(rows)), (KHEPERA4, CRAZYFLIE, KHEPERA4)[:rows], addresses, np.zeros((rows, 3)),
+        np.zeros(rows), 100.0, tuple(range(rows)), (Disturbance(),) * rows,
+    )  # fmt: skip
+
+
+def test_addresses_choose_the_bodies(monkeypatch):
+    asked = []
+
+    def load(group, name):
+        def opened(part):
+            asked.append((group, name, part.names, part.addresses, part.seeds))
+            return Recorded(0.0, len(part.names))
+
+        return opened
+
+    monkeypatch.setattr(fleet.plugins, "load", load)
+    assemble(request("radio://0/80", "twin", "radio://0/81"))
+    assert asked == [
+        (plugins.BODIES, "radio", ("R0", "R2"), ("radio://0/80", "radio://0/81"), (0, 2)),
+        (plugins.BODIES, "twin", ("R1",), ("twin",), (1,)),
+    ]
+
+
+def test_twins_share_one_body():
+    both = assemble(request("twin", "twin", "twin"))
+    assert both.read(0.0).position.shape == (3, 3)
+    ((rows, body),) = both._parts
+    assert rows.tolist() == [0, 1, 2]
+    assert isinstance(body, TwinBody)
+
+
+def test_an_unknown_body_is_named():
+    with pytest.raises(plugins.UnknownPlugin, match="hovercraft"):
+        assemble(request("hovercraft://1"))

@@ -1,0 +1,184 @@
+"""What goes out comes back in both encodings, and whatever else comes in is `Malformed`, never anything worse."""
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents import wire
+from agents.wire import JSON, MSGPACK, Event, Heard, Malformed, Order, Pose, Reply, State, Status, Stop
+
+FEW = settings(max_examples=60, deadline=None)
+KINDS = (Pose, State, Status, Order, Reply, Stop, Event)
+ENCODINGS = ("json", "msgpack")
+
+number = st.floats(allow_nan=False, allow_infinity=False)
+vector = st.tuples(number, number, number)
+count = st.integers(0, 2**53)
+word = st.text(max_size=12)
+heard = st.builds(Heard, word, count, number, number, vector)
+messages = st.one_of(
+    st.builds(Pose, word, count, number, vector, vector, number),
+    st.builds(
+        State, word, count, number, word, vector, vector, number, st.none() | vector,
+        st.none() | st.tuples(number, number, number, number), number, st.none() | vector, st.none() | number,
+        st.lists(heard, max_size=3),
+    ),
+    st.builds(Order, st.sampled_from(["takeoff", "start", "hold", "land", "stop", "get", "set"]), st.none() | number),
+    st.builds(Reply, word, st.booleans(), word, word, st.none() | number),
+    st.builds(Stop, word, word),
+    st.builds(Event, number, word, word, word),
+)  # fmt: skip
+POSE = Pose("KH01", 3, 1000.0, (0.1, -0.2, 0.0), (0.01, 0.0, 0.0), 1.5)
+REACH = (2.0, 2.0, 3.5)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@FEW
+@given(messages)
+def test_round_trip(encoding, message):
+    payload = wire.encode(message, encoding)
+    assert wire.decode(payload, wire.MIME[encoding], type(message)) == message
+    assert wire.decode(payload, wire.MIME[encoding] + ";v=1", type(message)) == message
+
+
+def test_a_status_survives_both_encodings():
+    status = Status(
+        robot="CF01", stamp=1.5, phase="running", reason="", battery=None, sent=1, heard=2, lost={"KH01": 3}, malformed=0,
+        refused=0, ticks=5, missed=1, decisions=2, interventions=0, late_s=0.001, started=0.5, missing=["KH02"], pid=1,
+        cpu_s=0.1, rss_mb=60.0,
+    )  # fmt: skip
+    for encoding in ENCODINGS:
+        assert wire.decode(wire.encode(status, encoding), wire.MIME[encoding], Status) == status
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("mime", [JSON, MSGPACK])
+@FEW
+@given(payload=st.binary(max_size=200))
+def test_random_bytes_are_malformed(kind, mime, payload):
+    with pytest.raises(Malformed):
+        wire.decode(payload, mime, kind)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@FEW
+@given(messages, st.data())
+def test_a_message_that_was_cut_or_bitten_is_a_message_or_malformed(encoding, message, data):
+    payload = bytearray(wire.encode(message, encoding))
+    for _ in range(data.draw(st.integers(1, 4))):
+        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    cut = bytes(payload[: data.draw(st.integers(0, len(payload)))])
+    for kind in KINDS:
+        try:
+            assert isinstance(wire.decode(cut, wire.MIME[encoding], kind), kind)
+        except Malformed:
+            pass
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5) | st.binary(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@FEW
+@given(anything, st.sampled_from([f.encode_name for f in msgspec.structs.fields(Pose)]))
+def test_fields_of_other_types_are_malformed(value, field):
+    whole = msgspec.to_builtins(POSE)
+    payload = msgspec.msgpack.encode({**whole, field: value})
+    try:
+        pose = wire.decode(payload, MSGPACK, Pose)
+    except Malformed:
+        return
+    assert isinstance(value, int | float | str | list)
+    try:
+        wire.check_pose(pose, robot="KH01", now=1000.0, reach=REACH)
+    except Malformed:
+        return
+    assert all(math.isfinite(number) for number in (*pose.position, *pose.velocity, pose.yaw, pose.stamp))
+
+
+@pytest.mark.parametrize(
+    ("payload", "mime"),
+    [
+        (b"", JSON),
+        (b"[" * 60_000, JSON),
+        (b'{"robot":' * 6_000, JSON),
+        (b"\x91" * 60_000, MSGPACK),
+        (b"\xdf\xff\xff\xff\xff", MSGPACK),  # a table of four thousand million entries, it says
+        (b"\xdd\xff\xff\xff\xff" * 100, MSGPACK),
+        (b"\xdb\xff\xff\xff\xff", MSGPACK),
+        (b'{"robot":"KH01","seq":' + b"9" * 5_000 + b"}", JSON),
+        (b'{"robot":"KH01","seq":1,"stamp":1' + b"0" * 400 + b',"position":[0,0,0],"velocity":[0,0,0],"yaw":0}', JSON),
+        (b'{"robot":"KH01","seq":1e999}', JSON),
+        (b'{"robot":"\xff\xfe"}', JSON),
+        (b'{"robot":"\\ud800","seq":1,"stamp":1,"position":[0,0,0],"velocity":[0,0,0],"yaw":0}', JSON),
+        (b'{"robot":"KH01","seq":1,"stamp":NaN,"position":[0,0,0],"velocity":[0,0,0],"yaw":0}', JSON),
+        (b'{"robot":"KH01","seq":1,"stamp":1,"position":[0,0],"velocity":[0,0,0],"yaw":0}', JSON),
+        (b'{"robot":"KH01","seq":1,"stamp":1,"position":[0,0,0],"velocity":[0,0,0],"yaw":0,"more":1}', JSON),
+        (b'{"robot":"KH01","seq":true,"stamp":1,"position":[0,0,0],"velocity":[0,0,0],"yaw":0}', JSON),
+        (wire.encode(POSE) + b"{}", JSON),
+        (wire.encode(POSE, "msgpack") + b"\x00", MSGPACK),
+        (wire.encode(POSE), MSGPACK),
+        (wire.encode(POSE, "msgpack"), JSON),
+        (wire.encode(POSE), "text/plain"),
+        (wire.encode(POSE), ""),
+        (b" " * (wire.MAX_PAYLOAD + 1), JSON),
+    ],
+    ids=range(23),
+)
+def test_malformed(payload, mime):
+    with pytest.raises(Malformed):
+        wire.decode(payload, mime, Pose)
+
+
+def test_the_largest_honest_state_fits():
+    neighbours = [Heard(f"Robot{k:03}", 12345, 1.7e9 + k, 1.7e9 + k, (-0.123456, -1.234567, 0.123456)) for k in range(100)]
+    state = State(
+        "Robot000", 12345, 1.7e9, "running", (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 0.0, None, None, 0.0, heard=neighbours
+    )
+    payload = wire.encode(state)
+    assert len(payload) < wire.MAX_PAYLOAD / 3
+    assert wire.decode(payload, JSON, State).heard == neighbours
+
+
+def test_a_pose_is_rounded_to_what_sensors_know():
+    made = wire.pose("KH01", 7, 1.23456789, [1 / 3, -2 / 3, 0.0], [1e-9, 1.0, -1.0], 2.0000004)
+    assert made == Pose("KH01", 7, 1.234568, (0.333333, -0.666667, 0.0), (0.0, 1.0, -1.0), 2.0)
+
+
+def test_an_honest_pose_passes():
+    wire.check_pose(POSE, robot="KH01", now=1000.0, reach=REACH)
+    wire.check_pose(POSE, robot="KH01", now=1e9, reach=REACH)  # late joiners get old ones
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"robot": "KH02"}, "pose of 'KH02' on the key of 'KH01'"),
+        ({"seq": 0}, "sequence number 0"),
+        ({"seq": -1}, "sequence number -1"),
+        ({"seq": 2**53}, "sequence number"),
+        ({"stamp": 1006.0}, "stamp 1006.0"),
+        ({"stamp": 0.0}, "stamp 0.0"),
+        ({"stamp": math.nan}, "stamp nan"),
+        ({"stamp": math.inf}, "stamp inf"),
+        ({"position": (2.01, 0.0, 0.0)}, "outside the arena"),
+        ({"position": (0.0, -2.01, 0.0)}, "outside the arena"),
+        ({"position": (0.0, 0.0, 9.0)}, "outside the arena"),
+        ({"position": (0.0, math.nan, 0.0)}, "outside the arena"),
+        ({"position": (math.inf, 0.0, 0.0)}, "outside the arena"),
+        ({"velocity": (0.0, 0.0, 51.0)}, "velocity"),
+        ({"velocity": (0.0, math.nan, 0.0)}, "velocity"),
+        ({"yaw": math.nan}, "yaw nan"),
+        ({"yaw": 1e4}, "yaw"),
+    ],
+)
+def test_a_pose_that_no_robot_can_have(change, says):
+    pose = msgspec.structs.replace(POSE, **change)
+    with pytest.raises(Malformed, match=says):
+        wire.check_pose(pose, robot="KH01", now=1000.0, reach=REACH)

@@ -1,0 +1,347 @@
+"""`zenpark check`: the reference experiment, its neighbours, and experiments that cannot work, each with its code."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments import document
+from experiments.check import Figures, check, command, figures, schema_command
+from experiments.document import Document
+from experiments.experiment import Arena, Experiment, Formation, Leg, Robot
+from experiments.problem import DocumentError
+
+PARK, TRIANGLE = "robotic-park", "triangle"
+
+
+def of(experiment: Experiment) -> Document:
+    """As if it had been read from a file."""
+    return Document(Path("made.json"), document.write_json(experiment).decode(), experiment, {"default": experiment})
+
+
+def bad(name: str, *changes: str) -> dict[str, tuple[str, str, str, str]]:
+    """The first error or warning of each code: severity, message, remedy, place."""
+    said: dict[str, tuple[str, str, str, str]] = {}
+    for each in check(document.read(name, changes), changes):
+        if each.severity != "note":
+            said.setdefault(each.code, (each.severity, each.message, each.remedy, each.where))
+    return said
+
+
+# ------------------------------------------------------------------ experiments that work
+
+
+def test_numbers_of_the_reference():
+    found = figures(document.read(PARK).cases()["event"])
+    assert (found.robots, found.links, found.edges, found.parts) == (7, 21, 12, 1)
+    assert found.leaders == ("TB01",)
+    assert (found.rank, found.rank_needed) == (11, 11)
+    assert (found.rank_space, found.rank_space_needed) == (12, 15)
+    assert found.residual_mm == pytest.approx(0.0, abs=1e-3)
+    assert found.loop_gain == pytest.approx(0.61, abs=0.02)
+    assert found.slowest_mode_s is not None
+    assert 5.0 < found.slowest_mode_s < 40.0
+    assert found.speed_needed == 0.15
+    assert found.speed_available == pytest.approx(0.0952, abs=1e-4)
+    assert found.acquired_s is not None
+    assert 9.0 <= found.acquired_s <= 12.0  # as published
+    assert found.end["TB01"] == pytest.approx((0.15, 0.8, 0.0))
+    assert found.end_inside
+    assert 15.0 < found.messages_hz < 45.0  # 7 robots; published: 5.07 Hz for each follower
+    assert figures(document.read(PARK).cases()["periodic"]).messages_hz == pytest.approx(350.0)
+
+
+def test_the_reference_is_feasible_but_its_leader_is_quick():
+    found = bad(PARK)
+    assert found.keys() == {"followers-lag"}
+    severity, message, remedy, where = found["followers-lag"]
+    assert severity == "warning"
+    assert "0.095 m/s" in message
+    assert "0.15 m/s" in message
+    assert "clamp" in remedy
+    lines = document.catalogue_path(PARK).read_text("utf-8").splitlines()
+    (line,) = (number for number, line in enumerate(lines, 1) if line.startswith("plan = "))
+    assert where.endswith(f"robotic-park.toml:{line}:8")
+
+
+@pytest.mark.parametrize("name", ["triangle", "convoy"])
+def test_the_other_experiments_of_the_catalogue_have_nothing_against_them(name):
+    assert bad(name) == {}
+
+
+def test_notes_say_what_was_found():
+    notes = {each.code: each.message for each in check(document.read(PARK)) if each.severity == "note"}
+    assert {"connected", "realisable", "rigid", "stable", "starts", "acquired", "inside"} <= notes.keys()
+    assert "rank 11 of 11" in notes["rigid"]
+    assert "12 of 15, not needed" in notes["rigid"]
+
+
+# ------------------------------------------------------------------ experiments that do not
+
+
+def test_a_hover_above_the_limit_names_the_limit():
+    severity, message, remedy, where = bad(PARK, "robots.CF01.hover=0.81")["too-high"]
+    assert severity == "error"
+    assert message.startswith("CF01 is too high at 0.81 m for")
+    assert "TB01 - CF01 (0.86 m)" in message
+    assert "lower than 0.806 m" in remedy
+    assert where == "--set robots.CF01.hover=0.81"
+    assert "too-high" not in bad(PARK, "robots.CF01.hover=0.805")
+
+
+@pytest.mark.parametrize(
+    ("gain", "code"),
+    [(5.0, None), (8.0, "rings"), (10.0, "hunts")],  # in a run in virtual time, 8 settles, 10 hunts
+)
+def test_gains(gain, code):
+    found = bad(PARK, f"formation.gain={gain}")
+    assert found.keys() & {"rings", "hunts"} == ({code} if code else set())
+    if code:
+        assert found[code][0] == ("error" if code == "hunts" else "warning")
+        assert "below 5.9" in found[code][2]
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "expected", "message", "remedy"),
+    [
+        (PARK, 'formation.links."KH01 - KH03"=1.3', ("error", "no-triangle"), "KH01 - KH03 (1.3 m)", "shorten"),
+        (PARK, "robots.CF02.hover=0.9", ("error", "too-high"), "KH02 - CF02 (0.86 m)", "0.860 m"),
+        (PARK, "timeline.0.plan.speed=0.3", ("error", "leader-too-fast"), "0.3 m/s; it has 0.22", "0.2 m/s"),
+        (PARK, "safety.speed=0.1", ("error", "leader-too-fast"), "it has 0.1 m/s", "0.09 m/s"),
+        (PARK, "timeline.0.plan.speed=0.21", ("warning", "leader-near-limit"), "of the 0.22 m/s", "0.2 m/s"),
+        (
+            PARK,
+            "timeline.0.plan.move_by=[2.0, 0.0]",
+            ("error", "leaves-arena"),
+            "TB01 would leave the arena at 31.8",
+            "shorten",
+        ),
+        (PARK, "timeline.0.plan.speed=0.02", ("warning", "leg-cut"), "lasts 37.5 s", "59"),
+        (PARK, "timeline.0.at_s=5", ("warning", "acquired-late"), "when the plans begin at 5 s", "begin later"),
+        (PARK, "duration_s=22", ("warning", "lags"), "lags behind its leader", "slowly"),
+        (PARK, "robots.KH01.start=[-0.98,-0.8]", ("warning", "start-margin"), "0.02 m from a wall", "margin"),
+        (PARK, "robots.CF01.start=[-0.6,0.75]", ("error", "start-overlap"), "TB01 and CF01 start 0.05 m", "floor"),
+        (
+            PARK,
+            "cases.periodic.trigger.period_s=0.005",
+            ("warning", "trigger-too-fast"),
+            "in case 'periodic'",
+            "to 200",
+        ),
+        (
+            PARK,
+            "cases.periodic.trigger.period_s=0.03",
+            ("warning", "trigger-uneven"),
+            "every 0.04 s",
+            "multiple of 0.02",
+        ),
+        (PARK, "rates.pose_hz=5", ("warning", "decides-unheard"), "at 5 Hz at most", "pose_hz"),
+        (PARK, "formation.leader=CF03", ("warning", "hears-nobody"), "TB01 hears nobody", "> TB01"),
+        (TRIANGLE, "robots.CF01.start=[0.0,-0.5]", ("warning", "local-minimum"), "another shape", "order"),
+        (TRIANGLE, "duration_s=2", ("warning", "not-acquired"), "mm off after 2 s", "duration_s"),
+    ],
+)
+def test_variants_that_do_not_work(name, change, expected, message, remedy):
+    severity, code = expected
+    found = bad(name, change)
+    assert code in found
+    assert found[code][0] == severity
+    assert message in found[code][1]
+    assert remedy in found[code][2]
+    assert found[code][3]
+
+
+GROUND = {
+    name: Robot(kind="khepera4", start=[x, y]) for name, x, y in [("A", 0, 0), ("B", 1, 0), ("C", 0, 1), ("D", 1, 1)]
+}
+
+
+def ground(links: dict[str, float], leader: str | None = None, **changes) -> dict[str, str]:
+    """Codes and messages of errors and warnings of four Kheperas in a large arena."""
+    formation = Formation(links=links, leader=leader)
+    made = Experiment(
+        title="made", robots=GROUND, duration_s=60.0, arena=Arena(size=(6.0, 6.0, 2.0)), formation=formation
+    )
+    found = check(of(msgspec.structs.replace(made, **changes)))
+    return {each.code: each.message for each in found if each.severity != "note"}
+
+
+def test_followers_that_cannot_hear_of_the_leader():
+    found = ground({"A > B": 1.0, "C - D": 1.0}, leader="A")
+    assert found["leader-unknown"].startswith("C, D cannot hear of the leader (A)")
+    assert "2 parts" in found["parts"]
+
+
+def test_a_leader_that_nobody_listens_to():
+    assert "leader-unheard" in ground({"B - C": 1.0, "C - D": 1.0, "B - D": 1.0}, leader="A")
+    assert "hears-nobody" in ground({"A > B": 1.0, "A > C": 1.0, "B - C": 1.0}, leader="A")
+
+
+def test_a_chain_folds():
+    assert "rank 3 of 5" in ground({"A > B": 1.0, "B > C": 1.0, "C > D": 1.0})["not-rigid"]
+
+
+def test_no_links_are_no_formation():
+    assert ground({}) == {}
+    made = Experiment(title="made", robots=GROUND, duration_s=5.0)
+    assert figures(made).rank is None
+    assert "no-formation" in {each.code for each in check(of(made))}
+
+
+def test_distances_that_contradict_one_another_without_a_triangle():
+    square = {"A - B": 1.0, "B - D": 1.0, "D - C": 1.0, "A - C": 1.0, "A - D": 1.4, "B - C": 1.1}
+    assert "A - D" in ground(square)["not-realisable"]
+
+
+def test_paths_that_cross():
+    swapped = {"A > B": 0.5, "A > C": 0.5, "B - C": 0.05}
+    assert ground(swapped, leader="A")["too-close"].startswith("B and C come within")
+
+
+def test_landing_on_a_robot():
+    robots = {"G": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="crazyflie", start=[0.5, 0.0], hover=0.8)}
+    found = ground({"G > F": 0.801}, robots=robots, duration_s=30.0, tolerance=0.1)
+    assert found["lands-on"] == "F ends above G and would land on it"
+
+
+def test_a_robot_at_the_wall_is_held_back():
+    plan = {"kind": "line", "move_by": [-2.97, 0.0], "speed": 0.1}
+    found = ground({}, timeline=[Leg(at_s=1.0, robot="A", plan=plan)])
+    assert found["near-wall"].startswith("A comes within the margin of 0.05 m of a wall at 30.")
+
+
+def test_a_plan_for_ever_is_not_cut_off():
+    plan = {"kind": "circle", "radius": 0.5, "period_s": 40.0}
+    assert ground({}, timeline=[Leg(at_s=1.0, robot="D", plan=plan)]) == {}
+
+
+def test_a_long_run_is_predicted_in_part():
+    made = Experiment(title="made", robots=GROUND, duration_s=86400.0)
+    assert figures(made).predicted_s == 600.0
+    assert "predicted-in-part" in {each.code for each in check(of(made))}
+
+
+def test_only_the_case_at_fault_is_named():
+    found = bad(PARK, "cases.event.formation.gain=10")
+    assert found["hunts"][1].startswith("in case 'event': the formation hunts")
+    assert found["hunts"][3] == "--set cases.event.formation.gain=10"
+
+
+def test_the_place_is_in_the_case_that_changes_it(tmp_path):
+    text = document.catalogue_path(PARK).read_text("utf-8")
+    file = tmp_path / "mine.toml"
+    file.write_text(f"{text}\n[cases.wild]\nformation = {{ gain = 12.0 }}\n", encoding="utf-8")
+    (hunts,) = (each for each in check(document.read(file)) if each.code == "hunts")
+    assert hunts.where == f"{file}:{text.count(chr(10)) + 3}:22"
+
+
+# ------------------------------------------------------------------ the command
+
+
+def test_the_table(capsys):
+    assert command(PARK, settings=[], as_json=False) == 0
+    said = capsys.readouterr().out
+    assert "✓ the formation is rigid, rank 11 of 11" in said
+    assert "! KH01 follows at 0.095 m/s" in said
+    assert "periodic 350.0 per second, event" in said
+    assert said.endswith("no errors, 1 warning\n")
+    assert command(PARK, settings=["formation.gain=10"], as_json=False) == 2
+    assert "✗ the formation hunts" in capsys.readouterr().out
+
+
+def test_json(capsys):
+    assert command(PARK, settings=["robots.CF01.hover=0.81"], as_json=True) == 2
+    said = json.loads(capsys.readouterr().out)
+    assert said["file"].endswith("robotic-park.toml")
+    assert said["ok"] is False
+    assert said["findings"][0]["code"] == "too-high"
+    assert said["figures"].keys() == {"periodic", "event"}
+    assert said["figures"]["event"].keys() == set(Figures.__struct_fields__)
+    assert command("triangle", settings=[], as_json=True) == 0
+    assert json.loads(capsys.readouterr().out)["ok"] is True
+
+
+def test_a_file_that_cannot_be_read(capsys):
+    with pytest.raises(DocumentError, match="no robot is called"):
+        command(PARK, settings=["formation.leader=TB02"], as_json=False)
+    assert command(PARK, settings=["formation.leader=TB02"], as_json=True) == 2
+    said = json.loads(capsys.readouterr().out)
+    assert (said["ok"], said["findings"][0]["code"], said["figures"]) == (False, "document", {})
+
+
+def test_a_terminal_without_greek(monkeypatch):
+    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", out)
+    assert command("triangle", settings=[], as_json=False) == 0
+    out.seek(0)
+    assert "no errors, no warnings" in out.read()
+
+
+def test_the_schema(capsys):
+    assert schema_command() == 0
+    assert json.loads(capsys.readouterr().out) == document.schema()
+
+
+# ------------------------------------------------------------------ whatever is in the file
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        'formation.links."KH01 - KH03"=1e200',
+        'formation.links."KH01 - KH03"=1e-9',
+        "formation.gain=1e300",
+        "formation.clamp=1e300",
+        "formation.tracking_gain=1e300",
+        "timeline.0.plan.speed=1e300",
+        "timeline.0.plan.move_by=[1e300,0]",
+        "safety.speed=1e-9",
+        "arena.size=[1e300,1e300,1e300]",
+        "rates.coordination_hz=0.01",
+    ],
+)
+def test_absurd_numbers_end_in_findings(change, capsys):
+    assert command(PARK, settings=[change, "duration_s=25"], as_json=True) in (0, 2)
+    assert "Infinity" not in capsys.readouterr().out
+
+
+@st.composite
+def experiments(draw: st.DrawFn) -> Experiment:
+    """One to six robots anywhere in the arena, linked anyhow."""
+    count = draw(st.integers(1, 6))
+    place = st.floats(-2.0, 2.0)
+    robots = {}
+    for number in range(count):
+        flies = draw(st.booleans())
+        kind = draw(st.sampled_from(["crazyflie", "tello"] if flies else ["khepera4", "turtlebot3"]))
+        hover = draw(st.floats(0.2, 2.0)) if flies else None
+        robots[f"R{number}"] = Robot(kind=kind, start=[draw(place), draw(place)], hover=hover)
+    pairs = [(i, j) for i in range(count) for j in range(i)]
+    chosen = draw(st.lists(st.sampled_from(pairs), unique=True)) if pairs else []
+    links = {f"R{i} {draw(st.sampled_from('>-'))} R{j}": draw(st.floats(0.05, 3.0)) for i, j in chosen}
+    leader = draw(st.sampled_from([None, *robots]))
+    move = [draw(place), draw(place)]
+    plan = {"kind": "line", "move_by": move, "speed": draw(st.floats(0.01, 1.0))}
+    legs = [Leg(at_s=draw(st.floats(0.0, 4.0)), robot=draw(st.sampled_from(list(robots))), plan=plan)]
+    formation = Formation(links=links, leader=leader, gain=draw(st.floats(0.1, 30.0)))
+    return Experiment(
+        title="made", robots=robots, duration_s=draw(st.floats(5.0, 10.0)), formation=formation, timeline=legs
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(experiments())
+def test_every_error_and_warning_has_a_remedy_and_a_place(made):
+    found = check(of(made))
+    assert found
+    for each in found:
+        assert each.message
+        assert each.severity == "note" or (each.remedy and each.where)
+    assert json.loads(msgspec.json.encode(figures(made)))["robots"] == len(made.robots)

@@ -1,0 +1,110 @@
+"""The numbers of the reference experiment (IEEE Access 2023, section IV), and shapes that do not exist."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.coordination import Distance
+from agents.graph import Links, links
+from experiments import assign, document
+from experiments.feasibility import algebraic_connectivity, conflicts, link_errors, modes, realise, stiffness, unfolded
+
+# where the reference formation may stand: TB01, KH01..03, CF01..03
+PUBLISHED = np.array(
+    [
+        (0, 0, 0),
+        (0.6, 0, 0),
+        (0.6, -0.6, 0),
+        (0, -0.6, 0),
+        (0.3, 0.098, 0.8),
+        (0.3, -0.502, 0.8),
+        (-0.2196, -0.2021, 0.8),
+    ]
+)
+
+
+@pytest.fixture(scope="module")
+def reference() -> Links:
+    return assign.all_links(document.read("robotic-park").experiment)
+
+
+def test_the_published_shape_meets_the_published_distances(reference):
+    assert link_errors(reference, PUBLISHED).max() < 1e-4  # four decimals were printed
+    found = realise(reference, [PUBLISHED], np.arange(7) > 0)
+    assert len(found) == 1
+    assert found[0].worst < 1e-9
+    assert found[0].position[0].tolist() == [0.0, 0.0, 0.0]
+    assert np.abs(found[0].position - PUBLISHED).max() < 1e-4
+
+
+def test_rigid_only_while_heights_are_held(reference):
+    planar, spatial = stiffness(PUBLISHED, reference, np.array([0]))
+    assert (planar.rank, planar.needed) == (11, 2 * 7 - 3)
+    assert (spatial.rank, spatial.needed) == (12, 3 * 7 - 6)
+    assert planar.rigid
+    assert not spatial.rigid
+
+
+def test_two_leaders_stand_in_for_a_bar():
+    net = links([(2, 0), (2, 1)], [1.0, 1.0], [1.0, 1.0])
+    position = np.array([(0, 0, 0), (1, 0, 0), (0.5, math.sqrt(0.75), 0)])
+    assert stiffness(position, net, np.array([0, 1]))[0].rigid
+    assert stiffness(position, net, np.array([0]))[0].rank == 2
+
+
+def test_stiffest_and_slowest_mode_of_the_reference(reference):
+    shape = realise(reference, [PUBLISHED], np.arange(7) > 0)[0]
+    hz = 1000.0  # u applied as a velocity: h = 1 / hz
+    found = modes(Distance(), reference, shape.position, np.full(7, 1.0 / hz), hz)
+    gain = 3.0
+    assert found.slowest_s * gain == pytest.approx(108.0, abs=0.5)
+    assert 2.0 / (found.gain * hz / gain) == pytest.approx(1.05, abs=0.005)
+    assert found.radius < 1.0
+
+
+def test_the_height_at_which_the_reference_closes(reference):
+    height = np.where(np.arange(7) < 4, 0.0, 0.81)
+    found = conflicts(reference, height)
+    assert [each.high for each in found] == [(4,), (5,)]
+    assert [each.ceiling for each in found] == pytest.approx([math.sqrt(0.86**2 - 0.3**2)] * 2)
+    assert conflicts(reference, np.where(np.arange(7) < 4, 0.0, 0.805)) == []
+
+
+def test_a_height_that_exceeds_the_distance():
+    net = links([(1, 0)], [0.5], [1.0])
+    (found,) = conflicts(net, np.array([0.2, 0.9]))
+    assert (found.rows, found.high) == ((0, 1), (1,))
+    assert found.ceiling == pytest.approx(0.7)
+
+
+def test_three_distances_that_make_no_triangle():
+    net = links([(1, 0), (2, 1), (2, 0)], [1.0, 1.0, 2.5], [1.0] * 3)
+    (found,) = conflicts(net, np.zeros(3))
+    assert found.rows == (0, 1, 2)
+    assert math.isnan(found.ceiling)
+
+
+def test_connectivity_of_known_graphs():
+    ring = links([(0, 1), (1, 2), (2, 3), (3, 0)], [1.0] * 4, [1.0] * 4)
+    assert algebraic_connectivity(ring, 4) == pytest.approx(2.0)
+    assert algebraic_connectivity(ring, 5) == pytest.approx(0.0)
+    assert algebraic_connectivity(links([], [], []), 1) == 0.0
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), rows=st.integers(3, 10))
+def test_distances_of_a_drawing_are_met_again(seed, rows):
+    rng = np.random.default_rng(seed)
+    height = rng.choice([0.0, 0.5], rows)
+    drawn = np.column_stack([rng.uniform(-1.0, 1.0, (rows, 2)), height])
+    pairs = [(i, j) for i in range(rows) for j in range(rows) if i != j]
+    distance = [float(np.linalg.norm(drawn[i] - drawn[j])) for i, j in pairs]
+    net = links(pairs, distance, [1.0] * len(pairs))
+    found = realise(net, [unfolded(net, height)], np.ones(rows, dtype=bool))
+    assert found[-1].worst < 1e-6
+    assert conflicts(net, height) == []
