@@ -298,9 +298,11 @@ class Agent:
         offset = law.offset(position, self.heard.position[self._live], self._live_links)
         goal = position.copy()
         toward = np.full(len(position), np.nan)
+        place = position.copy()
+        place[:, 2] = self._ground  # a plan begins at the height that is held, not where the climb was called done
         for itinerary in self._itineraries:
             rows = itinerary.rows
-            target, yaw = itinerary.target(t - self.life.start_at[rows], position[rows], state.yaw[rows])
+            target, yaw = itinerary.target(t - self.life.start_at[rows], place[rows], state.yaw[rows])
             toward[rows] = yaw
             leads = ~self._listens[rows]
             if leads.all():

@@ -6,12 +6,13 @@ The runtime finds bodies by the entry-point group `zenpark.bodies`: the word bef
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 
+from agents.keys import Keys
 from agents.kinds import Kind
 from agents.rows import Array, Index, Mask
 
@@ -39,7 +40,12 @@ class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
 @dataclass(frozen=True)
 class BodyRequest:
-    """What a body is opened with; every sequence has one entry per row."""
+    """What a body is opened with; every sequence has one entry per row.
+
+    `external` rows get their position from outside, through `Body.locate`. `device` holds each row's settings for its
+    hardware, as they stand in the experiment file; the body checks them. `endpoints` and `keys` are for bodies that
+    live on the network.
+    """
 
     names: tuple[str, ...]
     kinds: tuple[Kind, ...]
@@ -49,6 +55,10 @@ class BodyRequest:
     rate_hz: float  # how often it will be read and commanded
     seeds: tuple[int, ...]
     disturbance: tuple[Disturbance, ...]
+    external: tuple[bool, ...]
+    device: tuple[Mapping[str, Any], ...]
+    endpoints: tuple[str, ...]
+    keys: Keys
 
     def of(self, rows: Index) -> BodyRequest:
         """The same for some of the rows."""
@@ -61,7 +71,28 @@ class BodyRequest:
             self.rate_hz,
             tuple(self.seeds[row] for row in rows),
             tuple(self.disturbance[row] for row in rows),
+            tuple(self.external[row] for row in rows),
+            tuple(self.device[row] for row in rows),
+            self.endpoints,
+            self.keys,
         )
+
+
+@dataclass(frozen=True)
+class RangeScan:
+    """One sweep of a robot's range sensors.
+
+    Attributes:
+        time: When, on the clock of `Body.read` [s]; a newer scan has a newer time.
+        bearing: (m,) from the robot's nose, to the left [rad].
+        elevation: (m,) up [rad].
+        distance: (m,) [m]; NaN where nothing is in reach.
+    """
+
+    time: float
+    bearing: Array
+    elevation: Array
+    distance: Array
 
 
 @dataclass
@@ -77,6 +108,8 @@ class BodyState:
         true_yaw: (n,) the truth of a twin [rad].
         battery: (n,) charge, 0 to 1.
         flying: (n,) motors on, off the ground or about to be.
+        notes: What each row's hardware says of itself (supervisor, link), for people; empty if nothing.
+        ranges: The newest scan of each row; empty if the body has no range sensors.
     """
 
     time: Array
@@ -87,6 +120,8 @@ class BodyState:
     true_yaw: Array
     battery: Array
     flying: Mask
+    notes: tuple[str, ...] = ()
+    ranges: tuple[RangeScan | None, ...] = ()
 
 
 class Body(Protocol):
@@ -118,6 +153,10 @@ class Body(Protocol):
 
     def stop(self, rows: Index) -> None:
         """Motors off, at once, wherever the rows are: the emergency stop."""
+        ...
+
+    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
+        """An externally measured pose of a row: (3,) [m], yaw [rad] or NaN, taken at `t` on the clock of `read`."""
         ...
 
     def close(self) -> None:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
+from typing import Any, Final
 
 import numpy as np
 
 from agents import plugins
 from agents.body import Body, BodyRequest, BodyState
 from agents.rows import Array, Index
+
+
+PER_ROW: Final[dict[str, object]] = {"notes": "", "ranges": None}  # fields that are tuples, and what stands for none
 
 
 class Fleet:
@@ -40,14 +44,27 @@ class Fleet:
         if len(self._parts) == 1:
             return self._parts[0][1].read(t)
         states = [(group, body.read(t)) for group, body in self._parts]
-        merged = {}
+        merged: dict[str, Any] = {}
         for field in fields(BodyState):
+            if field.name in PER_ROW:
+                merged[field.name] = self._gathered(field.name, states)
+                continue
             first = getattr(states[0][1], field.name)
             column = np.empty((self._rows, *first.shape[1:]), dtype=first.dtype)
             for group, state in states:
                 column[group] = getattr(state, field.name)
             merged[field.name] = column
         return BodyState(**merged)
+
+    def _gathered(self, name: str, states: Sequence[tuple[Index, BodyState]]) -> tuple[object, ...]:
+        """A tuple with an entry per row from bodies of which some give none."""
+        if not any(getattr(state, name) for _, state in states):
+            return ()
+        found: list[object] = [PER_ROW[name]] * self._rows
+        for group, state in states:
+            for row, value in zip(group, getattr(state, name), strict=False):
+                found[row] = value
+        return tuple(found)
 
     def command(self, setpoint: Array) -> None:
         """See `Body.command`."""
@@ -68,6 +85,12 @@ class Fleet:
         """See `Body.stop`."""
         for body, which in self._split(rows):
             body.stop(self._place[rows[which]])
+
+    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
+        """See `Body.locate`."""
+        for group, body in self._parts:
+            if row in group:
+                body.locate(int(self._place[row]), t, position, yaw)
 
     def close(self) -> None:
         """Closes every body."""

@@ -31,6 +31,22 @@ class Keys:
         """Liveliness token."""
         return f"{self.realm}/{robot}/alive"
 
+    def position(self, robot: str) -> str:
+        """Pose of this robot, measured from outside (motion capture, a twin service)."""
+        return f"{self.realm}/{robot}/position"
+
+    def setpoint(self, robot: str) -> str:
+        """Commands for a body that lives in another process."""
+        return f"{self.realm}/{robot}/setpoint"
+
+    def ranges(self, robot: str) -> str:
+        """Readings of its range sensors."""
+        return f"{self.realm}/{robot}/ranges"
+
+    def truth(self, robot: str) -> str:
+        """Where a protocol twin really is: for recorder and simulated motion capture, never for robots."""
+        return f"{self.realm}/{robot}/truth"
+
     @property
     def estop(self) -> str:
         """Emergency stop for everyone."""

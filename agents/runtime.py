@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import floor, isfinite
+from math import floor, inf, isfinite, nan
 from types import FrameType
 from typing import Final
 
@@ -45,6 +45,7 @@ class Setup:
         encoding: Of the payloads that it sends.
         state_hz: Rate of telemetry.
         lifeline: Whether standard input is a lifeline.
+        located: Which rows get their position from outside.
     """
 
     keys: Keys
@@ -52,6 +53,7 @@ class Setup:
     encoding: wire.Encoding
     state_hz: float
     lifeline: bool
+    located: Sequence[bool]
 
 
 @dataclass
@@ -137,6 +139,13 @@ class Runtime:
         self._statuses = [network.pose_publisher(session, keys.status(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]
         self._estop = network.subscriber(session, keys.estop)
+        self._located = [
+            (row, network.subscriber(session, keys.position(name), 32))
+            for row, name in enumerate(names)
+            if self._setup.located[row]
+        ]
+        self._ranges = [network.publisher(session, keys.ranges(name), self._mime) for name in names]
+        self._scanned = [-inf] * len(names)
         self._tokens = [network.alive_token(session, keys.alive(name)) for name in names]
         by_speaker = links_by_speaker(self._assignment.links, self._assignment.speakers)
         self._subscribers = [network.pose_subscriber(session, keys.pose(name)) for name in by_speaker]
@@ -160,11 +169,25 @@ class Runtime:
                     agent.find(neighbour.links)
         for sample in network.received(self._estop.handler):
             self._stop(sample)
+        for row, positions in self._located:
+            for sample in network.received(positions.handler):
+                self._locate(row, sample, t)
         for row, queryable in enumerate(self._orders):
             for query in network.received(queryable.handler):
                 self._obey(row, query, t)
         for last in self._last:
             last.answer()
+
+    def _locate(self, row: int, sample: zenoh.Sample, t: float) -> None:
+        """Where a row is, as something outside of it says."""
+        try:
+            measured = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
+            wire.check_position(measured, robot=self._names[row], now=self._utc + t, reach=self._reach)
+        except wire.Malformed:
+            self._malformed += 1
+            return
+        yaw = nan if measured.yaw is None else measured.yaw
+        self._body.locate(row, measured.stamp - self._utc, np.array(measured.position), yaw)
 
     def _stop(self, sample: zenoh.Sample) -> None:
         """The emergency stop of everybody."""
@@ -274,6 +297,7 @@ class Runtime:
         if slot != self._state_slot:
             self._state_slot = slot
             self._tell(state, actions, t)
+            self._scan(state)
         self._report(t, everything=t >= self._status_due, state=state)
 
     def _act(self, actions: Actions) -> None:
@@ -330,6 +354,21 @@ class Runtime:
             self._telemetry[row].put(wire.encode(message, self._setup.encoding))
             self._news[row] = []
 
+    def _scan(self, state: BodyState) -> None:
+        """Sends the range readings that are new."""
+        for row, scan in enumerate(state.ranges):
+            if scan is not None and scan.time > self._scanned[row]:
+                self._scanned[row] = scan.time
+                distance = [value if isfinite(value) else None for value in scan.distance.tolist()]
+                ranges = wire.Ranges(
+                    self._names[row],
+                    self._utc + scan.time,
+                    scan.bearing.tolist(),
+                    scan.elevation.tolist(),
+                    distance,
+                )
+                self._ranges[row].put(wire.encode(ranges, self._setup.encoding))
+
     def _report(self, t: float, *, everything: bool, state: BodyState | None = None) -> None:
         """Sends statuses: of all rows when due, else of those whose phase or reason changed."""
         if not (everything or self.agent.life.moved):
@@ -351,6 +390,7 @@ class Runtime:
                 stamp=self._utc + t,
                 phase=Phase(life.phase[row]).word,
                 reason=life.reason[row],
+                body=state.notes[row] if state is not None and state.notes else "",
                 battery=battery if isfinite(battery) else None,
                 sent=self._sent[row],
                 heard=sum(n.heard for n in mine),

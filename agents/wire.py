@@ -76,11 +76,11 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a robot is: lifecycle phase, what holds it, and its counters since the process began.
+    """How a robot is: lifecycle phase, what holds it, what its body says, its counters since the process began.
 
     `missing` names neighbours that were never heard or are gone; `lost` counts, per neighbour, samples that the
     sequence numbers prove were sent and never heard. `late_s` is the largest lateness of a tick since the last status.
-    `drive_s` is the UTC time at which the robot began to run the experiment (0 before), `decisions` and `ticks` count
+    `started` is the UTC time at which the robot began to run the experiment (0 before), `decisions` and `ticks` count
     from there.
     """
 
@@ -88,6 +88,7 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stamp: float
     phase: str
     reason: str
+    body: str
     battery: float | None
     sent: int
     heard: int
@@ -104,6 +105,39 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pid: int
     cpu_s: float
     rss_mb: float
+
+
+class Position(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where a robot is, as something outside of it measured or knows: position [m], yaw [rad] if known, UTC [s]."""
+
+    robot: str
+    stamp: float
+    position: Vector
+    yaw: float | None = None
+
+
+class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a body in another process must do.
+
+    `setpoint` (see `State`) belongs to `drive`, `height` [m] to `takeoff`.
+    """
+
+    robot: str
+    seq: int
+    stamp: float
+    action: Literal["drive", "takeoff", "land", "stop"]
+    setpoint: Setpoint | None = None
+    height: float | None = None
+
+
+class Ranges(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One sweep of a robot's range sensors: bearing and elevation [rad] from its nose, distance [m], None: nothing."""
+
+    robot: str
+    stamp: float
+    bearing: list[float]
+    elevation: list[float]
+    distance: list[float | None]
 
 
 class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -141,8 +175,8 @@ class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     text: str
 
 
-Message = Pose | State | Status | Order | Reply | Stop | Event
-M = TypeVar("M", Pose, State, Status, Order, Reply, Stop, Event)
+Message = Pose | State | Status | Position | Command | Ranges | Order | Reply | Stop | Event
+M = TypeVar("M", Pose, State, Status, Position, Command, Ranges, Order, Reply, Stop, Event)
 
 _json = msgspec.json.Encoder()
 _msgpack = msgspec.msgpack.Encoder()
@@ -189,6 +223,22 @@ def decode(payload: bytes, mime: str, kind: type[M]) -> M:
         raise Malformed(f"not a {kind.__name__}: {error}") from None
     assert isinstance(message, kind)
     return message
+
+
+def check_position(measured: Position, *, robot: str, now: float, reach: Vector) -> None:
+    """Refuses a measured position that cannot be true.
+
+    Raises:
+        Malformed: As `check_pose`.
+    """
+    if measured.robot != robot:
+        raise Malformed(f"position of '{measured.robot}' on the key of '{robot}'")
+    if not (math.isfinite(measured.stamp) and 0.0 < measured.stamp < now + FUTURE_S):
+        raise Malformed(f"stamp {measured.stamp} is impossible")
+    if not all(abs(value) <= limit for value, limit in zip(measured.position, reach, strict=True)):
+        raise Malformed(f"position {measured.position} is outside the arena")
+    if measured.yaw is not None and not abs(measured.yaw) <= 1e3:
+        raise Malformed(f"yaw {measured.yaw} is impossible")
 
 
 def check_pose(pose: Pose, *, robot: str, now: float, reach: Vector) -> None:

@@ -11,6 +11,7 @@ from agents import plugins
 from agents.agent import Assignment
 from agents.body import BodyRequest, Disturbance
 from agents.graph import Links, links
+from agents.keys import Keys
 from agents.kinds import KINDS, Kind
 from agents.planning import Leg
 from agents.rows import Array, Index
@@ -133,8 +134,10 @@ def disturbance(experiment: Experiment, name: str) -> Disturbance:
     return Disturbance(**merged)  # type: ignore[arg-type]
 
 
-def request(experiment: Experiment, names: Sequence[str], seeds: Sequence[int]) -> BodyRequest:
-    """What the bodies of `names` are opened with, one repetition for each seed."""
+def request(
+    experiment: Experiment, names: Sequence[str], seeds: Sequence[int], endpoints: Sequence[str] = ()
+) -> BodyRequest:
+    """What the bodies of `names` are opened with, one repetition for each seed; `endpoints` are the routers."""
     position, yaw = start(experiment, names)
     copies = len(seeds)
     return BodyRequest(
@@ -146,4 +149,8 @@ def request(experiment: Experiment, names: Sequence[str], seeds: Sequence[int]) 
         rate_hz=experiment.rates.body_hz,
         seeds=tuple(seed for seed in seeds for _ in names),
         disturbance=tuple(disturbance(experiment, name) for name in names) * copies,
+        external=tuple(experiment.robots[name].position == "external" for name in names) * copies,
+        device=tuple(experiment.robots[name].device for name in names) * copies,
+        endpoints=tuple(endpoints),
+        keys=Keys(experiment.network.realm),
     )

@@ -47,6 +47,10 @@ class Robot(Part, frozen=True):
     start: Annotated[list[float], Meta(min_length=2, max_length=3, description="x, y [m] and, if wanted, yaw [rad]")]
     body: Annotated[str, Meta(description="twin, or the address of the real one")] = "twin"
     hover: Annotated[Positive | None, Meta(description="height that a flying robot holds [m]")] = None
+    position: Annotated[
+        Literal["body", "external"], Meta(description="its own estimate, or what is published on its key `position`")
+    ] = "body"
+    device: Annotated[dict[str, Any], Meta(description="settings of its hardware; the body knows them")] = {}
     process: Annotated[Name | None, Meta(description="robots of one name share one process")] = None
 
 

@@ -194,6 +194,7 @@ class Logbook:
                     stamp=EPOCH + end,
                     phase=phase,
                     reason="finished",
+                    body="",
                     battery=None,
                     sent=int(sent[done][row]),
                     heard=int(heard[done][row]),

@@ -33,13 +33,15 @@ def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[
     if unknown:
         hint = plugins.did_you_mean(unknown[0], experiment.robots)
         raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
-    body = assemble(assign.request(experiment, names, [experiment.seed]))
+    endpoints = list(connect) or experiment.network.connect or [DEFAULT_ENDPOINT]
+    body = assemble(assign.request(experiment, names, [experiment.seed], endpoints))
     setup = Setup(
         keys=Keys(experiment.network.realm),
-        endpoints=list(connect) or experiment.network.connect or [DEFAULT_ENDPOINT],
+        endpoints=endpoints,
         encoding=experiment.network.encoding,
         state_hz=experiment.rates.state_hz,
         lifeline=lifeline,
+        located=[experiment.robots[name].position == "external" for name in names],
     )
     return Runtime(assign.assign(experiment, names), body, setup).run()
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from agents.body import BodyError, BodyRequest, BodyState
 from agents.kinds import Kind
+from agents.positioning import External
 from agents.rows import Array, Index, span
 from twins.differential import DRIVES, Differential
 from twins.disturbance import Drift, HoverJitter, Latency, Measurement
@@ -45,6 +46,8 @@ class TwinBody:
         self._truth = np.array(request.start, dtype=float)
         self._endurance = np.array([ENDURANCE_S[k.name] for k in kinds])
         self._used = np.zeros(len(kinds))
+        self._outside = np.flatnonzero(request.external)
+        self._external = External(len(kinds))
         self._state = self._measure()
 
     @staticmethod
@@ -93,6 +96,10 @@ class TwinBody:
         """Where in `part` those of `rows` stand that belong to it."""
         return np.searchsorted(part, rows[np.isin(rows, part)])
 
+    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
+        """See `Body.locate`."""
+        self._external.update(row, t, position, yaw)
+
     def close(self) -> None:
         """See `Body.close`."""
 
@@ -137,7 +144,11 @@ class TwinBody:
             measured = measured.copy()
             measured[:, :2] += self._drift.error
         battery = 1.0 - self._used / self._endurance
-        return BodyState(np.full(rows, self._t), measured, velocity, heading, truth, yaw, battery, flying)
+        state = BodyState(np.full(rows, self._t), measured, velocity, heading, truth, yaw, battery, flying)
+        if len(self._outside):
+            state.position, state.yaw = measured.copy(), heading.copy()
+            self._external.fill(state, self._outside)
+        return state
 
 
 def open_twin(request: BodyRequest) -> TwinBody:

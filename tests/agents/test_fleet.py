@@ -1,12 +1,15 @@
 """Several bodies in one process look like one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from agents import fleet, plugins
-from agents.body import BodyError, BodyRequest, BodyState, Disturbance
+from agents.body import BodyError, BodyState
 from agents.fleet import Fleet, assemble
-from agents.kinds import CRAZYFLIE, KHEPERA4
+from experiments import assign
+from experiments.experiment import Experiment, Robot
 from twins.body import TwinBody
 
 
@@ -38,6 +41,9 @@ class Recorded:
     def stop(self, rows):
         self.told.append(("stop", rows.tolist()))
 
+    def locate(self, row, t, position, yaw):
+        self.told.append(("locate", row, t, position.tolist(), yaw))
+
     def close(self):
         self.told.append("close")
 
@@ -55,6 +61,22 @@ def test_states_are_put_where_their_rows_are():
     assert state.position[:, 2].tolist() == [20, 10, 21, 11, 22]
     assert state.flying.tolist() == [False, False, True, True, True]
     assert state.flying.dtype == bool
+
+
+def test_a_pose_from_outside_reaches_the_body_of_its_row():
+    both, a, b = interleaved()
+    both.locate(4, 1.5, np.array([1.0, 2.0, 3.0]), 0.5)
+    both.locate(1, 1.6, np.array([4.0, 5.0, 6.0]), np.nan)
+    assert b.told == [("locate", 2, 1.5, [1.0, 2.0, 3.0], 0.5)]
+    assert a.told[0][:4] == ("locate", 0, 1.6, [4.0, 5.0, 6.0])
+
+
+def test_what_some_bodies_say_of_their_rows_stands_at_their_rows():
+    both, _, b = interleaved()
+    assert both.read(0.0).notes == ()
+    plain = b.read
+    b.read = lambda t: replace(plain(t), notes=("locked", "", "tumbled"))
+    assert both.read(0.0).notes == ("locked", "", "", "", "tumbled")
 
 
 def test_each_body_is_told_what_concerns_its_rows():
@@ -77,11 +99,11 @@ def test_when_one_cannot_be_opened_the_others_are_closed_again():
 
 
 def request(*addresses):
-    rows = len(addresses)
-    return BodyRequest(
-        tuple(f"R{k}" for k in range(rows)), (KHEPERA4, CRAZYFLIE, KHEPERA4)[:rows], addresses, np.zeros((rows, 3)),
-        np.zeros(rows), 100.0, tuple(range(rows)), (Disturbance(),) * rows,
-    )  # fmt: skip
+    robots = {
+        f"R{k}": Robot(kind="crazyflie" if k == 1 else "khepera4", start=[0.5 * k, 0.0], body=address, hover=0.5)
+        for k, address in enumerate(addresses)
+    }
+    return assign.request(Experiment(title="Bodies", robots=robots, duration_s=1.0), tuple(robots), [7])
 
 
 def test_addresses_choose_the_bodies(monkeypatch):
@@ -89,7 +111,7 @@ def test_addresses_choose_the_bodies(monkeypatch):
 
     def load(group, name):
         def opened(part):
-            asked.append((group, name, part.names, part.addresses, part.seeds))
+            asked.append((group, name, part.names, part.addresses, part.start[:, 0].tolist()))
             return Recorded(0.0, len(part.names))
 
         return opened
@@ -97,8 +119,8 @@ def test_addresses_choose_the_bodies(monkeypatch):
     monkeypatch.setattr(fleet.plugins, "load", load)
     assemble(request("radio://0/80", "twin", "radio://0/81"))
     assert asked == [
-        (plugins.BODIES, "radio", ("R0", "R2"), ("radio://0/80", "radio://0/81"), (0, 2)),
-        (plugins.BODIES, "twin", ("R1",), ("twin",), (1,)),
+        (plugins.BODIES, "radio", ("R0", "R2"), ("radio://0/80", "radio://0/81"), [0.0, 1.0]),
+        (plugins.BODIES, "twin", ("R1",), ("twin",), [0.5]),
     ]
 
 

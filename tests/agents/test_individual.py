@@ -18,7 +18,7 @@ GROUND = (KHEPERA4, TURTLEBOT3)
 NOWHERE = np.full((1, 3), np.nan)
 
 
-def run(kinds, start, yaw, goal, toward, seconds, dt=0.01):
+def run(kinds, start, yaw, *, goal, toward, seconds, dt=0.01):
     """Drives twins to their goals: positions (T, n, 3), yaws (T, n), setpoints (T, n, 4)."""
     twin, control = Differential(kinds, start, yaw, dt), Individual(kinds)
     positions, yaws, setpoints = [], [], []
@@ -41,7 +41,7 @@ def drives():
     start[:, :2], goal[:, :2] = rng.uniform(-0.6, 0.6, (2, 40, 2))
     yaw, toward = rng.uniform(-math.pi, math.pi, (2, 40))
     toward[20:] = np.nan
-    return kinds, start, yaw, goal, toward, *run(kinds, start, yaw, goal, toward, 16.0)
+    return kinds, start, yaw, goal, toward, *run(kinds, start, yaw, goal=goal, toward=toward, seconds=16.0)
 
 
 def test_ground_robots_arrive_and_stand(drives):

@@ -78,8 +78,8 @@ def test_any_orders_in_any_order(flies, orders, ready):
     robots = Robots(flies)
     robots.ready[:] = ready
     before = robots.life.phase.copy()
-    for order, row, wait in orders:
-        row %= len(flies)
+    for order, number, wait in orders:
+        row = number % len(flies)
         phase = robots.life.phase[row]
         refusal = robots.order(row, order)
         if order == "takeoff":

@@ -113,10 +113,14 @@ def check(kind, setpoint, position, *, yaw=0.0, age=0.0, limits=LIMITS):
 
 
 def test_lawful_setpoints_pass_untouched():
-    for kind, setpoint in ((CRAZYFLIE, [0.1, 0.2, 0.8, 0.3]), (TELLO, [0.2, 0.1, -0.1, 1.0]), (KHEPERA4, [0.2, 2.0, 0, 0])):
+    for kind, setpoint in (
+        (CRAZYFLIE, [0.1, 0.2, 0.8, 0.3]),
+        (TELLO, [0.2, 0.1, -0.1, 1.0]),
+        (KHEPERA4, [0.2, 2.0, 0, 0]),
+    ):
         verdict = check(kind, setpoint, [0.0, 0.0, 0.8])
         np.testing.assert_array_equal(verdict.setpoint, [setpoint])
-        assert not (verdict.changed[0] or verdict.blind[0] or verdict.escaped[0])
+        assert (verdict.changed[0], verdict.blind[0], verdict.escaped[0]) == (False, False, False)
 
 
 def test_goals_are_pulled_into_the_arena_and_near_the_robot():
@@ -125,7 +129,9 @@ def test_goals_are_pulled_into_the_arena_and_near_the_robot():
     # 0.5 m/s, closed at 2/s: a goal may be 0.25 m ahead
     far = check(CRAZYFLIE, [0.9, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
     np.testing.assert_allclose(far.setpoint, [[0.25, 0.0, 1.0, 0.0]])
-    near = check(CRAZYFLIE, [0.9, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0], limits=Limits(LIMITS.low, LIMITS.high, goal_step=0.1))
+    near = check(
+        CRAZYFLIE, [0.9, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0], limits=Limits(LIMITS.low, LIMITS.high, goal_step=0.1)
+    )
     np.testing.assert_allclose(near.setpoint, [[0.1, 0.0, 1.0, 0.0]])
     assert high.changed[0]
     assert far.changed[0]

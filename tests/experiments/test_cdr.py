@@ -179,6 +179,7 @@ def test_a_status_survives(battery):
         stamp=1.76e9,
         phase="run",
         reason="",
+        body="",
         battery=battery,
         sent=3,
         heard=4,

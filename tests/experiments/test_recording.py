@@ -60,6 +60,7 @@ def status(robot="TB01", at=1.0, *, sent=0, lost=None, started=START, pid=7, tic
         stamp=START + at,
         phase="run",
         reason="",
+        body="",
         battery=None,
         sent=sent,
         heard=0,

@@ -1,0 +1,58 @@
+"""Positions that are measured outside of the robots: kept per row, with the velocity that follows from them."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from agents.body import BodyState
+from agents.rows import Array, Index
+
+SMOOTHING_S: Final = 0.1  # time constant of the velocity estimate
+FASTEST: Final = 5.0  # [m/s] a jump that would need more is a mistaken marker, not a motion
+PATIENCE_S: Final = 0.5  # after this silence any position is believed again
+
+
+class External:
+    """The last external pose of each row, and a filtered derivative of it.
+
+    Attributes:
+        time: (n,) [s], minus infinity before the first.
+        position: (n, 3) [m], NaN before the first.
+        velocity: (n, 3) [m/s].
+        yaw: (n,) [rad].
+        refused: Poses that were no motion of a robot.
+    """
+
+    def __init__(self, rows: int) -> None:
+        self.time = np.full(rows, -np.inf)
+        self.position = np.full((rows, 3), np.nan)
+        self.velocity = np.zeros((rows, 3))
+        self.yaw = np.full(rows, np.nan)
+        self.refused = 0
+
+    def update(self, row: int, t: float, position: Array, yaw: float) -> bool:
+        """Takes a pose in; False if it is old, or jumps farther than any robot moves."""
+        since = t - self.time[row]
+        if since <= 0.0:
+            return False
+        if since < PATIENCE_S:
+            moved = position - self.position[row]
+            if float(moved @ moved) > (FASTEST * since + 0.02) ** 2:
+                self.refused += 1
+                return False
+            share = since / (SMOOTHING_S + since)
+            self.velocity[row] += share * (moved / since - self.velocity[row])
+        else:
+            self.velocity[row] = 0.0
+        self.time[row], self.position[row] = t, position
+        if np.isfinite(yaw):
+            self.yaw[row] = yaw
+        return True
+
+    def fill(self, state: BodyState, rows: Index) -> None:
+        """Puts what is known of `rows` in place of what their bodies say; a yaw that was never measured is left alone."""
+        state.time[rows], state.position[rows] = self.time[rows], self.position[rows]
+        state.velocity[rows] = self.velocity[rows]
+        state.yaw[rows] = np.where(np.isfinite(self.yaw[rows]), self.yaw[rows], state.yaw[rows])
