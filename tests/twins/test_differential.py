@@ -1,0 +1,118 @@
+"""Wheels: arcs are arcs, limits keep the curve, and silence stops them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from agents.kinds import KHEPERA4, TURTLEBOT3
+from twins.differential import COMMAND_TIMEOUT_S, DRIVES, Differential
+
+DT = 0.01
+
+
+def robot(kind=KHEPERA4, yaw=0.0):
+    return Differential((kind,), np.zeros((1, 3)), np.array([yaw]), DT)
+
+
+def drive(twin, twist, seconds):
+    """(T, 3) positions and (T,) yaws of the first robot."""
+    path, yaws = [], []
+    for _ in range(round(seconds / DT)):
+        twin.command(np.array([twist], dtype=float))
+        twin.advance()
+        path.append(twin.position[0].copy())
+        yaws.append(twin.yaw[0])
+    return np.array(path), np.array(yaws)
+
+
+@pytest.mark.parametrize(("v", "w"), [(0.2, 0.5), (0.15, -1.5), (-0.1, 0.8)])
+def test_a_constant_twist_is_a_circle(v, w):
+    twin = robot(yaw=0.4)
+    drive(twin, (v, w), 0.5)  # up to speed
+    begin, heading = twin.position[0].copy(), twin.yaw[0]
+    path, yaws = drive(twin, (v, w), 3.0)
+    t = DT * np.arange(1, 301)
+    np.testing.assert_allclose(yaws, heading + w * t, atol=1e-12)
+    angle = heading + w * t
+    circle = begin[:2] + v / w * np.stack([np.sin(angle) - np.sin(heading), np.cos(heading) - np.cos(angle)], axis=1)
+    # chords of the length of the arc: longer than the circle's by (w dt)²/24
+    np.testing.assert_allclose(path[:, :2], circle, atol=abs(v / w) * (w * DT) ** 2 / 10)
+    assert not path[:, 2].any()
+
+
+def test_straight_on_and_on_the_spot():
+    twin = robot(yaw=math.pi / 3)
+    drive(twin, (0.2, 0.0), 1.0)
+    way = np.linalg.norm(twin.position[0])
+    np.testing.assert_allclose(twin.position[0], way * np.array([0.5, math.sqrt(0.75), 0.0]), atol=1e-12)
+    ramp = 0.2**2 / (2 * DRIVES["khepera4"].acceleration)
+    assert way == pytest.approx(0.2 - ramp, abs=0.002)
+    place = twin.position.copy()
+    drive(twin, (0.0, 0.0), 0.2)
+    place = twin.position.copy()
+    drive(twin, (0.0, 1.0), 1.0)
+    np.testing.assert_allclose(twin.position, place, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3], ids=lambda kind: kind.name)
+def test_the_speed_of_wheels_is_limited_and_the_curve_stays(kind):
+    limits, twin = DRIVES[kind.name], robot(kind)
+    v, w = 3.0, 6.0
+    drive(twin, (v, w), 2.0)
+    speed = np.linalg.norm(twin.velocity[0])
+    before = twin.yaw[0]
+    twin.advance()
+    rate = (twin.yaw[0] - before) / DT
+    assert speed / rate == pytest.approx(v / w, rel=1e-9)
+    assert speed + 0.5 * limits.base * rate == pytest.approx(limits.speed)
+
+
+def test_every_limit_of_a_kind_can_be_driven():
+    for kind in (KHEPERA4, TURTLEBOT3):
+        twin = robot(kind)
+        drive(twin, (kind.speed, 0.0), 1.0)
+        assert np.linalg.norm(twin.velocity[0]) == pytest.approx(kind.speed)
+
+
+def test_acceleration_of_wheels_is_limited():
+    twin = robot(TURTLEBOT3)
+    path, _ = drive(twin, (0.2, 0.0), 0.3)
+    speed = np.diff(path[:, 0], prepend=0.0) / DT
+    steps = np.diff(speed, prepend=0.0) / DT
+    assert steps.max() == pytest.approx(2.0)
+    assert speed[-1] == pytest.approx(0.2)
+
+
+def test_without_commands_the_wheels_stop():
+    twin = robot()
+    drive(twin, (0.2, 0.0), 0.5)
+    speeds = []
+    for _ in range(100):
+        twin.advance()
+        speeds.append(np.linalg.norm(twin.velocity[0]))
+    moving = np.count_nonzero(np.array(speeds) > 1e-12) * DT
+    ramp = 0.2 / DRIVES["khepera4"].acceleration
+    assert moving == pytest.approx(COMMAND_TIMEOUT_S + ramp, abs=0.02)
+    drive(twin, (0.2, 0.0), 0.2)
+    assert np.linalg.norm(twin.velocity[0]) == pytest.approx(0.2)
+
+
+def test_nan_is_no_command():
+    twin = robot()
+    drive(twin, (0.2, 0.0), 0.5)
+    drive(twin, (np.nan, np.nan), COMMAND_TIMEOUT_S - 0.03)
+    assert np.linalg.norm(twin.velocity[0]) == pytest.approx(0.2)
+    drive(twin, (np.nan, 0.0), 0.5)
+    drive(twin, (0.0, np.nan), 0.5)
+    assert np.linalg.norm(twin.velocity[0]) == 0.0
+    assert np.isfinite(twin.position).all()
+
+
+def test_halt():
+    twin = robot()
+    drive(twin, (0.2, 0.5), 0.5)
+    twin.halt(np.array([0]))
+    for _ in range(20):
+        twin.advance()
+    assert not twin.velocity.any()
