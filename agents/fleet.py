@@ -12,7 +12,6 @@ from agents import plugins
 from agents.body import Body, BodyRequest, BodyState
 from agents.rows import Array, Index
 
-
 PER_ROW: Final[dict[str, object]] = {"notes": "", "ranges": None}  # fields that are tuples, and what stands for none
 
 

@@ -19,6 +19,7 @@ BODIES: Final = "zenpark.bodies"
 TRIGGERS: Final = "zenpark.triggers"
 LAWS: Final = "zenpark.laws"
 PLANNERS: Final = "zenpark.planners"
+DEVICES: Final = "zenpark.devices"  # protocol twins: what stands in for hardware at the far end of a body's wire
 
 
 class PluginError(ValueError):

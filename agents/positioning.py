@@ -52,7 +52,7 @@ class External:
         return True
 
     def fill(self, state: BodyState, rows: Index) -> None:
-        """Puts what is known of `rows` in place of what their bodies say; a yaw that was never measured is left alone."""
+        """Puts what is known of `rows` in place of what their bodies say; a yaw never measured is left alone."""
         state.time[rows], state.position[rows] = self.time[rows], self.position[rows]
         state.velocity[rows] = self.velocity[rows]
         state.yaw[rows] = np.where(np.isfinite(self.yaw[rows]), self.yaw[rows], state.yaw[rows])

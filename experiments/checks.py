@@ -56,7 +56,7 @@ def _robot(experiment: Experiment, name: str, robot: Robot) -> Iterator[Fault]:
             path, f"a robot cannot be called '{name}', which has a meaning of its own", "rename it", on_key=True
         )
     body = plugins.body_name(robot.body)
-    bodies = plugins.names(plugins.BODIES)
+    bodies = [*plugins.names(plugins.BODIES), *plugins.names(plugins.DEVICES)]
     if body not in bodies:
         yield Fault((*path, "body"), f"no {body!r} among the bodies", did_you_mean(body, bodies))
     if robot.kind in KINDS:

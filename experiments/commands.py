@@ -25,6 +25,7 @@ def run(
     settings: Sequence[str],
     as_json: bool,
     seeds: int,
+    bodies: str | None,
     report: bool,
     open_report: bool,
 ) -> int:
@@ -33,6 +34,8 @@ def run(
     read = load(file, *changes)
     if seeds > 1 and not virtual:
         raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
+    if bodies not in (None, "protocol"):
+        raise DocumentError([Problem(f"--bodies {bodies}", 0, 0, "is not known", "the only choice is: protocol")])
     folder = new_folder(read, out)
     (folder / SOURCE).write_text(read.text, encoding="utf-8")
     interrupted = Interrupts()
@@ -41,7 +44,9 @@ def run(
         runs = simulate_seeds(read, range(first, first + seeds), cases=cases, folder=folder)
     else:
         with interrupted:
-            runs = [fly(read, folder, cases=cases, show=shown(quiet=as_json), interrupted=interrupted)]
+            show = shown(quiet=as_json)
+            protocol = bodies == "protocol"
+            runs = [fly(read, folder, cases=cases, show=show, interrupted=interrupted, protocol=protocol)]
     page = (
         _keep(runs, folder, _command(file, virtual=virtual, changes=changes, cases=cases, seeds=seeds))
         if report
@@ -90,6 +95,7 @@ def list_all() -> int:
         print(f"  {name:<{width}}  {title}")
     for what, group in (
         ("Bodies", plugins.BODIES),
+        ("Protocol twins", plugins.DEVICES),
         ("Triggers", plugins.TRIGGERS),
         ("Laws", plugins.LAWS),
         ("Planners", plugins.PLANNERS),
@@ -117,7 +123,12 @@ def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
     for name, figure in runs[0].figures().items():
         figures.save(figure, folder / "figures", name)
     return pages.write(
-        folder, traces, command=command, text=runs[0].source, measured=every, notes=[n for each in runs for n in each.notes]
+        folder,
+        traces,
+        command=command,
+        text=runs[0].source,
+        measured=every,
+        notes=[n for each in runs for n in each.notes],
     )
 
 

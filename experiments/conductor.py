@@ -18,6 +18,8 @@ from agents import session as network
 from agents import wire
 from agents.keys import Keys
 from experiments import orders
+from experiments import standins as standins_of
+from experiments.document import write_json
 from experiments.experiment import Experiment
 from experiments.launcher import LAND_S, ROUTER, Launcher, Process
 
@@ -154,11 +156,13 @@ class Conductor:
             str(self._source),
             *connect,
         )
-        for group, names in self._groups.items():
-            process = self._process(group)
-            self._launcher.start(process, "experiments.robot", str(self._file), *names, *connect, "--lifeline")
         start = ready = None
+        standins: tuple[str, ...] = ()
         try:
+            addressed, standins = self._stand_in(connect)
+            for group, names in self._groups.items():
+                process = self._process(group)
+                self._launcher.start(process, "experiments.robot", str(addressed), *names, *connect, "--lifeline")
             with ExitStack() as stack:
                 self._join(stack)
                 if self._until("ready", self._experiment.start.deadline_s, recorder=True):
@@ -172,8 +176,25 @@ class Conductor:
         finally:
             self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
             self._launcher.end([f"{self._case}-recorder"], grace_s=5.0)
+            self._launcher.end(standins, grace_s=2.0)
         gone = tuple(name for name, seen in self._robots.items() if seen.gone)
         return Result(self._recording, self._interrupted(), start, ready, gone)
+
+    def _stand_in(self, connect: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
+        """Starts protocol twins and positioning; the case as a file with addresses, and the processes' names."""
+        experiment, started = standins_of.start(
+            self._experiment,
+            self._file,
+            prefix=self._case,
+            launcher=self._launcher,
+            connect=connect,
+            interrupted=self._interrupted,
+        )
+        if not started:
+            return self._file, ()
+        file = self._file.with_name(f"{self._case}-addressed.json")
+        file.write_bytes(write_json(experiment))
+        return file, started
 
     # ------------------------------------------------------------------ phases
 

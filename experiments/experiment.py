@@ -131,6 +131,9 @@ class Experiment(Part, frozen=True):
     formation: Formation = Formation()
     timeline: list[Leg] = []
     trigger: Annotated[Choice, Meta(description="a registered trigger")] = "periodic"
+    positioning: Annotated[
+        str | None, Meta(description='who measures `position = "external"`: vicon://HOST[:PORT], or vicon-twin')
+    ] = None
     disturbance: Annotated[
         dict[str, Disturbance], Meta(description='by kind or by robot; "all" for every one; the narrower wins')
     ] = {}

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+import msgspec
 import zenoh
 
 from agents import session as network
@@ -29,6 +30,7 @@ from experiments.records import RecordingError
 POLL_S: Final = 0.02
 FLUSH_S: Final = 1.0
 AFTER_S: Final = 12.0  # how long robots may take to land after the conductor is gone
+FRESH_S: Final = 0.05  # a truth that is older does not belong to a state
 DEPTH: Final = 20_000  # samples that may wait while the disk does
 
 
@@ -45,6 +47,8 @@ class Recorder:
         self._statuses = network.pose_subscriber(session, keys.status("*"), DEPTH)
         self._states = network.subscriber(session, keys.state("*"), DEPTH)
         self._events = network.subscriber(session, keys.event, DEPTH)
+        self._truths = network.subscriber(session, keys.truth("*"), DEPTH)
+        self._truth: dict[str, wire.Position] = {}
         self._watch = network.alive_watch(session, keys.alive("*"))
         self._token = network.alive_token(session, keys.recorder)
 
@@ -63,6 +67,7 @@ class Recorder:
             robot = str(sample.key_expr)
             (self._alive.discard if sample.kind == zenoh.SampleKind.DELETE else self._alive.add)(robot)
         for handler, what in (
+            (self._truths.handler, self._take_truth),
             (self._states.handler, self._state),
             (self._poses.handler, self._pose),
             (self._statuses.handler, self._status),
@@ -83,7 +88,16 @@ class Recorder:
     def _state(self, sample: zenoh.Sample) -> None:
         state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
         self._own(sample, state.robot)
+        truth = self._truth.get(state.robot)
+        if state.true_position is None and truth is not None and abs(truth.stamp - state.stamp) < FRESH_S:
+            state = msgspec.structs.replace(state, true_position=truth.position, true_yaw=truth.yaw)
         self._recording.state(state)
+
+    def _take_truth(self, sample: zenoh.Sample) -> None:
+        """A protocol twin says where its robot really is: its bridge cannot know."""
+        truth = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
+        self._own(sample, truth.robot)
+        self._truth[truth.robot] = truth
 
     def _status(self, sample: zenoh.Sample) -> None:
         status = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Status)

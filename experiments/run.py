@@ -29,6 +29,7 @@ from experiments.logbook import Logbook
 from experiments.metrics import CaseMetrics
 from experiments.problem import DocumentError, Problem
 from experiments.progress import Shown
+from experiments.standins import behind_protocols
 from experiments.trace import Trace
 
 if TYPE_CHECKING:
@@ -132,6 +133,7 @@ def fly(
     cases: Sequence[str] = (),
     show: Shown,
     interrupted: Callable[[], bool] = lambda: False,
+    protocol: bool = False,
 ) -> Run:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
@@ -141,6 +143,7 @@ def fly(
         cases: Which of its cases; all if none is named.
         show: Shows the progress.
         interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
+        protocol: Whether every robot is put behind its real bridge and a protocol twin.
 
     Raises:
         RunFailed: If robots are not ready in time, unless the file says to go on without them.
@@ -157,6 +160,8 @@ def fly(
             for name, experiment in chosen(read, cases).items():
                 if interrupted():
                     break
+                if protocol:
+                    experiment = behind_protocols(experiment)  # noqa: PLW2901
                 file = folder / f"{name}.json"
                 file.write_bytes(document.write_json(experiment))
                 results[name] = Conductor(

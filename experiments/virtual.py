@@ -1,13 +1,14 @@
 """The virtual clock: the whole experiment in one process, without sleeping, reproducible to the bit from its seed.
 
 The decision is `agents.Agent` with all rows, the bodies are the twins, the network is `experiments.channel`; this file
-is only the loop. Several seeds run side by side as more rows, each with the result that it would have alone.
+is only the loop. Several seeds run side by side as more rows, each with the result that it would have alone (unless
+a lossy network makes one so much later ready that the others get their orders at another multiple of `ORDERS_S`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from experiments.experiment import Experiment
 from twins.body import TwinBody
 
 LEAD_S = 0.5  # from the order to the common start
+ORDERS_S = 0.5  # orders before the start fall on multiples of this, so that repetitions a few ticks apart get the same
 PATIENCE_S = 60.0  # an experiment whose robots are not ready, up or down after this long never will be
 
 
@@ -102,7 +104,8 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
     names = tuple(experiment.robots)
     assignment = assign.assign(experiment, names, copies=len(seeds))
     agent = Agent(assignment)
-    body = TwinBody(assign.request(experiment, names, seeds))
+    request = assign.request(experiment, names, seeds)
+    body = TwinBody(replace(request, external=(False,) * len(request.names)))  # nobody measures in virtual time
     channel = Channel(assignment.links, experiment.channel, seeds)
     rows = len(assignment.names)
     dt = 1.0 / assignment.body_hz
@@ -198,6 +201,8 @@ class _Conductor:
                 names = ", ".join(sorted({self._names[row % len(self._names)] for row in late}))
                 reason = self._agent.life.reason[late[0]]
                 raise Stuck(f"not {self._stage.word} after {PATIENCE_S:g} s: {names} ({reason})")
+            return
+        if self._stage < Phase.RUNNING and round(t / dt) % max(1, round(ORDERS_S / dt)):
             return
         self._since = t
         life = self._agent.life

@@ -27,6 +27,7 @@ EXPLAINED: Final = (
     ("experiments.records", "RecordingError"),
     ("experiments.conductor", "RunFailed"),
     ("experiments.virtual", "Stuck"),
+    ("experiments.standins", "StandInError"),
     ("tools.network", "KeyExpressionError"),
 )
 
@@ -70,6 +71,10 @@ def run(
     settings: Settings = None,
     as_json: AsJson = False,
     seeds: Annotated[int, typer.Option(min=1, help="Runs so many seeds: mean and spread (virtual only).")] = 1,
+    bodies: Annotated[
+        str | None,
+        typer.Option(metavar="protocol", help="Every robot behind its real bridge and a protocol twin (real time)."),
+    ] = None,
     report: Annotated[bool, typer.Option(help="Writes the report.")] = True,
     open_report: Annotated[bool, typer.Option("--open", help="Opens the report in the browser.")] = False,
 ) -> None:
@@ -86,6 +91,7 @@ def run(
             settings=settings or [],
             as_json=as_json,
             seeds=seeds,
+            bodies=bodies,
             report=report,
             open_report=open_report,
         )

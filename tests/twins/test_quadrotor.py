@@ -110,7 +110,7 @@ def test_take_off_climbs_over_the_place_and_stays(kind):
     assert quadrotor.yaw[0] == pytest.approx(0.5)
     halfway = 0.8 / CLIMB  # by then the polynomial has ended; the body lags behind it
     assert 0.4 < path[round(halfway / 0.01) - 1, 2] < 0.8
-    assert (np.diff(path[:, 2]) > -2e-4).all()
+    assert path[:, 2].max() < 0.8 + 0.05
 
 
 @pytest.mark.parametrize("kind", [CRAZYFLIE, TELLO])
@@ -122,7 +122,8 @@ def test_landing_ends_on_the_floor_with_motors_off(kind):
     np.testing.assert_array_equal(quadrotor.position, [[0.0, 0.0, 0.0]])
     np.testing.assert_array_equal(quadrotor.velocity, [[0.0, 0.0, 0.0]])
     assert (path[:, 2] >= 0.0).all()
-    assert np.diff(path[:, 2]).min() > -1.1 * 0.01  # it does not drop
+    aloft = path[path[:, 2] > 0.0, 2]
+    assert np.diff(aloft).min() > -2.2 * CLIMB * 0.01  # it does not drop: the polynomial peaks at 35/16 of its mean
     touch = path[:, 2] < TOUCHDOWN
     assert touch.argmax() * 0.01 > 0.8 / CLIMB
 

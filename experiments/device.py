@@ -1,0 +1,146 @@
+"""The process of protocol twins: `python -m experiments.device FILE NAME ...`.
+
+It stands where the hardware would stand: it knows the experiment only for where its robots start and what nature does
+to them. It says on standard output at which address each robot is, and tells recorder and simulated motion capture,
+never a robot, where they really are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import selectors
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from types import FrameType
+from typing import Final
+
+import msgspec
+import zenoh
+
+from agents import plugins, wire
+from agents import session as network
+from agents.keys import Keys
+from agents.lifeline import Lifeline
+from experiments import assign, document
+from experiments.problem import DocumentError, Problem
+from twins.device import Device, DeviceRequest, Faults
+
+AFTER_S: Final = 20.0  # how long robots may take to land after the launcher is gone
+
+
+class DeviceProcess:
+    """Runs a device: waits on its sockets, moves it on, publishes the truth."""
+
+    def __init__(
+        self, device: Device, names: Sequence[str], session: zenoh.Session, keys: Keys, rate_hz: float
+    ) -> None:
+        self._device, self._names, self._dt = device, names, 1.0 / rate_hz
+        self._truths = [network.publisher(session, keys.truth(name), wire.JSON) for name in names]
+        self._watches = [network.alive_watch(session, keys.alive(name)) for name in names]
+        self._alive = [False] * len(names)
+
+    def run(self, over: threading.Event, lost: threading.Event) -> None:
+        """Until told to end, or until the launcher and then the robots are gone."""
+        zero, utc = time.monotonic(), time.time()
+        due, last = 0.0, float("inf")
+        with selectors.DefaultSelector() as waiting:
+            while not over.is_set():
+                self._register(waiting)
+                now = time.monotonic() - zero
+                for ready, _ in waiting.select(max(0.0, due - now)):
+                    self._device.serve(ready.fileobj, time.monotonic() - zero)  # type: ignore[arg-type]
+                now = time.monotonic() - zero
+                if now >= due:
+                    self._device.advance(now)
+                    self._tell(utc + now)
+                    due = max(due + self._dt, now - 10.0 * self._dt)  # after a long stop it does not hurry
+                    if lost.is_set():
+                        last = min(last, now + AFTER_S)
+                        if now > last or not self._flown():
+                            return
+
+    def _register(self, waiting: selectors.DefaultSelector) -> None:
+        wanted = {sock.fileno(): sock for sock in self._device.sockets()}
+        known = dict(waiting.get_map())
+        for number, key in known.items():
+            if number not in wanted or wanted[number] is not key.fileobj:
+                waiting.unregister(key.fileobj)
+        for number, sock in wanted.items():
+            if number not in waiting.get_map():
+                waiting.register(sock, selectors.EVENT_READ)
+
+    def _tell(self, stamp: float) -> None:
+        position, yaw = self._device.truth()
+        for name, publisher, where, toward in zip(
+            self._names, self._truths, position.tolist(), yaw.tolist(), strict=True
+        ):
+            publisher.put(wire.encode(wire.Position(name, stamp, tuple(where), toward)))
+
+    def _flown(self) -> bool:
+        """Whether a robot process still uses the device."""
+        for row, watch in enumerate(self._watches):
+            for sample in network.received(watch.handler):
+                self._alive[row] = sample.kind != zenoh.SampleKind.DELETE
+        return any(self._alive)
+
+
+def stand_in(file: str, names: Sequence[str], *, faults: Faults, connect: Sequence[str], lifeline: bool) -> int:
+    """Runs the protocol twins of robots whose `body` asks for the same one; returns the exit code.
+
+    Raises:
+        DocumentError: If the file is wrong, or the robots do not ask for one and the same protocol twin.
+        Unreachable: If no router answers.
+    """
+    experiment = document.read(file).experiment
+    words = {experiment.robots[name].body if name in experiment.robots else "" for name in names}
+    known = plugins.names(plugins.DEVICES)
+    if len(words) != 1 or not words <= set(known):
+        hint = f"their `body` must be one of {', '.join(known)}"
+        raise DocumentError([Problem(file, 0, 0, f"{', '.join(names)} cannot share a protocol twin", hint)])
+    endpoints = list(connect) or experiment.network.connect or [network.DEFAULT_ENDPOINT]
+    request = DeviceRequest(assign.request(experiment, names, [experiment.seed], endpoints), faults)
+    over, lost = threading.Event(), threading.Event()
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        over.set()
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    if lifeline:
+        Lifeline(lost).start()
+    with network.open_session(endpoints, name=words.pop(), stop=over) as session:
+        device: Device = plugins.load(plugins.DEVICES, experiment.robots[names[0]].body)(request)
+        try:
+            for name, address in zip(names, device.addresses, strict=True):
+                print(f"address {name} {address}", flush=True)
+            keys = Keys(experiment.network.realm)
+            DeviceProcess(device, names, session, keys, experiment.rates.body_hz).run(over, lost)
+        finally:
+            device.close()
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line of the process."""
+    parser = argparse.ArgumentParser(prog="zenpark twin", description="Protocol twins of some robots.")
+    parser.add_argument("file", help="experiment file, or name in the catalogue")
+    parser.add_argument("names", nargs="+", metavar="ROBOT")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
+    parser.add_argument("--faults", default="{}", help="JSON, such as '{\"loss\": 0.05}'")
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent")
+    chosen = parser.parse_args(arguments)
+    try:
+        faults = msgspec.json.decode(chosen.faults, type=Faults)
+        return stand_in(chosen.file, chosen.names, faults=faults, connect=chosen.connect, lifeline=chosen.lifeline)
+    except msgspec.MsgspecError as error:
+        print(f"zenpark: --faults {chosen.faults}: {error}", file=sys.stderr)
+    except (DocumentError, plugins.PluginError, network.EndpointError, network.Unreachable, OSError) as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

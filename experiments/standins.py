@@ -1,0 +1,129 @@
+"""What stands in for hardware in a run: protocol twins for robots that ask for one, and who measures positions."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from agents import plugins
+from experiments.experiment import Experiment, Robot
+from experiments.launcher import Launcher, Process
+
+READY_S: Final = 15.0
+POLL_S: Final = 0.02
+VICON_TWIN: Final = "vicon-twin"
+VICON: Final = "vicon://"
+
+# what `--bodies protocol` makes of each kind: its protocol twin, the process that its robots share (several Crazyflies
+# hang on one radio, all Tellos of a computer on one port), and who knows where it is
+PROTOCOL: Final[dict[str, tuple[str, str | None, str]]] = {
+    "crazyflie": ("crazyflie-twin", "radio0", "body"),
+    "tello": ("tello-twin", "tellos", "external"),
+    "khepera4": ("khepera4-twin", None, "external"),
+    "turtlebot3": ("turtlebot3-twin", None, "external"),
+}
+
+
+class StandInError(RuntimeError):
+    """A protocol twin or a positioning system that did not start, with what it said."""
+
+
+def behind_protocols(experiment: Experiment) -> Experiment:
+    """The experiment with every robot behind its real bridge and a protocol twin, and simulated motion capture."""
+    robots = {}
+    for name, robot in experiment.robots.items():
+        body, process, position = PROTOCOL[robot.kind]
+        robots[name] = msgspec.structs.replace(robot, body=body, process=process, position=position)
+    return msgspec.structs.replace(experiment, robots=robots, positioning=VICON_TWIN)
+
+
+def start(
+    experiment: Experiment,
+    file: Path,
+    *,
+    prefix: str,
+    launcher: Launcher,
+    connect: Sequence[str],
+    interrupted: Callable[[], bool],
+) -> tuple[Experiment, tuple[str, ...]]:
+    """Starts what the experiment asks for, and fills in at which address each robot is.
+
+    Args:
+        experiment: A case.
+        file: The same as a file.
+        prefix: Of the processes' names.
+        launcher: Starts them.
+        connect: `--connect` and its endpoints.
+        interrupted: Asked while it waits.
+
+    Returns:
+        The experiment with addresses, and the names of the processes that were started.
+
+    Raises:
+        StandInError: If one does not start in time.
+    """
+    words = plugins.names(plugins.DEVICES)
+    groups: dict[str, list[str]] = {}
+    for name, robot in experiment.robots.items():
+        if robot.body in words:
+            groups.setdefault(robot.body, []).append(name)
+    processes = {
+        word: launcher.start(f"{prefix}-{word}", "experiments.device", str(file), *names, *connect, "--lifeline")
+        for word, names in groups.items()
+    }
+    addresses: dict[str, str] = {}
+    for word, names in groups.items():
+        wanted = _said(processes[word], r"^address (\w+) (\S+)$", len(names), interrupted)
+        addresses.update(wanted)
+    started = [process.name for process in processes.values()]
+    robots = {
+        name: msgspec.structs.replace(robot, body=addresses.get(name, robot.body))
+        for name, robot in experiment.robots.items()
+    }
+    started += _positioning(
+        experiment, robots, prefix=prefix, launcher=launcher, connect=connect, interrupted=interrupted
+    )
+    return msgspec.structs.replace(experiment, robots=robots), tuple(started)
+
+
+def _positioning(
+    experiment: Experiment,
+    robots: dict[str, Robot],
+    *,
+    prefix: str,
+    launcher: Launcher,
+    connect: Sequence[str],
+    interrupted: Callable[[], bool],
+) -> list[str]:
+    """Who measures external positions; the names of the processes that were started for it."""
+    measured = [name for name, robot in robots.items() if robot.position == "external"]
+    if experiment.positioning is None or not measured:
+        return []
+    started = []
+    host = experiment.positioning.removeprefix(VICON)
+    if experiment.positioning == VICON_TWIN:
+        arguments = ["--listen", "127.0.0.1:0", "--robots", *measured, *connect, "--lifeline"]
+        twin = launcher.start(f"{prefix}-{VICON_TWIN}", "twins.vicon", *arguments)
+        started.append(twin.name)
+        host = _said(twin, r"^vicon (ready on) (\S+)$", 1, interrupted)["ready on"]
+    maps = [part for name in measured for part in ("--map", f"{name}={name}")]
+    bridge = launcher.start(f"{prefix}-vicon", "bridges.vicon", host, *maps, *connect, "--lifeline")
+    return [*started, bridge.name]
+
+
+def _said(process: Process, pattern: str, count: int, interrupted: Callable[[], bool]) -> dict[str, str]:
+    """Waits until a process has said so many lines of a form; the two groups of each."""
+    deadline = time.monotonic() + READY_S
+    while True:
+        found = dict(re.findall(pattern, process.log.read_text(errors="replace"), re.MULTILINE))
+        if len(found) >= count:
+            return found
+        if interrupted() or not process.alive or time.monotonic() > deadline:
+            what = "was interrupted" if interrupted() else f"did not start ({process.exit})"
+            raise StandInError(f"{process.name} {what}: {process.tail() or 'it said nothing'}")
+        time.sleep(POLL_S)
