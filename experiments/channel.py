@@ -49,8 +49,14 @@ class Channel:
         self._flying: list[Samples] = []
         self.lost = np.zeros(len(links), dtype=np.intp)
 
-    def send(self, t: float, rows: Index, seq: Index, position: Array, velocity: Array) -> None:
-        """Rows say where they are: `position`, `velocity` (N, 3) and `seq` (N,) of all rows, of which `rows` speak."""
+    def send(
+        self, t: float, rows: Index, seq: Index, position: Array, velocity: Array, *, surely: bool = False
+    ) -> None:
+        """Rows say where they are: `position`, `velocity` (N, 3) and `seq` (N,) of all rows, of which `rows` speak.
+
+        Before the common start nothing is lost (`surely`): no run begins before everybody has heard his neighbours, and
+        the real network repeats a first pose until it arrives.
+        """
         spoke = np.zeros(len(position), dtype=bool)
         spoke[rows] = True
         speaker = self._links.speaker
@@ -63,7 +69,7 @@ class Channel:
                 chance[:, mine] = self._generators[copy].random((2, self._per_copy))
             chance = chance[:, at]
             delay -= self._jitter * np.log1p(-chance[1])
-            arrives = chance[0] >= self._loss
+            arrives = (chance[0] >= self._loss) | surely
             self.lost[at[~arrives]] += 1
             at, delay = at[arrives], delay[arrives]
         if len(at):

@@ -141,7 +141,7 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
             seq[speak] += 1
             said = (state.position[speak], state.velocity[speak], state.yaw[speak])
             sent.add(np.full(len(speak), t), speak, seq[speak], *said)
-            channel.send(t, speak, seq, state.position, state.velocity)
+            channel.send(t, speak, seq, state.position, state.velocity, surely=agent.decisions == 0)
         conductor.look(t, dt)
         tick += 1
     begin = conductor.start_at

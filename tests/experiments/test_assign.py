@@ -1,0 +1,161 @@
+"""What robots are told: each its own part of the experiment, repetitions side by side."""
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.body import Disturbance, Jitter
+from agents.coordination import Distance
+from agents.kinds import CRAZYFLIE, KHEPERA4, TURTLEBOT3
+from agents.planning import Line
+from agents.triggers import Periodic, SendOnDelta
+from experiments import assign, document
+from experiments.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Safety, Start
+
+NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
+
+
+@pytest.fixture(scope="module")
+def park():
+    return document.read("robotic-park").cases()["periodic"]
+
+
+def test_everybody_together(park):
+    made = assign.assign(park, NAMES)
+    assert made.names == made.speakers == NAMES
+    assert made.kinds == (TURTLEBOT3, KHEPERA4, KHEPERA4, KHEPERA4, CRAZYFLIE, CRAZYFLIE, CRAZYFLIE)
+    np.testing.assert_array_equal(made.hover, [np.nan] * 4 + [0.8] * 3)
+    assert made.law == Distance()
+    assert made.trigger == Periodic(period_s=0.02)
+    assert (made.clamp, made.tracking_gain, made.duration) == (0.1, 3.0, 45.0)
+    assert (made.body_hz, made.pose_every, made.decide_every) == (100.0, 2, 10)
+    assert made.patience_s is None
+    ((rows, (leg,)),) = made.legs
+    assert rows.tolist() == [0]
+    assert leg.at == 21.0
+    assert leg.planner == Line(move_by=[0.75, 0.0], speed_=0.15)
+
+
+def test_the_links_of_the_paper(park):
+    """Eq. (11) and figure 11: 12 edges, three of them from the leader only."""
+    net = assign.all_links(park)
+    heard = {NAMES[i]: {NAMES[j] for j in net.speaker[net.listener == i]} for i in range(7)}
+    assert heard == {
+        "TB01": set(),
+        "KH01": {"TB01", "KH02", "KH03", "CF01"},
+        "KH02": {"KH01", "KH03", "CF02"},
+        "KH03": {"TB01", "KH01", "KH02", "CF02"},
+        "CF01": {"TB01", "KH01", "CF02", "CF03"},
+        "CF02": {"KH02", "KH03", "CF01", "CF03"},
+        "CF03": {"CF01", "CF02"},
+    }
+    distance = {(NAMES[i], NAMES[j]): d for i, j, d in zip(net.listener, net.speaker, net.distance, strict=True)}
+    assert distance["KH01", "KH03"] == distance["KH03", "KH01"] == pytest.approx(0.6 * math.sqrt(2))
+    assert distance["CF01", "TB01"] == distance["KH02", "CF02"] == 0.86
+    assert (net.gain == 3.0).all()
+
+
+@pytest.mark.parametrize("names", [("CF01",), ("KH02", "CF03"), ("CF03", "TB01", "KH02")])
+def test_some_robots_in_any_order_know_their_own_part(park, names):
+    made, whole = assign.assign(park, names), assign.all_links(park)
+    assert made.names == names
+    assert made.speakers == NAMES
+    mine = {(names[i], NAMES[j], d) for i, j, d in zip(made.links.listener, made.links.speaker, made.links.distance, strict=True)}
+    everyone = {(NAMES[i], NAMES[j], d) for i, j, d in zip(whole.listener, whole.speaker, whole.distance, strict=True)}
+    assert mine == {link for link in everyone if link[0] in names}
+    planned = [names[row] for rows, _ in made.legs for row in rows]
+    assert planned == [name for name in names if name == "TB01"]
+
+
+def test_repetitions_stand_side_by_side(park):
+    made = assign.assign(park, NAMES, copies=3)
+    assert made.names == made.speakers == NAMES * 3
+    assert len(made.links) == 3 * len(assign.all_links(park))
+    assert (made.links.listener // 7 == made.links.speaker // 7).all()
+    ((rows, _),) = made.legs
+    assert rows.tolist() == [0, 7, 14]
+    assert made.hover.shape == (21,)
+    with pytest.raises(ValueError, match="only the whole experiment can be repeated"):
+        assign.assign(park, NAMES[1:], copies=2)
+
+
+def test_bodies_of_repetitions_differ_in_their_seeds_only(park):
+    made = assign.request(park, NAMES, [5, 6])
+    assert made.names == NAMES * 2
+    assert made.seeds == (5,) * 7 + (6,) * 7
+    assert made.addresses == ("twin",) * 14
+    assert made.rate_hz == 100.0
+    np.testing.assert_array_equal(made.start[:7], made.start[7:])
+    np.testing.assert_array_equal(made.start[[0, 4]], [[-0.6, 0.8, 0.0], [-0.2, 0.4, 0.0]])
+    assert made.disturbance[:7] == made.disturbance[7:]
+
+
+def experiment(**parts):
+    robots = {
+        "A": Robot(kind="khepera4", start=[0.5, -0.5, 1.5]),
+        "B": Robot(kind="crazyflie", start=[0.0, 0.25], hover=0.7),
+        "C": Robot(kind="turtlebot3", start=[-0.5, 0.0]),
+    }
+    return Experiment(**{"title": "Three", "robots": robots, "duration_s": 5.0, **parts})
+
+
+def test_starts_are_on_the_floor_with_a_yaw():
+    position, yaw = assign.start(experiment(), ("B", "A"))
+    np.testing.assert_array_equal(position, [[0.0, 0.25, 0.0], [0.5, -0.5, 0.0]])
+    np.testing.assert_array_equal(yaw, [0.0, 1.5])
+
+
+def test_limits_are_the_arena_and_the_safety_of_the_file():
+    made = assign.limits(experiment(arena=Arena((2.0, 3.0, 4.0)), safety=Safety(speed=0.3, goal_step=0.2, margin=0.1)))
+    np.testing.assert_array_equal(made.low, [-1.0, -1.5, 0.0])
+    np.testing.assert_array_equal(made.high, [1.0, 1.5, 4.0])
+    assert (made.speed, made.goal_step, made.margin) == (0.3, 0.2, 0.1)
+    assert (made.own_silence_s, made.link_silence_s) == (0.5, 1.0)
+    assert assign.limits(experiment()).speed == np.inf
+
+
+def test_links_may_have_gains_of_their_own():
+    formation = Formation(gain=2.0, links={"A > B": Link(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": Link(distance=1.0)})
+    net = assign.all_links(experiment(formation=formation))
+    table = list(zip(net.listener.tolist(), net.speaker.tolist(), net.distance.tolist(), net.gain.tolist(), strict=True))
+    assert table == [(0, 2, 1.0, 2.0), (1, 0, 0.5, 7.0), (1, 2, 0.6, 2.0), (2, 1, 0.6, 2.0)]
+
+
+@pytest.mark.parametrize(
+    ("formation", "leaders"),
+    [
+        (Formation(), []),  # nobody listens: nobody leads
+        (Formation(links={"A > B": 1.0, "A > C": 1.0}), ["A"]),
+        (Formation(links={"A > B": 1.0}), ["A", "C"]),
+        (Formation(links={"A - B": 1.0, "B > C": 1.0}), []),
+        (Formation(links={"A - B": 1.0}, leader="B"), ["B"]),
+    ],
+)
+def test_who_leads(formation, leaders):
+    assert assign.leaders(experiment(formation=formation)) == leaders
+
+
+def test_disturbances_merge_field_by_field_the_narrower_wins():
+    given = {
+        "all": Disturbance(position_sigma=0.001, yaw_sigma=0.01, latency_s=0.1),
+        "crazyflie": Disturbance(hover_jitter=Jitter(0.01), latency_s=0.2),
+        "B": Disturbance(position_sigma=0.0),
+    }
+    made = experiment(disturbance=given)
+    assert assign.disturbance(made, "A") == given["all"]
+    assert assign.disturbance(made, "B") == Disturbance(Jitter(0.01), 0.0, 0.01, 0.2)
+    assert assign.disturbance(experiment(), "A") == Disturbance()
+
+
+def test_rates_patience_and_triggers():
+    rates = Rates(body_hz=200.0, pose_hz=40.0, coordination_hz=20.0)
+    trigger = {"kind": "send-on-delta", "threshold": 0.02, "maximum_silence_s": 1.0}
+    made = assign.assign(
+        experiment(rates=rates, start=Start(deadline_s=7.0, missing="go-on"), trigger=trigger), ("A", "B", "C")
+    )
+    assert (made.body_hz, made.pose_every, made.decide_every, made.patience_s) == (200.0, 5, 10, 7.0)
+    assert made.trigger == SendOnDelta(threshold=0.02, maximum_silence_s=1.0)
+    with pytest.raises(msgspec.ValidationError, match="threshold"):
+        assign.assign(experiment(trigger={**trigger, "threshold": -1.0}), ("A",))

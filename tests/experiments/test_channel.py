@@ -1,0 +1,146 @@
+"""The modelled network: delays, jitter and losses with the numbers of the file, each repetition with luck of its own."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.graph import links
+from experiments.channel import Channel, Samples
+from experiments.experiment import Channel as Parameters
+
+DT = 0.01
+# 0 and 1 hear each other, 2 hears both
+NET = links([(0, 1), (1, 0), (2, 0), (2, 1)], [1.0] * 4, [1.0] * 4)
+
+
+class Talk:
+    """Rows that say their number and the time, and what arrives of it."""
+
+    def __init__(self, parameters, *, net=NET, rows=3, seeds=(1,)):
+        self.rows, self.seq, self.tick = rows * len(seeds), np.zeros(rows * len(seeds), dtype=np.intp), 0
+        self.channel = Channel(net.repeated(len(seeds), rows), parameters, seeds)
+        self.heard = []
+
+    def step(self, speak=()):
+        """One tick: what arrived first, then what is said."""
+        t = self.tick * DT
+        if (got := self.channel.due(t)) is not None:
+            self.heard.append((t, got))
+        speak = np.array(speak, dtype=np.intp)
+        if len(speak):
+            self.seq[speak] += 1
+            position = np.stack([np.arange(self.rows), np.full(self.rows, t), self.seq], axis=1).astype(float)
+            self.channel.send(t, speak, self.seq, position, -position)
+        self.tick += 1
+
+    def run(self, ticks, speak):
+        for _ in range(ticks):
+            self.step(speak)
+        return self
+
+    def all(self):
+        """Everything that arrived, in order: when it was taken in, and the samples."""
+        when = np.concatenate([np.full(len(got.link), t) for t, got in self.heard])
+        columns = ("link", "arrival", "stamp", "seq", "position", "velocity")
+        return when, Samples(*(np.concatenate([getattr(got, c) for _, got in self.heard]) for c in columns))
+
+
+def test_nothing_said_nothing_heard():
+    talk = Talk(Parameters()).run(5, [])
+    assert talk.heard == []
+
+
+def test_every_listener_hears_what_was_said():
+    talk = Talk(Parameters(delay_s=0.001))
+    talk.step([0, 2])
+    talk.step()
+    ((t, got),) = talk.heard
+    assert t == DT
+    assert got.link.tolist() == [1, 2]  # 1 and 2 listen to 0; nobody listens to 2
+    np.testing.assert_array_equal(got.position, [[0, 0, 1], [0, 0, 1]])
+    np.testing.assert_array_equal(got.velocity, -got.position)
+    assert got.seq.tolist() == [1, 1]
+    np.testing.assert_array_equal(got.stamp, [0.0, 0.0])
+    np.testing.assert_array_equal(got.arrival, [0.001, 0.001])
+
+
+@pytest.mark.parametrize(("delay", "ticks"), [(0.0, 1), (0.001, 1), (0.01, 1), (0.02, 2), (0.03, 3), (0.07, 7), (0.071, 8)])
+def test_a_delay_is_the_same_number_of_ticks_for_every_sample(delay, ticks):
+    talk = Talk(Parameters(delay_s=delay)).run(500, [0])
+    when, got = talk.all()
+    np.testing.assert_array_equal(np.round((when - got.stamp) / DT), ticks)
+    assert len(got.link) == 2 * (500 - ticks)
+    np.testing.assert_array_equal(got.seq[got.link == 1], np.arange(1, 501 - ticks))
+
+
+def test_jitter_adds_an_exponential_with_its_mean():
+    talk = Talk(Parameters(delay_s=0.005, jitter_s=0.03)).run(4000, [0, 1]).run(200, [])
+    when, got = talk.all()
+    extra = got.arrival - got.stamp - 0.005
+    assert len(extra) == 4 * 4000
+    assert extra.min() >= 0.0
+    assert extra.mean() == pytest.approx(0.03, rel=0.03)
+    assert extra.std() == pytest.approx(0.03, rel=0.05)
+    assert np.quantile(extra, 0.5) == pytest.approx(0.03 * np.log(2.0), rel=0.05)
+    assert (when - got.arrival >= -1e-9).all()
+    assert (when - got.arrival < DT + 1e-9).all()
+
+
+def test_what_arrives_is_in_order_of_arrival_though_not_of_sending():
+    talk = Talk(Parameters(jitter_s=0.05)).run(500, [0, 1])
+    for _, got in talk.heard:
+        assert (np.diff(got.arrival) >= 0.0).all()
+    _, got = talk.all()
+    assert (np.diff(got.seq[got.link == 1]) < 0).any()  # some overtook others
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.5])
+def test_the_share_that_is_lost(loss):
+    talk = Talk(Parameters(loss=loss)).run(5000, [0, 1]).run(2, [])
+    _, got = talk.all()
+    arrived = np.bincount(got.link, minlength=4)
+    np.testing.assert_array_equal(arrived + talk.channel.lost, 5000)
+    np.testing.assert_allclose(talk.channel.lost / 5000, loss, atol=0.025)
+    together = np.isin(got.seq[got.link == 1], got.seq[got.link == 2]).mean()  # links lose independently
+    assert together == pytest.approx(1.0 - loss, abs=0.03)
+
+
+def test_everything_or_nothing():
+    everything = Talk(Parameters(loss=1.0)).run(50, [0, 1, 2])
+    assert everything.heard == []
+    assert everything.channel.lost.tolist() == [50] * 4
+    nothing = Talk(Parameters(loss=0.0, jitter_s=0.001)).run(50, [0])
+    assert not nothing.channel.lost.any()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_repetitions_have_the_luck_that_they_would_have_alone(seed):
+    rng = np.random.default_rng(seed)
+    parameters, seeds = Parameters(delay_s=0.004, jitter_s=0.02, loss=0.3), (11, 12, 13)
+    speak = rng.random((40, 9)) < 0.15  # now one repetition speaks, now another
+    together = Talk(parameters, seeds=seeds)
+    for moment in speak:
+        together.step(np.flatnonzero(moment))
+    when, got = together.all()
+    for copy, own in enumerate(seeds):
+        alone = Talk(parameters, seeds=(own,))
+        for moment in speak[:, 3 * copy : 3 * copy + 3]:
+            alone.step(np.flatnonzero(moment))
+        mine = got.link // 4 == copy
+        np.testing.assert_array_equal(together.channel.lost[4 * copy : 4 * copy + 4], alone.channel.lost)
+        if not alone.heard:
+            assert not mine.any()
+            continue
+        moment, expected = alone.all()
+        np.testing.assert_array_equal(when[mine], moment)
+        np.testing.assert_array_equal(got.link[mine] - 4 * copy, expected.link)
+        np.testing.assert_array_equal(got.arrival[mine], expected.arrival)
+        np.testing.assert_array_equal(got.seq[mine], expected.seq)
+
+
+def test_a_network_without_links():
+    talk = Talk(Parameters(loss=0.5, jitter_s=0.1), net=links([], [], []), rows=1).run(10, [0])
+    assert talk.heard == []
+    assert talk.channel.lost.shape == (0,)

@@ -1,0 +1,207 @@
+"""The virtual clock: the same bits from the same seed, alone or beside other seeds, and names when it gets stuck."""
+
+from dataclasses import fields
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.body import Disturbance
+from agents.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING
+from experiments import document
+from experiments.experiment import Channel, Experiment, Formation, Leg, Robot, Start
+from experiments.virtual import LEAD_S, Log, Stuck, simulate
+
+
+def changed(experiment, **parts):
+    return msgspec.structs.replace(experiment, **parts)
+
+
+@pytest.fixture(scope="module")
+def park():
+    """The reference experiment with everything that is random, cut short."""
+    experiment = document.read("robotic-park").cases()["event"]
+    nature = {
+        **experiment.disturbance,
+        "KH02": Disturbance(odometry_drift=0.002, latency_s=0.02),
+        "CF02": Disturbance(latency_s=0.03),
+    }
+    leg = Leg(at_s=2.0, robot="TB01", plan={"kind": "line", "move_by": [0.2, 0.0], "speed": 0.2})
+    trigger = {"kind": "send-on-delta", "threshold": 0.01, "maximum_silence_s": 0.2}
+    channel = Channel(delay_s=0.004, jitter_s=0.01, loss=0.2)
+    return changed(experiment, duration_s=4.0, disturbance=nature, timeline=[leg], trigger=trigger, channel=channel)
+
+
+def ground(**parts):
+    """Two ground robots that listen to each other."""
+    robots = {"A": Robot(kind="khepera4", start=[-0.4, 0.0]), "B": Robot(kind="khepera4", start=[0.4, 0.1])}
+    given = {"title": "A pair", "duration_s": 2.0, "robots": robots, "formation": Formation(links={"A - B": 0.5})}
+    return Experiment(**{**given, **parts})
+
+
+def same(a: Log, b: Log):
+    """To the last bit, NaN included."""
+    for field in fields(Log):
+        one, other = getattr(a, field.name), getattr(b, field.name)
+        for x, y in zip(one, other, strict=True) if isinstance(one, tuple) else [(one, other)]:
+            np.testing.assert_array_equal(np.asarray(x), np.asarray(y), err_msg=field.name)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_others(park):
+    first = simulate(park, [7])
+    same(first, simulate(park, [7]))
+    other = simulate(park, [8])
+    assert not np.array_equal(first.position[-1], other.position[-1])
+
+
+def test_seeds_side_by_side_are_what_each_is_alone(park):
+    seeds = [3, 9, 4]
+    batch = simulate(park, seeds)
+    for copy, seed in enumerate(seeds):
+        alone = simulate(park, [seed])
+        rows, samples = slice(7 * copy, 7 * copy + 7), len(alone.time)
+        np.testing.assert_array_equal(batch.time[:samples], alone.time)
+        for what in ("phase", "position", "velocity", "yaw", "true_position", "true_yaw", "goal", "setpoint", "error"):
+            mine = getattr(batch, what)[:samples, rows]
+            np.testing.assert_array_equal(mine, getattr(alone, what), err_msg=f"{what} of seed {seed}")
+        links = len(alone.lost)
+        np.testing.assert_array_equal(batch.lost[links * copy : links * (copy + 1)], alone.lost)
+        for what, first, per in (("sent", 7 * copy, 7), ("heard", links * copy, links)):
+            columns, expected = getattr(batch, what), getattr(alone, what)
+            mine = (columns[1] // per == copy) & (columns[0] <= alone.ended - 0.05)
+            kept = expected[0] <= alone.ended - 0.05
+            for number, (got, want) in enumerate(zip(columns, expected, strict=True)):
+                shift = first if number == 1 else 0
+                np.testing.assert_array_equal(got[mine] - shift, want[kept], err_msg=f"{what} {number}")
+        assert batch.interventions[rows].tolist() == alone.interventions.tolist()
+    assert (batch.decisions, batch.ticks) == (alone.decisions, alone.ticks) == (40, 400)
+
+
+def test_the_common_start_is_time_zero():
+    log = simulate(ground(), [1])
+    k = int(np.argmin(np.abs(log.time)))
+    assert log.time[k] == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(np.diff(log.time), 0.02, atol=1e-9)  # state_hz
+    assert log.phase[k].tolist() == [RUNNING, RUNNING]
+    assert log.phase[k - 1].tolist() == [AIRBORNE, AIRBORNE]
+    assert log.phase[0].tolist() == [IDLE, IDLE]
+    assert log.airborne == pytest.approx(-LEAD_S)
+    end = int(np.flatnonzero(log.time < 2.0 - 1e-9)[-1])
+    assert log.phase[end].tolist() == [RUNNING, RUNNING]
+    assert (log.phase[end + 1] >= LANDING).all()
+    assert log.phase[-1].tolist() == [DONE, DONE]
+    assert (log.decisions, log.ticks) == (20, 200)
+
+
+def test_phases_never_go_back(park):
+    log = simulate(park, [1])
+    assert (np.diff(log.phase, axis=0) >= 0).all()
+    assert {IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE} >= set(log.phase.ravel().tolist())
+    np.testing.assert_array_equal(log.true_position[-1, 4:, 2], 0.0)
+    assert (log.true_position[..., 2] >= 0.0).all()
+
+
+def test_periodic_poses_are_all_sent_and_all_heard():
+    log = simulate(ground(trigger={"kind": "periodic", "period_s": 0.1}), [1])
+    time, row, seq, position, _, _ = log.sent
+    run = (time >= -1e-9) & (time < 2.0 - 1e-9)
+    assert np.bincount(row[run]).tolist() == [20, 20]
+    for robot in range(2):
+        np.testing.assert_array_equal(seq[row == robot], np.arange(1, (row == robot).sum() + 1))
+    arrival, link, number, stamp, place = log.heard
+    np.testing.assert_allclose(arrival - stamp, 0.001, atol=1e-9)
+    for this, (listener, speaker) in enumerate([(0, 1), (1, 0)]):
+        assert listener != speaker
+        mine, theirs = link == this, row == speaker
+        count = mine.sum()
+        np.testing.assert_array_equal(number[mine], seq[theirs][:count])
+        np.testing.assert_array_equal(place[mine], position[theirs][:count])
+        assert count >= theirs.sum() - 1
+    assert not log.lost.any()
+
+
+def test_losses_are_counted_from_the_start_to_the_landing():
+    experiment = ground(channel=Channel(loss=0.25), duration_s=10.0)
+    log = simulate(experiment, [1])
+    time, row, _, _, _, _ = log.sent
+    run = (time >= -1e-9) & (time < 10.0 - 1e-9)
+    heard = log.heard
+    stamped = (heard[3] >= -1e-9) & (heard[3] < 10.0 - 1e-9)
+    for link, speaker in enumerate((1, 0)):
+        missing = (row[run] == speaker).sum() - (heard[1][stamped] == link).sum()
+        assert log.lost[link] == missing
+    assert log.lost.sum() / run.sum() == pytest.approx(0.25, abs=0.05)
+
+
+def test_one_robot_alone():
+    robots = {"F": Robot(kind="crazyflie", start=[0.2, -0.1], hover=0.6)}
+    plan = {"kind": "circle", "radius": 0.2, "period_s": 8.0}
+    leg = Leg(at_s=0.0, robot="F", plan=plan)
+    log = simulate(Experiment(title="Alone", duration_s=8.0, robots=robots, timeline=[leg]), [1])
+    run = (log.time >= 0.0) & (log.time <= 8.0)
+    path = log.true_position[run, 0]
+    assert len(log.heard[0]) == 0
+    assert np.abs(path[:, 2] - 0.6).max() < 0.05
+    centre = np.array([0.2, 0.1])
+    # a position controller lags behind a circle and cuts it
+    assert np.linalg.norm(path[100:, :2] - centre, axis=1).max() < 0.21
+    assert np.ptp(path[:, 0]) > 0.3
+    np.testing.assert_allclose(path[-1, :2], [0.2, -0.1], atol=0.1)
+
+
+def test_three_robots_find_their_triangle():
+    robots = {
+        "A": Robot(kind="khepera4", start=[-0.6, -0.5]),
+        "B": Robot(kind="khepera4", start=[0.6, -0.5]),
+        "F": Robot(kind="crazyflie", start=[0.1, 0.6], hover=0.6),
+    }
+    links = {"A - B": 0.6, "A - F": 0.8, "B - F": 0.8}
+    nature = {"all": Disturbance(position_sigma=0.0003)}
+    experiment = Experiment(
+        title="Triangle", duration_s=25.0, robots=robots, formation=Formation(links=links), disturbance=nature
+    )
+    log = simulate(experiment, [1])
+    a, b, f = log.true_position[np.flatnonzero(log.time <= 25.0)[-1]]
+    for one, other, distance in ((a, b, 0.6), (a, f, 0.8), (b, f, 0.8)):
+        assert np.linalg.norm(one - other) == pytest.approx(distance, abs=0.012)
+    assert not log.interventions.any()
+
+
+def test_the_reference_formation_is_acquired():
+    experiment = changed(document.read("robotic-park").cases()["event"], duration_s=18.0, timeline=[])
+    log = simulate(experiment, [1, 2])
+    last = log.error[np.flatnonzero(log.time <= 18.0)[-1]].reshape(2, 7)
+    links_each = np.array([0, 4, 3, 4, 4, 4, 2])
+    assert (last <= 0.03 * links_each + 1e-9).all()
+    inside = np.abs(log.true_position[..., :2]).max()
+    assert inside < 1.0
+    sent = np.bincount(log.sent[1][(log.sent[0] >= 0) & (log.sent[0] < 18)], minlength=14) / 18.0
+    assert (sent[[1, 2, 3, 8, 9, 10]] < 6.0).all()  # Kheperas
+    assert (sent[[4, 5, 6, 11, 12, 13]] > 4.0).all()  # hover jitter makes Crazyflies speak
+    assert sent.max() < 25.0
+
+
+def test_who_hears_nobody_is_named():
+    with pytest.raises(Stuck, match=r"not ready after 60 s: A, B \(never heard B\)"):
+        simulate(ground(channel=Channel(loss=1.0)), [1])
+
+
+def test_who_cannot_get_up_is_named():
+    robots = {
+        "A": Robot(kind="khepera4", start=[0.0, 0.0]),
+        "F": Robot(kind="crazyflie", start=[0.5, 0.0], hover=0.5),
+        "G": Robot(kind="crazyflie", start=[-0.5, 0.0], hover=0.5),
+    }
+    # a measured height that is nearly always more than 5 cm off: it never knows that it has arrived
+    nature = {"G": Disturbance(position_sigma=500.0)}
+    experiment = Experiment(title="Stuck", duration_s=1.0, robots=robots, disturbance=nature)
+    with pytest.raises(Stuck, match=r"not airborne after 60 s: G"):
+        simulate(experiment, [1])
+
+
+def test_going_on_without_a_neighbour_that_is_never_heard():
+    log = simulate(ground(channel=Channel(loss=1.0), start=Start(deadline_s=1.0, missing="go-on")), [1])
+    run = (log.time >= 0.0) & (log.time <= 2.0)
+    np.testing.assert_allclose(log.true_position[run], np.tile(log.true_position[0], (run.sum(), 1, 1)), atol=1e-9)
+    assert not log.error.any()
+    assert log.time[0] == pytest.approx(-1.5 - LEAD_S)  # ready just after 1 s, sent off half a second later
