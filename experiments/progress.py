@@ -94,7 +94,7 @@ def _table(progress: Progress) -> RenderableType:
 
     elapsed = "" if progress.elapsed is None else f"  {progress.elapsed:5.1f} / {progress.duration:g} s"
     grid = Grid(title=f"{progress.case}: {progress.phase}{elapsed}", box=box.SIMPLE_HEAD, title_justify="left")
-    for heading in ("robot", "phase", "error [m]", "sent", "1/s", "lost", "late", "CPU", "battery", ""):
+    for heading in ("robot", "phase", "error, m", "sent", "1/s", "lost", "late", "CPU", "battery", ""):
         grid.add_column(heading, justify="left" if heading in ("robot", "phase", "") else "right", no_wrap=True)
     now = time.time()
     for name, seen in progress.robots.items():

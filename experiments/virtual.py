@@ -125,9 +125,10 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
             heard.add(arrived.arrival, arrived.link, arrived.seq, arrived.stamp, arrived.position)
         actions = agent.step(t, state)
         if agent.life.moved:
-            begun, ended = agent.decisions == 1, (agent.life.phase >= LANDING).all()
-            lost_before = channel.lost.copy() if begun else lost_before
-            lost_after = channel.lost.copy() if ended else lost_after
+            if lost_before is channel.lost and agent.decisions:
+                lost_before = channel.lost.copy()
+            if lost_after is channel.lost and agent.decisions and (agent.life.phase >= LANDING).all():
+                lost_after = channel.lost.copy()
         if actions.duties is not None:
             body.takeoff(actions.duties.takeoff, assignment.hover[actions.duties.takeoff])
             body.land(actions.duties.land)

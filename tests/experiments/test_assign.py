@@ -62,8 +62,11 @@ def test_some_robots_in_any_order_know_their_own_part(park, names):
     made, whole = assign.assign(park, names), assign.all_links(park)
     assert made.names == names
     assert made.speakers == NAMES
-    mine = {(names[i], NAMES[j], d) for i, j, d in zip(made.links.listener, made.links.speaker, made.links.distance, strict=True)}
-    everyone = {(NAMES[i], NAMES[j], d) for i, j, d in zip(whole.listener, whole.speaker, whole.distance, strict=True)}
+
+    def table(net, listeners):
+        return {(listeners[i], NAMES[j], d) for i, j, d in zip(net.listener, net.speaker, net.distance, strict=True)}
+
+    mine, everyone = table(made.links, names), table(whole, NAMES)
     assert mine == {link for link in everyone if link[0] in names}
     planned = [names[row] for rows, _ in made.legs for row in rows]
     assert planned == [name for name in names if name == "TB01"]
@@ -117,10 +120,10 @@ def test_limits_are_the_arena_and_the_safety_of_the_file():
 
 
 def test_links_may_have_gains_of_their_own():
-    formation = Formation(gain=2.0, links={"A > B": Link(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": Link(distance=1.0)})
-    net = assign.all_links(experiment(formation=formation))
-    table = list(zip(net.listener.tolist(), net.speaker.tolist(), net.distance.tolist(), net.gain.tolist(), strict=True))
-    assert table == [(0, 2, 1.0, 2.0), (1, 0, 0.5, 7.0), (1, 2, 0.6, 2.0), (2, 1, 0.6, 2.0)]
+    given = {"A > B": Link(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": Link(distance=1.0)}
+    net = assign.all_links(experiment(formation=Formation(gain=2.0, links=given)))
+    table = zip(*(column.tolist() for column in (net.listener, net.speaker, net.distance, net.gain)), strict=True)
+    assert list(table) == [(0, 2, 1.0, 2.0), (1, 0, 0.5, 7.0), (1, 2, 0.6, 2.0), (2, 1, 0.6, 2.0)]
 
 
 @pytest.mark.parametrize(

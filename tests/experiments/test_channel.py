@@ -1,4 +1,4 @@
-"""The modelled network: delays, jitter and losses with the numbers of the file, each repetition with luck of its own."""
+"""The modelled network: delays, jitter and losses as the file has them, each repetition with luck of its own."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def test_every_listener_hears_what_was_said():
     np.testing.assert_array_equal(got.arrival, [0.001, 0.001])
 
 
-@pytest.mark.parametrize(("delay", "ticks"), [(0.0, 1), (0.001, 1), (0.01, 1), (0.02, 2), (0.03, 3), (0.07, 7), (0.071, 8)])
+@pytest.mark.parametrize(("delay", "ticks"), [(0.0, 1), (0.001, 1), (0.01, 1), (0.02, 2), (0.07, 7), (0.071, 8)])
 def test_a_delay_is_the_same_number_of_ticks_for_every_sample(delay, ticks):
     talk = Talk(Parameters(delay_s=delay)).run(500, [0])
     when, got = talk.all()

@@ -89,7 +89,7 @@ def test_the_common_start_is_time_zero():
     end = int(np.flatnonzero(log.time < 2.0 - 1e-9)[-1])
     assert log.phase[end].tolist() == [RUNNING, RUNNING]
     assert (log.phase[end + 1] >= LANDING).all()
-    assert log.phase[-1].tolist() == [DONE, DONE]
+    assert log.ended - log.time[-1] <= 0.02 + 1e-9
     assert (log.decisions, log.ticks) == (20, 200)
 
 
@@ -97,7 +97,7 @@ def test_phases_never_go_back(park):
     log = simulate(park, [1])
     assert (np.diff(log.phase, axis=0) >= 0).all()
     assert {IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE} >= set(log.phase.ravel().tolist())
-    np.testing.assert_array_equal(log.true_position[-1, 4:, 2], 0.0)
+    assert (log.true_position[-1, 4:, 2] < 0.03).all()  # down, or about to touch down
     assert (log.true_position[..., 2] >= 0.0).all()
 
 
@@ -176,32 +176,39 @@ def test_the_reference_formation_is_acquired():
     inside = np.abs(log.true_position[..., :2]).max()
     assert inside < 1.0
     sent = np.bincount(log.sent[1][(log.sent[0] >= 0) & (log.sent[0] < 18)], minlength=14) / 18.0
-    assert (sent[[1, 2, 3, 8, 9, 10]] < 6.0).all()  # Kheperas
-    assert (sent[[4, 5, 6, 11, 12, 13]] > 4.0).all()  # hover jitter makes Crazyflies speak
-    assert sent.max() < 25.0
+    assert sent[[0, 7]].max() < 0.5  # the leader stands
+    assert sent.max() < 20.0
+    assert sent[[4, 5, 6, 11, 12, 13]].mean() > sent[[1, 2, 3, 8, 9, 10]].mean() > 3.0
 
 
-def test_who_hears_nobody_is_named():
-    with pytest.raises(Stuck, match=r"not ready after 60 s: A, B \(never heard B\)"):
-        simulate(ground(channel=Channel(loss=1.0)), [1])
+def test_who_hears_nobody_is_named(monkeypatch):
+    monkeypatch.setattr("experiments.virtual.PATIENCE_S", 5.0)
+    with pytest.raises(Stuck, match=r"not ready after 5 s: A, B \(never heard B\)"):
+        simulate(ground(channel=Channel(delay_s=100.0)), [1])
 
 
-def test_who_cannot_get_up_is_named():
+def test_who_cannot_get_up_is_named(monkeypatch):
+    monkeypatch.setattr("agents.lifecycle.AT_HEIGHT", -1.0)  # nobody is ever near enough to his height
+    monkeypatch.setattr("experiments.virtual.PATIENCE_S", 5.0)
     robots = {
         "A": Robot(kind="khepera4", start=[0.0, 0.0]),
         "F": Robot(kind="crazyflie", start=[0.5, 0.0], hover=0.5),
         "G": Robot(kind="crazyflie", start=[-0.5, 0.0], hover=0.5),
     }
-    # a measured height that is nearly always more than 5 cm off: it never knows that it has arrived
-    nature = {"G": Disturbance(position_sigma=500.0)}
-    experiment = Experiment(title="Stuck", duration_s=1.0, robots=robots, disturbance=nature)
-    with pytest.raises(Stuck, match=r"not airborne after 60 s: G"):
-        simulate(experiment, [1])
+    with pytest.raises(Stuck, match=r"not airborne after 5 s: F, G"):
+        simulate(Experiment(title="Stuck", duration_s=1.0, robots=robots), [1, 2])
 
 
 def test_going_on_without_a_neighbour_that_is_never_heard():
-    log = simulate(ground(channel=Channel(loss=1.0), start=Start(deadline_s=1.0, missing="go-on")), [1])
+    log = simulate(ground(channel=Channel(delay_s=100.0), start=Start(deadline_s=1.0, missing="go-on")), [1])
     run = (log.time >= 0.0) & (log.time <= 2.0)
     np.testing.assert_allclose(log.true_position[run], np.tile(log.true_position[0], (run.sum(), 1, 1)), atol=1e-9)
     assert not log.error.any()
-    assert log.time[0] == pytest.approx(-1.5 - LEAD_S)  # ready just after 1 s, sent off half a second later
+    assert log.time[0] == pytest.approx(-1.5 - 0.5 - LEAD_S)  # ready after 1 s, sent off at 1.5 s, up, started at 2 s
+
+
+def test_nothing_is_lost_before_the_start_and_everything_after_it():
+    log = simulate(ground(channel=Channel(loss=1.0)), [1])
+    assert log.heard[3].max() < 0.0
+    assert len(log.heard[0]) > 50
+    assert log.lost.tolist() == [100, 100]

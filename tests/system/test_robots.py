@@ -58,17 +58,16 @@ def zids(session: zenoh.Session) -> dict[str, str]:
     return named
 
 
-def test_each_robot_hears_exactly_its_neighbours(router: RouterProcess, watcher: Watcher) -> None:
-    experiment = document.read("robotic-park").experiment
+@pytest.mark.parametrize("file", ["robotic-park", "convoy"])  # nobody listens to the last robot of a convoy
+def test_each_robot_hears_exactly_its_neighbours(router: RouterProcess, watcher: Watcher, file: str) -> None:
+    experiment = document.read(file).experiment
     wanted = {
         name: {s for listener, s, _, _ in parse_links(experiment) if listener == name} for name in experiment.robots
     }
     with ExitStack() as stack:
         for name in experiment.robots:
-            fly(stack, router, "robotic-park", name)
-        watcher.until(
-            lambda: len(watcher.status) == 7 and all(s.phase == "ready" for s in watcher.status.values()), "all ready"
-        )
+            fly(stack, router, file, name)
+        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in experiment.robots), "all ready")
         known = zids(watcher.session)
         keys = subscriptions(watcher.session)
         for name, neighbours in wanted.items():

@@ -1,0 +1,1 @@
+"""What hardware and its protocol twins say to each other: ports, words, packing, units. No sockets here."""

@@ -1,0 +1,144 @@
+"""The TurtleBot3 Burger as its ROS 2 node shows it: topics, rates, units, and the settings that reach it.
+
+Shared by the bridge that drives one and the protocol twin that plays one. Sources: turtlebot3_node, the OpenCR firmware
+`turtlebot3_ros2`, and turtlebot3_bringup's parameter files.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import copysign
+from typing import Annotated, Any, Final, Literal, get_args
+from urllib.parse import parse_qsl
+
+import msgspec
+from msgspec import Meta
+
+from agents import ros2
+from agents.body import BodyError
+from agents.ros2 import Distro, Style
+
+COMMAND: Final = "cmd_vel"
+ODOMETRY: Final = "odom"
+SCAN: Final = "scan"
+BATTERY: Final = "battery_state"
+
+ODOMETRY_HZ: Final = 20.0
+SCAN_HZ: Final = 5.0  # LDS-01; the LDS-02 turns twice as fast
+BATTERY_HZ: Final = 1.0
+STEP: Final = 0.01  # [m/s, rad/s] the node cuts speeds down to whole steps
+RAYS: Final = 360
+NEAREST, FARTHEST = 0.12, 3.5  # [m] of the LDS-01
+EMPTY_V, FULL_V = 10.5, 12.3  # the firmware maps these voltages to 0 and 100 %
+
+_NAMESPACE: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The `device` table of a TurtleBot3. Robot and twin read the same one, so that a switch changes nothing else.
+
+    Attributes:
+        distro: ROS 2 distribution of the robot; what its address says counts more.
+        domain: ROS_DOMAIN_ID, for style "rmw"; likewise.
+        stamped: Whether cmd_vel is a TwistStamped (`enable_stamped_cmd_vel`); by distribution when left out.
+        endpoint: Zenoh router by which the robot is reached, where it is not that of the experiment.
+        origin: What stands at the robot's start pose: the robot when its body is opened, or the origin of its
+            odometry, which is where its node was started.
+        style: Of the twin.
+        watchdog_s: The twin stops when it hears no command for so long [s]. A TurtleBot3 as it is sold has no such
+            watchdog, hence None.
+    """
+
+    distro: Distro = "jazzy"
+    domain: Annotated[int, Meta(ge=0, le=ros2.MAX_DOMAIN)] = 0
+    stamped: bool | None = None
+    endpoint: str | None = None
+    origin: Literal["open", "boot"] = "open"
+    style: Style = "ros2dds"
+    watchdog_s: Annotated[float, Meta(gt=0.0)] | None = None
+
+
+@dataclass(frozen=True)
+class Address:
+    """How a robot is reached: `ros2dds://tb3_0?distro=humble`, `rmw://tb3_0?domain=0&distro=jazzy`."""
+
+    style: Style
+    namespace: str
+    distro: Distro
+    domain: int
+
+    def __str__(self) -> str:
+        domain = f"domain={self.domain}&" if self.style == "rmw" else ""
+        return f"{self.style}://{self.namespace}?{domain}distro={self.distro}"
+
+
+def settings(name: str, device: Mapping[str, Any]) -> Settings:
+    """The settings of a robot.
+
+    Raises:
+        BodyError: If they are wrong, with robot and field.
+    """
+    try:
+        return msgspec.convert(dict(device), Settings)
+    except msgspec.ValidationError as error:
+        raise BodyError(f"{name}: device: {error}") from None
+
+
+def address(name: str, text: str, chosen: Settings) -> Address:
+    """The address of a robot.
+
+    Raises:
+        BodyError: If it is wrong, with robot and part.
+    """
+    style, _, rest = text.partition("://")
+    path, _, query = rest.partition("?")
+    namespace = path.strip("/")
+    form = "write it like ros2dds://tb3_0 or rmw://tb3_0?domain=0&distro=jazzy"
+    if style not in get_args(Style):
+        raise BodyError(f"{name}: '{text}' is no TurtleBot3: {form}")
+    if namespace and not _NAMESPACE.fullmatch(namespace):
+        raise BodyError(f"{name}: '{namespace}' is no ROS namespace (letters, digits and _): {form}")
+    asked = dict(parse_qsl(query, keep_blank_values=True))
+    distro, domain = asked.pop("distro", chosen.distro), asked.pop("domain", str(chosen.domain))
+    if asked:
+        raise BodyError(f"{name}: '{next(iter(asked))}' is no part of '{text}': {form}")
+    if distro not in get_args(Distro):
+        raise BodyError(f"{name}: distro '{distro}' is not known; one of {', '.join(get_args(Distro))}")
+    if not (domain.isascii() and domain.isdigit() and int(domain) <= ros2.MAX_DOMAIN):
+        raise BodyError(f"{name}: domain '{domain}' is no number from 0 to {ros2.MAX_DOMAIN}")
+    return Address(style, namespace, distro, int(domain))  # type: ignore[arg-type]
+
+
+def command_type(distro: Distro, stamped: bool | None) -> str:
+    """Type of cmd_vel: Twist on Humble, TwistStamped from Jazzy on, unless the robot is set up otherwise."""
+    if stamped is None:
+        stamped = distro != "humble"
+    return ros2.TWIST_STAMPED if stamped else ros2.TWIST
+
+
+def cut(speed: float) -> float:
+    """What the node makes of a speed [m/s or rad/s]: C truncates to whole hundredths."""
+    return int(speed * 100.0) / 100.0
+
+
+def whole(speed: float, limit: float) -> float:
+    """The nearest speed that the node does not change, within ±limit.
+
+    It lies a fifth of a step beyond the hundredth, because 0.29 · 100 is less than 29 in binary numbers.
+    """
+    steps = min(round(abs(speed) / STEP), int(limit / STEP + 1e-9))
+    return copysign((steps + 0.2) * STEP, speed) if steps else 0.0
+
+
+def charge(voltage: float, percentage: float) -> float:
+    """Charge from 0 to 1 of a BatteryState.
+
+    ROS asks for a percentage from 0 to 1, the robot sends 0 to 100 and stops updating it when nearly empty: where the
+    voltage is known the lower of the two counts.
+    """
+    full = percentage / 100.0 if percentage > 1.0 else percentage
+    if voltage > 0.0:
+        full = min(full, (voltage - EMPTY_V) / (FULL_V - EMPTY_V))
+    return min(max(full, 0.0), 1.0)

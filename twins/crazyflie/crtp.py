@@ -1,0 +1,199 @@
+"""CRTP, the Crazyflie's protocol, version 12: ports, commands, answers, flags, units. Nobody else spells a number of it.
+
+One packet is a header byte (port, two set bits, channel) and up to 30 bytes; over UDP one datagram is one packet.
+Source: the protocol pages of Bitcraze's documentation, and what cflib 0.1.34 puts on the wire.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+from enum import IntEnum, IntFlag
+from struct import Struct
+from typing import Final
+
+VERSION: Final = 12  # the first with a supervisor port
+MTU: Final = 30  # [bytes] of payload
+GREETING: Final = b"Bitcraze Crazyflie".ljust(MTU, b"\0")  # how a Crazyflie is told from a boot loader
+SCAN: Final = 0xFF  # the header with which cflib asks whether anybody is there
+LOG_PAYLOAD: Final = 26  # [bytes] of values in one packet of a log block
+LOG_BLOCKS: Final = 16
+LOG_VARIABLES: Final = 128
+
+
+class Port(IntEnum):
+    """Which part of the firmware a packet is for."""
+
+    CONSOLE = 0
+    PARAM = 2
+    COMMANDER = 3
+    MEMORY = 4
+    LOG = 5
+    LOCATION = 6
+    SETPOINT = 7
+    HIGH_LEVEL = 8
+    SUPERVISOR = 9
+    PLATFORM = 13
+    LINK = 15
+
+
+class Status(IntEnum):
+    """The last byte of an answer; cflib falls over log errors that are not among these."""
+
+    OK = 0
+    REFUSED = 1  # by the planner: taking off while it flies, landing while it lands
+    UNKNOWN = errno.ENOENT
+    IO = errno.EIO
+    TOO_LARGE = errno.E2BIG
+    NO_COMMAND = errno.ENOEXEC
+    NO_ROOM = errno.ENOMEM
+    BUSY = errno.EBUSY  # not armed, or locked
+    EXISTS = errno.EEXIST
+
+
+class Info(IntFlag):
+    """What the supervisor says of itself: its answer on port 9, and the log variable supervisor.info."""
+
+    CAN_BE_ARMED = 1 << 0
+    ARMED = 1 << 1
+    AUTO_ARM = 1 << 2
+    CAN_FLY = 1 << 3
+    FLYING = 1 << 4
+    TUMBLED = 1 << 5
+    LOCKED = 1 << 6
+    CRASHED = 1 << 7
+    PLANNER_ACTIVE = 1 << 8
+    PLANNER_FINISHED = 1 << 9
+    PLANNER_DISABLED = 1 << 10
+
+
+class Power(IntEnum):
+    """Log variable pm.state."""
+
+    BATTERY = 0
+    CHARGING = 1
+    CHARGED = 2
+    LOW = 3
+    SHUTDOWN = 4
+
+
+class Toc(IntEnum):
+    """Commands of the tables of contents, channel 0 of parameters and logs."""
+
+    ITEM = 2
+    INFO = 3
+
+
+class Log(IntEnum):
+    """Commands of log blocks, channel 1."""
+
+    DELETE = 2
+    START = 3
+    STOP = 4
+    RESET = 5
+    CREATE = 6
+    APPEND = 7
+
+
+class Misc(IntEnum):
+    """Commands about parameters, channel 3."""
+
+    SET_BY_NAME = 0
+    EXTENDED = 2
+    STORE = 3
+    STORED = 4
+    CLEAR = 5
+    EXTENDED_2 = 7
+    DEFAULT_2 = 8
+
+
+class Setpoint(IntEnum):
+    """Kinds of low-level setpoints, channel 0 of port 7."""
+
+    STOP = 0
+    FULL_STATE = 6
+    POSITION = 7
+    VELOCITY = 8
+    HEIGHT = 9
+    HOVER = 10
+
+
+class HighLevel(IntEnum):
+    """Commands to the planner."""
+
+    GROUP = 0
+    STOP = 3
+    TAKEOFF = 7
+    LAND = 8
+    GO_TO = 12
+
+
+class Safety(IntEnum):
+    """Commands to the supervisor, channel 1, and its question, channel 0."""
+
+    ARM = 1
+    RECOVER = 2
+    STOP = 3
+    WATCHDOG = 4
+    ASK = 12
+    ANSWER = 0x80  # added to the command that is answered
+
+
+class Location(IntEnum):
+    """What comes over the localization port, channel 1."""
+
+    LPP = 2
+    STOP = 3
+    WATCHDOG = 4
+    POSE = 8
+    STORE_LIGHTHOUSE = 11
+
+
+class Memory(IntEnum):
+    """Kinds of memories."""
+
+    TRAJECTORY = 0x12
+    LOCO = 0x13
+    LIGHTHOUSE = 0x14
+    TESTER = 0x15
+
+
+ANCHOR_POSITION: Final = 1  # kind of LPP packet: where an anchor is, three floats [m]
+
+TOC_INFO: Final = Struct("<BHI")
+ITEM: Final = Struct("<BH")
+IDENT: Final = Struct("<H")
+VECTOR: Final = Struct("<fff")
+POSE: Final = Struct("<fffffff")
+CLIMB: Final = Struct("<ff?f")  # height [m], yaw [rad], keep yaw, time [s]
+GO_TO: Final = Struct("<??fffff")  # relative, linear, x y z [m], yaw [rad], time [s]
+FOUR: Final = Struct("<ffff")
+FULL_STATE: Final = Struct("<9hI3h")  # mm, mm/s, mm/s²; attitude in 32 bits; mrad/s
+THRUST: Final = Struct("<fffH")  # roll, pitch, yaw rate [degrees], thrust
+MEMORY: Final = Struct("<BI")  # memory, address
+MEMORY_INFO: Final = Struct("<BBBI8x")
+ANCHOR: Final = Struct("<fff?")
+
+MM: Final = 1e-3
+SECONDS_MS: Final = 1000.0
+
+
+def header(port: Port, channel: int) -> int:
+    """The first byte of a packet."""
+    return port << 4 | 0x0C | channel
+
+
+def yaw_of(attitude: int) -> float:
+    """Yaw [rad] of a quaternion in 32 bits: the number of the largest component, and the other three, 10 bits each."""
+    largest = attitude >> 30
+    q = [0.0] * 4
+    rest = 1.0
+    for i in (3, 2, 1, 0):
+        if i != largest:
+            size = (attitude & 0x1FF) / 0x1FF / math.sqrt(2.0)
+            q[i] = -size if attitude & 0x200 else size
+            rest -= size * size
+            attitude >>= 10
+    q[largest] = math.sqrt(max(rest, 0.0))
+    x, y, z, w = q
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

@@ -1,0 +1,246 @@
+"""Protocol twin of a Vicon: a DataStream server that shows clients where the other twins really are.
+
+`python -m twins.vicon --robots CF01 KH01` hears the truth on Zenoh; as a class it is told the poses directly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from agents.lifeline import Lifeline
+from agents.protocols import datastream
+from agents.protocols.datastream import Framer, Kind, Malformed, Segment
+from agents.rows import Array
+from twins.device import Faults
+
+BACKLOG: Final = 1 << 18  # [bytes] that may wait for a client; a slower one misses frames
+FRESH_S: Final = 0.5  # a robot whose truth is older is not there to be seen
+CATCH_UP: Final = 10  # frames; a process that was frozen for longer leaves the rest out
+
+
+def upright(yaw: float) -> Array:
+    """Rotation (3, 3) to the room of a body that stands upright at `yaw` [rad]."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(eq=False)
+class _Client:
+    """A connection: what came in half, what could not go out yet, and which frames were asked for."""
+
+    framer: Framer = field(default_factory=Framer)
+    unsent: bytearray = field(default_factory=bytearray)
+    streams: bool = False
+    asked: int = 0
+    named: bool = False  # has been told the names of the subjects
+
+
+class ViconTwin:
+    """A DataStream server for subjects whose poses it is told.
+
+    Attributes:
+        address: "127.0.0.1:PORT".
+        latency_s: How old it says that its frames are [s].
+    """
+
+    def __init__(
+        self,
+        subjects: Sequence[str],
+        *,
+        rate_hz: float = 100.0,
+        sigma: float = 0.0,
+        rng: np.random.Generator | None = None,
+        faults: Faults | None = None,
+        host: str = "127.0.0.1",
+        port: int = 0,
+    ) -> None:
+        """Begins to listen.
+
+        Args:
+            subjects: Names of the bodies, as clients see them.
+            rate_hz: Frames per second.
+            sigma: White noise of the positions, per axis [m].
+            rng: Where the noise comes from; needed if there is any.
+            faults: Silence, delay, occlusion.
+            host: Where to listen.
+            port: 0 for any free one.
+
+        Raises:
+            OSError: If it cannot listen there.
+        """
+        self._subjects = list(subjects)
+        self._rate, self._sigma, self._rng = rate_hz, sigma, rng or np.random.default_rng(0)
+        self._faults = faults or Faults()
+        self._position = np.zeros((len(self._subjects), 3))
+        self._rotation = np.repeat(np.eye(3)[None], len(self._subjects), axis=0)
+        self._seen = np.zeros(len(self._subjects), dtype=bool)
+        self.latency_s = 0.0
+        self._frames = 0
+        self._delayed: deque[tuple[float, bytes]] = deque()
+        self._names = b"".join(
+            [datastream.pack_stream_info(rate_hz), datastream.pack_axes()]
+            + [datastream.pack_subject(number, name) for number, name in enumerate(self._subjects)]
+        )
+        self._listener = socket.create_server((host, port))
+        self._listener.setblocking(False)
+        self._clients: dict[socket.socket, _Client] = {}
+        self.address = f"{host}:{self._listener.getsockname()[1]}"
+
+    def place(self, row: int, position: Array, rotation: Array) -> None:
+        """Puts a subject somewhere, in full view: (3,) [m], rotation to the room (3, 3)."""
+        self._position[row], self._rotation[row], self._seen[row] = position, rotation, True
+
+    def hide(self, row: int) -> None:
+        """Takes a subject out of view."""
+        self._seen[row] = False
+
+    def sockets(self) -> Sequence[socket.socket]:
+        """See `twins.device.Device.sockets`."""
+        return [self._listener, *self._clients]
+
+    def serve(self, ready: socket.socket, t: float) -> None:
+        """See `twins.device.Device.serve`."""
+        if ready is self._listener:
+            self._admit()
+        else:
+            self._hear(ready, t)
+
+    def advance(self, t: float) -> None:
+        """Sends the frame that is due at `t` [s], if one is."""
+        due = int(t * self._rate + 1e-6)
+        if due > self._frames:
+            self._frames = max(self._frames + 1, due - CATCH_UP)
+            if not self._faults.silent(t):
+                self._delayed.append((t + self._faults.delay_s, self._frame(t)))
+        while self._delayed and self._delayed[0][0] <= t:
+            self._send(self._delayed.popleft()[1])
+        for connection, client in list(self._clients.items()):
+            self._flush(connection, client)
+
+    def close(self) -> None:
+        """See `twins.device.Device.close`."""
+        for connection in (self._listener, *self._clients):
+            connection.close()
+        self._clients.clear()
+
+    def _admit(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:  # it has left already
+            return
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._clients[connection] = _Client(unsent=bytearray(datastream.pack_kinds(datastream.POSES)))
+        self._flush(connection, self._clients[connection])
+
+    def _hear(self, connection: socket.socket, t: float) -> None:
+        client = self._clients[connection]
+        try:
+            received = connection.recv(65536)
+            if not received:
+                raise ConnectionResetError
+            if self._faults.silent(t):
+                return
+            for body in client.framer.feed(received):
+                for kind, payload in datastream.blocks(body):
+                    if kind == Kind.REQUEST_FRAME:
+                        client.streams = payload[:1] == b"\x01"
+                        client.asked += not client.streams
+                    elif kind == Kind.REQUEST_NEXT_FRAME:
+                        client.asked += 1
+        except BlockingIOError:
+            return
+        except (OSError, Malformed):
+            self._drop(connection)
+
+    def _drop(self, connection: socket.socket) -> None:
+        del self._clients[connection]
+        connection.close()
+
+    def _frame(self, t: float) -> bytes:
+        """The blocks of a frame."""
+        position = self._position
+        if self._sigma > 0.0:
+            position = position + self._rng.normal(0.0, self._sigma, position.shape)
+        seen = self._seen & (not self._faults.occluded(t))
+        numbered = datastream.pack_frame_number(self._frames)
+        latency = datastream.pack_latency([("Data Collected", self.latency_s)])
+        poses = zip(seen.tolist(), position.tolist(), self._rotation.reshape(-1, 9).tolist(), strict=True)
+        return b"".join([
+            numbered,
+            latency,
+            *(
+                datastream.pack_segments(number, [Segment(0, (p[0], p[1], p[2]), tuple(r))] if visible else [])
+                for number, (visible, p, r) in enumerate(poses)
+            ),
+        ])  # fmt: skip
+
+    def _send(self, frame: bytes) -> None:
+        for client in self._clients.values():
+            if not (client.streams or client.asked) or len(client.unsent) > BACKLOG:
+                continue
+            client.unsent += datastream.packet(frame if client.named else self._names + frame)
+            client.named = True
+            client.asked = max(0, client.asked - 1)
+
+    def _flush(self, connection: socket.socket, client: _Client) -> None:
+        if not client.unsent:
+            return
+        try:
+            del client.unsent[: connection.send(client.unsent)]
+        except BlockingIOError:
+            return
+        except OSError:
+            self._drop(connection)
+
+
+class Truths:
+    """Where the twins of robots say that they really are, heard on Zenoh."""
+
+    def __init__(self, subscribers: Sequence[network.Polled[network.zenoh.Sample]], robots: Sequence[str]) -> None:
+        self._heard = list(zip(robots, subscribers, strict=True))
+        self._stamp = np.full(len(robots), -np.inf)
+
+    def show(self, vicon: ViconTwin, now: float) -> None:
+        """Places every robot that was heard of lately, at UTC time `now` [s], and hides the others."""
+        for row, (robot, handler) in enumerate(self._heard):
+            newest = None
+            for sample in network.received(handler):
+                newest = sample
+            if newest is not None:
+                self._take(vicon, row, robot, newest, now)
+        age = now - self._stamp
+        fresh = age <= FRESH_S
+        for row in np.flatnonzero(~fresh).tolist():
+            vicon.hide(row)
+        vicon.latency_s = max(0.0, float(age[fresh].mean())) if fresh.any() else 0.0
+
+    def _take(self, vicon: ViconTwin, row: int, robot: str, sample: network.zenoh.Sample, now: float) -> None:
+        try:
+            truth = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
+            wire.check_position(truth, robot=robot, now=now, reach=(1e3, 1e3, 1e3))
+        except Malformed:
+            return
+        except wire.Malformed:
+            return
+        self._stamp[row] = truth.stamp
+        vicon.place(row, np.array(truth.position), upright(truth.yaw or 0.0))
+
+
