@@ -129,11 +129,6 @@ def dds_type(kind: str) -> str:
     return f"{package}::{what}::dds_::{name}_"
 
 
-def ros_type(dds: str) -> str:
-    """The way back, as people read it: geometry_msgs/Twist."""
-    return dds.replace("::msg::dds_::", "/").removesuffix("_")
-
-
 def mangle(name: str) -> str:
     """A name with slashes as one chunk of an rmw_zenoh token."""
     return name.replace("/", "%")

@@ -15,10 +15,16 @@ from agents.ros2 import Message, Role, Style, Types
 
 
 class Participant:
-    """The ROS 2 side of one session; numbers its entities, as rmw_zenoh does."""
+    """The ROS 2 side of one session; numbers its entities, as rmw_zenoh does.
 
-    def __init__(self, session: zenoh.Session, types: Types, *, style: Style, domain: int = 0) -> None:
+    With "ros2dds", tokens belong to what plays the bridge between DDS and Zenoh (`announces`): it makes routes of them.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, types: Types, *, style: Style, domain: int = 0, announces: bool = False
+    ) -> None:
         self.session: Final = session
+        self.announces: Final = announces or style == "rmw"
         self.types: Final = types
         self.style: Final[Style] = style
         self.domain: Final = domain
@@ -88,7 +94,7 @@ class Publisher:
         self._publisher = participant.session.declare_publisher(
             key, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.DATA_HIGH
         )
-        self._token = network.alive_token(participant.session, token)
+        self._token = _announce(participant, token)
 
     def put(self, message: Message) -> None:
         """Publishes a message."""
@@ -104,7 +110,8 @@ class Publisher:
 
     def close(self) -> None:
         """Leaves the graph."""
-        self._token.undeclare()  # type: ignore[no-untyped-call]
+        if self._token is not None:
+            self._token.undeclare()  # type: ignore[no-untyped-call]
         self._publisher.undeclare()  # type: ignore[no-untyped-call]
 
 
@@ -121,7 +128,7 @@ class Subscriber:
         self.malformed = 0
         self._types = participant.types
         self._subscriber: zenoh.Subscriber[Handler[zenoh.Sample]] = network.subscriber(participant.session, key, depth)
-        self._token = network.alive_token(participant.session, token)
+        self._token = _announce(participant, token)
 
     def received(self) -> Iterator[Message]:
         """The messages that wait, oldest first."""
@@ -140,5 +147,10 @@ class Subscriber:
 
     def close(self) -> None:
         """Leaves the graph."""
-        self._token.undeclare()  # type: ignore[no-untyped-call]
+        if self._token is not None:
+            self._token.undeclare()  # type: ignore[no-untyped-call]
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _announce(participant: Participant, token: str) -> zenoh.LivelinessToken | None:
+    return network.alive_token(participant.session, token) if participant.announces else None

@@ -20,6 +20,7 @@ from typing import Final
 
 import msgspec
 import numpy as np
+import zenoh
 
 from agents import session as network
 from agents import wire
@@ -31,8 +32,8 @@ from agents.rows import Array
 from twins.device import Faults
 
 BACKLOG: Final = 1 << 18  # [bytes] that may wait for a client; a slower one misses frames
+REACH: Final = (1e3, 1e3, 1e3)  # [m] any room
 FRESH_S: Final = 0.5  # a robot whose truth is older is not there to be seen
-CATCH_UP: Final = 10  # frames; a process that was frozen for longer leaves the rest out
 
 
 def upright(yaw: float) -> Array:
@@ -126,7 +127,7 @@ class ViconTwin:
         """Sends the frame that is due at `t` [s], if one is."""
         due = int(t * self._rate + 1e-6)
         if due > self._frames:
-            self._frames = max(self._frames + 1, due - CATCH_UP)
+            self._frames = due  # cameras do not make up for frames that were missed
             if not self._faults.silent(t):
                 self._delayed.append((t + self._faults.delay_s, self._frame(t)))
         while self._delayed and self._delayed[0][0] <= t:
@@ -180,17 +181,15 @@ class ViconTwin:
         if self._sigma > 0.0:
             position = position + self._rng.normal(0.0, self._sigma, position.shape)
         seen = self._seen & (not self._faults.occluded(t))
-        numbered = datastream.pack_frame_number(self._frames)
-        latency = datastream.pack_latency([("Data Collected", self.latency_s)])
+        frame = [
+            datastream.pack_frame_number(self._frames),
+            datastream.pack_latency([("Data Collected", self.latency_s)]),
+        ]
         poses = zip(seen.tolist(), position.tolist(), self._rotation.reshape(-1, 9).tolist(), strict=True)
-        return b"".join([
-            numbered,
-            latency,
-            *(
-                datastream.pack_segments(number, [Segment(0, (p[0], p[1], p[2]), tuple(r))] if visible else [])
-                for number, (visible, p, r) in enumerate(poses)
-            ),
-        ])  # fmt: skip
+        for number, (visible, (x, y, z), rotation) in enumerate(poses):
+            segments = [Segment(0, (x, y, z), tuple(rotation))] if visible else []
+            frame.append(datastream.pack_segments(number, segments))
+        return b"".join(frame)
 
     def _send(self, frame: bytes) -> None:
         for client in self._clients.values():
@@ -212,35 +211,116 @@ class ViconTwin:
 
 
 class Truths:
-    """Where the twins of robots say that they really are, heard on Zenoh."""
+    """Where the twins of robots really are, as they say on Zenoh."""
 
-    def __init__(self, subscribers: Sequence[network.Polled[network.zenoh.Sample]], robots: Sequence[str]) -> None:
-        self._heard = list(zip(robots, subscribers, strict=True))
-        self._stamp = np.full(len(robots), -np.inf)
+    def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str]) -> None:
+        self._robots = list(robots)
+        self._heard = [network.subscriber(session, keys.truth(robot), 4) for robot in robots]
+        self._stamp = np.full(len(self._robots), -np.inf)
 
     def show(self, vicon: ViconTwin, now: float) -> None:
         """Places every robot that was heard of lately, at UTC time `now` [s], and hides the others."""
-        for row, (robot, handler) in enumerate(self._heard):
-            newest = None
-            for sample in network.received(handler):
-                newest = sample
-            if newest is not None:
-                self._take(vicon, row, robot, newest, now)
+        for row, subscriber in enumerate(self._heard):
+            for sample in network.received(subscriber.handler):
+                self._take(vicon, row, sample, now)
         age = now - self._stamp
         fresh = age <= FRESH_S
         for row in np.flatnonzero(~fresh).tolist():
             vicon.hide(row)
         vicon.latency_s = max(0.0, float(age[fresh].mean())) if fresh.any() else 0.0
 
-    def _take(self, vicon: ViconTwin, row: int, robot: str, sample: network.zenoh.Sample, now: float) -> None:
+    def _take(self, vicon: ViconTwin, row: int, sample: zenoh.Sample, now: float) -> None:
         try:
             truth = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
-            wire.check_position(truth, robot=robot, now=now, reach=(1e3, 1e3, 1e3))
-        except Malformed:
-            return
+            wire.check_position(truth, robot=self._robots[row], now=now, reach=REACH)
         except wire.Malformed:
             return
         self._stamp[row] = truth.stamp
         vicon.place(row, np.array(truth.position), upright(truth.yaw or 0.0))
 
 
+def serve(vicon: ViconTwin, truths: Truths, rate_hz: float, stop: threading.Event) -> None:
+    """Serves until `stop` is set, with a frame every 1 / `rate_hz` [s]."""
+    zero = time.monotonic()
+    frame = 0
+    while not stop.is_set():
+        wait = zero + (frame + 1) / rate_hz - time.monotonic()
+        ready, _, _ = select.select(vicon.sockets(), [], [], max(0.0, wait))
+        t = time.monotonic() - zero
+        for waiting in ready:
+            vicon.serve(waiting, t)
+        if int(t * rate_hz) > frame:
+            frame = int(t * rate_hz)
+            truths.show(vicon, time.time())
+        vicon.advance(t)
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not (host and port.isascii() and port.isdigit() and int(port) < 65536):
+        raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT, such as 127.0.0.1:801")
+    return host, int(port)
+
+
+def _faults(text: str) -> Faults:
+    try:
+        return msgspec.json.decode(text, type=Faults)
+    except msgspec.MsgspecError as error:
+        raise argparse.ArgumentTypeError(f"{error}; write it like '{{\"occluded_from_s\": 5}}'") from None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line of the process."""
+    parser = argparse.ArgumentParser(prog="vicon twin", description="A simulated Vicon that sees simulated robots.")
+    parser.add_argument("--robots", nargs="+", required=True, metavar="ROBOT", help="their names are the subjects'")
+    parser.add_argument("--listen", type=_address, default=("127.0.0.1", 0), metavar="HOST:PORT")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help=f"default: {network.DEFAULT_ENDPOINT}")
+    parser.add_argument("--realm", default=Keys().realm, help="first chunk of the keys")
+    parser.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="frames per second")
+    parser.add_argument("--sigma", type=float, default=0.0003, metavar="METRES", help="noise of the positions")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise")
+    parser.add_argument("--faults", type=_faults, default=Faults(), metavar="JSON", help="what goes wrong on purpose")
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent for 3 s")
+    chosen = parser.parse_args(arguments)
+    if not (1.0 <= chosen.rate <= 1000.0 and 0.0 <= chosen.sigma < 1.0 and chosen.seed >= 0):
+        parser.error("--rate is 1 to 1000 Hz, --sigma 0 to 1 m, --seed not negative")
+    stop = threading.Event()
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    if chosen.lifeline:
+        Lifeline(stop).start()
+    host, port = chosen.listen
+    endpoints = chosen.connect or [network.DEFAULT_ENDPOINT]
+    try:
+        with network.open_session(endpoints, name="vicon twin", stop=stop) as session:
+            vicon = ViconTwin(
+                chosen.robots,
+                rate_hz=chosen.rate,
+                sigma=chosen.sigma,
+                rng=np.random.default_rng(chosen.seed),
+                faults=chosen.faults,
+                host=host,
+                port=port,
+            )
+            print(f"vicon ready on {vicon.address}", flush=True)
+            try:
+                serve(vicon, Truths(session, Keys(chosen.realm), chosen.robots), chosen.rate, stop)
+            finally:
+                vicon.close()
+    except (network.Unreachable, network.EndpointError) as error:
+        print(f"vicon twin: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"vicon twin: cannot listen on {host}:{port}: {error.strerror}; choose another port", file=sys.stderr)
+        return 2
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

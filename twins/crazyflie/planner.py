@@ -87,7 +87,16 @@ class Planner:
         return Status.OK
 
     def go_to(
-        self, row: int, t: float, pose: Array, velocity: Array, goal: Array, span: float, *, relative: bool, linear: bool
+        self,
+        row: int,
+        t: float,
+        pose: Array,
+        velocity: Array,
+        goal: Array,
+        span: float,
+        *,
+        relative: bool,
+        linear: bool,
     ) -> Status:
         """To the pose `goal`, from the trajectory under way if there is one, else from `pose` and `velocity` (3,)."""
         span = max(span, SHORTEST)

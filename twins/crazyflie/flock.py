@@ -1,0 +1,148 @@
+"""What moves: the rows of Crazyflies of one process, their motion, estimate, battery and on-board logic."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from agents.body import BodyRequest
+from agents.rows import Array, Mask
+from twins.body import ENDURANCE_S
+from twins.crazyflie.commander import Commander
+from twins.crazyflie.crtp import Info, Power
+from twins.crazyflie.estimator import Estimator
+from twins.crazyflie.memory import Memories
+from twins.crazyflie.planner import Plan, Planner
+from twins.crazyflie.supervisor import Supervisor
+from twins.device import Faults
+from twins.disturbance import Measurement
+from twins.noise import Noise
+from twins.quadrotor import RESPONSES, Quadrotor
+
+FULL_V: Final = 4.2
+EMPTY_V: Final = 3.0
+LOW_V: Final = 3.2  # the firmware's own threshold
+ENOUGH_ANCHORS: Final = 4  # three dimensions and a common clock
+
+
+class Flock:
+    """Rows of Crazyflies; the protocol of each is a `twins.crazyflie.drone.Drone`.
+
+    Attributes:
+        planner, commander, supervisor, estimator: On-board logic of the rows.
+        quadrotor: Their motion.
+        memories: Of each row.
+        charge: (N,) of the batteries, 0 to 1.
+        estimate: (N, 3) where they believe to be [m].
+        dt: Of a tick [s].
+        t: Now [s].
+    """
+
+    def __init__(self, request: BodyRequest, faults: Faults) -> None:
+        rows = len(request.names)
+        self.dt = 1.0 / request.rate_hz
+        self.t = 0.0
+        systems = [_system(device) for device in request.device]
+        self.lighthouse = [system == "lighthouse" for system in systems]
+        self.loco = [system == "loco" for system in systems]
+        self.multiranger = [bool(device.get("multiranger")) for device in request.device]
+        outside = np.array(request.external) | np.array([system == "external" for system in systems])
+        self._on_board = ~(outside | np.array(self.lighthouse) | np.array(self.loco))
+        by_hand = [faults.refuse_arming or device.get("platform") == "brushless" for device in request.device]
+        self.refuse_arming = faults.refuse_arming
+        self.planner = Planner(rows)
+        self.commander = Commander(rows)
+        self.supervisor = Supervisor(~np.array(by_hand))
+        self.estimator = Estimator(rows)
+        self.quadrotor = Quadrotor(request.kinds, request.start, request.yaw, self.dt)
+        self.memories = [Memories() for _ in range(rows)]
+        self.charge = np.full(rows, faults.battery)
+        self._drain = self.dt * faults.drain / ENDURANCE_S["crazyflie"]
+        spatial = np.ones((rows, 3))
+        noise = Noise(request.names, request.seeds, "measurement", 4)
+        self._measurement = Measurement(request.disturbance, spatial, noise)
+        response, kind = RESPONSES["crazyflie"], request.kinds[0]
+        self._gain, self._turn_gain = np.array(response.position), np.array(kind.turn_response)
+        self.estimator.error[~self._on_board] = -self.quadrotor.position[~self._on_board]
+        self.estimate = self.quadrotor.position + self.estimator.error
+
+    def pose(self, row: int) -> Array:
+        """(4,) where a row believes to be: x, y, z [m], yaw [rad]."""
+        return np.append(self.estimate[row], self.quadrotor.yaw[row])
+
+    def voltage(self, row: int) -> float:
+        """Of a row's battery [V]."""
+        return EMPTY_V + (FULL_V - EMPTY_V) * float(self.charge[row])
+
+    def power(self, row: int) -> Power:
+        """What a row's power management says."""
+        if self.charge[row] <= 0.0:
+            return Power.SHUTDOWN
+        return Power.LOW if self.voltage(row) < LOW_V else Power.BATTERY
+
+    def info(self, row: int) -> Info:
+        """What a row's supervisor says."""
+        info = self.supervisor.info(row)
+        if self.planner.plan[row] != Plan.IDLE:
+            info |= Info.PLANNER_ACTIVE
+        if self.planner.finished(self.t)[row]:
+            info |= Info.PLANNER_FINISHED
+        return info
+
+    def station_status(self, row: int) -> int:
+        """Log variable lighthouse.status: 0 nothing received, 1 geometry or calibration missing, 2 measuring."""
+        if not self.lighthouse[row]:
+            return 0
+        memories = self.memories[row]
+        return 2 if memories.geometries & memories.calibrations else 1
+
+    def ready(self) -> Mask:
+        """(N,) rows whose positioning system on board works."""
+        working = self._on_board.copy()
+        for row, memories in enumerate(self.memories):
+            if self.lighthouse[row]:
+                working[row] = self.station_status(row) == 2
+            elif self.loco[row]:
+                working[row] = len(memories.anchors()) >= ENOUGH_ANCHORS
+        return working
+
+    def arm(self, row: int, *, on: bool) -> bool:
+        """An arming request."""
+        if on and self.refuse_arming:
+            return False
+        return self.supervisor.arm(row, self.t, on=on)
+
+    def advance(self, t: float) -> Mask:
+        """One tick, to time `t` [s]; returns (N,) which rows have just been locked."""
+        self.t = t
+        quadrotor, commander, supervisor = self.quadrotor, self.commander, self.supervisor
+        commander.follow(t, self.planner.goal(t))
+        locked = supervisor.advance(t, quadrotor.flying, commander.age(t))
+        for row in np.flatnonzero(locked):
+            self.planner.stop(int(row))
+        quadrotor.stop(np.flatnonzero(quadrotor.flying & ~self._spinning()))
+        quadrotor.flying[self._spinning()] = True
+        setpoint = commander.wanted(
+            self.estimate, quadrotor.velocity, quadrotor.yaw, supervisor.level, self._gain, self._turn_gain
+        )
+        setpoint[:, :3] -= self.estimate - quadrotor.position  # the controller flies the estimate, not the truth
+        quadrotor.command(setpoint)
+        quadrotor.advance()
+        np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
+        self.estimator.advance(t, self.dt, quadrotor.position, self.ready())
+        self.estimate = quadrotor.position + self.estimator.error
+        if self._measurement.present:
+            self.estimate = self.estimate + self._measurement.draw()[:, :3]
+        return locked
+
+    def _spinning(self) -> Mask:
+        """(N,) motors turn."""
+        return np.asarray(self.commander.on & self.supervisor.may_fly & (self.charge > 0.0))
+
+
+def _system(device: Mapping[str, Any]) -> str | None:
+    """Which positioning system a robot's settings name; the bridge checks them, the twin only looks."""
+    positioning = device.get("positioning")
+    return positioning.get("system") if isinstance(positioning, dict) else None

@@ -1,0 +1,94 @@
+"""The memories of a Crazyflie: trajectories, Loco anchors, Lighthouse base stations, and one for testing the link."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from twins.crazyflie.crtp import ANCHOR, Memory
+
+STATIONS: Final = 4  # the firmware's default
+ANCHORS: Final = 8
+PAGE: Final = 0x100
+GEOMETRY_BYTES: Final = 49  # origin, rotation, valid
+CALIBRATION_BYTES: Final = 61  # two sweeps of seven floats, identifier, valid
+CALIBRATION: Final = 0x1000  # where the calibrations begin
+ACTIVE: Final = 0x1000  # where the list of active anchors is
+ANCHOR_PAGES: Final = 0x2000
+
+SIZES: Final = {
+    Memory.TRAJECTORY: 4096,
+    Memory.LOCO: ANCHOR_PAGES + PAGE * 0x100,
+    Memory.LIGHTHOUSE: 2 * CALIBRATION,
+    Memory.TESTER: 0x1000,
+}
+
+
+class Memories:
+    """The memories of one Crazyflie, numbered in the order of `kinds`."""
+
+    kinds: Final = tuple(SIZES)
+
+    def __init__(self) -> None:
+        self._bytes = {kind: bytearray(size) for kind, size in SIZES.items()}
+        loco = self._bytes[Memory.LOCO]
+        for where in (0, ACTIVE):  # all anchors are on the air; where they are, nobody has said yet
+            loco[where : where + 1 + ANCHORS] = bytes((ANCHORS, *range(ANCHORS)))
+        self.stored = (0, 0)  # masks of the stations whose geometry and calibration would survive a restart
+
+    @staticmethod
+    def size(kind: Memory) -> int:
+        """Of a memory [bytes]."""
+        return SIZES[kind]
+
+    def read(self, kind: Memory, address: int, count: int) -> bytes | None:
+        """`count` bytes from `address` on; None where there is nothing."""
+        if kind == Memory.TESTER:
+            return bytes((address + k) & 0xFF for k in range(count))
+        data = self._bytes[kind]
+        if address + count > len(data) or not self._exists(kind, address):
+            return None
+        return bytes(data[address : address + count])
+
+    def write(self, kind: Memory, address: int, data: bytes) -> bool:
+        """Puts `data` at `address`; False where that cannot be."""
+        if kind == Memory.LOCO or address + len(data) > SIZES[kind] or not self._exists(kind, address):
+            return False
+        self._bytes[kind][address : address + len(data)] = data
+        return True
+
+    def place(self, anchor: int, x: float, y: float, z: float) -> None:
+        """An anchor has been told where it is [m], and says so from now on."""
+        where = ANCHOR_PAGES + PAGE * anchor
+        self._bytes[Memory.LOCO][where : where + ANCHOR.size] = ANCHOR.pack(x, y, z, True)
+
+    def anchors(self) -> dict[int, tuple[float, float, float]]:
+        """Positions [m] of the anchors that know theirs."""
+        loco, known = self._bytes[Memory.LOCO], {}
+        for anchor in range(ANCHORS):
+            x, y, z, valid = ANCHOR.unpack_from(loco, ANCHOR_PAGES + PAGE * anchor)
+            if valid:
+                known[anchor] = (x, y, z)
+        return known
+
+    def forget_stations(self) -> None:
+        """Geometries and calibrations are gone: what a change of the Lighthouse version does."""
+        self._bytes[Memory.LIGHTHOUSE] = bytearray(SIZES[Memory.LIGHTHOUSE])
+
+    @property
+    def geometries(self) -> int:
+        """Mask of the base stations whose geometry is valid."""
+        return self._valid(0, GEOMETRY_BYTES)
+
+    @property
+    def calibrations(self) -> int:
+        """Mask of the base stations whose calibration is valid."""
+        return self._valid(CALIBRATION, CALIBRATION_BYTES)
+
+    def _valid(self, begin: int, size: int) -> int:
+        data = self._bytes[Memory.LIGHTHOUSE]
+        return sum((data[begin + PAGE * i + size - 1] != 0) << i for i in range(STATIONS))
+
+    @staticmethod
+    def _exists(kind: Memory, address: int) -> bool:
+        """Whether anything is at an address: pages of base stations beyond the firmware's number are not."""
+        return kind != Memory.LIGHTHOUSE or address % CALIBRATION < STATIONS * PAGE
