@@ -35,6 +35,10 @@ class Keys:
         """Pose of this robot, measured from outside (motion capture, a twin service)."""
         return f"{self.realm}/{robot}/position"
 
+    def goal(self, robot: str) -> str:
+        """Where somebody outside wants this robot to go, as a `wire.Position`."""
+        return f"{self.realm}/{robot}/goal"
+
     def setpoint(self, robot: str) -> str:
         """Commands for a body that lives in another process."""
         return f"{self.realm}/{robot}/setpoint"

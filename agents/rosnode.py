@@ -9,9 +9,9 @@ from typing import Final
 import zenoh
 from zenoh.handlers import Handler
 
-from agents import ros2
 from agents import session as network
-from agents.ros2 import Message, Role, Style, Types
+from agents.protocols import ros2
+from agents.protocols.ros2 import Message, Role, Style, Types
 
 
 class Participant:
@@ -56,12 +56,12 @@ class Node:
     def publisher(self, topic: str, kind: str, quality: str = ros2.RELIABLE) -> Publisher:
         """Publishes messages of a type on a topic of the node's namespace, or on one that begins with a slash."""
         token, key = self.announce("MP", topic, kind, quality)
-        return Publisher(self.participant, kind, key, token)
+        return Publisher(self, kind, key, token)
 
     def subscriber(self, topic: str, kind: str, quality: str = ros2.RELIABLE, depth: int = 16) -> Subscriber:
         """Hears a topic likewise; the newest `depth` samples wait."""
         token, key = self.announce("MS", topic, kind, quality)
-        return Subscriber(self.participant, kind, key, token, depth)
+        return Subscriber(self, kind, key, token, depth)
 
     def announce(self, role: Role, topic: str, kind: str, quality: str) -> tuple[str, str]:
         """The token and the key of a new endpoint."""
@@ -72,9 +72,7 @@ class Node:
             return ros2.dds_token(it.zid, role, full, kind), key
         rest = ros2.endpoint_topic(full, kind, quality, it.types)
         entity = it.number()
-        return ros2.endpoint_token(
-            it.domain, it.zid, self._number, entity, role, self.namespace, self.name, rest
-        ), key
+        return ros2.endpoint_token(it.domain, it.zid, self._number, entity, role, self.namespace, self.name, rest), key
 
     def close(self) -> None:
         """Takes the node's token back; its endpoints are closed by themselves."""
@@ -85,7 +83,9 @@ class Node:
 class Publisher:
     """One end of a topic."""
 
-    def __init__(self, participant: Participant, kind: str, key: str, token: str) -> None:
+    def __init__(self, node: Node, kind: str, key: str, token: str) -> None:
+        participant = node.participant
+        self._node = node  # a token that nobody holds is taken back: the node lives as long as what it has
         self.kind: Final = kind
         self.key: Final = key
         self._types = participant.types
@@ -122,7 +122,9 @@ class Subscriber:
         malformed: Samples that were no message of the topic's type; they were left out.
     """
 
-    def __init__(self, participant: Participant, kind: str, key: str, token: str, depth: int) -> None:
+    def __init__(self, node: Node, kind: str, key: str, token: str, depth: int) -> None:
+        participant = node.participant
+        self._node = node  # as above
         self.kind: Final = kind
         self.key: Final = key
         self.malformed = 0

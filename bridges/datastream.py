@@ -88,6 +88,7 @@ class Reader:
         deadline = time.monotonic() + timeout_s
         self._framer, self._decoder = Framer(), Decoder()
         self._socket = socket.create_connection((host, port), timeout_s)
+        self._socket.setblocking(False)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             offered = self._offered(deadline)
@@ -140,7 +141,7 @@ class Reader:
         bodies: list[bytes] = []
         while True:
             try:
-                received = self._socket.recv(CHUNK, socket.MSG_DONTWAIT)
+                received = self._socket.recv(CHUNK)
             except BlockingIOError:
                 return bodies
             if not received:

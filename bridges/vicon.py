@@ -21,6 +21,7 @@ import zenoh
 
 from agents import session as network
 from agents import wire
+from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
 from agents.positioning import External
@@ -131,11 +132,12 @@ class Bridge:
         self._sieve, self._positions, self._say = sieve, positions, say
         self._state = ""
 
-    def run(self, stop: threading.Event) -> bool:
-        """Bridges until `stop` is set; False if nobody answered in the first seconds."""
+    def run(self, over: Callable[[], bool]) -> bool:
+        """Bridges until it is over; False if nobody answered in the first seconds."""
         begun = time.monotonic()
+        pause = threading.Event()
         ever = False
-        while not stop.is_set():
+        while not over():
             left = FIRST_S - (time.monotonic() - begun)
             if not ever and left <= 0.0:
                 return False
@@ -143,22 +145,22 @@ class Bridge:
                 reader = Reader(self._host, self._port, ATTEMPT_S if ever else min(ATTEMPT_S, max(0.1, left)))
             except (OSError, Malformed) as error:
                 self._tell(f"no connection to {self._host}:{self._port}: {reason(error)}; trying again")
-                stop.wait(PAUSE_S)
+                pause.wait(PAUSE_S)
                 continue
             ever = True
             self._tell(f"connected to {self._host}:{self._port}")
             try:
-                self._pump(reader, stop)
+                self._pump(reader, over)
             except (OSError, Malformed) as error:
                 self._tell(f"lost {self._host}:{self._port}: {reason(error)}; trying again")
             finally:
                 reader.close()
-            stop.wait(PAUSE_S)
+            pause.wait(PAUSE_S)
         return True
 
-    def _pump(self, reader: Reader, stop: threading.Event) -> None:
+    def _pump(self, reader: Reader, over: Callable[[], bool]) -> None:
         heard = time.monotonic()
-        while not stop.is_set():
+        while not over():
             frame = reader.newest(LOOK_S)
             now = time.monotonic()
             if frame is None:
@@ -189,7 +191,7 @@ def bridge(
     realm: str = "park",
     lifeline: bool = False,
 ) -> int:
-    """Bridges until SIGINT, SIGTERM or the loss of its lifeline; returns the exit code of the process.
+    """Bridges until SIGINT, SIGTERM or the loss of its lifeline (and of the robots); returns the exit code.
 
     Args:
         server: "HOST" or "HOST:PORT" of the DataStream server.
@@ -203,7 +205,7 @@ def bridge(
         network.EndpointError: If an endpoint is malformed.
     """
     host, port = split(server)
-    stop = threading.Event()
+    stop, lost = threading.Event(), threading.Event()
 
     def end(_signal: int, _frame: FrameType | None) -> None:
         stop.set()
@@ -213,11 +215,13 @@ def bridge(
 
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     if lifeline:
-        Lifeline(stop).start()
+        Lifeline(lost).start()
     try:
         with network.open_session(endpoints, name="vicon", stop=stop) as session:
-            positions = Positions(session, Keys(realm), list(subjects))
-            if Bridge(host, port, Sieve(subjects, say), positions, say).run(stop):
+            keys, robots = Keys(realm), list(subjects)
+            farewell = Farewell(session, keys, robots, lost)
+            made = Bridge(host, port, Sieve(subjects, say), Positions(session, keys, robots), say)
+            if made.run(lambda: stop.is_set() or farewell.over()):
                 return 0
     finally:
         for number, handler in before.items():

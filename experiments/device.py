@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from types import FrameType
 from typing import Final
 
@@ -23,8 +24,10 @@ import zenoh
 from agents import plugins, wire
 from agents import session as network
 from agents.keys import Keys
+from agents.kinds import KINDS
 from agents.lifeline import Lifeline
 from experiments import assign, document
+from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
 from twins.device import Device, DeviceRequest, Faults
 
@@ -35,11 +38,13 @@ class DeviceProcess:
     """Runs a device: waits on its sockets, moves it on, publishes the truth."""
 
     def __init__(
-        self, device: Device, names: Sequence[str], session: zenoh.Session, keys: Keys, rate_hz: float
+        self, device: Device, names: Sequence[str], session: zenoh.Session | None, keys: Keys, rate_hz: float
     ) -> None:
+        """Without a session nobody is told the truth."""
         self._device, self._names, self._dt = device, names, 1.0 / rate_hz
-        self._truths = [network.publisher(session, keys.truth(name), wire.JSON) for name in names]
-        self._watches = [network.alive_watch(session, keys.alive(name)) for name in names]
+        known = names if session is not None else ()
+        self._truths = [network.publisher(session, keys.truth(name), wire.JSON) for name in known if session]
+        self._watches = [network.alive_watch(session, keys.alive(name)) for name in known if session]
         self._alive = [False] * len(names)
 
     def run(self, over: threading.Event, lost: threading.Event) -> None:
@@ -75,7 +80,7 @@ class DeviceProcess:
     def _tell(self, stamp: float) -> None:
         position, yaw = self._device.truth()
         for name, publisher, where, toward in zip(
-            self._names, self._truths, position.tolist(), yaw.tolist(), strict=True
+            self._names, self._truths, position.tolist(), yaw.tolist(), strict=False
         ):
             publisher.put(wire.encode(wire.Position(name, stamp, tuple(where), toward)))
 
@@ -102,6 +107,46 @@ def stand_in(file: str, names: Sequence[str], *, faults: Faults, connect: Sequen
         raise DocumentError([Problem(file, 0, 0, f"{', '.join(names)} cannot share a protocol twin", hint)])
     endpoints = list(connect) or experiment.network.connect or [network.DEFAULT_ENDPOINT]
     request = DeviceRequest(assign.request(experiment, names, [experiment.seed], endpoints), faults)
+    word = words.pop()
+    keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
+    return _serve(word, request, keys=keys, rate_hz=rate, connect=endpoints, lifeline=lifeline)
+
+
+def by_hand(kind: str, count: int, *, faults: Faults, device: dict[str, object], connect: Sequence[str]) -> int:
+    """Runs `count` protocol twins of a kind of robot, in a row on the floor, without an experiment.
+
+    Args:
+        kind: Of robot.
+        count: How many.
+        faults: What goes wrong on purpose.
+        device: Settings of the device.
+        connect: Routers at which the truth is told, and at which twins that live on Zenoh are reached; may be none.
+
+    Raises:
+        DocumentError: If there is no such protocol twin.
+        Unreachable: If no router answers.
+    """
+    word = f"{kind}-twin"
+    if word not in (known := plugins.names(plugins.DEVICES)):
+        hint = plugins.did_you_mean(kind, [name.removesuffix("-twin") for name in known])
+        raise DocumentError([Problem(f"zenpark twin {kind}", 0, 0, "there is no such protocol twin", hint)])
+    hover = 0.8 if KINDS[kind].flies else None
+    robots = {
+        f"{kind[:2].upper()}{k + 1:02}": Robot(kind=kind, start=[0.5 * k, 0.0], body=word, hover=hover, device=device)
+        for k in range(count)
+    }
+    experiment = Experiment(title=word, robots=robots, duration_s=1.0)
+    endpoints = list(connect) or [network.DEFAULT_ENDPOINT]
+    request = DeviceRequest(assign.request(experiment, list(robots), [experiment.seed], endpoints), faults)
+    keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
+    return _serve(word, request, keys=keys, rate_hz=rate, connect=connect, lifeline=False)
+
+
+def _serve(
+    word: str, request: DeviceRequest, *, keys: Keys, rate_hz: float, connect: Sequence[str], lifeline: bool
+) -> int:
+    """Runs a device until it is told to end, or its lifeline is lost and the robots are gone."""
+    names = request.body.names
     over, lost = threading.Event(), threading.Event()
 
     def end(_signal: int, _frame: FrameType | None) -> None:
@@ -111,16 +156,30 @@ def stand_in(file: str, names: Sequence[str], *, faults: Faults, connect: Sequen
     signal.signal(signal.SIGTERM, end)
     if lifeline:
         Lifeline(lost).start()
-    with network.open_session(endpoints, name=words.pop(), stop=over) as session:
-        device: Device = plugins.load(plugins.DEVICES, experiment.robots[names[0]].body)(request)
-        try:
-            for name, address in zip(names, device.addresses, strict=True):
-                print(f"address {name} {address}", flush=True)
-            keys = Keys(experiment.network.realm)
-            DeviceProcess(device, names, session, keys, experiment.rates.body_hz).run(over, lost)
-        finally:
-            device.close()
+    with ExitStack() as stack:
+        session = None
+        if connect:
+            session = stack.enter_context(network.open_session(connect, name=word, stop=over))
+        device: Device = plugins.load(plugins.DEVICES, word)(request)
+        stack.callback(device.close)
+        for name, address in zip(names, device.addresses, strict=True):
+            print(f"address {name} {address}", flush=True)
+        DeviceProcess(device, names, session, keys, rate_hz).run(over, lost)
     return 0
+
+
+def command(kind: str, count: int, *, faults: str, device: str, connect: Sequence[str]) -> int:
+    """`zenpark twin`: as `by_hand`, with faults and settings as JSON."""
+    try:
+        wrong = msgspec.json.decode(faults, type=Faults)
+    except msgspec.MsgspecError as error:
+        raise DocumentError([Problem(f"--faults {faults}", 0, 0, str(error), "see twins/device.py")]) from None
+    try:
+        settings = msgspec.json.decode(device, type=dict[str, object])
+    except msgspec.MsgspecError as error:
+        hint = "write a JSON object"
+        raise DocumentError([Problem(f"--device {device}", 0, 0, str(error), hint)]) from None
+    return by_hand(kind, count, faults=wrong, device=settings, connect=connect)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -132,6 +132,33 @@ def router(
 
 
 @app.command()
+def twin(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="crazyflie, tello, khepera4 or turtlebot3.")],
+    count: Annotated[int, typer.Option(min=1, max=99, help="How many.")] = 1,
+    connect: Connect = None,
+    faults: Annotated[str, typer.Option(metavar="JSON", help="What goes wrong, such as '{\"loss\": 0.05}'.")] = "{}",
+    device: Annotated[str, typer.Option(metavar="JSON", help="Settings of the device.")] = "{}",
+) -> None:
+    """Stand in for hardware: protocol twins, to which vendor libraries connect."""
+    from experiments.device import command  # noqa: PLC0415
+
+    raise typer.Exit(command(kind, count, faults=faults, device=device, connect=connect or []))
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def bridge(
+    context: typer.Context,
+    what: Annotated[str, typer.Argument(metavar="vicon|ros2", help="`zenpark bridge vicon --help` says more.")],
+) -> None:
+    """Bring motion capture in (vicon), or show the robots to ROS 2 (ros2)."""
+    from importlib import import_module  # noqa: PLC0415
+
+    if what not in ("vicon", "ros2"):
+        raise typer.BadParameter(f"'{what}' is neither vicon nor ros2")
+    raise typer.Exit(import_module(f"bridges.{what}").main(context.args))
+
+
+@app.command()
 def check(file: File, settings: Settings = None, as_json: AsJson = False) -> None:
     """Check an experiment file and say what theory says of it."""
     from experiments.check import command  # noqa: PLC0415

@@ -70,6 +70,16 @@ class _Drone:
         self.state_due = 0.0
         self._outbox: deque[tuple[float, bytes, tuple[str, int]]] = deque()
 
+    @property
+    def aloft(self) -> bool:
+        """Whether it can be steered."""
+        return self.mode in (Mode.STICKS, Mode.MOVE, Mode.TURN)
+
+    def hover(self) -> None:
+        """Stays where it is, if it can be steered."""
+        if self.aloft:
+            self.mode, self.sticks = Mode.STICKS, (0, 0, 0, 0)
+
     def lost(self) -> bool:
         """Whether the air swallows this packet."""
         return self.faults.loss > 0.0 and float(self._chance.random()) < self.faults.loss
@@ -77,7 +87,7 @@ class _Drone:
     def send(self, text: str, to: tuple[str, int], t: float) -> None:
         """Queues a packet; it leaves at once, or after the delay that it was given."""
         if not self.lost():
-            self._outbox.append((t + self.faults.delay_s, text.encode("ascii"), to))
+            self._outbox.append((t + self.faults.delay_s, text.encode("ascii", "replace"), to))
             self.flush(t)
 
     def flush(self, t: float) -> None:
@@ -147,8 +157,10 @@ class TelloDevice:
             self._step(t)
         self._t = t
         for row, drone in enumerate(self._drones):
-            if drone.sdk and drone.peer is not None and t >= drone.state_due:
-                drone.state_due = max(drone.state_due + 1.0 / protocol.STATE_HZ, t)
+            if drone.sdk and drone.peer is not None and t >= drone.state_due - 0.5 * self._dt:
+                late = t - drone.state_due
+                period = 1.0 / protocol.STATE_HZ
+                drone.state_due += period if late < period else late + period  # what was missed is not made up for
                 if not drone.faults.silent(t):
                     drone.send(self._state(row), (drone.peer[0], protocol.STATE_PORT), t)
             drone.flush(t)
@@ -200,20 +212,32 @@ class TelloDevice:
     def _obey(self, row: int, word: str, arguments: list[str], sender: tuple[str, int]) -> str:
         """Does what a command says; its answer, or nothing if there is none yet, or none at all."""
         drone = self._drones[row]
-        rows = np.array([row])
         try:
             values = [int(argument) for argument in arguments]
         except ValueError:
             return "error"
-        aloft = drone.mode in (Mode.STICKS, Mode.MOVE, Mode.TURN)
-        if word == "command":
-            return "ok"
-        if word == "rc":
-            if len(values) != 4:
-                return "error"
+        if word in (*MOVES, "go", "cw", "ccw"):
+            return self._manoeuvre(row, word, values, sender) if drone.aloft else "error Motor stop"
+        if word in ("takeoff", "land", "emergency"):
+            return self._by_itself(row, word, sender)
+        if word == "rc" and len(values) == 4:
             right, forward, up, clockwise = (max(-protocol.STICK, min(protocol.STICK, value)) for value in values)
             drone.sticks = (right, forward, up, clockwise)
             return ""
+        if word == "stop":
+            answer = "ok" if drone.aloft else "error Motor stop"
+            drone.hover()
+        elif word == "speed":
+            answer = "ok" if len(values) == 1 and 10 <= values[0] <= 100 else "out of range"
+            drone.pace = 0.01 * values[0] if answer == "ok" else drone.pace
+        else:
+            known = ("command", "streamon", "streamoff", "mon", "moff", "mdirection")
+            answer = "ok" if word in known else "error" if word == "rc" else f"unknown command: {word}"
+        return answer
+
+    def _by_itself(self, row: int, word: str, sender: tuple[str, int]) -> str:
+        """What the drone does without sticks, and answers when it is done."""
+        drone, rows = self._drones[row], np.array([row])
         if word == "emergency":
             self._model.stop(rows)
             drone.mode, drone.waits, drone.sticks = Mode.FALL, None, (0, 0, 0, 0)
@@ -224,26 +248,12 @@ class TelloDevice:
             self._model.takeoff(rows, np.array([protocol.TAKEOFF_HEIGHT]))
             drone.mode, drone.waits, drone.sticks = Mode.CLIMB, sender, (0, 0, 0, 0)
             return ""
-        if word == "land":
-            if drone.mode in (Mode.GROUND, Mode.FALL):
-                return "error"
+        if drone.mode in (Mode.GROUND, Mode.FALL):
+            return "error"
+        if drone.mode is not Mode.LAND:  # told again, it goes on as it was
             self._model.land(rows)
-            drone.mode, drone.waits = Mode.LAND, sender
-            return ""
-        if word == "stop":
-            if aloft:
-                drone.mode, drone.sticks = Mode.STICKS, (0, 0, 0, 0)
-            return "ok" if aloft else "error Motor stop"
-        if word == "speed":
-            if len(values) != 1 or not 10 <= values[0] <= 100:
-                return "out of range"
-            drone.pace = 0.01 * values[0]
-            return "ok"
-        if word in (*MOVES, "go", "cw", "ccw"):
-            return self._manoeuvre(row, word, values, sender) if aloft else "error Motor stop"
-        if word in ("streamon", "streamoff", "mon", "moff", "mdirection"):
-            return "ok"
-        return f"unknown command: {word}"
+        drone.mode, drone.waits = Mode.LAND, sender
+        return ""
 
     def _manoeuvre(self, row: int, word: str, values: list[int], sender: tuple[str, int]) -> str:
         drone, yaw = self._drones[row], float(self._model.yaw[row])
@@ -328,11 +338,8 @@ class TelloDevice:
             drone.finish("ok", t)
         elif drone.mode is Mode.FALL and z <= 0.0:
             drone.mode = Mode.GROUND
-        elif drone.mode is Mode.MOVE and float(np.abs(drone.goal - model.position[row]).max()) < NEAR:
-            drone.mode, drone.sticks = Mode.STICKS, (0, 0, 0, 0)
-            drone.finish("ok", t)
-        elif drone.mode is Mode.TURN and abs(drone.heading - float(model.yaw[row])) < AIMED:
-            drone.mode, drone.sticks = Mode.STICKS, (0, 0, 0, 0)
+        elif drone.mode in (Mode.MOVE, Mode.TURN) and self._arrived(row, drone):
+            drone.hover()
             drone.finish("ok", t)
         if not flying:
             return
@@ -344,12 +351,19 @@ class TelloDevice:
             drone.finish("error Auto land", t)
             drone.mode = Mode.LAND
 
+    def _arrived(self, row: int, drone: _Drone) -> bool:
+        if drone.mode is Mode.TURN:
+            return abs(drone.heading - float(self._model.yaw[row])) < AIMED
+        return float(np.abs(drone.goal - self._model.position[row]).max()) < NEAR
+
 
 def _listen(name: str, address: str) -> socket.socket:
     """A socket where the address says, else on the first loopback host that has no Tello yet."""
     _, named, place = address.partition("://")
     if named:
         host, port = protocol.endpoint(name, f"tello://{place}")
+        if not host.startswith("127."):
+            raise BodyError(f"{name}: {address}: a twin lives on a loopback address, such as tello-twin://127.0.0.2")
         hosts, port = [host], port if ":" in place else PORT
     else:
         hosts, port = [f"127.0.0.{number}" for number in HOSTS], PORT

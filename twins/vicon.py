@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Final
@@ -24,6 +24,7 @@ import zenoh
 
 from agents import session as network
 from agents import wire
+from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
 from agents.protocols import datastream
@@ -112,6 +113,10 @@ class ViconTwin:
         """Takes a subject out of view."""
         self._seen[row] = False
 
+    def spoil(self, faults: Faults) -> None:
+        """From now on these things go wrong, and no others."""
+        self._faults = faults
+
     def sockets(self) -> Sequence[socket.socket]:
         """See `twins.device.Device.sockets`."""
         return [self._listener, *self._clients]
@@ -120,7 +125,7 @@ class ViconTwin:
         """See `twins.device.Device.serve`."""
         if ready is self._listener:
             self._admit()
-        else:
+        elif ready in self._clients:
             self._hear(ready, t)
 
     def advance(self, t: float) -> None:
@@ -239,11 +244,11 @@ class Truths:
         vicon.place(row, np.array(truth.position), upright(truth.yaw or 0.0))
 
 
-def serve(vicon: ViconTwin, truths: Truths, rate_hz: float, stop: threading.Event) -> None:
-    """Serves until `stop` is set, with a frame every 1 / `rate_hz` [s]."""
+def serve(vicon: ViconTwin, truths: Truths, rate_hz: float, over: Callable[[], bool]) -> None:
+    """Serves until it is over, with a frame every 1 / `rate_hz` [s]."""
     zero = time.monotonic()
     frame = 0
-    while not stop.is_set():
+    while not over():
         wait = zero + (frame + 1) / rate_hz - time.monotonic()
         ready, _, _ = select.select(vicon.sockets(), [], [], max(0.0, wait))
         t = time.monotonic() - zero
@@ -284,14 +289,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     if not (1.0 <= chosen.rate <= 1000.0 and 0.0 <= chosen.sigma < 1.0 and chosen.seed >= 0):
         parser.error("--rate is 1 to 1000 Hz, --sigma 0 to 1 m, --seed not negative")
-    stop = threading.Event()
+    stop, lost = threading.Event(), threading.Event()
 
     def end(_signal: int, _frame: FrameType | None) -> None:
         stop.set()
 
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     if chosen.lifeline:
-        Lifeline(stop).start()
+        Lifeline(lost).start()
     host, port = chosen.listen
     endpoints = chosen.connect or [network.DEFAULT_ENDPOINT]
     try:
@@ -307,7 +312,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
             print(f"vicon ready on {vicon.address}", flush=True)
             try:
-                serve(vicon, Truths(session, Keys(chosen.realm), chosen.robots), chosen.rate, stop)
+                keys = Keys(chosen.realm)
+                farewell = Farewell(session, keys, chosen.robots, lost)
+                truths = Truths(session, keys, chosen.robots)
+                serve(vicon, truths, chosen.rate, lambda: stop.is_set() or farewell.over())
             finally:
                 vicon.close()
     except (network.Unreachable, network.EndpointError) as error:

@@ -59,11 +59,16 @@ def endpoint(robot: str, address: str) -> tuple[str, int]:
 
 
 def sticks(velocity: tuple[float, float, float], yaw_rate: float, yaw: float) -> tuple[int, int, int, int]:
-    """What `rc` takes, right forward up clockwise, for a velocity in the world [m/s] and a yaw rate [rad/s] at `yaw`."""
+    """What `rc` takes (right, forward, up, clockwise) for a velocity in the world [m/s] and a yaw rate [rad/s]."""
     x, y, z = velocity
     cos, sin = math.cos(yaw), math.sin(yaw)
     forward, left = cos * x + sin * y, cos * y - sin * x
-    return _stick(-left / STICK_SPEED), _stick(forward / STICK_SPEED), _stick(z / STICK_SPEED), _stick(-yaw_rate / STICK_TURN)
+    return (
+        _stick(-left / STICK_SPEED),
+        _stick(forward / STICK_SPEED),
+        _stick(z / STICK_SPEED),
+        _stick(-yaw_rate / STICK_TURN),
+    )
 
 
 def motion(rc: tuple[int, int, int, int], yaw: float) -> tuple[float, float, float, float]:

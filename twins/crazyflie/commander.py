@@ -15,7 +15,7 @@ NEITHER: Final = (np.nan, np.nan, np.nan)
 class Commander:
     """Setpoints of N rows: each axis of a row follows a position, a velocity, or nothing.
 
-    A low-level setpoint has priority over the planner for ever, unless the client says that it will send no more of them.
+    A low-level setpoint has priority over the planner for ever, unless the client says that it sends no more of them.
 
     Attributes:
         target: (N, 3) positions wanted [m], NaN on axes that follow none.
@@ -79,7 +79,9 @@ class Commander:
         """(N,) of the setpoints that count [s]."""
         return t - self._received
 
-    def wanted(self, position: Array, velocity: Array, yaw: Array, level: Mask, gain: Array, turn_gain: Array) -> Array:
+    def wanted(
+        self, position: Array, velocity: Array, yaw: Array, *, level: Mask, gain: Array, turn_gain: float
+    ) -> Array:
         """The same as positions and yaws (N, 4), which is what the model of motion takes.
 
         Args:

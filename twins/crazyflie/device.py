@@ -12,8 +12,8 @@ import numpy as np
 
 from agents.body import BodyError
 from agents.kinds import CRAZYFLIE
+from agents.protocols.crtp import SCAN, Port, header
 from agents.rows import Array
-from twins.crazyflie.crtp import SCAN, Port, header
 from twins.crazyflie.drone import Drone
 from twins.crazyflie.flock import Flock
 from twins.device import DeviceRequest
@@ -149,6 +149,6 @@ def open_device(request: DeviceRequest) -> CrazyflieTwin:
     """The entry point `crazyflie-twin` of the group `zenpark.devices`.
 
     Raises:
-        BodyError: If a row is no Crazyflie.
+        BodyError: If a row is no Crazyflie, or its settings make no sense.
     """
     return CrazyflieTwin(request)

@@ -10,19 +10,18 @@ from typing import Final
 
 import numpy as np
 
-from twins.crazyflie import crtp
-from twins.crazyflie.crtp import HighLevel, Location, Log, Misc, Port, Safety, Setpoint, Status, Toc
+from agents.protocols import crtp
+from agents.protocols.crtp import HighLevel, Location, Misc, Port, Safety, Setpoint, Status, Toc
 from twins.crazyflie.flock import Flock
 from twins.crazyflie.logs import LogBlocks
 from twins.crazyflie.memory import ANCHORS, Memories
 from twins.crazyflie.planner import Plan
 from twins.crazyflie.tables import (
     EXTENDED,
-    LOGS,
     LOG_TABLE,
-    PARAMETERS,
     PARAMETER_TABLE,
     PARAMETER_TYPES,
+    PARAMETERS,
     READ_ONLY,
     Table,
 )
@@ -30,7 +29,6 @@ from twins.crazyflie.tables import (
 Send = Callable[[Port, int, bytes], None]
 HOVER_THRUST: Final = 36000.0  # about what a Crazyflie hovers with
 CLIMB_THRUST: Final = 24000.0  # that much more is a metre per second up, about
-UNPLANNED: Final = {HighLevel.GROUP, HighLevel.STOP}
 
 
 @dataclass
@@ -265,13 +263,12 @@ class Drone:
 
     def _plan(self, command: int, group: int, data: bytes) -> Status:
         flock, row, t = self.flock, self.row, self.flock.t
+        meant = not group or bool(group & self.group)
         if command == HighLevel.GROUP:
             self.group = group
-            return Status.OK
-        if group and not group & self.group:
-            return Status.OK  # meant for others
-        if command == HighLevel.STOP:
+        elif command == HighLevel.STOP and meant:
             flock.planner.stop(row)
+        if command in (HighLevel.GROUP, HighLevel.STOP) or not meant:
             return Status.OK
         if not flock.supervisor.may_fly[row]:
             return Status.BUSY
@@ -280,11 +277,11 @@ class Drone:
             height, yaw, keep, span = crtp.CLIMB.unpack_from(data)
             yaw = float(pose[3]) if keep else yaw
             climb = flock.planner.takeoff if command == HighLevel.TAKEOFF else flock.planner.land
-            return climb(row, t, pose, height, yaw, span)
+            return climb(row, t, pose, height=height, yaw=yaw, span=span)
         if command == HighLevel.GO_TO:
             relative, linear, x, y, z, yaw, span = crtp.GO_TO.unpack_from(data)
             goal, velocity = np.array([x, y, z, yaw]), flock.quadrotor.velocity[row]
-            return flock.planner.go_to(row, t, pose, velocity, goal, span, relative=relative, linear=linear)
+            return flock.planner.go_to(row, t, pose, velocity, goal=goal, span=span, relative=relative, linear=linear)
         return Status.NO_COMMAND
 
     # ------------------------------------------------------------------ position

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from agents.body import BodyRequest
+from agents.protocols.crazyflie import Lighthouse, Loco, Outside, chosen
+from agents.protocols.crtp import Info, Power
 from agents.rows import Array, Mask
-from twins.body import ENDURANCE_S
+from twins.body import CATCH_UP_S, ENDURANCE_S
 from twins.crazyflie.commander import Commander
-from twins.crazyflie.crtp import Info, Power
 from twins.crazyflie.estimator import Estimator
 from twins.crazyflie.memory import Memories
 from twins.crazyflie.planner import Plan, Planner
@@ -44,13 +44,16 @@ class Flock:
         rows = len(request.names)
         self.dt = 1.0 / request.rate_hz
         self.t = 0.0
-        systems = [_system(device) for device in request.device]
-        self.lighthouse = [system == "lighthouse" for system in systems]
-        self.loco = [system == "loco" for system in systems]
-        self.multiranger = [bool(device.get("multiranger")) for device in request.device]
-        outside = np.array(request.external) | np.array([system == "external" for system in systems])
+        settings = [
+            chosen(name, device, external=external)
+            for name, device, external in zip(request.names, request.device, request.external, strict=True)
+        ]
+        self.lighthouse = [isinstance(each.positioning, Lighthouse) for each in settings]
+        self.loco = [isinstance(each.positioning, Loco) for each in settings]
+        self.multiranger = [each.multiranger for each in settings]
+        outside = np.array([isinstance(each.positioning, Outside) for each in settings])
         self._on_board = ~(outside | np.array(self.lighthouse) | np.array(self.loco))
-        by_hand = [faults.refuse_arming or device.get("platform") == "brushless" for device in request.device]
+        by_hand = [faults.refuse_arming or each.platform == "brushless" for each in settings]
         self.refuse_arming = faults.refuse_arming
         self.planner = Planner(rows)
         self.commander = Commander(rows)
@@ -64,7 +67,7 @@ class Flock:
         noise = Noise(request.names, request.seeds, "measurement", 4)
         self._measurement = Measurement(request.disturbance, spatial, noise)
         response, kind = RESPONSES["crazyflie"], request.kinds[0]
-        self._gain, self._turn_gain = np.array(response.position), np.array(kind.turn_response)
+        self._gain, self._turn_gain = np.array(response.position), kind.turn_response
         self.estimator.error[~self._on_board] = -self.quadrotor.position[~self._on_board]
         self.estimate = self.quadrotor.position + self.estimator.error
 
@@ -106,7 +109,7 @@ class Flock:
                 working[row] = self.station_status(row) == 2
             elif self.loco[row]:
                 working[row] = len(memories.anchors()) >= ENOUGH_ANCHORS
-        return working
+        return np.asarray(working)
 
     def arm(self, row: int, *, on: bool) -> bool:
         """An arming request."""
@@ -115,7 +118,16 @@ class Flock:
         return self.supervisor.arm(row, self.t, on=on)
 
     def advance(self, t: float) -> Mask:
-        """One tick, to time `t` [s]; returns (N,) which rows have just been locked."""
+        """On to time `t` [s], by steps of dt; returns (N,) which rows have been locked on the way."""
+        steps = max(1, round((t - self.t) / self.dt))
+        if steps * self.dt > CATCH_UP_S:
+            steps = 1
+        locked = np.zeros(len(self.charge), dtype=bool)
+        for left in range(steps - 1, -1, -1):
+            locked |= self._step(t - left * self.dt)
+        return locked
+
+    def _step(self, t: float) -> Mask:
         self.t = t
         quadrotor, commander, supervisor = self.quadrotor, self.commander, self.supervisor
         commander.follow(t, self.planner.goal(t))
@@ -125,7 +137,12 @@ class Flock:
         quadrotor.stop(np.flatnonzero(quadrotor.flying & ~self._spinning()))
         quadrotor.flying[self._spinning()] = True
         setpoint = commander.wanted(
-            self.estimate, quadrotor.velocity, quadrotor.yaw, supervisor.level, self._gain, self._turn_gain
+            self.estimate,
+            quadrotor.velocity,
+            quadrotor.yaw,
+            level=supervisor.level,
+            gain=self._gain,
+            turn_gain=self._turn_gain,
         )
         setpoint[:, :3] -= self.estimate - quadrotor.position  # the controller flies the estimate, not the truth
         quadrotor.command(setpoint)
@@ -140,9 +157,3 @@ class Flock:
     def _spinning(self) -> Mask:
         """(N,) motors turn."""
         return np.asarray(self.commander.on & self.supervisor.may_fly & (self.charge > 0.0))
-
-
-def _system(device: Mapping[str, Any]) -> str | None:
-    """Which positioning system a robot's settings name; the bridge checks them, the twin only looks."""
-    positioning = device.get("positioning")
-    return positioning.get("system") if isinstance(positioning, dict) else None

@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from twins.crazyflie import crtp
-from twins.crazyflie.crtp import Info, Log, Status
+from agents.protocols import crtp
+from agents.protocols.crtp import Info, Log, Status
 from twins.crazyflie.flock import Flock
 from twins.crazyflie.tables import LOG_FORMATS, LOGS
 
@@ -49,17 +49,12 @@ class LogBlocks:
 
     def obey(self, command: int, number: int, rest: bytes, t: float) -> Status:
         """One command about block `number` at time `t` [s]."""
+        block = self._blocks.get(number)
         if command == Log.RESET:
             self._blocks.clear()
             return Status.OK
         if command == Log.CREATE:
-            if number in self._blocks:
-                return Status.EXISTS
-            if len(self._blocks) == crtp.LOG_BLOCKS:
-                return Status.NO_ROOM
-            self._blocks[number] = Block()
-            return self._append(self._blocks[number], rest)
-        block = self._blocks.get(number)
+            return self._create(number, rest)
         if block is None:
             return Status.UNKNOWN
         if command == Log.APPEND:
@@ -71,9 +66,7 @@ class LogBlocks:
             block.period = 0.0
         elif command == Log.DELETE:
             del self._blocks[number]
-        else:
-            return Status.NO_COMMAND
-        return Status.OK
+        return Status.OK if command in (Log.START, Log.STOP, Log.DELETE) else Status.NO_COMMAND
 
     def due(self, t: float) -> Iterator[bytes]:
         """Packets that are due at `t` [s]."""
@@ -88,6 +81,14 @@ class LogBlocks:
                 packing.pack(_wrapped(read(), packing) if whole else read()) for read, packing, whole in block.variables
             )
             yield bytes((number,)) + stamp + values
+
+    def _create(self, number: int, items: bytes) -> Status:
+        if number in self._blocks:
+            return Status.EXISTS
+        if len(self._blocks) == crtp.LOG_BLOCKS:
+            return Status.NO_ROOM
+        self._blocks[number] = Block()
+        return self._append(self._blocks[number], items)
 
     def _append(self, block: Block, items: bytes) -> Status:
         for begin in range(0, len(items) - 2, 3):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from twins.crazyflie.crtp import ANCHOR, Memory
+from agents.protocols.crtp import ANCHOR, Memory
 
 STATIONS: Final = 4  # the firmware's default
 ANCHORS: Final = 8

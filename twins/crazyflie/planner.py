@@ -12,8 +12,8 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.protocols.crtp import Status
 from agents.rows import Array, Mask
-from twins.crazyflie.crtp import Status
 
 SHORTEST = 0.01  # [s]
 
@@ -27,7 +27,7 @@ class Plan(IntEnum):
 
 
 def polynomial(span: float, begin: tuple[Array, Array, Array], end: tuple[Array, Array, Array]) -> Array:
-    """Coefficients (k, 8), constant first, from position, velocity, acceleration (k,) at both ends, `span` [s] apart."""
+    """Coefficients (k, 8), constant first, from position, velocity, acceleration (k,) at ends `span` [s] apart."""
     (p, v, a), (q, w, b) = begin, end
     d = q - (p + v * span + 0.5 * a * span**2)
     dv = (w - (v + a * span)) * span
@@ -70,19 +70,19 @@ class Planner:
         self._span = np.ones(rows)
         self._coefficients = np.zeros((rows, 4, 8))
 
-    def takeoff(self, row: int, t: float, pose: Array, height: float, yaw: float, span: float) -> Status:
+    def takeoff(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> Status:
         """Straight up, or down, to `height` [m]; refused unless idle."""
         if self.plan[row] != Plan.IDLE:
             return Status.REFUSED
-        self._vertical(row, t, pose, height, yaw, span)
+        self._vertical(row, t, pose, height=height, yaw=yaw, span=span)
         self.plan[row] = Plan.FLYING
         return Status.OK
 
-    def land(self, row: int, t: float, pose: Array, height: float, yaw: float, span: float) -> Status:
+    def land(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> Status:
         """To `height` [m], and then motors off; refused while landing."""
         if self.plan[row] == Plan.LANDING:
             return Status.REFUSED
-        self._vertical(row, t, pose, height, yaw, span)
+        self._vertical(row, t, pose, height=height, yaw=yaw, span=span)
         self.plan[row] = Plan.LANDING
         return Status.OK
 
@@ -92,9 +92,9 @@ class Planner:
         t: float,
         pose: Array,
         velocity: Array,
+        *,
         goal: Array,
         span: float,
-        *,
         relative: bool,
         linear: bool,
     ) -> Status:
@@ -139,7 +139,7 @@ class Planner:
             speed, acceleration = np.zeros(4), np.zeros(4)
         return pose, speed, acceleration
 
-    def _vertical(self, row: int, t: float, pose: Array, height: float, yaw: float, span: float) -> None:
+    def _vertical(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> None:
         span, zero = max(span, SHORTEST), np.zeros(4)
         goal = self._near(pose, np.array([pose[0], pose[1], height, yaw]))
         self._follow(row, t, span, polynomial(span, (pose, zero, zero), (goal, zero, zero)))

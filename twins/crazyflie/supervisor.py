@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.protocols.crtp import Info
 from agents.rows import Array, Mask
-from twins.crazyflie.crtp import Info
 
 LEVEL_S: Final = 0.5  # a low-level setpoint older than this is not followed any more
 LOCK_S: Final = 2.0  # and after this nobody will come back
@@ -109,7 +109,7 @@ class Supervisor:
         ).astype(np.int8)
         self._since[(after == State.LANDED) & (state != State.LANDED)] = t
         self.state = after
-        return lock
+        return np.asarray(lock)
 
     def info(self, row: int) -> Info:
         """What a row says of itself, without the planner's part."""

@@ -85,7 +85,7 @@ class Table:
     crc: int
 
     @classmethod
-    def of(cls, entries: Sequence[Parameter] | Sequence[LogVariable], salt: bytes) -> Table:
+    def of(cls, entries: Sequence[Parameter | LogVariable], salt: bytes) -> Table:
         """The table of these entries."""
         items = tuple(one.item for one in entries)
         return cls(items, {one.name: i for i, one in enumerate(entries)}, zlib.crc32(salt + b"".join(items)))

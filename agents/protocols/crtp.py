@@ -1,4 +1,4 @@
-"""CRTP, the Crazyflie's protocol, version 12: ports, commands, answers, flags, units. Nobody else spells a number of it.
+"""CRTP, the protocol of the Crazyflie, version 12: ports, commands, answers, flags. Nobody else spells a number of it.
 
 One packet is a header byte (port, two set bits, channel) and up to 30 bytes; over UDP one datagram is one packet.
 Source: the protocol pages of Bitcraze's documentation, and what cflib 0.1.34 puts on the wire.

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import struct
 from functools import cache
-from typing import Any, Final, Literal, TypeAlias
+from math import floor
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 from agents.body import BodyError
 
@@ -55,7 +56,7 @@ class Types:
 
     def __init__(self, distro: Distro) -> None:
         try:
-            from rosbags.interfaces import SerdeError  # noqa: PLC0415 - an extra, and 80 ms
+            from rosbags.serde import SerdeError  # noqa: PLC0415 - an extra, and 80 ms
             from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
         except ImportError:
             raise _missing() from None
@@ -64,7 +65,7 @@ class Types:
         self._malformed = SerdeError
         self._hashes: dict[str, str] = {}
 
-    def make(self, kind: str, **fields: object) -> Message:
+    def make(self, kind: str, **fields: Message) -> Message:
         """A message of a type such as "geometry_msgs/msg/Twist"."""
         return self._store.types[kind](**fields)
 
@@ -93,7 +94,8 @@ class Types:
 
     def header(self, stamp: float, frame: str) -> Message:
         """A std_msgs/Header for a UTC time [s]."""
-        seconds, nanoseconds = divmod(round(stamp * 1e9), 1_000_000_000)
+        seconds = floor(stamp)  # split first: today's UTC in nanoseconds has more digits than a float
+        nanoseconds = min(round((stamp - seconds) * 1e9), 999_999_999)
         time = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
         return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame)
 
@@ -184,28 +186,42 @@ def dds_token(zid: str, role: Role, topic: str, kind: str) -> str:
     return f"@/{zid}/@ros2_lv/{role}/{topic.removeprefix('/').replace('/', '§')}/{kind.replace('/', '§')}/:1:0:0,10"
 
 
-def endpoints(style: Style, role: Role, topic: str, *, domain: int) -> str:
-    """Key expression of the tokens of whoever publishes or subscribes to a topic; `*` as topic means any."""
+def endpoints(style: Style, role: Role, topic: str, *, domain: int | None = None) -> str:
+    """Key expression of the tokens of whoever publishes or subscribes to a topic.
+
+    Args:
+        style: Whose tokens.
+        role: Which end.
+        topic: By its full name; "*" means any.
+        domain: None means any.
+    """
     if style == "ros2dds":
         return f"@/*/@ros2_lv/{role}/{topic.removeprefix('/').replace('/', '§')}/**"
-    return f"@ros2_lv/{domain}/*/*/*/{role}/*/*/*/{mangle(topic)}/**"
+    return f"@ros2_lv/{'*' if domain is None else domain}/*/*/*/{role}/*/*/*/{mangle(topic)}/**"
 
 
-def announced(style: Style, token: str) -> tuple[str, str, str]:
-    """Topic by its full name, type as "geometry_msgs/msg/Twist", and hash (empty with ros2dds) of an endpoint's token.
+class Endpoint(NamedTuple):
+    """What the token of a publisher or subscriber tells; ros2dds knows neither type hashes nor domains."""
+
+    topic: str  # full name, "/tb3_0/odom"
+    kind: str  # "nav_msgs/msg/Odometry"
+    hash: str = ""
+    domain: int = 0
+
+
+def announced(style: Style, token: str) -> Endpoint:
+    """The endpoint that a token announces.
 
     Raises:
-        ValueError: If it is no such token.
+        ValueError: If it announces none.
     """
     chunks = token.split("/")
-    if style == "ros2dds":
-        if len(chunks) < 6:
-            raise ValueError(f"'{token}' is no token of zenoh-bridge-ros2dds")
-        return "/" + chunks[4].replace("§", "/"), chunks[5].replace("§", "/"), ""
-    if len(chunks) != 13:
-        raise ValueError(f"'{token}' is no token of an endpoint of rmw_zenoh")
-    kind = chunks[10].replace("::dds_::", "/").replace("::", "/").removesuffix("_")
-    return chunks[9].replace("%", "/"), kind, chunks[11]
+    if style == "ros2dds" and len(chunks) >= 6:
+        return Endpoint("/" + chunks[4].replace("§", "/"), chunks[5].replace("§", "/"))
+    if style == "rmw" and len(chunks) == 13:
+        kind = chunks[10].replace("::dds_::", "/").replace("::", "/").removesuffix("_")
+        return Endpoint(chunks[9].replace("%", "/"), kind, chunks[11], int(chunks[1]))
+    raise ValueError(f"'{token}' announces no publisher or subscriber")
 
 
 def gid(token: str) -> bytes:

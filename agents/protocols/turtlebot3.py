@@ -7,18 +7,17 @@ Shared by the bridge that drives one and the protocol twin that plays one. Sourc
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import copysign
-from typing import Annotated, Any, Final, Literal, get_args
+from typing import Annotated, Final, Literal, get_args
 from urllib.parse import parse_qsl
 
 import msgspec
 from msgspec import Meta
 
-from agents import ros2
 from agents.body import BodyError
-from agents.ros2 import Distro, Style
+from agents.protocols import ros2
+from agents.protocols.ros2 import Distro, Style
 
 COMMAND: Final = "cmd_vel"
 ODOMETRY: Final = "odom"
@@ -32,6 +31,7 @@ STEP: Final = 0.01  # [m/s, rad/s] the node cuts speeds down to whole steps
 RAYS: Final = 360
 NEAREST, FARTHEST = 0.12, 3.5  # [m] of the LDS-01
 EMPTY_V, FULL_V = 10.5, 12.3  # the firmware maps these voltages to 0 and 100 %
+ABSENT_V: Final = 7.0  # at this and below the node says that there is no battery
 
 _NAMESPACE: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
@@ -43,6 +43,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         distro: ROS 2 distribution of the robot; what its address says counts more.
         domain: ROS_DOMAIN_ID, for style "rmw"; likewise.
         stamped: Whether cmd_vel is a TwistStamped (`enable_stamped_cmd_vel`); by distribution when left out.
+        command_topic: Where it takes commands: cmd_vel, or what a watchdog in front of it listens to.
         endpoint: Zenoh router by which the robot is reached, where it is not that of the experiment.
         origin: What stands at the robot's start pose: the robot when its body is opened, or the origin of its
             odometry, which is where its node was started.
@@ -54,6 +55,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     distro: Distro = "jazzy"
     domain: Annotated[int, Meta(ge=0, le=ros2.MAX_DOMAIN)] = 0
     stamped: bool | None = None
+    command_topic: Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = COMMAND
     endpoint: str | None = None
     origin: Literal["open", "boot"] = "open"
     style: Style = "ros2dds"
@@ -72,18 +74,6 @@ class Address:
     def __str__(self) -> str:
         domain = f"domain={self.domain}&" if self.style == "rmw" else ""
         return f"{self.style}://{self.namespace}?{domain}distro={self.distro}"
-
-
-def settings(name: str, device: Mapping[str, Any]) -> Settings:
-    """The settings of a robot.
-
-    Raises:
-        BodyError: If they are wrong, with robot and field.
-    """
-    try:
-        return msgspec.convert(dict(device), Settings)
-    except msgspec.ValidationError as error:
-        raise BodyError(f"{name}: device: {error}") from None
 
 
 def address(name: str, text: str, chosen: Settings) -> Address:

@@ -1,0 +1,36 @@
+"""When those who serve robots (a simulated device, motion capture) may leave after their starter has gone."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from typing import Final
+
+import zenoh
+
+from agents import session as network
+from agents.keys import Keys
+
+AFTER_S: Final = 20.0  # how long robots may take to land after the launcher is gone
+
+
+class Farewell:
+    """Robots that have to land first still need what this process does for them."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str], lost: threading.Event) -> None:
+        """`lost` is that of the lifeline."""
+        self._watches = [network.alive_watch(session, keys.alive(robot)) for robot in robots]
+        self._alive = [False] * len(self._watches)
+        self._lost = lost
+        self._last = float("inf")
+
+    def over(self) -> bool:
+        """Whether the starter is gone, and then the robots, or their time is up; costs microseconds."""
+        for row, watch in enumerate(self._watches):
+            for sample in network.received(watch.handler):
+                self._alive[row] = sample.kind != zenoh.SampleKind.DELETE
+        if not self._lost.is_set():
+            return False
+        self._last = min(self._last, time.monotonic() + AFTER_S)
+        return not any(self._alive) or time.monotonic() > self._last

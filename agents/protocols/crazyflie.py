@@ -1,0 +1,150 @@
+"""The `device` table of a Crazyflie in the experiment file, and what its address may look like; the wire is `crtp`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Final, Literal
+
+import msgspec
+from msgspec import Meta
+
+from agents.body import BodyError
+from agents.protocols.settings import settings
+
+Positive = Annotated[float, Meta(gt=0)]
+Rate = Annotated[float, Meta(ge=1, le=100)]
+Wait = Annotated[float, Meta(gt=0, le=60)]
+PACKETS_PER_RADIO: Final = 500.0  # [1/s] about what one Crazyradio carries (cflib's maintainers, issue 258)
+ADDRESSES: Final = (
+    re.compile(r"radio://[0-9A-Za-z]+/([0-9]|[1-9][0-9]|1[01][0-9]|12[0-5])/(250K|1M|2M)(/[0-9A-Fa-f]{1,10})?(\?.*)?"),
+    re.compile(r"usb://[0-9]+"),
+    re.compile(r"udp://[^/:\s]+:[0-9]{1,5}"),
+)
+
+
+class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A table of the settings."""
+
+
+class Lighthouse(Part, frozen=True, tag_field="system", tag="lighthouse"):
+    """Lighthouse deck and base stations.
+
+    Attributes:
+        file: Geometry and calibration as the Crazyflie client saves them; None: what is stored on board.
+        base_stations: How many the firmware knows.
+    """
+
+    file: str | None = None
+    base_stations: Annotated[int, Meta(ge=1, le=16)] = 4
+
+
+class Loco(Part, frozen=True, tag_field="system", tag="loco"):
+    """Loco deck and anchors.
+
+    Attributes:
+        mode: How ranges are measured.
+        anchors: Positions [m] of anchors 0, 1, ...; empty: what they were told before.
+    """
+
+    mode: Literal["auto", "twr", "tdoa2", "tdoa3"] = "auto"
+    anchors: list[tuple[float, float, float]] = []
+
+
+class Outside(Part, frozen=True, tag_field="system", tag="external"):
+    """Positions from outside (motion capture), passed on to the Crazyflie's own estimator.
+
+    Attributes:
+        rate_hz: At most so many are passed on per second.
+        position_sigma: Their standard deviation [m].
+        attitude: Pass the yaw on as well; a marker set that is seen in two ways upsets the estimator.
+        attitude_sigma: Standard deviation of the attitude [rad].
+    """
+
+    rate_hz: Rate = 50.0
+    position_sigma: Positive = 0.01
+    attitude: bool = False
+    attitude_sigma: Positive = 0.05
+
+
+class Settings(Part, frozen=True):
+    """How one Crazyflie is driven.
+
+    Attributes:
+        control: `position` and `velocity` stream setpoints, `high-level` sends the planner on board to each new goal.
+        stream_hz: Rate of streamed setpoints.
+        log_hz: Rate of the pose; a log period is a multiple of 10 ms.
+        status_hz: Rate of battery and supervisor.
+        multiranger: It carries a Multi-ranger deck.
+        ranges_hz: Rate of its ranges.
+        positioning: Which system tells it where it is; None: what it carries is set up already.
+        estimator: On board; None: Kalman if a positioning system is named, else as it is.
+        parameters: Firmware parameters to set on connecting.
+        arm: Arm it before taking off, where the platform asks for that.
+        platform: For the twin only: a `brushless` one must be armed.
+        connect_s: It must be connected after this [s].
+        converge_s: Its position estimate must have settled after this [s].
+    """
+
+    control: Literal["position", "velocity", "high-level"] = "position"
+    stream_hz: Rate = 20.0
+    log_hz: Rate = 50.0
+    status_hz: Rate = 10.0
+    multiranger: bool = False
+    ranges_hz: Rate = 10.0
+    positioning: Lighthouse | Loco | Outside | None = None
+    estimator: Literal["auto", "complementary", "kalman", "ukf"] | None = None
+    parameters: dict[str, float] = {}
+    arm: bool = True
+    platform: Literal["crazyflie", "brushless"] = "crazyflie"
+    connect_s: Wait = 15.0
+    converge_s: Wait = 10.0
+
+    @property
+    def packets_hz(self) -> float:
+        """Log packets per second."""
+        return self.log_hz + self.status_hz + (self.ranges_hz if self.multiranger else 0.0)
+
+
+def address(name: str, given: str) -> str:
+    """The address of the robot `name`, if it is one that cflib understands.
+
+    Raises:
+        BodyError: If not.
+    """
+    if not any(pattern.fullmatch(given) for pattern in ADDRESSES):
+        raise BodyError(
+            f"{name}: '{given}' is no Crazyflie's address; "
+            "write radio://0/80/2M/E7E7E7E701, usb://0 or udp://127.0.0.1:19850"
+        )
+    return given
+
+
+def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> Settings:
+    """The settings of the robot `name`; `external` if its position comes from outside.
+
+    Raises:
+        BodyError: If they make no sense.
+    """
+    read = settings(Settings, name, device)
+    if isinstance(read.positioning, Outside) and not external:
+        raise BodyError(f'{name}: positioning system "external" needs position = "external" in the robot\'s table')
+    if external and read.positioning is None:
+        return msgspec.structs.replace(read, positioning=Outside())
+    return read
+
+
+def crowded(addresses: Sequence[str], each: Sequence[Settings]) -> dict[str, str]:
+    """What is to be said of radios that would have to carry more packets than they can, by address."""
+    radios = [address.split("/")[2] if address.startswith("radio://") else "" for address in addresses]
+    said: dict[str, str] = {}
+    for radio in set(radios) - {""}:
+        on_it = [row for row, other in enumerate(radios) if other == radio]
+        packets = sum(each[row].packets_hz for row in on_it)
+        if packets > PACKETS_PER_RADIO:
+            text = (
+                f"radio {radio}: {len(on_it)} robots log {packets:.0f} packets/s, "
+                f"it carries about {PACKETS_PER_RADIO:.0f}: lower log_hz, or plug in another radio"
+            )
+            said |= {addresses[row]: text for row in on_it}
+    return said

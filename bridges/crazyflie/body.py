@@ -1,0 +1,155 @@
+"""Rows of Crazyflies as one body: one thread each, one radio or several, one process."""
+
+from __future__ import annotations
+
+import time
+from math import isfinite
+from typing import Final
+
+import numpy as np
+
+from agents.body import BodyError, BodyRequest, BodyState, RangeScan
+from agents.positioning import External
+from agents.protocols.crazyflie import Lighthouse, address, chosen, crowded
+from agents.rows import Array, Index
+from bridges.crazyflie.link import prepare
+from bridges.crazyflie.pilot import Pilot
+from bridges.crazyflie.telemetry import BEARING, ELEVATION, Board, Telemetry
+
+STALE_S: Final = 0.5  # a pose older than this is worth a word
+POLL_S: Final = 0.01
+
+
+class CrazyflieBody:
+    """Crazyflies; implements `agents.body.Body`."""
+
+    def __init__(self, request: BodyRequest) -> None:
+        self._names = request.names
+        for name, kind in zip(request.names, request.kinds, strict=True):
+            if kind.name != "crazyflie":
+                raise BodyError(f"{name} is a {kind.name}: this body flies Crazyflies")
+        addresses = [address(*pair) for pair in zip(request.names, request.addresses, strict=True)]
+        twice = {one for one in addresses if addresses.count(one) > 1}
+        if twice:
+            raise BodyError(f"several robots have the address {', '.join(sorted(twice))}: give each its own")
+        settings = [
+            chosen(name, device, external=outside)
+            for name, device, outside in zip(request.names, request.device, request.external, strict=True)
+        ]
+        self._crowded = [crowded(addresses, settings).get(one, "") for one in addresses]
+        rows = len(addresses)
+        self._board = Board(rows)
+        self._patience = max(each.connect_s + each.converge_s for each in settings) + 5.0
+        self._pilots = [
+            Pilot(
+                name,
+                where,
+                each,
+                Telemetry(self._board, row, lighthouse=isinstance(each.positioning, Lighthouse)),
+                (request.start[row], float(request.yaw[row])),
+            )
+            for row, (name, where, each) in enumerate(zip(request.names, addresses, settings, strict=True))
+        ]
+        self._outside = np.flatnonzero(request.external)
+        self._external = External(rows)
+        self._zero = time.monotonic()  # of the process's clock, on the monotonic one
+        self._ranging = [row for row, each in enumerate(settings) if each.multiranger]
+
+    def open(self) -> None:
+        """See `Body.open`. Of several, those that cannot be had are left out: their notes say why, and it is tried on.
+
+        Raises:
+            BodyError: If none can be had.
+        """
+        prepare()
+        for pilot in self._pilots:
+            pilot.start()
+        deadline = time.monotonic() + self._patience
+        waiting = list(self._pilots)
+        while waiting and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+            waiting = [pilot for pilot in waiting if not pilot.opened.is_set() and pilot.failure is None]
+        if not any(pilot.opened.is_set() for pilot in self._pilots):
+            self.close()
+            failures = [pilot.failure for pilot in self._pilots if pilot.failure is not None]
+            raise failures[0] if failures else BodyError(f"{', '.join(self._names)}: not ready in time")
+
+    def read(self, t: float) -> BodyState:
+        """See `Body.read`."""
+        now = time.monotonic()
+        self._zero = now - t
+        board = self._board
+        pose = np.where(board.placed[:, None], board.pose, np.nan)
+        unknown = np.full_like(pose[:, :3], np.nan)
+        state = BodyState(
+            time=board.heard - self._zero,
+            position=pose[:, :3].copy(),
+            velocity=pose[:, 3:6].copy(),
+            yaw=board.pose[:, 6].copy(),
+            true_position=unknown,
+            true_yaw=unknown[:, 0],
+            battery=board.battery.copy(),
+            flying=board.airborne.copy(),
+            notes=tuple(self._note(row, now) for row in range(len(self._pilots))),
+            ranges=tuple(self._scan(row) for row in range(len(self._pilots))) if self._ranging else (),
+        )
+        if len(self._outside):
+            rows, heard = self._outside, state.time.copy()
+            self._external.fill(state, rows)
+            state.position[rows[~board.placed[rows]]] = np.nan  # seen, but it does not know that yet: it must not fly
+            state.time[rows] = np.minimum(state.time[rows], heard[rows])  # seen, but out of control, is lost as well
+        return state
+
+    def command(self, setpoint: Array) -> None:
+        """See `Body.command`."""
+        now = time.monotonic()
+        for pilot, (x, y, z, yaw) in zip(self._pilots, setpoint.tolist(), strict=True):
+            pilot.aim(now, (x, y, z, yaw) if isfinite(x + y + z + yaw) else None)
+
+    def takeoff(self, rows: Index, height: Array) -> None:
+        """See `Body.takeoff`."""
+        for row, up in zip(rows.tolist(), height.tolist(), strict=True):
+            self._board.airborne[row] = True  # as far as anybody who waits for a landing is concerned
+            self._pilots[row].give("takeoff", up)
+
+    def land(self, rows: Index) -> None:
+        """See `Body.land`."""
+        for row in rows.tolist():
+            self._pilots[row].give("land")
+
+    def stop(self, rows: Index) -> None:
+        """See `Body.stop`. Rows that stand are left alone: an emergency stop locks them until they are restarted."""
+        for row in rows.tolist():
+            self._pilots[row].give("stop")
+
+    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
+        """See `Body.locate`."""
+        if self._external.update(row, t, position, yaw):
+            self._pilots[row].locate(self._zero + t, position, yaw)
+
+    def close(self) -> None:
+        """See `Body.close`. Rows that are still in the air are landed first."""
+        for pilot in self._pilots:
+            pilot.close()
+        for pilot in self._pilots:
+            pilot.join()
+
+    def _note(self, row: int, now: float) -> str:
+        age = now - self._board.heard[row]
+        stale = f"no pose for {age:.1f} s" if STALE_S < age < np.inf else ""
+        return "; ".join(part for part in (self._pilots[row].note, stale, self._crowded[row]) if part)
+
+    def _scan(self, row: int) -> RangeScan | None:
+        scanned = float(self._board.scanned[row])
+        if not np.isfinite(scanned):
+            return None
+        return RangeScan(scanned - self._zero, BEARING, ELEVATION, self._board.ranges[row].copy())
+
+
+def open_crazyflie(request: BodyRequest) -> CrazyflieBody:
+    """The entry points `radio`, `usb` and `udp` of the group `zenpark.bodies`.
+
+    Raises:
+        BodyError: If an address or a setting makes no sense.
+    """
+    return CrazyflieBody(request)

@@ -1,0 +1,232 @@
+"""Telling a Crazyflie how it finds out where it is, and waiting until it knows: before that it must not fly."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from agents.body import BodyError
+from agents.protocols import crtp
+from agents.protocols.crazyflie import Lighthouse, Loco, Outside, Settings
+from agents.rows import Array
+from bridges.crazyflie.link import Link, LinkError
+
+ESTIMATORS: Final = {"auto": 0, "complementary": 1, "kalman": 2, "ukf": 3}
+LOCO_MODES: Final = {"auto": 0, "twr": 1, "tdoa2": 2, "tdoa3": 3}
+UPLOAD_S: Final = 8.0
+ANCHORS_S: Final = 5.0  # an anchor hears of its position by radio, and says so once per second
+AGREE: Final = 1e-3  # [m]
+RESET_S: Final = 0.1  # how long the reset of the estimator is held
+VARIANCE_HZ: Final = 20.0
+SETTLED: Final = 1e-3  # [m²] the variances of half a second differ by less,
+SURE: Final = 0.1  # [m²] and are below this
+SAMPLES: Final = 10
+VARIANCES: Final = {f"kalman.varP{axis}": "float" for axis in "XYZ"}
+
+Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
+
+
+class Geometry(msgspec.Struct, frozen=True):
+    """Where a base station is, and how it looks."""
+
+    origin: Three
+    rotation: Annotated[list[Three], Meta(min_length=3, max_length=3)]
+
+
+class Sweep(msgspec.Struct, frozen=True):
+    """Calibration of one of its two planes of light."""
+
+    phase: float
+    tilt: float
+    curve: float
+    gibmag: float
+    gibphase: float
+    ogeemag: float
+    ogeephase: float
+
+
+class Calibration(msgspec.Struct, frozen=True):
+    """Calibration of a base station."""
+
+    sweeps: Annotated[list[Sweep], Meta(min_length=2, max_length=2)]
+    uid: int
+
+
+class StationFile(msgspec.Struct, frozen=True, kw_only=True, rename={"system_type": "systemType"}):
+    """A Lighthouse configuration as the Crazyflie client saves it."""
+
+    type: str
+    version: str
+    system_type: Annotated[int, Meta(ge=1, le=2)] = 2
+    geos: dict[int, Geometry] = {}
+    calibs: dict[int, Calibration] = {}
+
+
+def stations(path: str, count: int) -> StationFile:
+    """The Lighthouse configuration in a file, for `count` base stations at most.
+
+    Raises:
+        BodyError: If there is none in it.
+    """
+    try:
+        read = msgspec.yaml.decode(Path(path).read_bytes(), type=StationFile)
+    except OSError as error:
+        raise BodyError(f"{path}: {error.strerror}; save it in the Crazyflie client, tab Lighthouse") from error
+    except msgspec.DecodeError as error:
+        raise BodyError(f"{path} is no Lighthouse configuration: {error}") from error
+    if (read.type, read.version) != ("lighthouse_system_configuration", "1"):
+        raise BodyError(f"{path} is no Lighthouse configuration of version 1; save it again in the Crazyflie client")
+    beyond = sorted(number for number in read.geos.keys() | read.calibs.keys() if number >= count)
+    if beyond:
+        raise BodyError(f"{path} has base station {beyond[0] + 1}, the firmware is said to know {count}: base_stations")
+    return read
+
+
+def configure(link: Link, settings: Settings) -> None:
+    """Chooses the estimator and sets up the positioning system.
+
+    Raises:
+        BodyError: If the Crazyflie does not have what it takes, or did not take what it was told.
+        LinkError: If it does not answer.
+    """
+    system = settings.positioning
+    estimator = settings.estimator or (None if system is None else "kalman")
+    if estimator is not None:
+        link.set("stabilizer.estimator", ESTIMATORS[estimator])
+    if isinstance(system, Lighthouse):
+        _lighthouse(link, system)
+    elif isinstance(system, Loco):
+        _loco(link, system)
+    elif isinstance(system, Outside):
+        link.set("locSrv.extPosStdDev", system.position_sigma)
+        link.set("locSrv.extQuatStdDev", system.attitude_sigma)
+
+
+class Convergence:
+    """A reset of the position estimator, and the wait until it has settled; never blocks.
+
+    Attributes:
+        done: It has.
+    """
+
+    def __init__(self, link: Link, start: Array, yaw: float) -> None:
+        """`start` (3,) [m] and `yaw` [rad] are where the robot stands; no system but an attitude measures the yaw."""
+        self.done = False
+        self._link = link
+        self._seen: deque[tuple[float, ...]] = deque(maxlen=SAMPLES)
+        place = {f"kalman.initial{axis}": float(value) for axis, value in zip("XYZ", start, strict=True)}
+        for name, value in (place | {"kalman.initialYaw": yaw, "kalman.resetEstimation": 1.0}).items():
+            link.ask(name, value)
+        self._release: float | None = time.monotonic() + RESET_S
+
+    def advance(self, now: float) -> bool:
+        """Goes on at `now` on the monotonic clock [s]; True when it has settled."""
+        if self._release is not None and now >= self._release:
+            self._release = None
+            self._link.ask("kalman.resetEstimation", 0.0)
+            self._link.log("variance", VARIANCE_HZ, VARIANCES, self._see)
+        if not self.done and len(self._seen) == SAMPLES:
+            seen = np.array(self._seen)
+            if np.ptp(seen, axis=0).max() < SETTLED and seen.max() < SURE:
+                self.done = True
+                self._link.silence("variance")
+        return self.done
+
+    def _see(self, _t: float, values: Mapping[str, float]) -> None:
+        self._seen.append(tuple(values.values()))
+
+
+def _lighthouse(link: Link, system: Lighthouse) -> None:
+    from cflib.crazyflie import mem  # noqa: PLC0415 - an optional extra
+    from cflib.localization.lighthouse_config_manager import LighthouseConfigWriter  # noqa: PLC0415
+
+    if not link.value("deck.bcLighthouse4"):
+        raise BodyError("no Lighthouse deck is found on it: is it on top, the right way round?")
+    if system.file is None:
+        return
+    wanted = stations(system.file, system.base_stations)
+    geometries, calibrations = {}, {}
+    for number, geometry in wanted.geos.items():
+        geometries[number] = mem.LighthouseBsGeometry.from_file_object(msgspec.to_builtins(geometry))
+    for number, calibration in wanted.calibs.items():
+        calibrations[number] = mem.LighthouseBsCalibration.from_file_object(msgspec.to_builtins(calibration))
+    # naming the version erases what is stored, and takes a second
+    version = None if link.value("lighthouse.systemType") == wanted.system_type else wanted.system_type
+    writer = LighthouseConfigWriter(link.cf, system.base_stations)
+    stored = _told(
+        link,
+        lambda tell: writer.write_and_store_config(tell, geos=geometries, calibs=calibrations, system_type=version),
+        "geometry of the base stations",
+    )
+    if not stored:
+        raise BodyError(f"the firmware does not know {system.base_stations} base stations: lower base_stations")
+    found = _told(link, mem.LighthouseMemHelper(link.cf).read_all_geos, "geometry of the base stations")
+    for number, geometry in wanted.geos.items():
+        if number not in found or not np.allclose(found[number].origin, geometry.origin, atol=AGREE):
+            raise BodyError(
+                f"base station {number + 1} was not stored: write the geometry with the Crazyflie client once"
+            )
+
+
+def _loco(link: Link, system: Loco) -> None:
+    from cflib.crazyflie.mem import MemoryElement  # noqa: PLC0415 - an optional extra
+
+    memories = link.cf.mem.get_mems(MemoryElement.TYPE_LOCO2)
+    if not link.value("deck.bcLoco") or not memories:
+        raise BodyError("no Loco positioning deck is found on it: is it there, the right way round?")
+    link.set("loco.mode", LOCO_MODES[system.mode])
+    wanted = dict(enumerate(system.anchors))
+    deadline = time.monotonic() + ANCHORS_S
+    missing = wanted
+    while missing:
+        for anchor, place in missing.items():
+            link.cf.loc.send_short_lpp_packet(anchor, bytes((crtp.ANCHOR_POSITION,)) + crtp.VECTOR.pack(*place))
+        time.sleep(RESET_S)
+        known = _anchors(link, memories[0])
+        missing = {
+            anchor: place
+            for anchor, place in wanted.items()
+            if anchor not in known or not np.allclose(known[anchor], place, atol=AGREE)
+        }
+        if missing and time.monotonic() > deadline:
+            raise BodyError(f"anchor {min(missing)} did not take its position: is it on, in the mode {system.mode}?")
+    if not wanted and len(_anchors(link, memories[0])) == 0:
+        raise BodyError("no anchor knows where it is: write positioning.anchors = [[x, y, z], ...]")
+
+
+def _anchors(link: Link, memory: Any) -> dict[int, tuple[float, float, float]]:  # noqa: ANN401 - cflib's
+    """Positions [m] that the anchors say they have."""
+    listed = _told(link, memory.update_id_list, "list of anchors")
+    if listed.nr_of_anchors == 0:
+        return {}
+    read = _told(link, memory.update_data, "positions of anchors")
+    return {number: anchor.position for number, anchor in read.anchor_data.items() if anchor.is_valid}
+
+
+def _told(link: Link, ask: Callable[[Callable[[Any], None]], object], what: str) -> Any:  # noqa: ANN401 - cflib's own objects
+    """What cflib calls back with.
+
+    Raises:
+        LinkError: If it never does.
+    """
+    come = threading.Event()
+    answers: list[object] = []
+
+    def tell(answer: object) -> None:
+        answers.append(answer)
+        come.set()
+
+    ask(tell)
+    deadline = time.monotonic() + UPLOAD_S
+    while not come.wait(0.02):
+        if link.error is not None or time.monotonic() > deadline:
+            raise LinkError(f"no answer: {what}")
+    return answers[0]

@@ -1,0 +1,278 @@
+"""A body in another process: any simulator, or any robot, that hears commands and says where it is on two keys.
+
+The contract is `docs/external-simulators.md`; nothing of it is asked about here that the far end could not know.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from math import isfinite
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+import zenoh
+
+from agents import session as network
+from agents import wire
+from agents.body import BodyError, BodyRequest, BodyState
+from agents.positioning import External
+from agents.rows import Array, Index
+
+Action = Literal["drive", "takeoff", "land", "stop"]
+
+OPEN_S: Final = 5.0  # for the router to answer and a first position of every row to come
+LOOK_S: Final = 0.02  # between looks for it
+STALE_S: Final = 0.5  # what the robots bear
+REPEAT_S: Final = 0.1  # an order is said again this often: the publisher drops what does not fit
+TAKEOFF_S: Final = 3.0  # for so long
+LANDING_S: Final = 10.0  # a robot that was told to land this long ago, and cannot be seen, is taken for down
+AWAY_M: Final = 0.05  # higher above the place of take-off than this it is in the air, lower it is down
+SETTLED: Final = 0.1  # [m/s] slower than this it is down
+REACH: Final = (1e3, 1e3, 1e3)  # [m] any room
+
+
+class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The `device` of a robot whose body is external: nothing to set."""
+
+
+class _Standing(msgspec.Struct):
+    """An order that is repeated, under the number that it had, until `until` [s] or until its effect is seen."""
+
+    order: wire.Command
+    until: float
+
+
+class ExternalBody:
+    """Rows whose robots live in another process; implements `agents.body.Body`.
+
+    Its own clock is the monotonic one, from when it was made; `read` tells how the clock of its caller lies to it.
+    """
+
+    def __init__(self, request: BodyRequest) -> None:
+        """Makes it ready to be opened.
+
+        Raises:
+            BodyError: If a row has settings: there are none.
+        """
+        for name, device in zip(request.names, request.device, strict=True):
+            try:
+                msgspec.convert(dict(device), Settings)
+            except msgspec.ValidationError as error:
+                raise BodyError(f"{name}: device: {error}; a body that is external has no settings") from None
+        rows = len(request.names)
+        self._names, self._kinds, self._keys = request.names, request.kinds, request.keys
+        self._endpoints = request.endpoints
+        self._flies = np.array([kind.flies for kind in request.kinds])
+        self._zero = time.monotonic()
+        self._utc = time.time()  # one reading, as in the runtime: a step of the wall clock moves nothing
+        self._shift = np.inf  # from the caller's clock to this one
+        self._seen = External(rows)
+        self._yaw = np.array(request.yaw, dtype=float)
+        self._flying = np.zeros(rows, dtype=bool)
+        self._landing = np.full(rows, np.inf)  # since when
+        self._ground = np.zeros(rows)
+        self._stopped = np.zeros(rows, dtype=bool)
+        self._sent = [0] * rows
+        self._standing: dict[int, _Standing] = {}
+        self._repeat = 0.0
+        self._trouble = [""] * rows
+        self._malformed = [0] * rows
+        self._session: zenoh.Session | None = None
+
+    # ------------------------------------------------------------------ Body
+
+    def open(self) -> None:
+        """See `Body.open`."""
+        deadline = time.monotonic() + OPEN_S
+        try:
+            name = f"body of {'+'.join(self._names)}"
+            self._session = network.open_session(self._endpoints, name=name, wait_s=OPEN_S)
+        except (network.Unreachable, network.EndpointError) as error:
+            raise BodyError(f"{', '.join(self._names)}: {error}") from None
+        session, keys, mime = self._session, self._keys, wire.MIME["json"]
+        self._positions = [network.subscriber(session, keys.position(name), 32) for name in self._names]
+        self._setpoints = [network.publisher(session, keys.setpoint(name), mime) for name in self._names]
+        pause = threading.Event()
+        while (missing := self._missing()) and time.monotonic() < deadline:
+            pause.wait(LOOK_S)
+        if missing:
+            self.close()
+            raise BodyError("\n".join(missing))
+
+    def read(self, t: float) -> BodyState:
+        """See `Body.read`."""
+        self._shift = min(self._shift, self._now() - t)  # whoever calls late, sees too large a difference
+        self._listen()
+        self._settle()
+        rows = len(self._names)
+        nothing = np.full((rows, 3), np.nan)
+        return BodyState(
+            time=self._seen.time - self._shift,
+            position=self._seen.position.copy(),
+            velocity=self._seen.velocity.copy(),
+            yaw=np.where(np.isfinite(self._seen.yaw), self._seen.yaw, self._yaw),
+            true_position=nothing,
+            true_yaw=nothing[:, 0],
+            battery=nothing[:, 0],
+            flying=self._flying.copy(),
+            notes=self._notes(),
+        )
+
+    def command(self, setpoint: Array) -> None:
+        """See `Body.command`."""
+        given = np.isfinite(setpoint).all(axis=1) & ~self._stopped
+        values = setpoint.tolist()
+        for row in np.flatnonzero(given).tolist():
+            x, y, z, w = values[row]
+            self._say(row, "drive", setpoint=(x, y, z, w))
+        now = self._now()
+        if self._standing and now >= self._repeat:
+            self._repeat = now + REPEAT_S
+            for row, standing in list(self._standing.items()):
+                if now > standing.until:
+                    del self._standing[row]
+                else:
+                    self._put(row, msgspec.structs.replace(standing.order, stamp=self._stamp()))
+
+    def takeoff(self, rows: Index, height: Array) -> None:
+        """See `Body.takeoff`; ground robots have nothing to do."""
+        for row, up in zip(rows.tolist(), height.tolist(), strict=True):
+            if self._flies[row]:
+                z = self._seen.position[row, 2]
+                self._ground[row] = z if isfinite(z) else 0.0
+                self._flying[row], self._landing[row], self._stopped[row] = True, np.inf, False
+                self._stand(row, self._say(row, "takeoff", height=up), TAKEOFF_S)
+
+    def land(self, rows: Index) -> None:
+        """See `Body.land`."""
+        for row in rows.tolist():
+            self._landing[row] = self._now()
+            self._stand(row, self._say(row, "land"), LANDING_S if self._flying[row] else TAKEOFF_S)
+
+    def stop(self, rows: Index) -> None:
+        """See `Body.stop`; said again for as long as this process lives."""
+        self._flying[rows], self._stopped[rows] = False, True
+        for row in rows.tolist():
+            self._stand(row, self._say(row, "stop"), np.inf)
+
+    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
+        """Nothing: what the runtime heard on the key `position` has been heard here."""
+
+    def close(self) -> None:
+        """See `Body.close`."""
+        if self._session is not None:
+            self._session.close()  # type: ignore[no-untyped-call]
+            self._session = None
+
+    # ------------------------------------------------------------------ what the far end says
+
+    def _now(self) -> float:
+        return time.monotonic() - self._zero
+
+    def _stamp(self) -> float:
+        return round(self._utc + self._now(), 6)
+
+    def _listen(self) -> None:
+        for row, subscriber in enumerate(self._positions):
+            for sample in network.received(subscriber.handler):
+                self._take(row, sample)
+
+    def _take(self, row: int, sample: zenoh.Sample) -> None:
+        now = self._now()
+        try:
+            measured = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
+            wire.check_position(measured, robot=self._names[row], now=self._utc + now, reach=REACH)
+        except wire.Malformed as error:
+            self._malformed[row] += 1
+            self._trouble[row] = str(error)
+            return
+        yaw = np.nan if measured.yaw is None else measured.yaw
+        # a clock that is ahead must not make a pose look fresh for longer than it is
+        self._seen.update(row, min(measured.stamp - self._utc, now), np.array(measured.position), yaw)
+
+    def _missing(self) -> list[str]:
+        """What every row lacks before it can be driven, and what to do."""
+        self._listen()
+        now, found = self._now(), []
+        for row, name in enumerate(self._names):
+            key, age = self._keys.position(name), now - float(self._seen.time[row])
+            if not isfinite(age):
+                found.append(
+                    f"{name}: what is published on {key} is no position: {self._trouble[row]}"
+                    if self._malformed[row]
+                    else f"{name}: nothing is published on {key}: is the simulator running and connected to "
+                    f"{', '.join(self._endpoints)}?"
+                )
+            elif age > STALE_S:
+                found.append(
+                    f"{name}: the position on {key} was measured {age:.1f} s ago by its stamp: stamps are UTC seconds, "
+                    "not the time of the simulation; if they are, set the clocks of both computers"
+                )
+            elif self._kinds[row].takes == "twist" and not isfinite(self._seen.yaw[row]):
+                found.append(f"{name}: the position on {key} has no yaw, without which a robot on wheels cannot steer")
+        return found
+
+    def _settle(self) -> None:
+        """Ends what has come to its end: climbs, landings."""
+        if not self._standing:
+            return
+        high = self._seen.position[:, 2] - self._ground > AWAY_M
+        slow = np.abs(self._seen.velocity[:, 2]) < SETTLED
+        now = self._now()
+        aged = now - self._seen.time > STALE_S
+        down = self._flying & np.isfinite(self._landing)
+        down &= np.where(aged, now - self._landing > LANDING_S, ~high & slow)
+        self._flying &= ~down
+        for row, standing in list(self._standing.items()):
+            climbs = standing.order.action == "takeoff" and high[row] and not aged[row]
+            if climbs or (standing.order.action == "land" and down[row]):
+                del self._standing[row]
+
+    def _notes(self) -> tuple[str, ...]:
+        age = self._now() - self._seen.time
+        if not (age > STALE_S).any() and not any(self._malformed):
+            return ()
+        notes = []
+        for row, seconds in enumerate(age.tolist()):
+            parts = [f"no position for {seconds:.0f} s"] if seconds > STALE_S else []
+            if self._malformed[row]:
+                parts.append(f"{self._malformed[row]} positions refused, the last because {self._trouble[row]}")
+            notes.append("; ".join(parts))
+        return tuple(notes)
+
+    # ------------------------------------------------------------------ what the far end is told
+
+    def _say(
+        self,
+        row: int,
+        action: Action,
+        *,
+        setpoint: wire.Setpoint | None = None,
+        height: float | None = None,
+    ) -> wire.Command:
+        self._sent[row] += 1
+        command = wire.Command(self._names[row], self._sent[row], self._stamp(), action, setpoint, height)
+        self._put(row, command)
+        return command
+
+    def _stand(self, row: int, order: wire.Command, seconds: float) -> None:
+        self._standing[row] = _Standing(order, self._now() + seconds)
+
+    def _put(self, row: int, command: wire.Command) -> None:
+        if self._session is None:
+            return  # `stop` may come after `close`
+        try:
+            self._setpoints[row].put(wire.encode(command))
+        except zenoh.ZError as error:
+            self._trouble[row] = f"cannot be told anything: {error}"
+
+
+def open_external(request: BodyRequest) -> ExternalBody:
+    """The entry point `external` of the group `zenpark.bodies`.
+
+    Raises:
+        BodyError: If a row has settings.
+    """
+    return ExternalBody(request)

@@ -1,0 +1,283 @@
+"""The robots of a realm in the graph of ROS 2, over rmw_zenoh: `python -m bridges.ros2`, no ROS needed here.
+
+Out: /<robot>/pose, /<robot>/velocity and /diagnostics. In: /<robot>/goal. Robots come and go with their liveliness.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from math import atan2, cos, isfinite, sin
+from types import FrameType
+from typing import Final, get_args
+
+import zenoh
+
+from agents import session as network
+from agents import wire
+from agents.body import BodyError
+from agents.keys import Keys
+from agents.lifeline import Lifeline
+from agents.protocols import ros2
+from agents.protocols.ros2 import Distro, Message, Types
+from agents.rosnode import Participant, Publisher, Subscriber
+
+NODE: Final = "zenpark"
+FRAME: Final = "map"  # the arena, as rviz and nav2 name the fixed frame; goals must be in it
+POLL_S: Final = 0.01
+OK, WARN, ERROR = 0, 1, 2  # levels of a DiagnosticStatus
+
+
+@dataclass
+class _Robot:
+    """What one robot has in the graph."""
+
+    pose: Publisher
+    velocity: Publisher
+    goal: Subscriber
+    out: zenoh.Publisher
+
+    def close(self) -> None:
+        self.pose.close()
+        self.velocity.close()
+        self.goal.close()
+        self.out.undeclare()  # type: ignore[no-untyped-call]
+
+
+class Graph:
+    """The robots of a realm as topics; call `poll` from a loop.
+
+    Attributes:
+        robots: Those in the graph now.
+        malformed: Samples of the realm that were not what their key promises.
+        refused: Goals that were not finite, or not in the frame "map".
+    """
+
+    def __init__(self, session: zenoh.Session, participant: Participant, keys: Keys) -> None:
+        self.malformed = self.refused = 0
+        self._session, self._keys = session, keys
+        self._types = participant.types
+        self._node = participant.node(NODE)
+        self._diagnostics = self._node.publisher("/diagnostics", ros2.DIAGNOSTIC_ARRAY)
+        self._robots: dict[str, _Robot] = {}
+        self._states = network.subscriber(session, keys.state("*"), 1024)
+        self._statuses = network.pose_subscriber(session, keys.status("*"), 256)
+        self._alive = network.alive_watch(session, keys.alive("*"))
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Names of the robots that are alive, sorted."""
+        return tuple(sorted(self._robots))
+
+    def poll(self) -> None:
+        """Passes on what has arrived."""
+        statuses = [*self._lives(), *self._reports()]
+        if statuses:
+            header = self._types.header(time.time(), "")
+            self._diagnostics.put(self._types.make(ros2.DIAGNOSTIC_ARRAY, header=header, status=statuses))
+        self._moves()
+        for name, robot in self._robots.items():
+            for message in robot.goal.received():
+                self._order(name, robot, message)
+
+    def _lives(self) -> list[Message]:
+        """Who comes and goes; says so to the graph."""
+        gone = []
+        for sample in network.received(self._alive.handler):
+            name = self._keys.robot(str(sample.key_expr))
+            if sample.kind == zenoh.SampleKind.DELETE:
+                if (robot := self._robots.pop(name, None)) is not None:
+                    robot.close()
+                    gone.append(diagnostic(self._types, name, ERROR, "gone", {}))
+            elif name not in self._robots:
+                self._robots[name] = self._enter(name)
+        return gone
+
+    def _enter(self, name: str) -> _Robot:
+        chunk = ros_name(name)
+        return _Robot(
+            self._node.publisher(f"/{chunk}/pose", ros2.POSE_STAMPED),
+            self._node.publisher(f"/{chunk}/velocity", ros2.TWIST_STAMPED),
+            self._node.subscriber(f"/{chunk}/goal", ros2.POSE_STAMPED, depth=8),
+            network.publisher(self._session, self._keys.goal(name), wire.JSON),
+        )
+
+    def _moves(self) -> None:
+        """Telemetry as pose and velocity."""
+        for sample in network.received(self._states.handler):
+            robot = self._robots.get(self._keys.robot(str(sample.key_expr)))
+            if robot is None:
+                continue
+            try:
+                state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
+            except wire.Malformed:
+                self.malformed += 1
+                continue
+            robot.pose.put(pose(self._types, state))
+            robot.velocity.put(velocity(self._types, state))
+
+    def _reports(self) -> list[Message]:
+        """Statuses as diagnostics."""
+        found = []
+        for sample in network.received(self._statuses.handler):
+            try:
+                status = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Status)
+            except wire.Malformed:
+                self.malformed += 1
+                continue
+            if status.robot in self._robots:
+                found.append(diagnosis(self._types, status))
+        return found
+
+    def _order(self, name: str, robot: _Robot, message: Message) -> None:
+        """A goal from ROS, passed on into the realm."""
+        place, q = message.pose.position, message.pose.orientation
+        numbers = (place.x, place.y, place.z, q.x, q.y, q.z, q.w)
+        if message.header.frame_id not in ("", FRAME) or not all(isfinite(number) for number in numbers):
+            self.refused += 1
+            return
+        turned = q.x or q.y or q.z or q.w  # a quaternion of zeros: whoever asks does not care
+        yaw = atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z)) if turned else None
+        goal = wire.Position(name, time.time(), (place.x, place.y, place.z), yaw)
+        robot.out.put(wire.encode(goal))
+
+
+def ros_name(robot: str) -> str:
+    """A robot's name as ROS allows it: letters, digits, underscores, no digit first."""
+    name = re.sub(r"[^A-Za-z0-9_]", "_", robot)
+    return f"_{name}" if name[:1].isdigit() else name
+
+
+def pose(types: Types, state: wire.State) -> Message:
+    """A PoseStamped in the arena; only the yaw of the robot is known."""
+    x, y, z = state.position
+    place = types.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    half = 0.5 * state.yaw
+    toward = types.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin(half), w=cos(half))
+    stamped = types.make("geometry_msgs/msg/Pose", position=place, orientation=toward)
+    return types.make(ros2.POSE_STAMPED, header=types.header(state.stamp, FRAME), pose=stamped)
+
+
+def velocity(types: Types, state: wire.State) -> Message:
+    """A TwistStamped along the axes of the arena; its angular part is not known and zero."""
+    twist = types.twist(state.velocity, (0.0, 0.0, 0.0))
+    return types.make(ros2.TWIST_STAMPED, header=types.header(state.stamp, FRAME), twist=twist)
+
+
+def diagnosis(types: Types, status: wire.Status) -> Message:
+    """A DiagnosticStatus: a warning while the body or the network has something to complain of."""
+    level = WARN if status.body or status.missing else OK
+    said = "; ".join(part for part in (status.phase, status.reason, status.body) if part)
+    values = {
+        "phase": status.phase,
+        "reason": status.reason,
+        "body": status.body,
+        "battery": "" if status.battery is None else f"{status.battery:.3f}",
+        "missing": " ".join(status.missing),
+        "sent": str(status.sent),
+        "heard": str(status.heard),
+        "lost": str(sum(status.lost.values())),
+        "malformed": str(status.malformed),
+        "refused": str(status.refused),
+        "interventions": str(status.interventions),
+        "missed ticks": f"{status.missed} of {status.ticks}",
+    }
+    return diagnostic(types, status.robot, level, said, values)
+
+
+def diagnostic(types: Types, robot: str, level: int, said: str, values: dict[str, str]) -> Message:
+    """A DiagnosticStatus of a robot."""
+    pairs = [types.make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()]
+    return types.make(
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        level=level,
+        name=f"{NODE}: {robot}",
+        message=said,
+        hardware_id=robot,
+        values=pairs,
+    )
+
+
+def serve(
+    endpoints: Sequence[str],
+    *,
+    ros_endpoints: Sequence[str] = (),
+    realm: str = "park",
+    domain: int = 0,
+    distro: Distro = "jazzy",
+    stop: threading.Event,
+) -> None:
+    """Runs the bridge until `stop` is set; prints a line when it is ready and whenever a robot comes or goes.
+
+    Args:
+        endpoints: Routers of the robots.
+        ros_endpoints: Routers of ROS 2 (rmw_zenohd), where they are others.
+        realm: Of the robots.
+        domain: ROS_DOMAIN_ID.
+        distro: ROS 2 distribution, for type hashes.
+        stop: Ends it.
+
+    Raises:
+        BodyError: If the extra `ros` is not installed.
+        EndpointError, Unreachable: If a router cannot be had.
+    """
+    types = ros2.types(distro)
+    with ExitStack() as stack:
+        session = outside = stack.enter_context(network.open_session(endpoints, name="ros2", stop=stop))
+        if ros_endpoints:
+            outside = stack.enter_context(network.open_session(ros_endpoints, name="ros2", stop=stop))
+        graph = Graph(session, Participant(outside, types, style="rmw", domain=domain), Keys(realm))
+        print(f"ros2 ready: node /{NODE}, domain {domain}, {distro}", flush=True)
+        known: tuple[str, ...] = ()
+        while not stop.wait(POLL_S):
+            graph.poll()
+            if graph.robots != known:
+                known = graph.robots
+                print(f"ros2: robots {' '.join(known) or 'none'}", flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line of the process."""
+    parser = argparse.ArgumentParser(prog="zenpark bridge ros2", description="The robots as ROS 2 topics.")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help=f"default: {network.DEFAULT_ENDPOINT}")
+    parser.add_argument("--ros", action="append", default=[], metavar="ENDPOINT", help="router of ROS 2, if another")
+    parser.add_argument("--realm", default="park", help="first chunk of the robots' keys")
+    parser.add_argument("--domain", type=int, default=0, choices=range(ros2.MAX_DOMAIN + 1), metavar="0..232")
+    parser.add_argument("--distro", default="jazzy", choices=get_args(Distro))
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent")
+    chosen = parser.parse_args(arguments)
+    stop = threading.Event()
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    if chosen.lifeline:
+        Lifeline(stop).start()
+    try:
+        serve(
+            chosen.connect or [network.DEFAULT_ENDPOINT],
+            ros_endpoints=chosen.ros,
+            realm=chosen.realm,
+            domain=chosen.domain,
+            distro=chosen.distro,
+            stop=stop,
+        )
+    except (BodyError, network.EndpointError, network.Unreachable) as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        return 2
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,214 @@
+"""The Crazyflie bridge over the real cflib, against protocol twins: what it does is read off the twins' own state."""
+
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents.body import BodyError
+from agents.protocols.crtp import Memory
+from bridges.crazyflie import open_crazyflie
+from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
+from tests.twins.loopback import request
+from twins.crazyflie.supervisor import State
+
+pytestmark = pytest.mark.system
+
+STATION = """
+    origin: [{x}, 0.5, 2.0]
+    rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+"""
+SWEEP = "{phase: 0.1, tilt: 0.02, curve: 0.0, gibmag: 0.0, gibphase: 1.0, ogeemag: 0.0, ogeephase: 1.5}"
+
+
+@pytest.fixture(autouse=True)
+def toc_cache(monkeypatch, tmp_path_factory):
+    """cflib's cache, kept from one test to the next and away from the user's."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+def lighthouse_file(folder: Path, *numbers: int) -> str:
+    lines = ["type: lighthouse_system_configuration", "version: '1'", "systemType: 2", "geos:"]
+    lines += [f"  {number}:" + STATION.format(x=number + 0.25) for number in numbers]
+    lines.append("calibs:")
+    for number in numbers:
+        lines += [f"  {number}:", f"    sweeps: [{SWEEP}, {SWEEP}]", f"    uid: {1000 + number}"]
+    path = folder / "stations.yaml"
+    path.write_text("\n".join(lines))
+    return str(path)
+
+
+def test_flight_and_next_session(capsys):
+    """Take-off, a goal by streamed positions, landing; and again by another client, which the first must not hinder."""
+    begin = time.monotonic()
+    with flown() as (twin, process):
+        with capsys.disabled():
+            print(f"\n  connected, all parameters read: {time.monotonic() - begin:.2f} s")
+        process.takeoff()
+        process.setpoint = [(0.4, 0.3, 0.6, 0.5)]
+        process.until(lambda: np.abs(truth(twin) - [0.4, 0.3, 0.6]).max() < 0.02, "goal")
+        process.until(lambda: twin.truth()[1][0] == pytest.approx(0.5, abs=0.05), "yaw")
+        assert process.state.position[0] == pytest.approx(truth(twin), abs=0.05)
+        assert process.state.yaw[0] == pytest.approx(0.5, abs=0.06)
+        assert process.t - process.state.time[0] < 0.5
+        assert supervised(twin) == State.FLYING
+        process.land()
+        assert truth(twin)[2] == 0.0
+        assert not twin.device.flock.quadrotor.flying[0]
+        process.body.stop(np.array([0]))
+        process.close()
+        assert supervised(twin) != State.LOCKED  # an emergency stop of one that stands would lock it
+        again = Process(open_crazyflie(request("crazyflie", twin.addresses)))
+        try:
+            again.takeoff()
+            assert truth(twin)[2] == pytest.approx(0.5, abs=0.06)
+        finally:
+            again.close()  # in the air: it lands first
+        assert truth(twin)[2] == 0.0
+        assert supervised(twin) != State.LOCKED
+
+
+@pytest.mark.parametrize("control", ["velocity", "high-level"])
+def test_other_ways_of_control(control):
+    with flown(device={"control": control}) as (twin, process):
+        process.takeoff(0.3)
+        process.setpoint = [(0.3, -0.2, 0.5, 0.0)]
+        process.until(lambda: np.abs(truth(twin) - [0.3, -0.2, 0.5]).max() < 0.03, "goal")
+        process.cut()
+
+
+def test_emergency_stop():
+    """Motors off in mid-air; the twin is locked, says so, and refuses to fly again."""
+    with flown() as (twin, process):
+        process.takeoff()
+        process.body.stop(np.array([0]))
+        process.until(lambda: supervised(twin) == State.LOCKED, "locked")
+        process.until(lambda: truth(twin)[2] == 0.0, "down")
+        process.until(lambda: not process.state.flying[0] and "locked" in process.state.notes[0], "said so")
+        process.body.takeoff(np.array([0]), np.array([0.5]))
+        process.until(lambda: "switch it off and on" in process.state.notes[0] and not process.state.flying[0], "no")
+        assert truth(twin)[2] == 0.0
+
+
+def test_several_at_a_hundred_hertz(capsys):
+    """Several Crazyflies, one process, every one logged at 100 Hz."""
+    with flown(rows=4, device={"log_hz": 100.0}) as (_, process):
+        process.run(0.5)
+        last, gaps, stamps = process.state.time.copy(), np.zeros(4), set()
+        end = process.t + 1.5
+        while process.t < end:
+            state = process.tick()
+            gaps = np.maximum(gaps, state.time - last)
+            last = state.time.copy()
+            stamps.add(float(state.time[0]))
+        with capsys.disabled():
+            print(f"\n  4 at 100 Hz: {len(stamps) / 1.5:.0f} new poses/s read, worst gap {1e3 * gaps.max():.0f} ms")
+        assert len(stamps) > 40
+        assert gaps.max() < 3.0
+
+
+def test_parameters_are_set():
+    with flown(device={"parameters": {"hlCommander.vtoff": 0.7, "stabilizer.controller": 2}}) as (twin, _):
+        assert twin.device.drones[0].value("hlCommander.vtoff") == pytest.approx(0.7)
+        assert twin.device.drones[0].value("stabilizer.controller") == 2
+
+
+@pytest.mark.parametrize(
+    ("device", "said"),
+    [
+        ({"parameters": {"no.such": 1.0}}, "no parameter no.such"),
+        ({"parameters": {"deck.bcLoco": 1.0}}, "read-only"),
+        ({"parameters": {"senseless": 1.0}}, "senseless"),
+        ({"positioning": {"system": "loco"}}, "no anchor knows where it is"),
+        (
+            {"positioning": {"system": "lighthouse"}, "converge_s": 1.2},
+            r"not settled after 1.2 s: misses geometry or calibration",
+        ),
+        ({"positioning": {"system": "lighthouse", "file": "/nowhere.yaml"}}, "/nowhere.yaml: No such file"),
+    ],
+)
+def test_what_cannot_be_set_up(device, said):
+    with pytest.raises(BodyError, match=said), flown(device=device):
+        pass
+
+
+def test_missing_deck():
+    with (
+        pytest.raises(BodyError, match="no Loco positioning deck"),
+        flown(device={"positioning": {"system": "loco"}}, serve={"parameters": {}}),
+    ):
+        pass
+
+
+def test_lighthouse(tmp_path):
+    """Geometry and calibration arrive, are stored, and only then does the estimate settle."""
+    device = {"positioning": {"system": "lighthouse", "file": lighthouse_file(tmp_path, 0, 1)}}
+    with flown(device=device) as (twin, process):
+        memories = twin.device.flock.memories[0]
+        assert (memories.geometries, memories.calibrations) == (0b11, 0b11)
+        assert memories.stored == (0b1111, 0b1111)
+        assert struct.unpack("<fff", memories.read(Memory.LIGHTHOUSE, 0x100, 12)) == pytest.approx((1.25, 0.5, 2.0))
+        assert twin.device.drones[0].value("stabilizer.estimator") == 2
+        assert twin.device.flock.estimator.variance[0] < 1e-2
+        process.until(lambda: process.state.notes[0] == "", "nothing to say")
+
+
+def test_loco():
+    """Anchors are told where they are, and say so; the mode is set; the estimate settles."""
+    anchors = [[-2.0, -2.0, 0.0], [2.0, -2.0, 2.5], [2.0, 2.0, 0.0], [-2.0, 2.0, 2.5]]
+    device = {"positioning": {"system": "loco", "mode": "tdoa3", "anchors": anchors}}
+    with flown(device=device) as (twin, _):
+        known = twin.device.flock.memories[0].anchors()
+        assert {number: list(place) for number, place in known.items()} == dict(enumerate(anchors))
+        assert twin.device.drones[0].value("loco.mode") == 3
+        assert twin.device.drones[0].value("stabilizer.estimator") == 2
+        assert twin.device.flock.estimator.variance[0] < 1e-2
+
+
+def test_external_position():
+    """It does not fly before it was told where it is, and knows it; then it flies the estimate that comes of that."""
+    device = {"positioning": {"system": "external", "position_sigma": 0.02}}
+    with flown(device=device, external=True, start=[[0.5, 0.2, 0.0]]) as (twin, process):
+        process.run(0.2)
+        assert np.isnan(process.state.position[0]).all()
+        assert "no position from outside" in process.state.notes[0]
+        process.body.takeoff(np.array([0]), np.array([0.5]))
+        process.until(lambda: "does not know where it is" in process.state.notes[0], "refusal")
+        assert not process.state.flying[0]
+
+        tick = process.tick
+
+        def located():
+            process.body.locate(0, process.t, truth(twin), 0.0)
+            return tick()
+
+        process.tick = located
+        process.until(lambda: np.isfinite(process.state.position[0]).all(), "settled")
+        assert twin.device.drones[0].value("locSrv.extPosStdDev") == pytest.approx(0.02)
+        assert twin.device.flock.estimator.received[0] > 10
+        process.takeoff(0.3)
+        process.setpoint = [(0.3, 0.1, 0.4, 0.0)]
+        process.until(lambda: np.abs(truth(twin) - [0.3, 0.1, 0.4]).max() < 0.03, "goal")
+        process.cut()
+
+
+def test_arming():
+    """A platform that must be armed is."""
+    with flown(device={"platform": "brushless"}) as (twin, process):
+        assert supervised(twin) == State.DISARMED
+        process.takeoff(0.2)
+        assert supervised(twin) == State.FLYING
+        process.cut()
+
+
+def test_ranges():
+    """Distances to the walls of the twin's room, as a scan."""
+    device = {"multiranger": True, "ranges_hz": 20.0}
+    with flown(device=device, start=[[0.5, 0.0, 0.0]]) as (_, process):
+        process.until(lambda: process.state.ranges[0] is not None, "scan")
+        scan = process.state.ranges[0]
+        assert scan.distance == pytest.approx([1.5, 2.5, 2.0, 2.0, 2.5], abs=2e-3)
+        assert scan.bearing == pytest.approx(np.radians([0.0, 180.0, 90.0, -90.0, 0.0]))
+        assert scan.elevation[4] == pytest.approx(np.pi / 2)

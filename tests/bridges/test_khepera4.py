@@ -1,0 +1,376 @@
+"""The Khepera bridge: odometry by numbers, and real sockets between bridge and twin."""
+
+import os
+import select
+import socket
+import threading
+import time
+import tty
+from contextlib import ExitStack, closing
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents.body import BodyError
+from agents.individual import Individual
+from agents.kinds import KHEPERA4
+from agents.protocols import khepera4 as protocol
+from bridges.khepera4 import open_khepera4
+from bridges.khepera4_link import Address
+from bridges.odometry import Odometer
+from tests.twins.loopback import Served, reached, request
+from twins import khepera4 as twin
+from twins.device import Faults
+from twins.khepera4 import open_device
+
+TICK = 0.01
+PARK, KTEAM = {"protocol": "park"}, {"protocol": "kteam"}
+
+
+class Drive:
+    """Drives a body as the runtime does."""
+
+    def __init__(self, body, goals=None, truth=None):
+        self.body, self.truth = body, truth
+        self.goal = None if goals is None else np.column_stack([goals, np.zeros(len(goals))])
+        self.zero, self.tick, self.slowest = time.monotonic(), 0, 0.0
+        self.pause, self.state = threading.Event(), None
+
+    def once(self):
+        self.tick = max(self.tick + 1, int((time.monotonic() - self.zero) / TICK))
+        self.pause.wait(max(0.0, self.zero + self.tick * TICK - time.monotonic()))
+        t = self.tick * TICK
+        if self.truth is not None:
+            position, yaw = self.truth()
+            for row in range(len(yaw)):
+                self.body.locate(row, t, position[row], float(yaw[row]))
+        begin = time.monotonic()
+        self.state = self.body.read(t)
+        if self.goal is not None:
+            law = Individual([KHEPERA4] * len(self.goal))
+            free = np.full(len(self.goal), np.nan)
+            self.body.command(law.setpoint(self.goal, free, self.state.position, self.state.yaw))
+        self.slowest = max(self.slowest, time.monotonic() - begin)
+        return t
+
+    def until(self, true, patience=5.0):
+        begin = self.once()
+        while not true():
+            assert self.once() - begin < patience, self.state
+        return self.tick * TICK - begin
+
+
+@pytest.fixture
+def served():
+    with ExitStack() as stack:
+        yield lambda rows, **faults: stack.enter_context(Served(open_device, rows, **faults))
+
+
+def opened(body):
+    body.open()
+    return closing(body)
+
+
+# ---------------------------------------------------------------------- by numbers
+
+
+@given(st.lists(st.tuples(st.floats(-0.01, 0.01), st.floats(-0.05, 0.05)), max_size=40), st.floats(-3.0, 3.0))
+def test_all_odometries_of_a_robot_agree(steps, yaw):
+    ways = {kind: Odometer(1.0, 2.0, yaw) for kind in ("pose", "wheels", "steps", "heading")}
+    x = y = theta = left = right = 0.0
+    stamp = 0.0
+    for way, turn in [(0.0, 0.0), *steps]:
+        x += way * np.cos(theta + 0.5 * turn)
+        y += way * np.sin(theta + 0.5 * turn)
+        theta += turn
+        left += (way - 0.5 * protocol.BASE * turn) / protocol.PULSE
+        right += (way + 0.5 * protocol.BASE * turn) / protocol.PULSE
+        stamp += 0.04
+        ways["pose"].pose(x, y, np.remainder(theta + np.pi, 2 * np.pi) - np.pi, stamp)
+        ways["wheels"].wheels(left, right, stamp)
+        ways["steps"].steps(way, turn, stamp)
+        ways["heading"].heading(way, theta, stamp)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    expected = (1.0 + cos * x - sin * y, 2.0 + sin * x + cos * y, yaw + theta)
+    for odometer in ways.values():
+        assert (odometer.x, odometer.y, odometer.yaw) == pytest.approx(expected, abs=1e-9)
+
+
+def test_odometry_begins_where_the_experiment_says_whatever_the_robot_counted_before():
+    odometer = Odometer(0.5, 0.0, np.pi / 2)
+    odometer.pose(7.0, 8.0, 1.0, 0.0)
+    assert (odometer.x, odometer.y, odometer.yaw) == (0.5, 0.0, np.pi / 2)
+    odometer.pose(7.0 + np.cos(1.0), 8.0 + np.sin(1.0), 1.0, 1.0)  # one metre along its nose
+    assert (odometer.x, odometer.y) == pytest.approx((0.5, 1.0))
+
+
+def test_a_robot_that_was_switched_on_anew_goes_on_from_where_it_was():
+    odometer = Odometer(0.0, 0.0, 0.0)
+    odometer.pose(0.0, 0.0, 0.0, 0.0)
+    odometer.pose(0.3, 0.0, 0.0, 0.1)
+    odometer.reconnected()
+    odometer.pose(0.4, 0.0, 0.0, 0.2)  # its server lived on, it rolled a little
+    assert odometer.x == pytest.approx(0.4)
+    odometer.reconnected()
+    odometer.pose(0.0, 0.0, 0.0, 0.3)  # its server is new
+    assert odometer.x == pytest.approx(0.4)
+    odometer.pose(0.1, 0.0, 0.0, 0.4)
+    assert odometer.x == pytest.approx(0.5)
+    odometer.pose(0.0, 0.0, 0.0, 0.5)  # it backs up over its zero: no doubt about that
+    assert odometer.x == pytest.approx(0.4)
+
+
+def test_velocity_follows_with_a_tenth_of_a_second():
+    odometer = Odometer(0.0, 0.0, np.pi / 2)
+    for step in range(26):
+        odometer.steps(0.008, 0.0, 0.04 * step)
+    assert odometer.velocity == pytest.approx((0.0, 0.2), abs=0.002)
+
+
+@pytest.mark.parametrize(
+    ("address", "expected"),
+    [
+        ("khepera4://192.168.0.21", Address(False, "192.168.0.21", 50000, "")),
+        ("khepera4://kh1.lab:1234", Address(False, "kh1.lab", 1234, "")),
+        ("kteam://10.0.0.3:2000", Address(True, "10.0.0.3", 2000, "")),
+        ("kteam:///dev/ttyS0", Address(True, "", 0, "/dev/ttyS0")),
+    ],
+)
+def test_addresses(address, expected):
+    assert Address.of("K", address) == expected
+
+
+@pytest.mark.parametrize("address", ["khepera4", "khepera4://", "kteam://10.0.0.3", "khepera4://h:port", "kteam:"])
+def test_wrong_addresses_are_named(address):
+    with pytest.raises(BodyError, match=f"^R0: {address}: "):
+        open_khepera4(request("khepera4", [address]))
+
+
+def test_wrong_settings_are_named():
+    with pytest.raises(BodyError, match=r"^R0: device: .*poll_hz must be 2 to 30"):
+        open_khepera4(request("khepera4", ["khepera4://h"], device={"poll_hz": 100.0}))
+    with pytest.raises(BodyError, match=r"^R0: device: .*`odometri`; its fields are protocol, odometry"):
+        open_khepera4(request("khepera4", ["khepera4://h"], device={"odometri": "pose"}))
+
+
+def test_nobody_there_is_said_with_the_remedy():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    begin = time.monotonic()
+    with pytest.raises(BodyError) as caught:
+        open_khepera4(request("khepera4", [f"khepera4://127.0.0.1:{port}", "kteam:///dev/ttyNONE"])).open()
+    assert time.monotonic() - begin < 5.0
+    assert f"R0: 127.0.0.1:{port}: Connection refused; start the server on the robot" in str(caught.value)
+    assert "R1: /dev/ttyNONE: No such file or directory; is it plugged in" in str(caught.value)
+
+
+# ---------------------------------------------------------------------- with twins
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("speaks", [PARK, KTEAM, PARK | {"odometry": "increments"}, PARK | {"odometry": "heading"}])
+def test_robots_drive_to_their_goals(served, speaks):
+    rows = request("khepera4", ["khepera4-twin"] * 2, device=speaks, yaw=0.5)
+    twins = served(rows)
+    goals = np.array([[0.25, 0.1], [-0.2, 0.95]])
+    with opened(open_khepera4(reached(rows, twins.addresses))) as body:
+        drive = Drive(body, goals)
+        drive.until(lambda: np.abs(twins.truth()[0][:, :2] - goals).max() < 0.008, 8.0)
+        drive.goal = None
+        body.land(np.arange(2))
+        drive.until(lambda: (np.abs(drive.state.velocity) < 0.01).all())
+        state, (position, yaw) = drive.state, twins.truth()
+        drive.until(lambda: drive.state.ranges[0] is not None)
+        bearings = len(drive.state.ranges[0].bearing)
+    assert state.position == pytest.approx(position, abs=0.004)
+    assert state.yaw == pytest.approx(yaw, abs=0.01)
+    assert not state.flying.any()
+    assert state.notes == ("", "")
+    assert np.isnan(state.battery).all() if speaks["protocol"] == "park" else (state.battery > 0.98).all()
+    assert bearings == (5 if speaks["protocol"] == "park" else 13)
+    assert np.isnan(drive.state.ranges[0].distance).all()
+    assert (np.abs(twins.truth()[0] - position) < 1e-3).all()
+
+
+@pytest.mark.system
+def test_a_position_from_outside_takes_the_place_of_odometry(served):
+    rows = request("khepera4", ["khepera4-twin"], external=True, start=[[0.3, 0.0, 0.0]])
+    twins = served(rows)
+    lied = reached(request("khepera4", ["-"], external=True, start=[[9.0, 9.0, 0.0]], yaw=2.0), twins.addresses)
+    with opened(open_khepera4(lied)) as body:
+        drive = Drive(body, np.array([[0.5, 0.1]]))
+        drive.once()
+        assert np.isnan(drive.state.position).all()
+        drive.truth = twins.truth
+        drive.until(lambda: np.abs(twins.truth()[0][0, :2] - [0.5, 0.1]).max() < 0.008, 8.0)
+        assert drive.state.position[0] == pytest.approx(twins.truth()[0][0], abs=0.004)
+
+
+@pytest.mark.system
+def test_what_goes_wrong_with_one_leaves_the_others_driving(served):
+    one = {speaks["protocol"]: request("khepera4", ["khepera4-twin"], device=speaks) for speaks in (PARK, KTEAM)}
+    good, killed = served(one["park"]), served(one["park"])
+    silent = served(one["kteam"], silent_from_s=1.0)
+    empty = served(one["kteam"], battery=0.03)
+    addresses = [each.addresses[0] for each in (good, killed, silent, empty)]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        absent = f"khepera4://127.0.0.1:{free.getsockname()[1]}"
+    rows = request("khepera4", [*addresses, absent], start=np.zeros((5, 3)))
+    body = open_khepera4(rows)
+    begin = time.monotonic()
+    with opened(body):
+        assert time.monotonic() - begin < 5.0
+        drive = Drive(body, np.tile([0.5, 0.0], (5, 1)))
+        drive.until(lambda: killed.truth()[0][0, 0] > 0.02)
+        killed.kill()
+        drive.until(lambda: drive.state.notes[1] and drive.tick * TICK - drive.state.time[1] > 0.5)
+        drive.until(lambda: drive.state.notes[2])
+        drive.until(lambda: drive.tick * TICK - drive.state.time[2] > 0.5)
+        notes = drive.state.notes
+        drive.until(lambda: abs(good.truth()[0][0, 0] - 0.5) < 0.008, 8.0)
+        assert drive.state.notes[0] == ""
+        assert drive.slowest < 0.5
+    assert notes[1].startswith("silent for")
+    assert "Connection refused" in notes[1] or "closed the connection" in notes[1]
+    assert "no answer to" in notes[2]
+    assert notes[3] == "battery at 3%: it does not drive on"
+    assert empty.truth()[0][0, 0] == 0.0
+    assert "Connection refused; start the server" in notes[4]
+    assert np.isnan(drive.state.position[4]).all()
+
+
+@pytest.mark.system
+def test_a_link_that_was_lost_comes_back_and_goes_on(served):
+    rows = request("khepera4", ["khepera4-twin"])
+    first = served(rows)
+    with opened(open_khepera4(reached(rows, first.addresses))) as body:
+        drive = Drive(body, np.array([[0.5, 0.0]]))
+        drive.until(lambda: first.truth()[0][0, 0] > 0.1)
+        first.kill()
+        drive.until(lambda: drive.state.notes[0])
+        stood = drive.state.position[0, 0]
+        place = first.addresses[0].replace("khepera4://", "khepera4-twin://")
+        second = served(request("khepera4", [place], start=[[stood, 0.0, 0.0]]))
+        drive.until(lambda: not drive.state.notes[0])
+        drive.until(lambda: abs(second.truth()[0][0, 0] - 0.5) < 0.008, 8.0)
+        assert drive.state.position[0, 0] == pytest.approx(second.truth()[0][0, 0], abs=0.004)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("speaks", [PARK, KTEAM])
+def test_wheels_stop_without_setpoints_and_when_the_body_closes(served, speaks):
+    rows = request("khepera4", ["khepera4-twin"], device=speaks)
+    twins = served(rows)
+    with opened(open_khepera4(reached(rows, twins.addresses))) as body:
+        drive = Drive(body)
+        drive.once()
+        body.command(np.array([[0.2, 0.0, 0.0, 0.0]]))
+        drive.until(lambda: drive.state.velocity[0, 0] > 0.1)
+        drive.until(lambda: drive.state.velocity[0, 0] < 0.005, 2.0)  # the setpoint is not given again
+        went = twins.truth()[0][0, 0]
+        assert 0.09 < went < 0.2  # half a second, the time to be heard, the time to stop
+        body.command(np.array([[np.nan, 0.0, 0.0, 0.0]]))
+        body.command(np.array([[0.2, 0.0, 0.0, 0.0]]))
+        drive.until(lambda: drive.state.velocity[0, 0] > 0.05)
+    before = twins.truth()[0][0, 0]
+    drive.pause.wait(0.2)
+    stood = twins.truth()[0][0, 0]
+    assert stood - before < 0.02
+    drive.pause.wait(0.2)
+    assert twins.truth()[0][0, 0] == stood
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("speaks", [PARK, KTEAM])
+def test_a_second_client_is_told_that_it_is_one(served, speaks):
+    rows = request("khepera4", ["khepera4-twin"], device=speaks)
+    twins = served(rows)
+    with opened(open_khepera4(reached(rows, twins.addresses))) as first:
+        with pytest.raises(BodyError, match="no answer to .*another program may hold it"):
+            open_khepera4(reached(rows, twins.addresses)).open()
+        drive = Drive(first)
+        drive.once()
+        assert drive.state.notes == ("",)
+
+
+@pytest.mark.system
+def test_the_wrong_protocol_is_named(served):
+    park, kteam = served(request("khepera4", ["-"], device=PARK)), served(request("khepera4", ["-"], device=KTEAM))
+    crossed = [park.addresses[0].replace("khepera4", "kteam"), kteam.addresses[0].replace("kteam", "khepera4")]
+    with pytest.raises(BodyError) as caught:
+        open_khepera4(request("khepera4", crossed)).open()
+    assert str(caught.value).count("it speaks the other protocol") == 2
+    older = served(request("khepera4", ["-"], device=PARK | {"odometry": "increments"}))
+    with pytest.raises(BodyError, match=r'answers p with .*, not with 3 numbers; does device = { odometry = "..." }'):
+        open_khepera4(request("khepera4", older.addresses)).open()
+
+
+@pytest.mark.system
+def test_park_never_gets_two_commands_at_once():
+    """A server that notes what each of its reads brought."""
+    reads = []
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve():
+            client, _ = listener.accept()
+            with client:
+                while data := client.recv(255):
+                    reads.append(data.decode())
+                    if data == b"p":
+                        client.sendall(b"0.0,0.0,0.0")
+                    elif data == b"get_data":
+                        client.sendall(b"30,1000,2000,0,100")
+
+        server = threading.Thread(target=serve, daemon=True)
+        server.start()
+        with opened(open_khepera4(request("khepera4", [f"khepera4://127.0.0.1:{listener.getsockname()[1]}"]))) as body:
+            drive = Drive(body, np.array([[1.0, 0.0]]))
+            drive.until(lambda: len(reads) > 60)
+            scan = drive.state.ranges[0]
+        server.join(2.0)
+    assert {text.split()[0] for text in reads} == {"d", "p", "get_data", "stop"}
+    assert all(len(text.split()) == 3 for text in reads if text[0] == "d")
+    assert reads[-3:] == ["stop"] * 3
+    assert scan.distance == pytest.approx([0.37, np.nan, np.nan, 0.32, 1.07], nan_ok=True)
+    assert scan.bearing[0] == pytest.approx(np.pi / 2)
+
+
+@pytest.mark.system
+def test_kteam_over_a_serial_line():
+    """A pseudo terminal with the twin's side of the protocol at its other end."""
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    robot = twin._Robot(protocol.Settings(), Faults())
+    ending = threading.Event()
+    heard = []
+
+    def serve():
+        begun = b""
+        while not ending.is_set():
+            if select.select([ours], [], [], 0.02)[0]:
+                *lines, begun = (begun + os.read(ours, 255)).split(b"\r")
+                for line in lines:
+                    heard.append(line.decode())
+                    os.write(ours, f"{twin.kteam(robot, line.decode())}\r\n".encode())
+
+    server = threading.Thread(target=serve, daemon=True)
+    server.start()
+    try:
+        with opened(open_khepera4(request("khepera4", [f"kteam://{os.ttyname(theirs)}"]))) as body:
+            drive = Drive(body)
+            drive.once()
+            body.command(np.array([[0.1, 0.5, 0.0, 0.0]]))
+            drive.until(lambda: "D,109,186" in heard)
+            assert drive.state.notes == ("",)
+            assert drive.state.battery[0] == 1.0
+    finally:
+        ending.set()
+        server.join()
+        os.close(ours)
+        os.close(theirs)
+    assert heard[:2] == ["B", "U,31"]
+    assert heard[-3:] == ["D,0,0"] * 3

@@ -1,0 +1,404 @@
+"""The formats of ROS 2 on Zenoh against published literals, and the robots of a realm in the graph of ROS 2."""
+
+import math
+import re
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import xxhash
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+from zenoh.ext import Int64, z_serialize
+from zenoh.handlers import RingChannel
+
+from agents import wire
+from agents.keys import Keys
+from agents.protocols import ros2
+from agents.session import alive_token, open_session, pose_publisher, publisher, received
+from bridges.ros2 import main, ros_name
+
+ROOT = Path(__file__).resolve().parents[2]
+JSON = "application/json"
+
+HASHES = {
+    "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+    "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
+    "geometry_msgs/msg/Twist": "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
+    "geometry_msgs/msg/TwistStamped": "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
+    "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    "sensor_msgs/msg/LaserScan": "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
+    "sensor_msgs/msg/Imu": "7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b",
+    "sensor_msgs/msg/BatteryState": "4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741",
+}
+
+
+@pytest.mark.parametrize("distro", ["jazzy", "kilted", "rolling"])
+def test_hashes_are_the_published_ones(distro):
+    types = ros2.types(distro)
+    assert {kind: types.hash(kind) for kind in HASHES} == {kind: f"RIHS01_{code}" for kind, code in HASHES.items()}
+
+
+def test_humble_has_no_hashes():
+    assert ros2.types("humble").hash(ros2.TWIST) == "TypeHashNotSupported"
+
+
+def test_cdr_is_what_the_encapsulation_says_byte_by_byte():
+    types = ros2.types("jazzy")
+    twist = types.encode(types.twist((0.22, 0.0, 0.0), (0.0, 0.0, -2.84)), ros2.TWIST)
+    assert twist == b"\0\1\0\0" + struct.pack("<6d", 0.22, 0.0, 0.0, 0.0, 0.0, -2.84)
+    stamped = types.make(
+        ros2.TWIST_STAMPED,
+        header=types.header(1700000000.25, "map"),
+        twist=types.twist((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
+    )
+    head = struct.pack("<iI", 1700000000, 250000000) + struct.pack("<I", 4) + b"map\0"
+    assert types.encode(stamped, ros2.TWIST_STAMPED) == b"\0\1\0\0" + head + struct.pack("<6d", 1, 2, 3, 4, 5, 6)
+
+
+@pytest.mark.parametrize("distro", ["humble", "jazzy"])
+@pytest.mark.parametrize("kind", [ros2.TWIST, ros2.TWIST_STAMPED, ros2.POSE_STAMPED])
+def test_cdr_is_identical_to_rosbags(distro, kind):
+    types, store = ros2.types(distro), get_typestore(Stores[f"ROS2_{distro.upper()}"])
+    if kind == ros2.POSE_STAMPED:
+        point = types.make("geometry_msgs/msg/Point", x=1.0, y=-2.0, z=0.5)
+        turn = types.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.6, w=0.8)
+        pose = types.make("geometry_msgs/msg/Pose", position=point, orientation=turn)
+        message = types.make(kind, header=types.header(12.5, "odom"), pose=pose)
+    else:
+        message = types.twist((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
+        if kind == ros2.TWIST_STAMPED:
+            message = types.make(kind, header=types.header(12.5, ""), twist=message)
+    raw = types.encode(message, kind)
+    assert raw == bytes(store.serialize_cdr(store.deserialize_cdr(raw, kind), kind))
+    assert len(raw) == {ros2.TWIST: 52, ros2.TWIST_STAMPED: 68, ros2.POSE_STAMPED: 84}[kind]
+
+
+@given(st.binary(max_size=120), st.sampled_from([ros2.TWIST, ros2.TWIST_STAMPED, ros2.ODOMETRY, ros2.LASER_SCAN]))
+def test_bytes_that_are_no_message_are_refused(raw, kind):
+    types = ros2.types("jazzy")
+    try:
+        types.decode(b"\0\1\0\0" + raw, kind)
+    except ros2.UnknownMessage as error:
+        assert kind in str(error)  # noqa: PT017 - most bytes are refused, a few are a message
+
+
+def test_a_twist_is_no_stamped_twist_and_the_other_way_round():
+    types = ros2.types("jazzy")
+    twist = types.twist((0.1, 0.0, 0.0), (0.0, 0.0, 0.0))
+    stamped = types.make(ros2.TWIST_STAMPED, header=types.header(1.0, "base_link"), twist=twist)
+    with pytest.raises(ros2.UnknownMessage, match="TwistStamped"):
+        types.decode(types.encode(twist, ros2.TWIST), ros2.TWIST_STAMPED)
+    with pytest.raises(ros2.UnknownMessage, match="Twist"):
+        types.decode(types.encode(stamped, ros2.TWIST_STAMPED), ros2.TWIST)
+
+
+def test_attachment_is_that_of_zenoh_ext():
+    source = bytes(range(16))
+    raw = ros2.attachment(5, 7, source)
+    assert raw == bytes.fromhex("0500000000000000070000000000000010000102030405060708090a0b0c0d0e0f")
+    assert raw == z_serialize((Int64(5), Int64(7), source)).to_bytes()
+    assert ros2.attached(raw) == (5, 7, source)
+    with pytest.raises(ros2.UnknownMessage, match="32 bytes"):
+        ros2.attached(raw[:32])
+
+
+def test_gid_is_xxh3_of_the_token_low_half_first():
+    assert ros2.gid("") == bytes.fromhex("99aa06d3014798d86001c324468d497f")[::-1]  # the published value of no input
+    digest = xxhash.xxh3_128_intdigest(b"@ros2_lv/0")
+    assert ros2.gid("@ros2_lv/0") == struct.pack("<QQ", digest & (2**64 - 1), digest >> 64)
+
+
+def test_keys_of_both_styles():
+    types = ros2.types("jazzy")
+    plain = ros2.topic_key("ros2dds", "/tb3_0/cmd_vel", ros2.TWIST, domain=0, types=types)
+    rmw = ros2.topic_key("rmw", "/tb3_0/cmd_vel", ros2.TWIST, domain=30, types=types)
+    assert plain == "tb3_0/cmd_vel"
+    assert rmw == f"30/tb3_0/cmd_vel/geometry_msgs::msg::dds_::Twist_/RIHS01_{HASHES[ros2.TWIST]}"
+    assert ros2.absolute("", "cmd_vel") == "/cmd_vel"
+    assert ros2.absolute("tb3_0", "/diagnostics") == "/diagnostics"
+
+
+def test_tokens_are_those_of_rmw_zenoh():
+    zid = "aac3178e146ba6f1fc6e6a4085e77f21"
+    assert ros2.node_token(2, zid, 0, "", "listener") == f"@ros2_lv/2/{zid}/0/0/NN/%/%/listener"
+    assert ros2.node_token(0, zid, 3, "a/b", "n") == f"@ros2_lv/0/{zid}/3/3/NN/%/%a%b/n"
+    rest = ros2.endpoint_topic("/chatter", "std_msgs/msg/String", ros2.qos(depth=7), ros2.types("jazzy"))
+    token = ros2.endpoint_token(2, zid, 0, 10, "MP", "", "talker", rest)
+    assert token == (
+        f"@ros2_lv/2/{zid}/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/"
+        f"RIHS01_{HASHES['std_msgs/msg/String']}/::,7:,:,:,,"
+    )
+    assert ros2.announced("rmw", token) == ros2.Endpoint(
+        "/chatter", "std_msgs/msg/String", f"RIHS01_{HASHES['std_msgs/msg/String']}", 2
+    )
+    assert (ros2.RELIABLE, ros2.SENSOR_DATA, ros2.qos(depth=42)) == ("::,10:,:,:,,", "2::,5:,:,:,,", "::,:,:,:,,")
+    assert zenoh.KeyExpr(ros2.endpoints("rmw", "MP", "/chatter", domain=2)).includes(zenoh.KeyExpr(token))
+    assert not zenoh.KeyExpr(ros2.endpoints("rmw", "MS", "/chatter", domain=2)).intersects(zenoh.KeyExpr(token))
+    dds = ros2.dds_token("1f", "MS", "/tb3_0/cmd_vel", ros2.TWIST)
+    assert dds.startswith("@/1f/@ros2_lv/MS/tb3_0§cmd_vel/geometry_msgs§msg§Twist/")
+    assert ros2.announced("ros2dds", dds) == ros2.Endpoint("/tb3_0/cmd_vel", ros2.TWIST)
+    assert zenoh.KeyExpr(ros2.endpoints("ros2dds", "MS", "/tb3_0/cmd_vel")).includes(zenoh.KeyExpr(dds))
+
+
+@pytest.mark.parametrize("style", ["rmw", "ros2dds"])
+def test_what_announces_nothing_is_said_to(style):
+    with pytest.raises(ValueError, match="announces no"):
+        ros2.announced(style, "@ros2_lv/0/1f/0")
+
+
+@pytest.mark.parametrize(("robot", "name"), [("CF01", "CF01"), ("tb3-0", "tb3_0"), ("3rd", "_3rd"), ("ä b", "__b")])
+def test_names_that_ros_allows(robot, name):
+    assert ros_name(robot) == name
+
+
+def test_wrong_command_lines_end_without_a_traceback(capsys):
+    assert main(["--connect", "nonsense"]) == 2
+    assert "write it like tcp/127.0.0.1:7447" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["--domain", "233"])
+
+
+# ---------------------------------------------------------------------- a ROS 2 node that knows only what is published
+
+
+class RosNode:
+    """Plain zenoh and rosbags: keys, tokens and attachments are spelled here once more, by hand."""
+
+    def __init__(self, session, domain=0):
+        self.session, self.domain = session, domain
+        self.store = get_typestore(Stores.ROS2_JAZZY)
+        self.tokens = {}
+        self.watch = session.liveliness().declare_subscriber(f"@ros2_lv/{domain}/**", RingChannel(256), history=True)
+
+    def subscribe(self, topic, kind):
+        package, _, name = kind.split("/")
+        code = f"RIHS01_{HASHES[kind]}" if kind in HASHES else "*"
+        key = f"{self.domain}/{topic}/{package}::msg::dds_::{name}_/{code}"
+        return self.session.declare_subscriber(key, RingChannel(64)), kind
+
+    def take(self, subscription):
+        subscriber, kind = subscription
+        found = []
+        while (sample := subscriber.try_recv()) is not None:
+            sequence, stamp, size, gid = struct.unpack("<qqB16s", sample.attachment.to_bytes())
+            assert size == 16
+            assert abs(stamp / 1e9 - time.time()) < 10.0
+            found.append((self.store.deserialize_cdr(sample.payload.to_bytes(), kind), sequence, gid))
+        return found
+
+    def graph(self):
+        while (sample := self.watch.try_recv()) is not None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self.tokens[str(sample.key_expr)] = True
+            else:
+                self.tokens.pop(str(sample.key_expr), None)
+        return set(self.tokens)
+
+    def topics(self):
+        """Role, topic and type of every endpoint, as `ros2 topic list -t` would show them."""
+        parts = [token.split("/") for token in self.graph()]
+        return {(p[5], p[9].replace("%", "/"), p[10]) for p in parts if p[5] != "NN"}
+
+
+class Realm:
+    """Robots as the bridge sees them."""
+
+    def __init__(self, session):
+        self.session, self.keys, self.tokens, self.out = session, Keys("park"), {}, {}
+
+    def enter(self, name):
+        self.out[name] = (
+            publisher(self.session, self.keys.state(name), JSON),
+            pose_publisher(self.session, self.keys.status(name), JSON),
+        )
+        self.tokens[name] = alive_token(self.session, self.keys.alive(name))
+
+    def leave(self, name):
+        self.tokens.pop(name).undeclare()
+
+    def state(self, name, position, velocity, yaw):
+        state = wire.State(name, 1, 1700000000.5, "running", position, velocity, yaw, None, None, 0.0)
+        self.out[name][0].put(wire.encode(state))
+
+    def status(self, name, body=""):
+        status = wire.Status(
+            name,
+            time.time(),
+            "running",
+            "",
+            body,
+            0.75,
+            10,
+            20,
+            {"CF02": 1},
+            0,
+            0,
+            100,
+            2,
+            50,
+            3,
+            0.01,
+            0.0,
+            [],
+            1,
+            0.5,
+            30,
+        )
+        self.out[name][1].put(wire.encode(status))
+
+
+@pytest.fixture
+def bridge(router):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "bridges.ros2", "--connect", router.endpoint, "--domain", "7"],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout.readline() == "ros2 ready: node /zenpark, domain 7, jazzy\n"
+    yield process
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(10) == 0
+    process.stdout.close()
+
+
+@pytest.mark.system
+def test_robots_are_in_the_graph_of_ros(router, bridge, eventually):
+    with (
+        open_session([router.endpoint], name="realm") as inside,
+        open_session([router.endpoint], name="ros") as outside,
+    ):
+        node, realm = RosNode(outside, 7), Realm(inside)
+        eventually(lambda: any("/NN/%/%/zenpark" in token for token in node.graph()))
+        diagnostics = node.subscribe("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+        poses = node.subscribe("CF01/pose", "geometry_msgs/msg/PoseStamped")
+        speeds = node.subscribe("CF01/velocity", "geometry_msgs/msg/TwistStamped")
+        realm.enter("CF01")
+        realm.enter("tb3-0")
+        wanted = {
+            (role, f"/{name}/{topic}", f"geometry_msgs::msg::dds_::{kind}_")
+            for name in ("CF01", "tb3_0")
+            for role, topic, kind in (
+                ("MP", "pose", "PoseStamped"),
+                ("MP", "velocity", "TwistStamped"),
+                ("MS", "goal", "PoseStamped"),
+            )
+        }
+        wanted |= {("MP", "/diagnostics", "diagnostic_msgs::msg::dds_::DiagnosticArray_")}
+        eventually(lambda: node.topics() == wanted)
+        assert all(
+            re.fullmatch(r"RIHS01_[0-9a-f]{64}", token.split("/")[11]) for token in node.graph() if "/NN/" not in token
+        )
+
+        got = []
+
+        def pose_came():
+            realm.state("CF01", (1.0, -2.0, 0.5), (0.1, 0.2, -0.3), math.pi / 2)
+            got.extend(node.take(poses))
+            return len(got) >= 3
+
+        eventually(pose_came)
+        message, _, gid = got[0]
+        assert message.header.frame_id == "map"
+        assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1700000000, 500000000)
+        place, turn = message.pose.position, message.pose.orientation
+        assert (place.x, place.y, place.z) == (1.0, -2.0, 0.5)
+        assert (turn.z, turn.w) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
+        assert [sequence for _, sequence, _ in got] == list(range(1, len(got) + 1))
+        token = next(token for token in node.graph() if "/MP/" in token and "%CF01%pose" in token)
+        assert gid == xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
+        speed = node.take(speeds)[0][0].twist.linear
+        assert (speed.x, speed.y, speed.z) == (0.1, 0.2, -0.3)
+
+        found = []
+
+        def report_came():
+            realm.status("CF01", "LOCKED")
+            for array, _, _ in node.take(diagnostics):
+                found.extend(array.status)
+            return bool(found)
+
+        eventually(report_came)
+        assert (found[0].name, found[0].level, found[0].hardware_id) == ("zenpark: CF01", 1, "CF01")
+        assert "LOCKED" in found[0].message
+        values = {pair.key: pair.value for pair in found[0].values}
+        assert (values["battery"], values["lost"], values["missed ticks"]) == ("0.750", "1", "2 of 100")
+
+        realm.leave("CF01")
+        eventually(
+            lambda: (
+                {topic for _, topic, _ in node.topics()}
+                == {"/diagnostics", "/tb3_0/pose", "/tb3_0/velocity", "/tb3_0/goal"}
+            )
+        )
+        found.clear()
+        eventually(
+            lambda: (
+                found.extend(s for a, _, _ in node.take(diagnostics) for s in a.status)
+                or "gone" in {s.message for s in found}
+            )
+        )
+        realm.enter("CF01")
+        eventually(lambda: node.topics() == wanted)
+
+
+@pytest.mark.system
+def test_goals_come_in(router, bridge, eventually):
+    with (
+        open_session([router.endpoint], name="realm") as inside,
+        open_session([router.endpoint], name="ros") as outside,
+    ):
+        node, realm = RosNode(outside, 7), Realm(inside)
+        goals = inside.declare_subscriber("park/CF01/goal", RingChannel(16))
+        realm.enter("CF01")
+        eventually(lambda: ("MS", "/CF01/goal", "geometry_msgs::msg::dds_::PoseStamped_") in node.topics())
+        key = f"7/CF01/goal/geometry_msgs::msg::dds_::PoseStamped_/RIHS01_{HASHES['geometry_msgs/msg/PoseStamped']}"
+        kinds = node.store.types
+        out = outside.declare_publisher(key)
+
+        def send(frame, x, turn):
+            message = kinds["geometry_msgs/msg/PoseStamped"](
+                header=kinds["std_msgs/msg/Header"](
+                    stamp=kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id=frame
+                ),
+                pose=kinds["geometry_msgs/msg/Pose"](
+                    position=kinds["geometry_msgs/msg/Point"](x=x, y=0.25, z=0.5),
+                    orientation=kinds["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=turn[0], w=turn[1]),
+                ),
+            )
+            raw = bytes(node.store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
+            out.put(raw, attachment=struct.pack("<qqB16s", 1, time.time_ns(), 16, bytes(16)))
+
+        out.put(b"\0\1\0\0garbage", attachment=struct.pack("<qqB16s", 1, time.time_ns(), 16, bytes(16)))
+        send("odom", 3.0, (0.0, 1.0))  # another frame
+        send("map", math.nan, (0.0, 1.0))
+        send("map", 1.5, (math.sin(0.25), math.cos(0.25)))
+        send("", 2.5, (0.0, 0.0))
+        samples = []
+        eventually(lambda: samples.extend(received(goals)) or len(samples) >= 2)
+        first, second = (wire.decode(s.payload.to_bytes(), str(s.encoding), wire.Position) for s in samples)
+        assert (first.robot, first.position) == ("CF01", (1.5, 0.25, 0.5))
+        assert first.yaw == pytest.approx(0.5)
+        assert (second.position, second.yaw) == ((2.5, 0.25, 0.5), None)
+        assert str(samples[0].encoding) == JSON
+
+
+@pytest.mark.system
+def test_the_graph_survives_its_router(router, bridge, eventually):
+    with open_session([router.endpoint], name="ros") as outside:
+        node = RosNode(outside, 7)
+        realm = Realm(outside)
+        realm.enter("CF01")
+        eventually(lambda: len(node.topics()) == 4)
+        router.kill()
+        eventually(lambda: not [token for token in node.graph() if "zenpark" in token])
+        router.start()
+        eventually(lambda: len(node.topics()) == 4)

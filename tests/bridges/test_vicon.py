@@ -1,0 +1,364 @@
+"""The Vicon bridge: what it believes, what it says, what it survives; and what robots make of it."""
+
+from __future__ import annotations
+
+import math
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from agents.protocols import datastream
+from agents.protocols.datastream import Segment
+from bridges.datastream import Frame
+from bridges.vicon import Sieve, heading, pairs, split
+from experiments import document
+from tests.conftest import ROOT, RouterProcess
+from tests.system.lab import RobotProcess, Watcher, until
+from tests.twins.camera import Camera
+from twins.vicon import upright
+
+UPRIGHT = tuple(upright(0.3).ravel().tolist())
+
+
+def frame(*, latency: float = 0.0, z_up: bool = True, **poses: tuple[float, float, float] | Segment | None) -> Frame:
+    seen = {name: Segment(0, pose, UPRIGHT) if type(pose) is tuple else pose for name, pose in poses.items()}
+    return Frame(1, latency, seen, z_up)  # type: ignore[arg-type]
+
+
+# ---------------------------------------------------------------------- what it believes
+
+
+angle = st.floats(-3.1, 3.1)
+
+
+@given(angle, st.floats(-1.4, 1.4), angle, st.floats(1.01, 3.0))
+def test_the_heading_is_where_the_nose_points_and_only_of_rotations(
+    yaw: float, pitch: float, roll: float, scale: float
+) -> None:
+    tilt = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
+    bank = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
+    turned = upright(yaw) @ tilt @ bank
+    assert heading(turned.ravel().tolist()) == pytest.approx(yaw, abs=1e-9)
+    mirrored = turned * [1.0, 1.0, -1.0]
+    for wrong in (turned * scale, turned / scale, mirrored, turned * np.nan, turned * 0.0, turned + np.inf):
+        assert math.isnan(heading(wrong.ravel().tolist()))
+
+
+def test_what_was_not_seen_is_not_said() -> None:
+    said: list[str] = []
+    sieve = Sieve({"CF01": "cf_1", "KH01": "kh_1"}, said.append)
+    nan = Segment(0, (math.nan, 0.0, 0.0), UPRIGHT)
+    flat = Segment(0, (0.0, 0.0, 0.0), (0.0,) * 9)
+    (first,) = sieve.sift(frame(cf_1=(0.1, 0.2, 0.3), kh_1=None, other=(0.0, 0.0, 0.0), latency=0.004), 1.0)
+    assert first == ("CF01", 0.996, Segment(0, (0.1, 0.2, 0.3), UPRIGHT), pytest.approx(0.3))
+    for pose in (nan, flat, None):
+        assert sieve.sift(frame(cf_1=pose, kh_1=pose), 1.1) == []
+    assert sieve.refused == 4
+    assert said == [
+        "CF01 is seen as 'cf_1'",
+        "KH01 is not seen: markers hidden, or subject 'kh_1' is switched off",
+    ]
+    sieve.sift(frame(other=(0.0, 0.0, 0.0)), 1.6)
+    assert said[2:] == [
+        "CF01: no subject 'cf_1' (there are: other); name another with --map CF01=SUBJECT",
+        "KH01: no subject 'kh_1' (there are: other); name another with --map KH01=SUBJECT",
+    ]
+
+
+def test_a_jump_is_not_believed_until_it_has_lasted() -> None:
+    sieve = Sieve({"CF01": "CF01"}, lambda _: None)
+    believed = []
+    for tick in range(200):
+        t = 0.01 * tick
+        x = 0.5 * t  # half a metre a second, with an excursion of one frame and one that stays
+        jump = 1.0 if tick == 50 or tick >= 100 else 0.0
+        believed += [(tick, s.position[0]) for _, _, s, _ in sieve.sift(frame(CF01=(x + jump, 0.0, 1.0)), t)]
+    ticks = [tick for tick, _ in believed]
+    assert [tick for tick in range(200) if tick not in ticks] == [
+        50,
+        *range(100, 121),
+    ]  # 1 m in 0.22 s a robot could just have flown
+    assert sieve.refused == 22
+    steps = np.diff([x for _, x in believed])
+    assert np.sort(steps)[-2:] == pytest.approx([0.01, 1.11], abs=1e-9)
+
+
+def test_frames_that_overtake_each_other_and_axes_that_lie_are_left_out() -> None:
+    said: list[str] = []
+    sieve = Sieve({"CF01": "CF01"}, said.append)
+    assert len(sieve.sift(frame(CF01=(0.0, 0.0, 1.0)), 1.00)) == 1
+    assert sieve.sift(frame(CF01=(0.0, 0.0, 1.0), latency=0.02), 1.01) == []  # measured before the last
+    assert sieve.sift(frame(CF01=(0.0, 0.0, 1.0), z_up=False), 1.02) == []
+    assert len(sieve.sift(frame(CF01=(0.0, 0.0, 1.0)), 1.03)) == 1
+    assert said[1:] == [
+        "no positions: the server's z axis does not point up; set it so in its options",
+        "the z axis points up",
+    ]
+
+
+def test_the_command_line_is_understood_or_refused() -> None:
+    assert split("vicon") == ("vicon", 801)
+    assert split("10.0.0.7:8801") == ("10.0.0.7", 8801)
+    assert pairs(["CF01=cf_1", "KH01"]) == {"CF01": "cf_1", "KH01": "KH01"}
+    for wrong in ("", ":801", "host:", "host:0", "host:99999", "host:x"):
+        with pytest.raises(ValueError, match="neither HOST nor HOST:PORT"):
+            split(wrong)
+    for maps in (["=cf_1"], ["CF01="], ["CF01", "CF01=a"], ["CF01=a", "CF02=a"]):
+        with pytest.raises(ValueError, match=r"neither ROBOT|another --map"):
+            pairs(maps)
+
+
+# ---------------------------------------------------------------------- the process
+
+
+class BridgeProcess:
+    """`python -m bridges.vicon` and what it says."""
+
+    def __init__(self, endpoint: str, server: str, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "bridges.vicon", server, "--connect", endpoint, *arguments],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.lines: list[str] = []
+        self.over = False
+        self._ears = threading.Thread(target=self._hear, daemon=True)
+        self._ears.start()
+
+    def _hear(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.lines.append(line.rstrip())
+
+    def until_said(self, words: str, times: int = 1) -> None:
+        until(lambda: sum(words in line for line in self.lines) >= times, f"{words!r} in {self.lines}", 10.0)
+
+    def end(self, number: signal.Signals = signal.SIGTERM) -> int:
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.wait()
+
+    def wait(self) -> int:
+        code = self.process.wait(10)
+        self._ears.join(5)
+        for stream in (self.process.stdin, self.process.stderr):
+            assert stream is not None
+            stream.close()
+        self.over = True
+        return code
+
+
+Start = Callable[..., BridgeProcess]
+
+
+@pytest.fixture
+def start(router: RouterProcess) -> Iterator[Start]:
+    """Starts bridges and sees to their end."""
+    made: list[BridgeProcess] = []
+
+    def begin(server: str, *arguments: str) -> BridgeProcess:
+        made.append(BridgeProcess(router.endpoint, server, *arguments))
+        return made[-1]
+
+    yield begin
+    for bridge in made:
+        if not bridge.over:
+            bridge.end()
+
+
+class Listener:
+    """Positions of a robot, as it would hear them."""
+
+    def __init__(self, session: network.zenoh.Session, robot: str) -> None:
+        self._subscriber = network.subscriber(session, Keys().position(robot), 4096)
+        self.heard: list[wire.Position] = []
+
+    def look(self) -> int:
+        for sample in network.received(self._subscriber.handler):
+            self.heard.append(wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position))
+        return len(self.heard)
+
+    def until(self, more: int) -> None:
+        wanted = self.look() + more
+        until(lambda: self.look() >= wanted, f"{more} more positions", 10.0)
+
+
+@pytest.fixture
+def session(router: RouterProcess) -> Iterator[network.zenoh.Session]:
+    with network.open_session([router.endpoint], name="test") as made:
+        yield made
+
+
+@pytest.mark.system
+def test_positions_arrive_as_they_were_placed_and_when_they_were_measured(
+    start: Start, session: network.zenoh.Session
+) -> None:
+    with Camera(["cf_1", "KH01"], rate_hz=200.0) as camera:
+        camera.place("cf_1", [0.123456789, -0.5, 1.0], 0.3)
+        camera.place("KH01", [-1.0, 0.25, 0.06], -2.0)
+        camera.twin.latency_s = 0.25
+        drone, rover = Listener(session, "CF01"), Listener(session, "KH01")
+        bridge = start(camera.twin.address, "--map", "CF01=cf_1", "--map", "KH01")
+        drone.until(200)
+        rover.look()
+        now = time.time()
+        assert bridge.end() == 0
+    assert {(p.robot, p.position) for p in drone.heard} == {("CF01", pytest.approx((0.123456789, -0.5, 1.0)))}
+    assert {p.yaw for p in rover.heard} == {pytest.approx(-2.0, abs=1e-12)}
+    stamps = np.array([p.stamp for p in drone.heard])
+    assert np.diff(stamps).min() > 0.0
+    assert np.median(np.diff(stamps)) == pytest.approx(0.005, abs=0.001)
+    assert -2.0 < stamps[-1] + 0.25 - now < 0.001
+    assert bridge.lines == [
+        f"vicon: connected to {camera.twin.address}",
+        "vicon: CF01 is seen as 'cf_1'",
+        "vicon: KH01 is seen as 'KH01'",
+    ]
+
+
+@pytest.mark.system
+def test_occlusion_is_a_gap_and_never_a_wrong_pose(start: Start, session: network.zenoh.Session) -> None:
+    begin = time.monotonic()
+    with Camera(["CF01"], look=lambda: camera.twin.place(0, place(), upright(0.0))) as camera:
+
+        def place() -> np.ndarray:
+            return np.array([0.4 * (time.monotonic() - begin), 0.0, 1.0])
+
+        listener = Listener(session, "CF01")
+        bridge = start(camera.twin.address, "--map", "CF01")
+        listener.until(50)
+        camera.occlude(0.3)
+        listener.until(50)
+        camera.occlude(1.0)
+        bridge.until_said("CF01 is not seen")
+        listener.until(50)
+        bridge.until_said("CF01 is seen", 2)
+        assert bridge.end(signal.SIGINT) == 0
+    stamps = np.array([p.stamp for p in listener.heard])
+    gaps = np.sort(np.diff(stamps))[-2:]
+    assert gaps == pytest.approx([0.3, 1.0], abs=0.1)
+    way = np.array([p.position[0] for p in listener.heard])
+    line = np.polyfit(stamps - stamps[0], way, 1)
+    assert line[0] == pytest.approx(0.4, abs=0.01)
+    assert np.abs(way - np.polyval(line, stamps - stamps[0])).max() < 0.02
+
+
+@pytest.mark.system
+def test_a_server_that_goes_and_one_that_talks_nonsense_are_survived(
+    start: Start, session: network.zenoh.Session
+) -> None:
+    listener = Listener(session, "CF01")
+    with Camera(["CF01"]) as camera:
+        camera.place("CF01", [0.0, 0.0, 1.0])
+        port = camera.port
+        bridge = start(camera.twin.address, "--map", "CF01")
+        listener.until(20)
+    bridge.until_said(f"lost {camera.twin.address}")
+    offer = datastream.pack_kinds(datastream.POSES)
+    good = datastream.packet(datastream.pack_frame_number(1))
+    for nonsense, words in (
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "a packet begins with 0x50545448"),
+        (datastream.pack_kinds([1]), "no segments to offer"),
+        (offer + good[:-3] + b"\x00" * 40, "a packet begins with"),
+        (offer + datastream.packet(datastream.block(9, b"\x01")), "cut off"),
+        (offer + datastream.block(datastream.MAGIC, b"\x05\x00\x00\x00\xff\xff\xff\xff"), "a block of"),
+    ):
+        with socket.create_server(("127.0.0.1", port)) as server:
+            server.settimeout(10.0)
+            client, _ = server.accept()
+            client.sendall(nonsense)
+            bridge.until_said(words)
+            client.close()
+    before = listener.look()
+    with Camera(["CF01"], port=port) as camera:
+        camera.place("CF01", [0.0, 0.0, 1.5])
+        listener.until(20)
+        bridge.until_said(f"connected to {camera.twin.address}", 2)
+    assert bridge.end() == 0
+    assert {p.position for p in listener.heard[:before]} == {(0.0, 0.0, 1.0)}
+    assert {p.position for p in listener.heard[before:]} == {(0.0, 0.0, 1.5)}
+
+
+@pytest.mark.system
+def test_a_wrong_host_is_said_and_ends_it(start: Start) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        port = closed.getsockname()[1]
+    bridge = start(f"127.0.0.1:{port}", "--map", "CF01")
+    assert bridge.wait() == 2
+    assert bridge.lines[0] == f"vicon: no connection to 127.0.0.1:{port}: Connection refused; trying again"
+    assert f"nobody answered at 127.0.0.1:{port} in 5 s" in bridge.lines[-1]
+    assert "firewall let TCP port" in bridge.lines[-1]
+    wrong = start("127.0.0.1:vicon", "--map", "CF01")
+    assert wrong.wait() == 2
+    assert wrong.lines == ["zenpark: '127.0.0.1:vicon' is neither HOST nor HOST:PORT, such as 192.168.0.10:801"]
+
+
+@pytest.mark.system
+def test_it_ends_with_its_starter(start: Start) -> None:
+    with Camera(["CF01"]) as camera:
+        bridge = start(camera.twin.address, "--map", "CF01", "--lifeline")
+        bridge.until_said("connected")
+        assert bridge.process.stdin is not None
+        bridge.process.stdin.close()
+        assert bridge.wait() == 0
+
+
+# ---------------------------------------------------------------------- robots
+
+
+@pytest.mark.system
+def test_a_robot_flies_on_through_a_short_occlusion_and_lands_in_a_long_one(
+    start: Start, router: RouterProcess, tmp_path: Path
+) -> None:
+    """The whole way round: simulated bodies, a Vicon that sees them, its stream, the bridge, the robots' process."""
+    file = tmp_path / "seen.toml"
+    text = document.read("triangle").text.replace("hover = 0.6", 'hover = 0.6\nposition = "external"')
+    file.write_text(text, encoding="utf-8")
+    watcher = Watcher(router.endpoint)
+    keys, heights = watcher.keys, [0.0]
+    states = network.subscriber(watcher.session, keys.state("CF01"), 64)
+
+    def look() -> None:
+        for sample in network.received(states.handler):
+            state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
+            assert state.true_position is not None
+            heights.append(state.true_position[2])
+            camera.twin.place(0, np.array(state.true_position), upright(state.true_yaw or 0.0))
+
+    with ExitStack() as stack:
+        stack.callback(watcher.close)
+        camera = Camera(["CF01"], look=look)
+        camera.place("CF01", [0.1, 0.6, 0.0])
+        stack.enter_context(camera)
+        start(camera.twin.address, "--map", "CF01")
+        robots = RobotProcess(router.endpoint, file, "KH01", "KH02", "CF01")
+        stack.callback(lambda: robots.process.returncode is not None or robots.end())
+        watcher.until(lambda: watcher.phase("CF01") == "ready", "it is ready")
+        assert watcher.order("CF01", wire.Order("takeoff")).ok
+        watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
+        camera.occlude(0.3)
+        flown = len(heights)
+        watcher.until(lambda: len(heights) > flown + 50, "a second passes")
+        assert watcher.phase("CF01") == "airborne"
+        assert min(heights[flown:]) > 0.5
+        camera.occlude(5.0)
+        watcher.until(lambda: watcher.phase("CF01") == "done", "it is down")
+        assert watcher.status["CF01"].reason == "its own position is lost"
+        assert watcher.phase("KH01") == "ready"
+        watcher.until(lambda: heights[-1] < 0.03, "it is on the ground")

@@ -1,0 +1,114 @@
+"""TurtleBot3 twins and their bridge on one fast clock: four seconds of theirs pass in one of ours."""
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from agents.body import BodyRequest, Disturbance
+from agents.individual import drive
+from agents.keys import Keys
+from agents.kinds import TURTLEBOT3
+from bridges.turtlebot3 import open_turtlebot3
+from twins.device import DeviceRequest, Faults
+from twins.turtlebot3 import open_device
+
+FAST = 4.0
+DT = 0.01
+
+
+def clock():
+    return FAST * time.monotonic()
+
+
+def request(endpoint, *, start=((0.0, 0.0),), yaw=None, device=None, external=False, addresses=None, disturbance=None):
+    rows = len(start)
+    return BodyRequest(
+        names=tuple(f"TB{row}" for row in range(rows)),
+        kinds=(TURTLEBOT3,) * rows,
+        addresses=addresses or ("turtlebot3-twin",) * rows,
+        start=np.array([[*place, 0.0] for place in start]),
+        yaw=np.zeros(rows) if yaw is None else np.array(yaw),
+        rate_hz=1.0 / DT,
+        seeds=(1,) * rows,
+        disturbance=(disturbance or Disturbance(),) * rows,
+        external=(external,) * rows,
+        device=(device or {},) * rows,
+        endpoints=(endpoint,),
+        keys=Keys("park"),
+    )
+
+
+class Stage:
+    """Twins that live on a thread, and what a robot process would do with their bridge."""
+
+    def __init__(self, twins_request, *, faults=None, body_request=None):
+        self.twin = open_device(DeviceRequest(twins_request, faults or Faults()))
+        wanted = body_request or twins_request
+        self.body = open_turtlebot3(
+            replace(wanted, addresses=wanted.addresses if body_request else self.twin.addresses)
+        )
+        self.body._clock = clock
+        self.rows = len(twins_request.names)
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._live, name="turtlebot3-twin")
+        self.zero = clock()
+        self.t = 0.0
+        self.state = None
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.body.close()
+        self.kill()
+
+    def kill(self):
+        if not self._end.is_set():
+            self._end.set()
+            self._thread.join()
+            self.twin.close()
+
+    def _live(self):
+        due = 0.0
+        while not self._end.wait(max(0.0, (self.zero + due - clock()) / FAST)):
+            self.twin.advance(clock() - self.zero)
+            due += DT
+
+    def run(self, seconds, decide=None):
+        """Reads and commands at 100 Hz of the fast clock for so long, or until `decide` returns True."""
+        end = self.t + seconds
+        pause = threading.Event()
+        while self.t < end:
+            pause.wait(max(0.0, (self.zero + self.t + DT - clock()) / FAST))
+            self.t = clock() - self.zero
+            self.state = self.body.read(self.t)
+            setpoint = np.full((self.rows, 4), np.nan)
+            if decide is not None and (decided := decide(self.state)) is not None:
+                setpoint[:, 2:] = 0.0
+                setpoint[:, :2] = decided
+            self.body.command(setpoint)
+        return self.state
+
+    def toward(self, goal):
+        """The position controller of the robot process."""
+        full = {
+            name: np.full(self.rows, getattr(TURTLEBOT3, name))
+            for name in ("response", "turn_response", "speed", "turn_rate")
+        }
+        return lambda state: drive(goal - state.position[:, :2], state.yaw, np.full(self.rows, np.nan), **full)
+
+    def constant(self, v, w=0.0):
+        return lambda _: np.tile([v, w], (self.rows, 1))
+
+    @property
+    def place(self):
+        return self.twin.truth()[0][:, :2].copy()
+
+    def moved(self, seconds, decide=None):
+        """How far the robots really move in so long [m]."""
+        before = self.place
+        self.run(seconds, decide)
+        return np.linalg.norm(self.place - before, axis=1)

@@ -1,0 +1,283 @@
+"""The Khepera twin by its two protocols: a client of bare sockets, and the device's own time."""
+
+import select
+import socket
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents.body import BodyError, Disturbance
+from agents.protocols import khepera4 as protocol
+from tests.twins.loopback import request
+from twins import khepera4
+from twins.device import DeviceRequest, Faults
+
+DT = 0.01
+
+
+class Conversation:
+    """A client of one robot that lets its time pass tick by tick."""
+
+    def __init__(self, speaks, *, faults=None, **parts):
+        rows = request("khepera4", ["khepera4-twin"], device={"protocol": speaks, **parts.pop("device", {})}, **parts)
+        self.device = khepera4.open_device(DeviceRequest(rows, Faults(**(faults or {}))))
+        host, port = self.device.addresses[0].partition("://")[2].split(":")
+        self.place = (host, int(port))
+        self.clients = []
+        self.tick = 0
+        self.client = self.connect()
+
+    def connect(self):
+        self.clients.append(socket.create_connection(self.place, 1.0))
+        self.clients[-1].setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.serve()
+        return self.clients[-1]
+
+    def close(self):
+        for client in self.clients:
+            client.close()
+        self.device.close()
+
+    def serve(self):
+        """Lets the device see what has come."""
+        ready = select.select(self.device.sockets(), [], [], 0.05)[0]
+        for wire in ready:
+            self.device.serve(wire, self.tick * DT)
+        return bool(ready)
+
+    def say(self, data, client=None):
+        (client or self.client).sendall(data)
+        return self.serve()
+
+    def heard(self, client=None):
+        client = client or self.client
+        return client.recv(1024).decode() if select.select([client], [], [], 0.0)[0] else None
+
+    def ask(self, data):
+        self.say(data)
+        return self.heard()
+
+    def wait(self, seconds):
+        for _ in range(round(seconds / DT)):
+            self.tick += 1
+            self.device.advance(self.tick * DT)
+
+    def truth(self):
+        position, yaw = self.device.truth()
+        return [*position[0, :2], yaw[0]]
+
+
+@pytest.fixture
+def talk():
+    made = []
+
+    def begin(speaks, **parts):
+        made.append(Conversation(speaks, **parts))
+        return made[-1]
+
+    yield begin
+    for each in made:
+        each.close()
+
+
+def values(answer):
+    return [float(word) for word in answer.split(",")]
+
+
+def test_park_drives_in_centimetres_and_counts_its_own_pose(talk):
+    robot = talk("park", start=[[0.5, -0.2, 0.0]], yaw=np.pi / 2)
+    assert robot.ask(b"p") == "0.0000,0.0000,0.0000"
+    robot.say(b"d 10.0 0.0")
+    robot.wait(2.0)
+    assert robot.truth() == pytest.approx([0.5, 0.0, np.pi / 2], abs=0.004)
+    assert values(robot.ask(b"p")) == pytest.approx([0.2, 0.0, 0.0], abs=0.004)
+    robot.say(b"d 0.0 0.5")
+    robot.wait(1.0)
+    assert values(robot.ask(b"p"))[2] == pytest.approx(0.5, abs=0.01)
+    robot.say(b"stop")
+    robot.wait(0.2)
+    before = robot.truth()
+    robot.wait(1.0)
+    assert robot.truth() == before
+    assert robot.ask(b"get_data") == "1000,1000,1000,1000,1000"
+
+
+def test_park_has_no_watchdog_but_stops_when_its_client_goes(talk):
+    robot = talk("park")
+    robot.say(b"d 5 0")
+    robot.wait(5.0)
+    assert robot.truth()[0] == pytest.approx(0.25, abs=0.01)
+    robot.client.close()
+    robot.serve()
+    robot.wait(0.2)
+    before = robot.truth()
+    robot.wait(1.0)
+    assert robot.truth() == before
+
+
+def test_park_loses_what_is_glued_to_a_command(talk):
+    robot = talk("park")
+    robot.say(b"d 10.0 0.0stop")
+    robot.wait(1.0)
+    assert robot.truth()[0] > 0.08
+
+
+def test_park_sets_its_pose_and_goes_to_a_goal_by_itself(talk):
+    robot = talk("park", start=[[0.3, 0.0, 0.0]])
+    robot.say(b"i 1.0 0.5 1.0")
+    assert robot.ask(b"p") == "1.0000,0.5000,1.0000"
+    assert robot.ask(b"t") == "0.0000,1.0000"
+    robot.say(b"g 1.2 0.6")
+    robot.wait(8.0)
+    assert values(robot.ask(b"p"))[:2] == pytest.approx([1.2, 0.6], abs=0.006)
+    x, y, yaw = robot.truth()  # its frame is turned by 1 rad against the world
+    cos, sin = np.cos(-1.0), np.sin(-1.0)
+    assert [x - 0.3, y] == pytest.approx([cos * 0.2 - sin * 0.1, sin * 0.2 + cos * 0.1], abs=0.01)
+
+
+@pytest.mark.parametrize(("odometry", "expected"), [("increments", [0.05, 0.1]), ("heading", [0.05, 0.2])])
+def test_park_of_other_years_counts_from_the_last_question(talk, odometry, expected):
+    robot = talk("park", device={"odometry": odometry})
+    robot.say(b"d 5.0 0.1")
+    robot.wait(1.0)
+    robot.ask(b"p")
+    robot.wait(1.0)
+    assert values(robot.ask(b"p")) == pytest.approx(expected, abs=0.004)
+
+
+@pytest.mark.parametrize("nonsense", [b"d", b"d fast", b"g 1", b"i", b"x", b"\xff\x00", b"d nan nan", b"d 1e999 0"])
+def test_park_ignores_what_it_does_not_understand(talk, nonsense):
+    robot = talk("park")
+    assert robot.ask(nonsense) is None
+    assert robot.ask(b"p") == "0.0000,0.0000,0.0000"
+
+
+def test_kteam_speaks_in_lines_units_and_pulses(talk):
+    robot = talk("kteam")
+    assert robot.ask(b"B\r\n") == "b,C,4\r\n"
+    assert robot.ask(b"D,147,147\r") == "d\r\n"
+    robot.wait(2.0)
+    assert robot.ask(b"E\r") == "e,147,147\r\n"
+    assert robot.truth()[0] == pytest.approx(0.1994, abs=0.004)
+    left, right = values(robot.ask(b"R\r")[2:])
+    assert left == right == pytest.approx(robot.truth()[0] / 6.781e-6, abs=1.0)
+    assert robot.ask(b"I\r") == "i\r\n"
+    assert robot.ask(b"R\r") == "r,0,0\r\n"
+    assert robot.ask(b"D,-50,50\r") == "d\r\n"
+    robot.wait(1.0)
+    assert robot.truth()[2] == pytest.approx(100 * 0.6781e-3 / 0.1054, abs=0.01)
+    assert robot.ask(b"G\r") == "g,1000,1000,1000,1000,1000\r\n"
+    assert robot.ask(b"U,4\r") == "u\r\n"
+    assert robot.ask(b"G\r") == "g,2000,2000,1000,2000,2000\r\n"
+    assert robot.ask(b"N\r").count(",") == 12
+    assert robot.ask(b"V,5\r") == "v,100\r\n"
+
+
+@pytest.mark.parametrize("line", [b"Q\r", b"D,1\r", b"D,a,b\r", b"V,99\r", b"\xff\r", b"d,1,1\r"])
+def test_kteam_answers_a_dollar_to_what_it_does_not_know(talk, line):
+    assert talk("kteam").ask(line) == "$\r\n"
+
+
+def test_kteam_puts_lines_together_and_takes_them_apart(talk):
+    robot = talk("kteam")
+    assert robot.ask(b"D,10") is None
+    assert robot.ask(b"0,100\rE") == "d\r\n"
+    assert robot.ask(b"\r\nB\r") == "e,0,0\r\nb,C,4\r\n"
+
+
+def test_the_motors_have_a_limit(talk):
+    robot = talk("kteam")
+    robot.say(b"D,99999,99999\r")
+    robot.wait(2.0)
+    robot.ask(b"E\r")
+    assert robot.ask(b"E\r") == "e,1200,1200\r\n"
+
+
+@pytest.mark.parametrize("speaks", ["park", "kteam"])
+def test_a_second_client_waits_until_the_first_has_gone(talk, speaks):
+    robot = talk(speaks)
+    question = {"park": b"p", "kteam": b"R\r"}[speaks]
+    second = robot.connect()
+    robot.say(question, second)
+    assert robot.heard(second) is None
+    assert robot.ask(question) is not None
+    robot.client.close()
+    for _ in range(3):  # the first goes, the second is let in, and heard
+        robot.serve()
+    assert robot.heard(second) is not None
+
+
+def test_silence_and_delay(talk):
+    robot = talk("park", faults={"silent_from_s": 1.0, "silent_for_s": 1.0, "delay_s": 0.05})
+    assert robot.ask(b"p") is None
+    robot.wait(0.05)
+    assert robot.heard() is not None
+    robot.say(b"d 10 0")
+    robot.wait(1.0)
+    robot.say(b"p")
+    robot.say(b"stop")
+    robot.wait(0.5)
+    assert robot.heard() is None
+    assert robot.truth()[0] > 0.12  # it drives on, for it heard nothing
+    robot.wait(0.6)
+    robot.say(b"p")
+    robot.wait(0.06)
+    assert robot.heard() is not None
+
+
+def test_a_battery_that_ends_stops_and_silences_it(talk):
+    robot = talk("kteam", faults={"battery": 0.5, "drain": 1800.0})
+    robot.say(b"D,100,100\r")
+    robot.wait(4.0)
+    assert 0 < int(robot.ask(b"V,5\r")[2:]) < 20 or robot.heard()
+    robot.wait(2.0)
+    before = robot.truth()
+    robot.wait(1.0)
+    assert robot.truth() == before
+    assert robot.ask(b"V,5\r") is None
+
+
+def test_odometry_drifts_and_commands_are_late_as_the_experiment_says(talk):
+    robot = talk("park", disturbance=Disturbance(odometry_drift=0.02, latency_s=0.2))
+    robot.say(b"d 20 0")
+    robot.wait(0.2)
+    assert robot.truth()[0] == 0.0
+    robot.wait(5.0)
+    error = np.array(values(robot.ask(b"p"))[:2]) - robot.truth()[:2]
+    assert 0.001 < np.abs(error).max() < 0.1  # 0.02 m per root metre, on one metre
+
+
+def test_addresses_that_cannot_be_had(talk):
+    held = talk("park").device.addresses[0].removeprefix("khepera4://")
+    for address, why in [
+        (f"khepera4-twin://{held}", "name another address"),
+        ("khepera4-twin://192.168.0.21", "loopback"),
+        ("khepera4-twin://127.0.0.1:99999", "name another address"),
+        ("khepera4-twin://127.0.0.1:port", "loopback"),
+    ]:
+        with pytest.raises(BodyError, match=why):
+            khepera4.open_device(DeviceRequest(request("khepera4", [address]), Faults()))
+    with pytest.raises(BodyError, match=r"R0: device: .*protocol"):
+        khepera4.open_device(DeviceRequest(request("khepera4", ["k"], device={"protocol": "morse"}), Faults()))
+
+
+@given(st.floats(-0.27, 0.27), st.floats(-2.0, 2.0))
+def test_units_and_their_inverse(v, turn):
+    back = protocol.twist(*protocol.units(v, turn))
+    assert back == pytest.approx((v, turn), abs=0.6781e-3 / 0.1054)
+
+
+def test_a_curve_too_fast_for_the_wheels_stays_that_curve():
+    left, right = protocol.units(2.0, 4.0)
+    assert max(left, right) == protocol.FASTEST
+    v, turn = protocol.twist(left, right)
+    assert turn / v == pytest.approx(2.0, rel=0.002)
+
+
+def test_ranges_in_metres_from_the_centre():
+    sound = protocol.sound_distance(np.array([0.0, 25.0, 250.0, 1000.0, 2000.0]))
+    assert sound == pytest.approx([0.32, 0.32, 2.57, np.nan, np.nan], nan_ok=True)
+    light = protocol.light_distance(np.array([1023.0, 1000.0, 250.0, 101.0, 100.0, 0.0]))
+    assert light == pytest.approx([0.07, 0.07, 0.1625, 0.2615, np.nan, np.nan], abs=0.001, nan_ok=True)

@@ -1,0 +1,269 @@
+"""The Tello twin by its protocol: answers are on the wire, motions are the model's, time is the device's own."""
+
+import select
+import socket
+
+import numpy as np
+import pytest
+
+from agents.body import BodyError, Disturbance, Jitter
+from tests.twins.loopback import request
+from twins import tello
+from twins.device import DeviceRequest, Faults
+
+DT = 0.01
+
+
+class Conversation:
+    """A client of one or more drones that lets their time pass tick by tick."""
+
+    def __init__(self, monkeypatch, rows=1, **parts):
+        self.states = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.states.bind(("127.0.0.1", 0))
+        monkeypatch.setattr(tello.protocol, "STATE_PORT", self.states.getsockname()[1])
+        faults = Faults(**parts.pop("faults", {}))
+        self.device = tello.open_device(DeviceRequest(request("tello", ["tello-twin"] * rows, **parts), faults))
+        self.wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.wire.bind(("127.0.0.1", 0))
+        self.tick = 0
+
+    def close(self):
+        for wire in (self.wire, self.states):
+            wire.close()
+        self.device.close()
+
+    def say(self, text, row=0):
+        drone = self.device.sockets()[row]
+        self.wire.sendto(text.encode(), drone.getsockname())
+        assert select.select([drone], [], [], 1.0)[0]
+        self.device.serve(drone, self.tick * DT)
+
+    def heard(self):
+        """The answer that is there, or None."""
+        return self.wire.recv(1024).decode() if select.select([self.wire], [], [], 0.0)[0] else None
+
+    def ask(self, text, row=0):
+        self.say(text, row)
+        return self.heard()
+
+    def wait(self, seconds):
+        """Lets time pass; the answers that came, each with when."""
+        answers = []
+        for _ in range(round(seconds / DT)):
+            self.tick += 1
+            self.device.advance(self.tick * DT)
+            while (answer := self.heard()) is not None:
+                answers.append((answer, self.tick * DT))
+        return answers
+
+    def state(self):
+        """The newest state line, as a table, and how many came."""
+        last, count = "", 0
+        while select.select([self.states], [], [], 0.0)[0]:
+            last, count = self.states.recv(1024).decode(), count + 1
+        return dict(field.split(":") for field in last.strip().strip(";").split(";") if field), count
+
+    def place(self, row=0):
+        return self.device.truth()[0][row]
+
+    def up(self):
+        assert self.ask("command") == "ok"
+        self.say("takeoff")
+        return self.wait(8.0)
+
+
+@pytest.fixture
+def talk(monkeypatch):
+    made = []
+
+    def begin(**parts):
+        made.append(Conversation(monkeypatch, **parts))
+        return made[-1]
+
+    yield begin
+    for each in made:
+        each.close()
+
+
+def test_it_is_silent_until_it_is_in_sdk_mode(talk):
+    drone = talk()
+    assert drone.ask("battery?") is None
+    drone.wait(1.0)
+    assert drone.state()[1] == 0
+    assert drone.ask("command") == "ok"
+    assert drone.ask("battery?") == "100\r\n"
+    assert drone.ask("sdk?") == "20\r\n"
+    drone.wait(1.0)
+    state, count = drone.state()
+    assert count == 10
+    assert (state["bat"], state["h"], state["time"], state["tof"], state["yaw"]) == ("100", "0", "0", "10", "0")
+
+
+def test_take_off_and_landing_are_answered_when_they_are_over(talk):
+    drone = talk()
+    [(answer, when)] = drone.up()
+    assert answer == "ok"
+    assert 2.0 < when < 6.0
+    assert drone.place()[2] == pytest.approx(0.8, abs=0.01)
+    drone.say("land")
+    begun = drone.tick * DT
+    [(answer, when)] = drone.wait(8.0)
+    assert answer == "ok"
+    assert when - begun > 1.0
+    assert drone.place()[2] == 0.0
+    assert drone.ask("land") == "error"
+
+
+def test_sticks_are_velocities_in_its_own_frame_until_they_change(talk):
+    drone = talk(yaw=np.pi / 2)  # its nose points along y
+    drone.up()
+    before = drone.place()
+    assert drone.ask("rc 0 50 0 0") is None
+    drone.wait(4.0)
+    after = drone.place()
+    # 0.5 m/s, reached with a time constant of 1/3 s: 4 s less that
+    assert after - before == pytest.approx([0.0, 0.5 * (4.0 - 1.0 / 3.0), 0.0], abs=0.02)
+    drone.say("rc 40 0 -10 0")
+    drone.wait(2.0)
+    drone.state()
+    drone.wait(0.1)
+    state, _ = drone.state()
+    assert (int(state["vgx"]), int(state["vgy"]), int(state["vgz"])) == (0, 4, 1)
+    drone.say("rc 0 0 0 50")  # clockwise
+    drone.wait(1.0)
+    assert drone.device.truth()[1][0] == pytest.approx(np.pi / 2 - np.radians(50.0), abs=1e-9)
+    drone.wait(0.05)
+    assert int(drone.state()[0]["yaw"]) == pytest.approx(52, abs=3)
+
+
+def test_moves_end_where_they_should(talk):
+    drone = talk()
+    drone.up()
+    begin = drone.place()
+    drone.say("go 50 -40 30 100")
+    assert [answer for answer, _ in drone.wait(5.0)] == ["ok"]
+    assert drone.place() - begin == pytest.approx([0.5, -0.4, 0.3], abs=0.035)
+    drone.say("ccw 90")
+    assert [answer for answer, _ in drone.wait(3.0)] == ["ok"]
+    assert drone.device.truth()[1][0] == pytest.approx(np.pi / 2, abs=0.02)
+    begin = drone.place()
+    drone.say("left 60")
+    assert [answer for answer, _ in drone.wait(5.0)] == ["ok"]
+    assert drone.place() - begin == pytest.approx([-0.6, 0.0, 0.0], abs=0.04)
+
+
+@pytest.mark.parametrize(
+    ("command", "answer"),
+    [
+        ("forward 10", "out of range"),
+        ("forward", "out of range"),
+        ("go 10 10 10 50", "error"),
+        ("go 501 0 0 50", "out of range"),
+        ("cw 361", "out of range"),
+        ("speed 5", "out of range"),
+        ("takeoff", "error"),
+        ("rc 0 0", "error"),
+        ("rc a b c d", "error"),
+        ("dance", "unknown command: dance"),
+        ("why?", "unknown command: why?"),
+        ("speed 50", "ok"),
+        ("stop", "ok"),
+    ],
+)
+def test_what_it_refuses_in_the_air(talk, command, answer):
+    drone = talk()
+    drone.up()
+    assert drone.ask(command) == answer
+
+
+def test_what_it_refuses_on_the_ground(talk):
+    drone = talk()
+    drone.ask("command")
+    assert drone.ask("forward 50") == "error Motor stop"
+    assert drone.ask("stop") == "error Motor stop"
+    assert drone.ask(" ") is None
+    assert drone.ask("\xff") == "unknown command: ??"
+
+
+def test_it_lands_by_itself_after_fifteen_seconds_without_a_command(talk):
+    drone = talk()
+    drone.up()
+    drone.wait(6.9)
+    assert drone.place()[2] == pytest.approx(0.8, abs=0.01)  # 14.9 s after the last command
+    drone.wait(0.4)
+    assert drone.place()[2] < 0.8
+    drone.wait(6.0)
+    assert drone.place()[2] == 0.0
+
+
+def test_the_emergency_stop_lets_it_fall(talk):
+    drone = talk()
+    drone.up()
+    assert drone.ask("emergency") == "ok"
+    drone.wait(0.5)
+    assert drone.place()[2] == 0.0
+
+
+def test_a_battery_that_ends_brings_it_down(talk):
+    weak = talk(faults={"battery": 0.08})
+    weak.ask("command")
+    assert weak.ask("takeoff") == "error"
+    drained = talk(faults={"battery": 0.12, "drain": 10.0})
+    drained.up()
+    drained.wait(6.0)
+    assert drained.place()[2] == 0.0
+    assert 0 <= int(drained.ask("battery?")) < 5
+    assert drained.ask("takeoff") == "error"
+
+
+def test_silence_loss_and_delay(talk):
+    drone = talk(faults={"silent_from_s": 1.0, "silent_for_s": 1.0, "delay_s": 0.2})
+    drone.say("command")
+    [(answer, when)] = drone.wait(0.5)
+    assert (answer, when) == ("ok", pytest.approx(0.2))
+    drone.wait(0.55)
+    drone.state()
+    assert drone.ask("battery?") is None
+    assert drone.wait(0.9) == []
+    assert drone.state()[1] == 1  # what had left before the silence
+    drone.wait(0.1)
+    drone.say("battery?")
+    assert len(drone.wait(0.5)) == 1
+    lossy = talk(faults={"loss": 0.5})
+    answers = [lossy.ask("command") for _ in range(200)]
+    assert 30 < answers.count("ok") < 70  # a quarter comes through both ways
+
+
+def test_disturbance_shows_in_the_truth(talk):
+    drone = talk(disturbance=Disturbance(hover_jitter=Jitter(0.02), latency_s=0.1))
+    drone.up()
+    places = []
+    for _ in range(300):
+        drone.wait(DT)
+        places.append(drone.place())
+    assert 0.002 < np.std(places, axis=0)[0] < 0.06
+
+
+def test_drones_have_addresses_of_their_own(talk):
+    pair = talk(rows=2)
+    assert len(set(pair.device.addresses)) == 2
+    assert all(address.startswith("tello://127.0.0.") for address in pair.device.addresses)
+    assert pair.ask("command", row=1) == "ok"
+    pair.say("takeoff", row=1)
+    pair.wait(3.0)
+    assert pair.place(0)[2] == 0.0
+    assert pair.place(1)[2] > 0.5
+
+
+def test_addresses_that_cannot_be_had(talk):
+    held = talk().device.addresses[0].removeprefix("tello://")
+    for address, why in [
+        (f"tello-twin://{held}", "in use"),
+        ("tello-twin://192.168.10.1", "loopback"),
+        ("tello-twin://kitchen", "IPv4"),
+        ("tello-twin://127.0.0.200:99999", "out of range"),
+    ]:
+        with pytest.raises(BodyError, match=why):
+            tello.open_device(DeviceRequest(request("tello", [address]), Faults()))
+    with pytest.raises(BodyError, match=r"R0: device: .*silence"):
+        tello.open_device(DeviceRequest(request("tello", ["tello-twin"], device={"silence": 1}), Faults()))

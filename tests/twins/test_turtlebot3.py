@@ -1,0 +1,343 @@
+"""The protocol twin of the TurtleBot3, heard and told by plain zenoh and rosbags."""
+
+import struct
+import time
+from math import inf, pi
+
+import numpy as np
+import pytest
+import zenoh
+from rosbags.typesys import Stores, get_typestore
+from zenoh.handlers import RingChannel
+
+from agents.body import BodyError, Disturbance
+from agents.session import open_session
+from tests.bridges.turtlebots import request
+from tests.conftest import RouterProcess
+from twins.device import DeviceRequest, Faults
+from twins.turtlebot3 import open_device
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+KINDS = {
+    "odom": "nav_msgs/msg/Odometry",
+    "scan": "sensor_msgs/msg/LaserScan",
+    "battery_state": "sensor_msgs/msg/BatteryState",
+}
+COMMANDS = {"humble": "geometry_msgs/msg/Twist", "jazzy": "geometry_msgs/msg/TwistStamped"}
+HASHES = {
+    "nav_msgs/msg/Odometry": "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    "sensor_msgs/msg/LaserScan": "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
+    "sensor_msgs/msg/BatteryState": "RIHS01_4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741",
+    "geometry_msgs/msg/TwistStamped": "RIHS01_5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
+}
+
+
+@pytest.fixture(scope="module")
+def hub():
+    made = RouterProcess()
+    yield made
+    made.stop()
+
+
+def key_of(style, distro, topic, kind):
+    """A key as the two middlewares publish it."""
+    if style == "ros2dds":
+        return f"TB0/{topic}"
+    package, _, name = kind.split("/")
+    code = "TypeHashNotSupported" if distro == "humble" else HASHES[kind]
+    return f"0/TB0/{topic}/{package}::msg::dds_::{name}_/{code}"
+
+
+class Listener:
+    """A ROS application without ROS; it moves the twin's clock by hand."""
+
+    def __init__(self, session, twin, style="ros2dds", distro="jazzy", wait=None):
+        self.session, self.twin, self.style, self.wait = session, twin, style, wait
+        self.t, self.inbox = 0.0, {topic: [] for topic in KINDS}
+        self.subscribers = {
+            topic: session.declare_subscriber(key_of(style, distro, topic, kind), RingChannel(1000))
+            for topic, kind in KINDS.items()
+        }
+        self.kind = COMMANDS[distro]
+        self.publisher = session.declare_publisher(key_of(style, distro, "cmd_vel", self.kind))
+        self.sent = 0
+
+    def ready(self):
+        """Both ends of every topic have found each other."""
+        self.wait(lambda: self.publisher.matching_status.matching)
+        self.wait(lambda: self.advance(0.05) or self.inbox["odom"])
+        return self
+
+    def advance(self, seconds):
+        for _ in range(round(seconds * 100)):
+            self.t += 0.01
+            self.twin.advance(self.t)
+        self.take()
+
+    def take(self):
+        for topic, subscriber in self.subscribers.items():
+            while (sample := subscriber.try_recv()) is not None:
+                self.inbox[topic].append(
+                    (STORE.deserialize_cdr(sample.payload.to_bytes(), KINDS[topic]), sample.attachment)
+                )
+
+    def count(self, seconds, topic="odom"):
+        """How many messages of a topic so many seconds of the twin bring, when all have arrived."""
+        self.settle()
+        before = {name: len(box) for name, box in self.inbox.items()}
+        self.advance(seconds)
+        self.settle()
+        return len(self.inbox[topic]) - before[topic]
+
+    def settle(self):
+        """Whatever was under way has arrived: a query to and fro on the same links is slower than a sample."""
+        for _ in range(2):
+            list(self.session.liveliness().get("nobody/**", timeout=1.0))
+        self.take()
+
+    def tell(self, v, w, kind=None):
+        made = STORE.types
+        vector = lambda x, z: made["geometry_msgs/msg/Vector3"](x=x, y=0.0, z=z)  # noqa: E731
+        kind = kind or self.kind
+        message = made["geometry_msgs/msg/Twist"](linear=vector(v, 0.0), angular=vector(0.0, w))
+        if kind.endswith("Stamped"):
+            stamp = made["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
+            message = made[kind](header=made["std_msgs/msg/Header"](stamp=stamp, frame_id=""), twist=message)
+        self.put(bytes(STORE.serialize_cdr(message, kind)))
+
+    def put(self, raw):
+        self.sent += 1
+        self.publisher.put(raw, attachment=struct.pack("<qqB16s", self.sent, time.time_ns(), 16, bytes(range(16))))
+
+    def obeyed(self, count):
+        self.wait(lambda: self.advance(0.01) or self.twin.heard[0] >= count)
+
+
+@pytest.fixture
+def listen(hub, eventually):
+    opened = []
+
+    def make(faults=None, style="ros2dds", distro="jazzy", ready=True, **kinds):
+        device = {"style": style, "distro": distro} | kinds.pop("device", {})
+        twin = open_device(DeviceRequest(request(hub.endpoint, device=device, **kinds), faults or Faults()))
+        session = open_session([hub.endpoint], name="listener")
+        opened.extend([twin, session])
+        listener = Listener(session, twin, style, distro, eventually)
+        return listener.ready() if ready else listener
+
+    yield make
+    for each in opened:
+        each.close()
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("distro", ["humble", "jazzy"])
+@pytest.mark.parametrize("style", ["ros2dds", "rmw"])
+def test_says_what_turtlebot3_node_says(listen, style, distro):
+    listener = listen(style=style, distro=distro)
+    assert listener.count(4.0) == 80
+    listener.inbox["scan"].clear()
+    assert listener.count(4.0, "scan") == 20
+    assert listener.count(4.0, "battery_state") == 4
+    odometry, attachment = listener.inbox["odom"][-1]
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_footprint")
+    assert (odometry.pose.pose.position.x, odometry.pose.pose.orientation.w) == (0.0, 1.0)
+    scan = listener.inbox["scan"][-1][0]
+    assert len(scan.ranges) == 360
+    assert np.isinf(scan.ranges).all()
+    assert scan.angle_increment == pytest.approx(pi / 180.0)
+    battery = listener.inbox["battery_state"][-1][0]
+    assert 99.0 < battery.percentage < 100.0  # per cent, as the robot does and ROS does not want
+    assert battery.voltage == pytest.approx(12.3, abs=0.01)
+    if style == "ros2dds":
+        assert attachment is None
+    else:
+        numbers = [struct.unpack("<qqB16s", a.to_bytes()) for _, a in listener.inbox["odom"]]
+        assert {(size, gid) for _, _, size, gid in numbers} == {(16, numbers[0][3])}
+        assert np.diff([sequence for sequence, *_ in numbers]).tolist() == [1] * (len(numbers) - 1)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("distro", ["humble", "jazzy"])
+@pytest.mark.parametrize("style", ["ros2dds", "rmw"])
+def test_obeys_its_type_of_command_and_no_other(listen, style, distro):
+    listener = listen(style=style, distro=distro)
+    wrong = COMMANDS["jazzy" if distro == "humble" else "humble"]
+    listener.tell(0.2, 0.0, wrong)
+    listener.put(b"")
+    listener.put(b"\0\1\0\0rubbish")
+    listener.tell(float("nan"), 0.0)
+    listener.tell(0.1, 0.0)
+    listener.obeyed(1)
+    listener.advance(1.0)
+    assert listener.twin.heard == [1]
+    listener.settle()
+    assert listener.inbox["odom"][-1][0].twist.twist.linear.x == pytest.approx(0.1)
+
+
+@pytest.mark.system
+def test_cuts_and_limits_speeds_and_holds_them(listen):
+    listener = listen()
+    for command, made in (((0.139, -0.999), (0.13, -0.99)), ((0.29, 0.0), (0.22, 0.0)), ((0.0, -9.0), (0.0, -2.84))):
+        count = listener.twin.heard[0]
+        listener.tell(*command)
+        listener.obeyed(count + 1)
+        listener.advance(5.0)  # no watchdog: one command is for ever
+        listener.settle()
+        twist = listener.inbox["odom"][-1][0].twist.twist
+        assert (twist.linear.x, twist.angular.z) == pytest.approx(made, abs=1e-5)
+
+
+@pytest.mark.system
+def test_a_watchdog_stops_it(listen):
+    listener = listen(device={"watchdog_s": 0.5})
+    listener.tell(0.2, 0.0)
+    listener.obeyed(1)
+    listener.advance(1.0)
+    before = listener.twin.truth()[0]
+    assert 0.08 < before[0, 0] < 0.13  # half a second at 0.2 m/s, and rolling out
+    listener.advance(1.0)
+    np.testing.assert_array_equal(listener.twin.truth()[0], before)
+
+
+@pytest.mark.system
+def test_odometry_counts_from_where_it_starts(listen):
+    listener = listen(start=((1.0, -2.0),), yaw=(2.0,))
+    listener.tell(0.2, 0.5)
+    listener.obeyed(1)
+    listener.advance(3.0)
+    listener.settle()
+    (position,), (yaw,) = listener.twin.truth()
+    odometry = listener.inbox["odom"][-1][0].pose.pose
+    turned = 2.0 * np.arctan2(odometry.orientation.z, odometry.orientation.w)
+    c, s = np.cos(2.0), np.sin(2.0)
+    x, y = odometry.position.x, odometry.position.y
+    placed = np.array([1.0 + c * x - s * y, -2.0 + s * x + c * y])
+    assert np.linalg.norm(placed - position[:2]) < 0.012  # at most 50 ms old
+    assert abs(turned - (yaw - 2.0)) < 0.03
+    assert np.linalg.norm(position[:2] - [1.0, -2.0]) > 0.3
+
+
+@pytest.mark.system
+def test_odometry_drifts_and_truth_does_not(listen):
+    listener = listen(disturbance=Disturbance(odometry_drift=0.05))
+    listener.tell(0.2, 0.0)
+    listener.obeyed(1)
+    listener.advance(10.0)
+    listener.settle()
+    (position,), _ = listener.twin.truth()
+    place = listener.inbox["odom"][-1][0].pose.pose.position
+    assert abs(position[1]) < 1e-9
+    assert 0.005 < np.hypot(place.x - position[0], place.y) < 0.3
+
+
+@pytest.mark.system
+def test_its_scanner_sees_what_it_is_shown(listen):
+    listener = listen(start=((0.0, 0.0),), yaw=(pi / 2,))
+
+    def wall(position, yaw, bearing):  # at x = 1
+        with np.errstate(divide="ignore"):
+            away = (1.0 - position[0]) / np.cos(bearing)
+        return np.where(away > 0.0, away, inf)
+
+    listener.twin.sight = wall
+    listener.advance(0.5)
+    listener.settle()
+    scan = listener.inbox["scan"][-1][0]
+    nearest = int(np.argmin(scan.ranges))
+    assert nearest == 270  # to its right
+    assert scan.ranges[nearest] == pytest.approx(1.0)
+    assert np.isinf(scan.ranges[0])  # along the wall
+    assert scan.ranges[270 + 60] == pytest.approx(2.0)
+    assert np.isinf(scan.ranges[270 + 80])  # 5.8 m: out of reach
+
+
+@pytest.mark.system
+def test_announces_itself(listen, eventually):
+    for style, pattern, role, topic, wanted in (
+        ("rmw", "@ros2_lv/0/**", 5, 9, "NN MS%TB0%cmd_vel MP%TB0%odom MP%TB0%scan MP%TB0%battery_state"),
+        ("ros2dds", "@/*/@ros2_lv/**", 3, 4, "MSTB0§cmd_vel MPTB0§odom MPTB0§scan MPTB0§battery_state"),
+    ):
+        session = listen(style=style).session
+
+        def announced(session=session, pattern=pattern, role=role, topic=topic):
+            replies = session.liveliness().get(pattern, timeout=1.0)
+            tokens = [str(reply.ok.key_expr).split("/") for reply in replies]
+            return {parts[role] + "".join(parts[topic : topic + 1]) for parts in tokens}
+
+        eventually(lambda announced=announced, wanted=wanted: announced() == set(wanted.split()))
+
+
+# ---------------------------------------------------------------------- faults
+
+
+@pytest.mark.system
+def test_loss_is_a_share_of_what_it_says_and_hears(listen):
+    listener = listen(faults=Faults(loss=0.3))
+    count = listener.count(20.0)
+    assert 0.6 < count / 400 < 0.8
+    for _ in range(20):
+        for _ in range(10):
+            listener.tell(0.0, 0.0)
+        listener.settle()
+        listener.advance(0.01)
+    assert 0.55 < listener.twin.heard[0] / 200 < 0.85
+
+
+@pytest.mark.system
+def test_delay_is_of_what_it_says(listen):
+    listener = listen(faults=Faults(delay_s=0.5), ready=False)
+    assert listener.count(0.5) == 0
+    assert listener.count(0.5) == 10
+
+
+@pytest.mark.system
+def test_silence_is_of_both_directions_and_ends(listen):
+    listener = listen(ready=True)
+    listener.twin._faults = Faults(silent_from_s=listener.t + 1.0, silent_for_s=2.0)
+    listener.tell(0.1, 0.0)
+    listener.obeyed(1)
+    assert listener.count(1.0) <= 20
+    assert listener.count(1.5) == 0
+    listener.tell(0.0, 0.0)
+    listener.settle()
+    listener.advance(0.1)
+    assert listener.twin.heard == [1]
+    assert listener.twin.truth()[0][0, 0] > 0.2  # it went on
+    assert listener.count(1.5) >= 20
+
+
+@pytest.mark.system
+def test_an_empty_battery(listen):
+    listener = listen(faults=Faults(battery=0.5, drain=900.0))
+    listener.advance(4.0)
+    listener.settle()
+    charges = [battery.percentage for battery, _ in listener.inbox["battery_state"]]
+    assert np.diff(charges) == pytest.approx([-10.0] * (len(charges) - 1), abs=0.2)
+    listener.advance(6.0)
+    listener.settle()
+    assert listener.inbox["battery_state"][-1][0].percentage == 0.0
+
+
+@pytest.mark.system
+def test_wrong_settings_are_named(hub):
+    with pytest.raises(BodyError, match=r"TB0: device: .*`colour`"):
+        open_device(DeviceRequest(request(hub.endpoint, device={"colour": 1}), Faults()))
+
+
+@pytest.mark.system
+def test_the_session_is_gone_when_it_is_closed(hub, eventually):
+    twin = open_device(DeviceRequest(request(hub.endpoint), Faults()))
+    with open_session([hub.endpoint], name="listener") as session:
+        seen = session.liveliness().declare_subscriber("@/*/@ros2_lv/**", RingChannel(64), history=True)
+        alive = set()
+
+        def tokens():
+            while (sample := seen.try_recv()) is not None:
+                (alive.add if sample.kind == zenoh.SampleKind.PUT else alive.discard)(str(sample.key_expr))
+            return len(alive)
+
+        eventually(lambda: tokens() == 4)
+        assert twin.sockets() == ()
+        twin.close()
+        eventually(lambda: tokens() == 0)

@@ -1,0 +1,364 @@
+"""The Vicon twin: what the vendor's own client and ours read from it, and what it does when things go wrong."""
+
+from __future__ import annotations
+
+import json
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from agents.protocols import datastream
+from agents.protocols.datastream import Framer, Kind, Malformed, Segment
+from bridges.datastream import Decoder, Frame, Reader
+from tests.conftest import ROOT, RouterProcess
+from tests.twins.camera import Camera
+from twins.device import Faults
+from twins.vicon import ViconTwin, upright
+
+# the vendor's client, in a process of its own: it holds the interpreter, and never returns from a dead server
+VENDOR = """
+import json, os, sys
+import motioncapture
+vicon = motioncapture.connect("vicon", {"hostname": sys.argv[1]})
+for _ in range(10):
+    vicon.waitForNextFrame()
+bodies = vicon.rigidBodies
+print(json.dumps({name: [*map(float, body.position), *(getattr(body.rotation, part) for part in "wxyz")]
+                  for name, body in bodies.items()}), flush=True)
+os._exit(0)
+"""
+
+
+def rotation(w: float, x: float, y: float, z: float) -> np.ndarray:
+    """Rotation matrix of a quaternion."""
+    w, x, y, z = np.array([w, x, y, z]) / np.sqrt(w * w + x * x + y * y + z * z)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def read(port: int, frames: int = 1) -> list[Frame]:
+    reader = Reader("127.0.0.1", port)
+    try:
+        found = [reader.newest(2.0) for _ in range(frames)]
+    finally:
+        reader.close()
+    assert all(frame is not None for frame in found)
+    return [frame for frame in found if frame is not None]
+
+
+# ---------------------------------------------------------------------- the wire format
+
+
+finite = st.floats(-50.0, 50.0)
+bodies = st.lists(st.tuples(finite, finite, finite, st.lists(finite, min_size=9, max_size=9)), max_size=5)
+
+
+@given(bodies, st.integers(0, 2**32 - 1), st.integers(1, 40))
+def test_what_is_packed_is_unpacked_however_it_is_cut(
+    bodies: list[tuple[float, float, float, list[float]]], number: int, cut: int
+) -> None:
+    sent = [Segment(0, (x, y, z), tuple(turn)) for x, y, z, turn in bodies]
+    stream = datastream.packet(
+        datastream.pack_axes(),
+        *(datastream.pack_subject(row, f"körper {row}") for row in range(len(sent))),
+        datastream.pack_frame_number(number),
+        datastream.pack_latency([("a", 0.25), ("b", 0.125)]),
+        *(datastream.pack_segments(row, [segment]) for row, segment in enumerate(sent)),
+    )
+    framer, decoder = Framer(), Decoder()
+    packets = [body for at in range(0, 2 * len(stream), cut) for body in framer.feed((stream * 2)[at : at + cut])]
+    assert len(packets) == 2
+    for body in packets:
+        frame = decoder.frame(body)
+        assert frame is not None
+        assert (frame.number, frame.latency_s, frame.z_up) == (number, 0.375, True)
+        assert list(frame.poses) == [f"körper {row}" for row in range(len(sent))]
+        for seen, placed in zip(frame.poses.values(), sent, strict=True):
+            assert seen is not None
+            assert seen.position == pytest.approx(placed.position, abs=1e-12)
+            assert seen.rotation == placed.rotation
+
+
+@given(st.binary(max_size=200), st.integers(0, 400), st.integers(0, 255))
+def test_damage_is_malformed_and_nothing_else(noise: bytes, at: int, value: int) -> None:
+    honest = datastream.packet(
+        datastream.pack_subject(0, "CF01"),
+        datastream.pack_frame_number(1),
+        datastream.pack_latency([("all", 0.002)]),
+        datastream.pack_segments(0, [Segment(0, (1.0, 2.0, 3.0), (1.0,) * 9)]),
+    )
+    damaged = bytearray(honest)
+    damaged[at % len(honest)] = value
+    for stream in (noise, bytes(damaged), datastream.block(datastream.MAGIC, noise), honest[: at % len(honest)]):
+        decoder = Decoder()
+        try:
+            for body in Framer().feed(stream):
+                decoder.frame(body)
+                for _, payload in datastream.blocks(body):
+                    datastream.unpack_kinds(payload)
+        except Malformed:
+            pass  # anything else would fail the test
+
+
+def test_the_root_segment_is_the_pose_of_a_subject_and_new_names_replace_the_old() -> None:
+    def subject(number: int, name: str, segments: list[tuple[int, int]]) -> bytes:
+        def text(words: str) -> bytes:
+            return len(words).to_bytes(4, "little") + words.encode()
+
+        parts = [
+            parent.to_bytes(4, "little") + segment.to_bytes(4, "little") + bytes(24) + text("part")
+            for parent, segment in segments
+        ]
+        payload = number.to_bytes(4, "little") + text(name) + len(parts).to_bytes(4, "little") + b"".join(parts)
+        return datastream.block(Kind.SUBJECT_INFO, payload + bytes(8))
+
+    near, far = Segment(7, (1.0, 0.0, 0.0), (0.0,) * 9), Segment(3, (2.0, 0.0, 0.0), (0.0,) * 9)
+    moved = datastream.pack_frame_number(5) + datastream.pack_segments(1, [near, far])
+    decoder = Decoder()
+    root = datastream.NO_PARENT
+    assert decoder.frame(subject(1, "arm", [(root, 3), (3, 7)]) + subject(2, "leg", [(root, 0)])) is None
+    first = decoder.frame(moved)
+    assert first is not None
+    assert first.poses == {"arm": far, "leg": None}
+    again = decoder.frame(subject(1, "hand", [(7, 3), (root, 7)]) + moved)
+    assert again is not None
+    assert again.poses == {"hand": near}
+
+
+# ---------------------------------------------------------------------- the twin
+
+
+@pytest.mark.system
+@pytest.mark.skipif(find_spec("motioncapture") is None, reason="needs motioncapture, the vendor's client in a wheel")
+def test_the_vendors_client_and_ours_read_the_same_poses() -> None:
+    placed = {
+        "exact": ([1.25, -0.5, 0.75], [1.0, 0.0, 0.0, 0.0]),  # these have no error as single precision either
+        "high": ([0.0, 2.0, 1.5], [0.5, 0.5, 0.5, 0.5]),
+        "tilted": ([0.123456789, -1.987654321, 0.314159265], [0.9, 0.1, -0.2, 0.3]),
+    }
+    with Camera(list(placed)) as camera:
+        for name, (position, quaternion) in placed.items():
+            camera.place(name, position, rotation=rotation(*quaternion))
+        (frame,) = read(camera.port)
+        vendor = subprocess.run(
+            [sys.executable, "-c", VENDOR, camera.twin.address], capture_output=True, text=True, timeout=20, check=True
+        )
+    theirs = json.loads(vendor.stdout)
+    assert theirs.keys() == frame.poses.keys() == placed.keys()
+    for name, (position, quaternion) in placed.items():
+        ours = frame.poses[name]
+        assert ours is not None
+        assert ours.position == pytest.approx(position, abs=1e-12)
+        np.testing.assert_allclose(np.array(ours.rotation).reshape(3, 3), rotation(*quaternion), atol=1e-12)
+        # that wheel hands out single precision: to the last bit of it they are the same
+        np.testing.assert_array_equal(np.float32(theirs[name][:3]), np.float32(ours.position))
+        turned = rotation(*theirs[name][3:]).ravel()
+        np.testing.assert_allclose(turned, ours.rotation, atol=1e-9 if name in ("exact", "high") else 3e-7)
+    for name in ("exact", "high"):
+        assert theirs[name][:3] == pytest.approx(placed[name][0], abs=1e-9)
+
+
+@pytest.mark.system
+def test_clients_come_and_go_and_a_slow_one_holds_nobody_up() -> None:
+    with Camera(["CF01"], rate_hz=250.0) as camera:
+        camera.place("CF01", [0.1, 0.2, 0.3], 0.5)
+        slow = socket.create_connection(("127.0.0.1", camera.port))
+        slow.sendall(datastream.packet(datastream.block(Kind.REQUEST_FRAME, b"\x01")))
+        rude = socket.create_connection(("127.0.0.1", camera.port))
+        rude.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        for _ in range(3):
+            numbers = [frame.number for frame in read(camera.port, 20)]
+            assert numbers == sorted(set(numbers))
+            assert numbers[-1] - numbers[0] < 60
+        rude.settimeout(2.0)
+        heard = b""
+        while part := rude.recv(4096):  # it is told what there is, and then left
+            heard += part
+        assert heard == datastream.pack_kinds(datastream.POSES)
+        slow.close()
+        rude.close()
+
+
+@pytest.mark.system
+def test_a_client_may_ask_for_single_frames() -> None:
+    with Camera(["CF01"]) as camera, socket.create_connection(("127.0.0.1", camera.port), 2.0) as client:
+        camera.place("CF01", [1.0, 2.0, 3.0])
+        framer, decoder, frames = Framer(), Decoder(), []
+        ask = datastream.packet(datastream.block(Kind.REQUEST_NEXT_FRAME))
+        for wanted in (1, 2):
+            client.sendall(ask)
+            while len(frames) < wanted:
+                bodies = framer.feed(client.recv(65536))
+                frames += [frame for body in bodies if (frame := decoder.frame(body)) is not None]
+        client.settimeout(0.05)
+        with pytest.raises(TimeoutError):
+            client.recv(65536)
+        assert [list(frame.poses) for frame in frames] == [["CF01"], ["CF01"]]
+
+
+@pytest.mark.system
+def test_a_delayed_frame_comes_late_and_as_it_was() -> None:
+    twin = ViconTwin(["CF01"], faults=Faults(delay_s=0.05))
+    with socket.create_connection(("127.0.0.1", int(twin.address.rpartition(":")[2])), 2.0) as client:
+        listener = twin.sockets()[0]
+        select.select([listener], [], [], 2.0)
+        twin.serve(listener, 0.0)
+        client.sendall(datastream.packet(datastream.block(Kind.REQUEST_FRAME, b"\x01")))
+        select.select(twin.sockets(), [], [], 2.0)
+        twin.serve(twin.sockets()[1], 0.0)
+        offer = datastream.pack_kinds(datastream.POSES)
+        assert client.recv(65536) == offer
+        for t, height in ((0.01, 1.0), (0.02, 2.0), (0.055, 3.0)):
+            twin.place(0, np.array([0.0, 0.0, height]), upright(0.0))
+            twin.advance(t)
+        client.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            client.recv(65536)
+        twin.advance(0.061)
+        client.settimeout(2.0)
+        (body,) = Framer().feed(client.recv(65536))
+        frame = Decoder().frame(body)
+        assert frame is not None
+        assert frame.number == 1
+        assert frame.poses["CF01"] is not None
+        assert frame.poses["CF01"].position == (0.0, 0.0, 1.0)
+    twin.close()
+
+
+@pytest.mark.system
+def test_occlusion_and_silence_come_when_they_should() -> None:
+    faults = {"occluded_from_s": 0.2, "occluded_for_s": 0.3}
+    with Camera(["CF01"], faults=faults) as camera:
+        camera.place("CF01", [0.0, 0.0, 1.0])
+        frames = read(camera.port, 70)
+    seen = {frame.number: frame.poses["CF01"] is not None for frame in frames}
+    hidden = [number for number, visible in seen.items() if not visible]
+    assert min(hidden) == pytest.approx(20, abs=2)
+    assert max(hidden) == pytest.approx(50, abs=2)
+    assert len(hidden) == pytest.approx(30, abs=4)
+    with Camera(["CF01"], faults={"silent_from_s": 0.3}) as camera:
+        reader = Reader("127.0.0.1", camera.port)
+        last = None
+        while (frame := reader.newest(0.3)) is not None:
+            last = frame
+        reader.close()
+    assert last is not None
+    assert last.number == pytest.approx(30, abs=2)
+
+
+@pytest.mark.system
+def test_noise_has_the_size_that_was_asked_for() -> None:
+    with Camera(["CF01"], rate_hz=1000.0, sigma=0.001, rng=np.random.default_rng(3)) as camera:
+        camera.place("CF01", [0.3, -0.3, 1.0])
+        frames = read(camera.port, 200)
+    seen = [segment.position for frame in frames if (segment := frame.poses["CF01"]) is not None]
+    error = np.array(seen) - [0.3, -0.3, 1.0]
+    assert error.std(axis=0) == pytest.approx([0.001] * 3, rel=0.25)
+    assert np.abs(error.mean(axis=0)).max() < 4e-4
+
+
+# ---------------------------------------------------------------------- the process
+
+
+@pytest.fixture
+def process(router: RouterProcess) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "twins.vicon", "--robots", "CF01", "KH01", "--connect", router.endpoint]
+    made = subprocess.Popen(
+        [*command, "--sigma", "0", "--rate", "200", "--lifeline"],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    yield made
+    assert made.stdin is not None
+    assert made.stdout is not None
+    made.stdin.close()
+    made.stdout.close()
+    if made.poll() is None:
+        made.kill()
+    made.wait(10)
+
+
+@pytest.mark.system
+def test_the_process_shows_the_truth_that_it_hears(process: subprocess.Popen[str], router: RouterProcess) -> None:
+    assert process.stdout is not None
+    said = process.stdout.readline()
+    assert said.startswith("vicon ready on 127.0.0.1:")
+    keys = Keys()
+    with network.open_session([router.endpoint], name="test") as session:
+        truth = network.publisher(session, keys.truth("CF01"), wire.JSON)
+        reader = Reader("127.0.0.1", int(said.rpartition(":")[2]))
+        deadline = time.monotonic() + 5.0
+        seen = None
+        while seen is None and time.monotonic() < deadline:
+            truth.put(wire.encode(wire.Position("CF01", time.time() - 0.02, (0.4, -0.2, 0.9), 0.7)))
+            session.put(keys.truth("KH01"), b"{}", encoding=wire.JSON)
+            frame = reader.newest(1.0)
+            assert frame is not None
+            assert frame.poses["KH01"] is None
+            seen = frame.poses["CF01"]
+        assert seen is not None
+        assert seen.position == pytest.approx((0.4, -0.2, 0.9), abs=1e-12)
+        assert np.arctan2(seen.rotation[3], seen.rotation[0]) == pytest.approx(0.7, abs=1e-12)
+        assert 0.02 <= frame.latency_s < 0.3
+        while seen is not None and time.monotonic() < deadline:  # silence is no place
+            frame = reader.newest(1.0)
+            assert frame is not None
+            seen = frame.poses["CF01"]
+        assert seen is None
+        reader.close()
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(5) == 0
+
+
+@pytest.mark.system
+def test_the_process_ends_with_its_starter_but_not_before_the_robots(
+    process: subprocess.Popen[str], router: RouterProcess
+) -> None:
+    assert process.stdin is not None
+    assert process.stdout is not None
+    said = process.stdout.readline()
+    reader = Reader("127.0.0.1", int(said.rpartition(":")[2]))
+    with network.open_session([router.endpoint], name="robot") as session:
+        token = network.alive_token(session, Keys().alive("KH01"))
+        process.stdin.close()
+        for _ in range(40):
+            assert reader.newest(1.0) is not None
+        assert process.poll() is None
+        token.undeclare()  # type: ignore[no-untyped-call]
+        assert process.wait(5) == 0
+    reader.close()
+
+
+@pytest.mark.system
+def test_what_a_user_can_mend_is_said_without_a_traceback() -> None:
+    endpoint = network.free_endpoint(preferred_port=0)
+    for arguments, words in (
+        (["--listen", "801"], "is not HOST:PORT"),
+        (["--faults", '{"occluded": 1}'], "occluded"),
+        (["--rate", "0"], "--rate is 1 to 1000 Hz"),
+    ):
+        command = [sys.executable, "-m", "twins.vicon", "--robots", "CF01", "--connect", endpoint, *arguments]
+        ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20, check=False)
+        assert ended.returncode == 2
+        assert words in ended.stderr
+        assert "Traceback" not in ended.stderr
