@@ -8,6 +8,7 @@ from __future__ import annotations
 import select
 import socket
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
@@ -87,6 +88,7 @@ class Reader:
         """
         deadline = time.monotonic() + timeout_s
         self._framer, self._decoder = Framer(), Decoder()
+        self._waiting: deque[bytes] = deque()  # packets that came with the server's first word
         self._socket = socket.create_connection((host, port), timeout_s)
         self._socket.setblocking(False)
         try:
@@ -112,7 +114,9 @@ class Reader:
         """
         deadline = time.monotonic() + timeout_s
         while True:
-            frames = [frame for body in self._drain() if (frame := self._decoder.frame(body)) is not None]
+            self._drain()
+            bodies, self._waiting = self._waiting, deque()
+            frames = [frame for body in bodies if (frame := self._decoder.frame(body)) is not None]
             if frames:
                 return frames[-1]
             if not self._readable(deadline):
@@ -126,8 +130,9 @@ class Reader:
         while True:
             if not self._readable(deadline):
                 raise TimeoutError("it is silent")
-            for body in self._drain():
-                for kind, payload in datastream.blocks(body):
+            self._drain()
+            while self._waiting:
+                for kind, payload in datastream.blocks(self._waiting.popleft()):
                     if kind == Kind.OBJECT_ENUMS:
                         return datastream.unpack_kinds(payload)
 
@@ -136,14 +141,13 @@ class Reader:
         waiting.register(self._socket, select.POLLIN)
         return bool(waiting.poll(1000.0 * max(0.0, deadline - time.monotonic())))
 
-    def _drain(self) -> list[bytes]:
-        """Bodies of all packets that have arrived."""
-        bodies: list[bytes] = []
+    def _drain(self) -> None:
+        """Takes in all packets that have arrived."""
         while True:
             try:
                 received = self._socket.recv(CHUNK)
             except BlockingIOError:
-                return bodies
+                return
             if not received:
                 raise ConnectionResetError("the server has closed the connection")
-            bodies += self._framer.feed(received)
+            self._waiting += self._framer.feed(received)

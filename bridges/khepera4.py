@@ -16,7 +16,7 @@ from agents.protocols.settings import settings
 from agents.rows import Array, Index
 from bridges.khepera4_link import Address, Link
 
-OPEN_S: Final = 4.0  # for the first odometry of a robot
+OPEN_S: Final = 3.0  # for the first odometry of a robot
 
 
 class KheperaBody:

@@ -330,6 +330,8 @@ class Link:
     def _converse(self, driver: Driver) -> None:
         """One connection, until it breaks or the process ends."""
         driver.begin()
+        driver.drive(0.0, 0.0)
+        driver.move(self._odometer)  # before it moves: one that counts from zero has been switched on anew
         period = 1.0 / self._settings.poll_hz
         ranges_due = battery_due = due = time.monotonic()
         while not self._ending.wait(max(0.0, due - time.monotonic())):

@@ -185,7 +185,11 @@ class Flight:
 
     def doubt(self) -> None:
         """The link has been gone for so long that the firmware has cut the motors, if setpoints were streamed."""
-        if self.phase is not Phase.STOPPED:
+        if self.airborne:
+            alone = self.phase is Phase.FLYING and self._settings.control == "high-level"
+            self.trouble = (
+                "out of reach: it may still hover, by itself" if alone else "out of reach: its motors are off"
+            )
             self._enter(Phase.GROUND)
 
     def resume(self) -> bool:

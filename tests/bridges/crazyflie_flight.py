@@ -77,7 +77,7 @@ class Process:
 
 @contextmanager
 def flown(rows=1, *, device=None, external=False, start=None, serve=None, **faults):
-    """Twins of Crazyflies, and a process that is connected to them; `serve` are the twins' settings if not the robots'."""
+    """Twins of Crazyflies, and a process that is connected to them; `serve`: settings of the twins, if others."""
     asked = request("crazyflie", ["crazyflie-twin"] * rows, device=serve or device, external=external, start=start)
     with Served(open_device, asked, **faults) as twin:
         body = request("crazyflie", twin.addresses, device=device, external=external, start=start)

@@ -13,6 +13,7 @@ from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import Served, request
 from twins.crazyflie import open_device
 from twins.crazyflie.supervisor import State
+from twins.device import Faults
 
 RADIO = "radio://0/80/2M/E7E7E7E70{}"
 
@@ -24,70 +25,56 @@ def toc_cache(monkeypatch, tmp_path_factory):
 
 
 @pytest.mark.system
-def test_five_percent_loss():
-    """In both directions: it connects, flies, lands."""
-    with flown(loss=0.05) as (twin, process):
-        process.takeoff(0.3)
-        process.setpoint = [(0.3, 0.0, 0.4, 0.0)]
-        process.until(lambda: np.abs(truth(twin) - [0.3, 0.0, 0.4]).max() < 0.03, "goal")
-        process.land()
-        assert supervised(twin) != State.LOCKED
-
-
-@pytest.mark.system
-def test_silence_for_good():
-    """Nothing gets through any more: the firmware cuts the motors by itself, the bridge says that the link is lost."""
-    with flown(silent_from_s=3.0) as (twin, process):
-        process.takeoff(0.3)
-        process.setpoint = [(0.0, 0.0, 0.3, 0.0)]
-        process.until(lambda: "no pose for" in process.state.notes[0], "silence noticed")
-        process.until(lambda: supervised(twin) == State.LOCKED, "motors cut")
-        process.until(lambda: not process.state.flying[0], "given up")
-        assert truth(twin)[2] == 0.0
-        assert process.t - process.state.time[0] > 0.5  # the robot's loop sees how old its position is
-
-
-@pytest.mark.system
-def test_silence_that_ends():
-    """On the ground: a fresh connection, and nothing to say any more."""
-    with flown(silent_from_s=0.7, silent_for_s=1.5) as (_, process):
-        process.until(lambda: "link lost" in process.state.notes[0], "lost")
-        process.until(lambda: process.state.notes[0] == "" and process.t - process.state.time[0] < 0.3, "back")
-
-
-@pytest.mark.system
-def test_silence_in_the_air():
-    """Shorter than the firmware's patience: connected again, it is landed."""
-    with flown(silent_from_s=3.0, silent_for_s=1.3) as (twin, process):
-        process.takeoff(0.3)
-        process.setpoint = [(0.0, 0.0, 0.3, 0.0)]
-        process.until(lambda: "link lost" in process.state.notes[0], "lost")
-        process.until(lambda: not process.state.flying[0], "landed")
-        assert truth(twin)[2] == 0.0
-        assert not twin.device.flock.quadrotor.flying[0]
-
-
-@pytest.mark.system
-def test_one_is_killed_the_other_flies_on():
-    first = Served(open_device, request("crazyflie", ["crazyflie-twin"]))
-    second = Served(open_device, request("crazyflie", ["crazyflie-twin"], start=[[0.0, 1.0, 0.0]]))
-    process = Process(open_crazyflie(request("crazyflie", [first.addresses[0], second.addresses[0]])))
+def test_each_fails_in_its_own_way_and_the_others_fly_on():
+    """In one process: one is well, one loses 5 % of all packets; one falls silent for good, one for a moment, the battery
+    of one runs empty, and one is killed: these end on the ground with their motors off.
+    """
+    well, lossy, mute, blinking, empty, killed = range(6)
+    twin = Served(open_device, request("crazyflie", ["crazyflie-twin"] * 5))
+    other = Served(open_device, request("crazyflie", ["crazyflie-twin"], start=[[0.0, 5.0, 0.0]]))
+    lines = twin.device.lines
+    lines[lossy].faults = Faults(loss=0.05)
+    process = Process(open_crazyflie(request("crazyflie", [*twin.addresses, *other.addresses])))
     try:
         process.takeoff(0.3)
-        process.setpoint = [(0.0, 0.0, 0.3, 0.0), (0.0, 1.0, 0.3, 0.0)]
-        process.run(0.2)
-        first.kill()
-        process.until(lambda: process.state.notes[0] != "", "said so")
-        process.setpoint = [(np.nan,) * 4, (0.3, 1.0, 0.3, 0.0)]
-        process.until(lambda: not process.state.flying[0], "given up")
-        process.until(lambda: abs(truth(second)[0] - 0.3) < 0.02, "goal")
-        assert process.state.flying[1]
-        assert process.state.notes[1] == ""
-        process.cut()
+        process.setpoint = [(0.0, float(row), 0.3, 0.0) for row in range(6)]
+        process.run(0.3)
+        lines[mute].faults = Faults(silent_from_s=0.0)
+        lines[blinking].faults = Faults(silent_from_s=lines[blinking].t, silent_for_s=1.2)
+        twin.device.flock.charge[empty] = 0.16
+        other.kill()
+        process.setpoint[well] = (0.3, float(well), 0.3, 0.0)
+        process.setpoint[lossy] = (0.3, float(lossy), 0.3, 0.0)
+        said: list[set[str]] = [set() for _ in range(6)]
+
+        def settled():
+            for row, note in enumerate(process.state.notes):
+                said[row].add(note)
+            return not process.state.flying[mute:].any()
+
+        process.until(settled, "those that fail are down")
+        assert [supervised(twin, row) == State.LOCKED for row in range(5)] == [False, False, True, False, False]
+        assert not twin.device.flock.quadrotor.flying[mute:].any()
+        assert truth(twin, mute)[2] == truth(twin, blinking)[2] == truth(twin, empty)[2] == 0.0
+        assert any("no pose for" in note for note in said[mute])
+        assert any("link lost" in note for note in said[blinking])
+        assert any("landed it: battery low" in note for note in said[empty])
+        assert any("link lost" in note for note in said[killed])
+        assert process.t - process.state.time[mute] > 0.5  # the robot's loop sees how old its position is
+        assert said[well] == {""}
+        assert process.state.flying[: lossy + 1].all()
+        process.until(
+            lambda: abs(truth(twin, well)[0] - 0.3) < 0.03 and abs(truth(twin, lossy)[0] - 0.3) < 0.03, "goals"
+        )
+        assert process.t - process.state.time[well] < 0.5
+        process.body.takeoff(np.array([empty]), np.array([0.5]))
+        process.until(lambda: "does not take off: battery low" in process.state.notes[empty], "refusal")
+        process.body.stop(np.arange(6))
+        process.until(lambda: not process.state.flying.any(), "motors off")
     finally:
         process.close()
-        first.kill()
-        second.kill()
+        twin.kill()
+        other.kill()
 
 
 @pytest.mark.system
@@ -103,21 +90,6 @@ def test_loop_that_stops_commanding():
             pause.wait(0.02)
         assert supervised(twin) != State.LOCKED
         assert "nobody commanded" in process.tick().notes[0]
-
-
-@pytest.mark.system
-def test_battery_runs_empty():
-    """It lands by itself, and does not take off again."""
-    with flown(battery=0.18, drain=5.0) as (twin, process):
-        process.takeoff(0.3)
-        process.setpoint = [(0.0, 0.0, 0.3, 0.0)]
-        process.until(lambda: not process.state.flying[0], "landed")
-        assert truth(twin)[2] == 0.0
-        assert supervised(twin) != State.LOCKED
-        assert process.state.battery[0] < 0.17
-        process.body.takeoff(np.array([0]), np.array([0.5]))
-        process.until(lambda: "does not take off: battery low" in process.state.notes[0], "refusal")
-        assert not process.state.flying[0]
 
 
 @pytest.mark.system

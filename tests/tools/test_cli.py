@@ -43,6 +43,8 @@ def test_commands():
                 "keys",
                 "echo",
                 "hz",
+                "twin",
+                "bridge",
             ]
         )
         == COMMANDS

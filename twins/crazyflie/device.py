@@ -27,7 +27,14 @@ Peer = tuple[str, int]
 
 
 class Line:
-    """The link of one Crazyflie: its socket, its client, and its losses."""
+    """The link of one Crazyflie: its socket, its client, and its losses.
+
+    Attributes:
+        socket: Where its packets arrive.
+        peer: Its client, None before the first packet.
+        faults: What goes wrong on it.
+        t: Now [s].
+    """
 
     def __init__(self, random: np.random.Generator, request: DeviceRequest) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -36,7 +43,7 @@ class Line:
         self.socket.setblocking(False)
         self.peer: Peer | None = None
         self.t = 0.0
-        self._faults, self._random = request.faults, random
+        self.faults, self._random = request.faults, random
         self._waiting: deque[tuple[float, bytes]] = deque()
 
     @property
@@ -46,14 +53,14 @@ class Line:
 
     def lost(self) -> bool:
         """Whether the packet at hand never arrives."""
-        faults = self._faults
+        faults = self.faults
         return faults.silent(self.t) or (faults.loss > 0.0 and self._random.random() < faults.loss)
 
     def send(self, port: Port, channel: int, data: bytes) -> None:
         """One packet to the client, if there is one."""
         packet = bytes((header(port, channel),)) + data
-        if self._faults.delay_s > 0.0:
-            self._waiting.append((self.t + self._faults.delay_s, packet))
+        if self.faults.delay_s > 0.0:
+            self._waiting.append((self.t + self.faults.delay_s, packet))
         else:
             self._put(packet)
 
@@ -91,6 +98,7 @@ class CrazyflieTwin:
         addresses: One per row.
         flock: What moves.
         drones: The protocol of each row.
+        lines: The link of each row.
     """
 
     def __init__(self, request: DeviceRequest) -> None:
@@ -99,10 +107,10 @@ class CrazyflieTwin:
         if strange:
             raise BodyError(f"a Crazyflie's twin flies no {', '.join(strange)}; name another body")
         self.flock = Flock(body, request.faults)
-        self._lines = [Line(np.random.default_rng([seed, row]), request) for row, seed in enumerate(body.seeds)]
-        self.drones = [Drone(self.flock, row, line.send) for row, line in enumerate(self._lines)]
-        self.addresses = tuple(line.address for line in self._lines)
-        self._row = {line.socket: row for row, line in enumerate(self._lines)}
+        self.lines = [Line(np.random.default_rng([seed, row]), request) for row, seed in enumerate(body.seeds)]
+        self.drones = [Drone(self.flock, row, line.send) for row, line in enumerate(self.lines)]
+        self.addresses = tuple(line.address for line in self.lines)
+        self._row = {line.socket: row for row, line in enumerate(self.lines)}
 
     def sockets(self) -> Sequence[socket.socket]:
         """See `Device.sockets`."""
@@ -111,7 +119,7 @@ class CrazyflieTwin:
     def serve(self, ready: socket.socket, t: float) -> None:
         """See `Device.serve`."""
         row = self._row[ready]
-        line, drone = self._lines[row], self.drones[row]
+        line, drone = self.lines[row], self.drones[row]
         line.t = t
         for _ in range(AT_ONCE):
             packet = line.receive()
@@ -128,7 +136,7 @@ class CrazyflieTwin:
     def advance(self, t: float) -> None:
         """See `Device.advance`."""
         locked = self.flock.advance(t)
-        for line, drone in zip(self._lines, self.drones, strict=True):
+        for line, drone in zip(self.lines, self.drones, strict=True):
             line.t = t
             if locked[drone.row]:
                 drone.console("SUP: Locked, reboot required\n")
@@ -141,7 +149,7 @@ class CrazyflieTwin:
 
     def close(self) -> None:
         """See `Device.close`."""
-        for line in self._lines:
+        for line in self.lines:
             line.socket.close()
 
 
