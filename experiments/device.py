@@ -23,6 +23,7 @@ import zenoh
 
 from agents import plugins, wire
 from agents import session as network
+from agents.body import BodyError
 from agents.keys import Keys
 from agents.kinds import KINDS
 from agents.lifeline import Lifeline
@@ -31,6 +32,14 @@ from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
 from twins.device import Device, DeviceRequest, Faults
 
+EXPLAINED: Final = (
+    DocumentError,
+    BodyError,
+    plugins.PluginError,
+    network.EndpointError,
+    network.Unreachable,
+    OSError,
+)
 AFTER_S: Final = 20.0  # how long robots may take to land after the launcher is gone
 
 
@@ -196,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return stand_in(chosen.file, chosen.names, faults=faults, connect=chosen.connect, lifeline=chosen.lifeline)
     except msgspec.MsgspecError as error:
         print(f"zenpark: --faults {chosen.faults}: {error}", file=sys.stderr)
-    except (DocumentError, plugins.PluginError, network.EndpointError, network.Unreachable, OSError) as error:
+    except EXPLAINED as error:
         print(f"zenpark: {error}", file=sys.stderr)
     return 2
 

@@ -60,7 +60,7 @@ class Process:
         rows = np.arange(len(self.tick().time))
         self.setpoint = None
         self.body.takeoff(rows, np.full(len(rows), height))
-        self.until(lambda: (np.abs(self.state.position[:, 2] - height) < 0.05).all(), "take-off")
+        self.until(lambda: bool((np.abs(self.state.position[:, 2] - height) < 0.05).all()), "take-off")
 
     def land(self):
         self.body.land(np.arange(len(self.state.time)))

@@ -26,8 +26,8 @@ def toc_cache(monkeypatch, tmp_path_factory):
 
 @pytest.mark.system
 def test_each_fails_in_its_own_way_and_the_others_fly_on():
-    """In one process: one is well, one loses 5 % of all packets; one falls silent for good, one for a moment, the battery
-    of one runs empty, and one is killed: these end on the ground with their motors off.
+    """In one process: one is well, one loses 5 % of all packets; one falls silent for good, one for a moment, one's
+    battery runs empty, and one is killed: these four end on the ground with their motors off.
     """
     well, lossy, mute, blinking, empty, killed = range(6)
     twin = Served(open_device, request("crazyflie", ["crazyflie-twin"] * 5))

@@ -5,6 +5,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from math import pi
@@ -189,9 +190,7 @@ def test_an_empty_namespace_two_domains_and_another_router(hub):
         raw = bytes(types.serialize_cdr(message, "nav_msgs/msg/Odometry"))
         body = TurtleBot3(request(hub.endpoint, addresses=("ros2dds://",), device={"origin": "boot"}))
         heard = session.declare_subscriber("cmd_vel", RingChannel(4))
-        from threading import Thread  # noqa: PLC0415
-
-        opening = Thread(target=body.open)
+        opening = threading.Thread(target=body.open)
         opening.start()
         while opening.is_alive():
             out.put(raw)
@@ -266,12 +265,10 @@ def test_ends_standing(hub, how):
         rows = np.array([0])
         if how == "close":
             stage.body.close()
-            pause = time.monotonic()
-            while time.monotonic() < pause + 0.1:
-                stage.body.stop(rows)  # nothing left to stop, and nothing is raised
+            threading.Event().wait(0.1)  # the twin lives on: it rolls out
             before = stage.place
-            while time.monotonic() < pause + 0.2:
-                stage.body.land(rows)
+            stage.body.stop(rows)  # nothing left to stop, and nothing is raised
+            threading.Event().wait(0.1)
             np.testing.assert_array_equal(stage.place, before)
             return
         getattr(stage.body, how)(rows)

@@ -15,7 +15,7 @@ def bootstrap(tmp_path, monkeypatch):
     loader = SourceFileLoader("bootstrap", str(ROOT / "zenpark"))
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader("bootstrap", loader))
     loader.exec_module(module)
-    for name in ("pyproject.toml", "requirements.lock", "requirements-dev.lock"):
+    for name in ("pyproject.toml", "requirements.lock", "requirements-hardware.lock", "requirements-dev.lock"):
         (tmp_path / name).write_bytes((ROOT / name).read_bytes())
     (tmp_path / ".venv" / "bin").mkdir(parents=True)
     (tmp_path / ".venv" / "bin" / "python").touch()
@@ -31,12 +31,12 @@ def locked(name):
 
 
 def test_locks_name_no_address():
-    for name in ("requirements.lock", "requirements-dev.lock"):
+    for name in ("requirements.lock", "requirements-hardware.lock", "requirements-dev.lock"):
         assert not re.search(r"https?:|--index|--extra-index|--find-links", (ROOT / name).read_text())
 
 
 def test_every_locked_package_has_hashes():
-    for name in ("requirements.lock", "requirements-dev.lock"):
+    for name in ("requirements.lock", "requirements-hardware.lock", "requirements-dev.lock"):
         text = re.sub(r"\\\n", "", (ROOT / name).read_text())
         assert all("--hash=sha256:" in line for line in text.splitlines() if not line.startswith("#"))
 
@@ -60,7 +60,9 @@ def test_ready_only_for_what_was_installed(bootstrap):
     assert bootstrap.ready("dev")
 
 
-@pytest.mark.parametrize("changed", ["pyproject.toml", "requirements.lock", "requirements-dev.lock"])
+@pytest.mark.parametrize(
+    "changed", ["pyproject.toml", "requirements.lock", "requirements-hardware.lock", "requirements-dev.lock"]
+)
 def test_a_changed_file_makes_it_stale(bootstrap, changed):
     bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} dev\n")
     with (bootstrap.ROOT / changed).open("a") as file:

@@ -1,0 +1,405 @@
+"""The external body: what it says on the network, what it believes, and a run in a simulator that is nobody's twin."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents import session as network
+from agents import wire
+from agents.body import BodyError, BodyRequest, Disturbance
+from agents.keys import Keys
+from agents.kinds import KINDS
+from bridges import external
+from bridges.external import ExternalBody, open_external
+from tests.conftest import ROOT, RouterProcess
+from tests.system.lab import Flight, RobotProcess, Watcher, until
+
+KEYS = Keys()
+PLACES = {"KH01": (-0.6, -0.5), "KH02": (0.6, -0.5), "CF01": (0.1, 0.6)}
+ROWS = {"CF01": "crazyflie", "TE01": "tello", "KH01": "khepera4"}
+
+
+def request(endpoint: str, rows: dict[str, str] = ROWS, **device: object) -> BodyRequest:
+    count = len(rows)
+    return BodyRequest(
+        names=tuple(rows),
+        kinds=tuple(KINDS[kind] for kind in rows.values()),
+        addresses=("external",) * count,
+        start=np.zeros((count, 3)),
+        yaw=np.full(count, 0.25),
+        rate_hz=100.0,
+        seeds=(1,) * count,
+        disturbance=(Disturbance(),) * count,
+        external=(False,) * count,
+        device=(device,) * count,
+        endpoints=(endpoint,),
+        keys=KEYS,
+    )
+
+
+class FarEnd:
+    """The other side, by hand: where each robot is, and what it was told."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.session = network.open_session([endpoint], name="far end")
+        self._subscriber = network.subscriber(self.session, KEYS.setpoint("*"), 4096)
+        self.told: list[wire.Command] = []
+        self.place = {name: [0.0, 0.0, 0.0] for name in ROWS}
+        self._quiet = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def say(self, name: str, position: list[float], *, stamp: float | None = None, yaw: float | None = 0.5) -> None:
+        text = {"robot": name, "stamp": time.time() if stamp is None else stamp, "position": position, "yaw": yaw}
+        self.session.put(KEYS.position(name), json.dumps(text), encoding="application/json")
+
+    def talk(self, *names: str) -> None:
+        """Says where they are, 100 times a second, in a thread, until `hush`."""
+
+        def run() -> None:
+            while not self._quiet.wait(0.01):
+                for name in names:
+                    self.say(name, self.place[name])
+
+        self._quiet.clear()
+        self._thread = threading.Thread(target=run)
+        self._thread.start()
+
+    def hush(self) -> None:
+        self._quiet.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def look(self) -> list[wire.Command]:
+        for sample in network.received(self._subscriber.handler):
+            self.told.append(wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Command))
+        return self.told
+
+    def actions(self, name: str, action: str) -> list[wire.Command]:
+        return [command for command in self.look() if (command.robot, command.action) == (name, action)]
+
+    def close(self) -> None:
+        self.hush()
+        self.session.close()  # type: ignore[no-untyped-call]
+
+
+@pytest.fixture
+def far(router: RouterProcess) -> Iterator[FarEnd]:
+    made = FarEnd(router.endpoint)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def body(router: RouterProcess, far: FarEnd) -> Iterator[ExternalBody]:
+    """Open, at the other end of `far`, which talks."""
+    far.talk(*ROWS)
+    made = open_external(request(router.endpoint))
+    made.open()
+    yield made
+    made.close()
+
+
+class Drive:
+    """Reads and commands, as the runtime does."""
+
+    def __init__(self, body: ExternalBody) -> None:
+        self.body = body
+        self.zero = time.monotonic()
+        self.silent = np.full((len(ROWS), 4), np.nan)
+
+    def until(self, true: Callable[[], object], what: str, setpoint: np.ndarray | None = None) -> None:
+        def tick() -> object:
+            self.state = self.body.read(time.monotonic() - self.zero)
+            self.body.command(self.silent if setpoint is None else setpoint)
+            return true()
+
+        until(tick, what, 15.0)
+
+
+# ---------------------------------------------------------------------- opening
+
+
+@pytest.mark.system
+def test_it_says_whose_position_is_missing_and_why(
+    router: RouterProcess, far: FarEnd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(external, "OPEN_S", 0.5)
+
+    def refusal(rows: dict[str, str]) -> str:
+        body = open_external(request(router.endpoint, rows))
+        with pytest.raises(BodyError) as caught:
+            body.open()
+        return str(caught.value)
+
+    far.talk("CF01")
+    lines = refusal({"CF01": "crazyflie", "TE01": "tello"})
+    assert lines == (
+        "TE01: nothing is published on park/TE01/position: is the simulator running and connected to "
+        f"{router.endpoint}?"
+    )
+    far.hush()
+    for message, words in (
+        ({"stamp": 12.5, "yaw": None}, "stamps are UTC seconds, not the time of the simulation"),
+        ({"stamp": time.time() - 7.0, "yaw": None}, "s ago by its stamp"),
+        ({"stamp": None, "yaw": None}, "no yaw, without which a robot on wheels cannot steer"),
+    ):
+        stop = threading.Event()
+
+        def run(message: dict[str, float | None] = message, stop: threading.Event = stop) -> None:
+            while not stop.wait(0.02):
+                far.say("KH01", [0.0, 0.0, 0.0], **message)  # type: ignore[arg-type]
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            assert words in refusal({"KH01": "khepera4"})
+        finally:
+            stop.set()
+            thread.join()
+
+
+@pytest.mark.system
+def test_what_is_no_position_is_said_and_so_are_settings_and_routers(
+    router: RouterProcess, far: FarEnd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(external, "OPEN_S", 0.5)
+    body = open_external(request(router.endpoint, {"CF01": "crazyflie"}))
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.wait(0.02):
+            far.session.put(KEYS.position("CF01"), b'{"x": 1.0}', encoding="application/json")
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        with pytest.raises(BodyError, match="what is published on park/CF01/position is no position: not a Position"):
+            body.open()
+    finally:
+        stop.set()
+        thread.join()
+    with pytest.raises(BodyError, match=r"CF01: device: .*`rate`.*has no settings"):
+        open_external(request(router.endpoint, {"CF01": "crazyflie"}, rate=5))
+    with pytest.raises(BodyError, match="CF01: no router answers at"):
+        open_external(request(network.free_endpoint(preferred_port=0), {"CF01": "crazyflie"})).open()
+
+
+# ---------------------------------------------------------------------- what it believes
+
+
+@pytest.mark.system
+def test_poses_are_as_they_were_said_and_grow_old(body: ExternalBody, far: FarEnd) -> None:
+    drive = Drive(body)
+    far.hush()
+    drive.until(lambda: drive.state.notes and drive.state.notes[0], "what was said before is old")
+    utc, clock = time.time(), time.monotonic() - drive.zero
+    for step in range(30):  # half a metre a second along x, with one frame that is elsewhere
+        jump = 3.0 if step == 20 else 0.0
+        far.say("CF01", [0.005 * step + jump, 0.0, 0.0], stamp=utc - 0.29 + 0.01 * step, yaw=None)
+    drive.until(lambda: drive.state.position[0, 0] >= 0.14, "the last of them is heard")
+    state = drive.state
+    assert state.position[0] == pytest.approx([0.145, 0.0, 0.0], abs=1e-12)
+    assert state.velocity[0] == pytest.approx([0.5, 0.0, 0.0], abs=0.05)
+    assert state.yaw == pytest.approx([0.5, 0.5, 0.5])
+    assert state.time[0] == pytest.approx(clock, abs=0.01)
+    assert np.isnan(state.true_position).all()
+    assert np.isnan(state.battery).all()
+    assert not state.flying.any()
+    old = state.time.copy()
+    drive.until(lambda: all("no position for" in note for note in drive.state.notes or ("",)), "they grow old")
+    np.testing.assert_allclose(drive.state.time, old, atol=0.02)
+    far.session.put(KEYS.position("CF01"), b"\xff\x00", encoding="application/json")
+    far.say("CF01", [float("nan"), 0.0, 0.0])
+    far.say("CF01", [0.0, 0.0, 0.0], stamp=time.time() + 3600.0)
+    far.session.put(KEYS.position("CF01"), b'{"robot":"KH01","stamp":1.0,"position":[0,0,0]}', encoding=wire.JSON)
+    drive.until(lambda: "4 positions refused" in drive.state.notes[0], "nonsense is counted")
+    assert drive.state.position[0] == pytest.approx([0.145, 0.0, 0.0], abs=1e-12)
+    far.talk(*ROWS)
+    drive.until(lambda: drive.state.position[0, 0] == 0.0 and "no position" not in drive.state.notes[0], "it is back")
+
+
+# ---------------------------------------------------------------------- what it says
+
+
+@pytest.mark.system
+def test_every_setpoint_is_said_once_and_rows_of_nan_are_left_alone(body: ExternalBody, far: FarEnd) -> None:
+    sent = np.arange(40.0).reshape(10, 1, 4) + 100.0 * np.arange(3).reshape(3, 1)
+    sent[:, 1] = np.nan
+    for setpoint in sent:
+        body.command(setpoint)
+    until(lambda: len(far.look()) >= 20, "they arrive", 5.0)
+    for row, name in ((0, "CF01"), (2, "KH01")):
+        drives = far.actions(name, "drive")
+        assert [command.setpoint for command in drives] == [tuple(values) for values in sent[:, row].tolist()]
+        assert [command.seq for command in drives] == list(range(1, 11))
+        assert all(abs(command.stamp - time.time()) < 5.0 for command in drives)
+    assert far.actions("TE01", "drive") == []
+
+
+@pytest.mark.system
+def test_orders_are_repeated_until_they_are_seen_to_be_obeyed(body: ExternalBody, far: FarEnd) -> None:
+    drive = Drive(body)
+    drive.until(lambda: True, "a first look")
+    rows = np.arange(3)
+    body.takeoff(rows, np.array([0.6, 0.8, 0.0]))
+    drive.until(lambda: len(far.actions("CF01", "takeoff")) >= 3, "takeoff is repeated")
+    assert drive.state.flying.tolist() == [True, True, False]
+    assert {(c.seq, c.height) for c in far.actions("CF01", "takeoff")} == {(1, 0.6)}
+    assert {c.height for c in far.actions("TE01", "takeoff")} == {0.8}
+    assert far.actions("KH01", "takeoff") == []
+    far.place["CF01"] = [0.0, 0.0, 0.3]
+    far.place["TE01"] = [0.0, 0.0, 0.3]
+    drive.until(lambda: drive.state.position[:2, 2].min() > 0.2, "they are up")
+    silent = len(far.actions("CF01", "takeoff"))
+    again = len(far.actions("TE01", "takeoff"))
+
+    body.land(rows)
+    drive.until(lambda: len(far.actions("CF01", "land")) >= 3, "land is repeated")
+    assert len(far.actions("CF01", "takeoff")) - silent <= 1
+    assert len(far.actions("TE01", "takeoff")) - again <= 1
+    assert drive.state.flying.tolist() == [True, True, False]
+    assert {c.seq for c in far.actions("CF01", "land")} == {2}
+    assert len(far.actions("KH01", "land")) >= 1
+    far.place["CF01"] = [0.0, 0.0, 0.01]
+    drive.until(lambda: not drive.state.flying[0], "one is down")
+    assert drive.state.flying.tolist() == [False, True, False]
+
+    body.stop(np.array([1, 2]))
+    moving = np.ones((3, 4))
+    drive.until(lambda: len(far.actions("TE01", "stop")) >= 5, "stop is repeated", moving)
+    assert not drive.state.flying.any()
+    assert {c.seq for c in far.actions("TE01", "stop")} == {3}
+    assert len(far.actions("KH01", "stop")) >= 5
+    assert far.actions("TE01", "drive") == far.actions("KH01", "drive") == []  # a stop is the last word
+    assert len(far.actions("CF01", "drive")) >= 5
+
+
+@pytest.mark.system
+def test_a_robot_that_lands_unseen_is_taken_for_down_in_the_end(
+    body: ExternalBody, far: FarEnd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(external, "LANDING_S", 1.0)
+    drive = Drive(body)
+    far.place["CF01"] = far.place["TE01"] = [0.0, 0.0, 0.0]
+    drive.until(lambda: True, "a first look")
+    body.takeoff(np.array([0, 1]), np.array([0.6, 0.6]))
+    far.place["CF01"] = far.place["TE01"] = [0.0, 0.0, 0.5]
+    drive.until(lambda: drive.state.position[:2, 2].min() > 0.4, "they are up")
+    far.hush()
+    far.talk("TE01")
+    body.land(np.array([0, 1]))
+    drive.until(lambda: not drive.state.flying[0], "nobody has seen it for long")
+    assert drive.state.flying[1]  # this one is seen, and does not come down
+    assert drive.state.notes[0].startswith("no position for")
+
+
+@pytest.mark.system
+def test_it_outlives_its_router(body: ExternalBody, far: FarEnd, router: RouterProcess) -> None:
+    drive = Drive(body)
+    drive.until(lambda: True, "a first look")
+    router.kill()
+    drive.until(lambda: drive.state.notes and drive.state.notes[0], "silence is noticed", np.ones((3, 4)))
+    before = len(far.look())
+    router.start()
+    drive.until(lambda: not any(drive.state.notes), "it is back", np.ones((3, 4)))
+    drive.until(lambda: len(far.look()) > before, "it is heard again", np.ones((3, 4)))
+
+
+# ---------------------------------------------------------------------- a stranger's simulator
+
+
+class Simulator:
+    """tests/bridges/simulator.py, which knows nothing of zenpark."""
+
+    def __init__(self, endpoint: str, *names: str) -> None:
+        takes = {"KH": "twist", "CF": "position", "TE": "velocity"}
+        robots = [f"{n}:{takes[n[:2]]}:{PLACES[n][0]}:{PLACES[n][1]}:0" for n in names]
+        environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        self.process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("simulator.py")), endpoint, *robots],
+            cwd="/",
+            env=environment,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == "ready\n"
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait(10)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def simulator(router: RouterProcess) -> Iterator[Simulator]:
+    made = Simulator(router.endpoint, *PLACES)
+    yield made
+    made.kill()
+
+
+def elsewhere(*names: str) -> list[str]:
+    return [part for name in names for part in ("--set", f'robots.{name}.body="external"')]
+
+
+def test_the_simulator_owes_nothing_to_zenpark() -> None:
+    text = Path(__file__).with_name("simulator.py").read_text()
+    imported = {line.split()[1] for line in text.splitlines() if line.startswith(("import", "from"))}
+    assert imported == {"json", "math", "sys", "time", "zenoh"}
+
+
+@pytest.mark.system
+def test_the_triangle_forms_up_in_a_strangers_simulator(
+    router: RouterProcess, simulator: Simulator, tmp_path: Path
+) -> None:
+    settings = [*elsewhere(*PLACES), "--set", f'network.connect=["{router.endpoint}"]', "--set", "duration_s=8"]
+    flight = Flight(tmp_path / "run", "triangle", "--json", "--case", "event", *settings)
+    code, out = flight.finish(60.0)
+    assert code == 0, out
+    robots = json.loads(out)["cases"]["event"]["robots"]
+    assert set(robots) == set(PLACES)
+    for robot in robots.values():
+        assert robot["acquired_s"] < 6.0
+        assert robot["lost"] == 0
+
+
+@pytest.mark.system
+def test_when_the_simulator_hangs_robots_land_and_the_others_stay(router: RouterProcess, tmp_path: Path) -> None:
+    flying = Simulator(router.endpoint, "CF01")
+    watcher = Watcher(router.endpoint)
+    file = ROOT / "experiments" / "catalogue" / "triangle.toml"
+    text = file.read_text().replace('kind = "crazyflie" ', 'body = "external"\nkind = "crazyflie" ')
+    assert "external" in text
+    changed = tmp_path / "triangle.toml"
+    changed.write_text(text)
+    robots = RobotProcess(router.endpoint, changed, "KH01", "KH02", "CF01")
+    try:
+        watcher.until(lambda: watcher.phase("CF01") == "ready", "it is ready")
+        assert watcher.order("CF01", wire.Order("takeoff")).ok
+        assert watcher.order("KH01", wire.Order("takeoff")).ok
+        watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
+        flying.process.send_signal(signal.SIGSTOP)
+        watcher.until(lambda: watcher.phase("CF01") == "landing", "silence is noticed")
+        assert watcher.status["CF01"].reason == "its own position is lost"
+        assert watcher.phase("KH01") == "airborne"
+        flying.process.send_signal(signal.SIGCONT)
+        watcher.until(lambda: watcher.phase("CF01") == "done", "it lands as soon as the simulator goes on")
+        assert watcher.state["CF01"].position[2] < 0.1
+        assert watcher.phase("KH01") == "airborne"
+    finally:
+        flying.process.send_signal(signal.SIGCONT)
+        robots.end()
+        flying.kill()
+        watcher.close()
