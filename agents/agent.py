@@ -236,7 +236,7 @@ class Agent:
                 self.told.tell(speak, t, state.position, state.velocity)
         setpoint = self._individual.setpoint(self.goal, self.toward, state.position, state.yaw)
         verdict = self._safety.check(setpoint, state.position, state.yaw, t - state.time)
-        self._escalate(verdict.blind, verdict.escaped)
+        self._escalate(verdict.blind, verdict.escaped, self._flies & ~state.flying)
         setpoint, changed = verdict.setpoint, verdict.changed
         if not self.life.all_running:
             phase = self.life.phase
@@ -319,11 +319,16 @@ class Agent:
         error = self.assignment.law.error(position, self.heard.position[self._live], self._live_links)
         self.error = self._live_links.onto_listeners(error[:, None], len(position))[:, 0]
 
-    def _escalate(self, blind: Mask, escaped: Mask) -> None:
-        """A flying robot that does not know where it is lands; one that left the arena lands or halts."""
-        if not (some(blind) or some(escaped)):
+    def _escalate(self, blind: Mask, escaped: Mask, grounded: Mask) -> None:
+        """A flying robot that does not know where it is lands; one that left the arena lands or halts.
+
+        One whose motors are off in mid-run has come down by itself: it must not be commanded as if it flew.
+        """
+        if not (some(blind) or some(escaped) or some(grounded)):
             return
-        active = self.life.active
+        active, phase = self.life.active, self.life.phase
+        for row in np.flatnonzero(grounded & (phase >= AIRBORNE) & (phase <= RUNNING)).tolist():
+            self.life.land(row, "it came down by itself")
         for row in np.flatnonzero(active & blind & self._flies).tolist():
             self.life.land(row, "its own position is lost")
         for row in np.flatnonzero(active & escaped).tolist():

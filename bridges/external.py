@@ -74,7 +74,8 @@ class ExternalBody:
         self._landing = np.full(rows, np.inf)  # since when
         self._ground = np.zeros(rows)
         self._stopped = np.zeros(rows, dtype=bool)
-        self._sent = [0] * rows
+        # so that numbers grow over restarts: a simulator that outlives this process knows new orders from old
+        self._sent = [round(1e3 * self._utc)] * rows
         self._standing: dict[int, _Standing] = {}
         self._repeat = 0.0
         self._trouble = [""] * rows

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -242,7 +243,7 @@ class Link:
 
     def _fail(self, text: str) -> None:
         lines = [line.strip() for line in str(text).splitlines() if line.strip()]
-        self._error = lines[-1] if lines else "lost"
+        self._error = re.sub(r"^\w+: ", "", lines[-1]) if lines else "lost"  # the last line of a traceback
 
 
 def _nothing() -> None:

@@ -21,6 +21,9 @@ STATUS: Final = {
     "pm.batteryLevel": "uint8_t",
     "pm.state": "int8_t",
     "lighthouse.status": "uint8_t",
+    "sys.canfly": "uint8_t",  # these three for firmwares from before the supervisor
+    "sys.isFlying": "uint8_t",
+    "sys.isTumbled": "uint8_t",
 }
 RANGES: Final = {f"range.{side}": "uint16_t" for side in ("front", "back", "left", "right", "up")}
 BEARING: Final = np.radians([0.0, 180.0, 90.0, -90.0, 0.0])
@@ -127,7 +130,7 @@ class Telemetry:
 
     def _status(self, t: float, values: Mapping[str, float]) -> None:
         board, row = self.board, self.row
-        board.info[row] = int(values.get("supervisor.info", 0))
+        board.info[row] = int(values["supervisor.info"]) if "supervisor.info" in values else _info(values)
         board.power[row] = int(values.get("pm.state", Power.BATTERY))
         level = values.get("pm.batteryLevel")
         volts = values.get("pm.vbat", nan)
@@ -139,3 +142,15 @@ class Telemetry:
         seen = (values.get(name, OUT_OF_REACH_MM) for name in RANGES)
         self.board.ranges[self.row] = [nan if mm >= OUT_OF_REACH_MM else MM * mm for mm in seen]
         self.board.scanned[self.row] = t
+
+
+def _info(values: Mapping[str, float]) -> Info:
+    """What a supervisor would say, from what firmwares without one do."""
+    info = Info(0)
+    if values.get("sys.canfly"):
+        info |= Info.ARMED | Info.CAN_FLY
+    if values.get("sys.isFlying"):
+        info |= Info.FLYING
+    if values.get("sys.isTumbled"):
+        info |= Info.TUMBLED
+    return info

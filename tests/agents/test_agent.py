@@ -458,6 +458,23 @@ def test_a_drone_that_left_the_arena_lands(moment):
     assert (swarm.phase("F"), swarm.agent("F").life.reason) == (LANDING, ["it left the arena"])
 
 
+def test_a_drone_whose_motors_stop_by_themselves_is_not_commanded_any_more():
+    swarm = drone()
+    swarm.running().run(0.2)
+    (group,) = swarm.groups
+
+    def down(t, state):
+        state.flying = np.zeros_like(state.flying)
+        return state
+
+    group.spoil = down
+    swarm.step()
+    assert (swarm.phase("F"), group.agent.life.reason) == (LANDING, ["it came down by itself"])
+    swarm.step()
+    assert np.isnan(swarm.row("F", "setpoint")).all()
+    assert swarm.phase("F") == DONE
+
+
 def test_a_ground_robot_that_does_not_know_where_it_is_stops_and_goes_on():
     swarm = Swarm(pair(), [["A"], ["B"]]).running().run(0.5)
     group, _ = swarm.where["A"]

@@ -17,7 +17,7 @@ class Robot:
     def __init__(self, session, text):
         self.name, self.takes, *numbers = text.split(":")
         self.x, self.y, self.yaw = map(float, numbers)
-        self.z, self.height, self.motors = 0.0, 0.0, self.takes == "twist"
+        self.z, self.height, self.motors = 0.0, 0.0, False
         self.setpoint, self.heard, self.done = None, 0.0, 0
         key = f"park/{self.name}/"
         self.commands = session.declare_subscriber(key + "setpoint", zenoh.handlers.RingChannel(100))
@@ -32,7 +32,7 @@ class Robot:
             if action == "drive":
                 self.setpoint, self.heard = order["setpoint"], now
             elif action == "takeoff":
-                self.motors, self.height, self.setpoint = True, order["height"], None
+                self.motors, self.height, self.setpoint, self.heard = True, order["height"], None, 0.0
             elif action == "land":
                 self.height, self.setpoint = 0.0, None
             else:
@@ -40,13 +40,17 @@ class Robot:
 
     def move(self, now):
         if self.takes == "twist":
-            v, w = self.setpoint[:2] if self.motors and self.setpoint and now - self.heard < 0.5 else (0.0, 0.0)
+            v, w = self.setpoint[:2] if self.setpoint and now - self.heard < 0.5 else (0.0, 0.0)
             self.yaw += w * DT
             self.x, self.y = self.x + v * math.cos(self.yaw) * DT, self.y + v * math.sin(self.yaw) * DT
             return
         if not self.motors:
             self.z = max(0.0, self.z - 3.0 * DT)
             return
+        if self.setpoint and now - self.heard > 0.5:  # nobody steers any more: hold, and after a while land
+            self.setpoint = None if self.takes == "velocity" else self.setpoint
+        if self.heard and now - self.heard > 3.0:
+            self.height, self.setpoint = 0.0, None
         vx, vy, vz = 0.0, 0.0, max(-0.5, min(0.5, 3.0 * (self.height - self.z)))
         if self.setpoint and self.takes == "velocity":
             vx, vy, vz = self.setpoint[:3]

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from agents.body import BodyError
+from agents.protocols.crtp import Info
 from bridges.crazyflie import open_crazyflie
+from bridges.crazyflie.telemetry import Board, Telemetry
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import Served, request
 from twins.crazyflie import open_device
@@ -162,6 +164,24 @@ def test_wrong_address(address):
 def test_wrong_settings(device, said):
     with pytest.raises(BodyError, match=said):
         open_crazyflie(request("crazyflie", [RADIO.format(1)], device=device))
+
+
+def test_firmware_without_supervisor():
+    """What older firmwares say instead is enough to take off and to land."""
+    board = Board(1)
+    telemetry = Telemetry(board, 0, lighthouse=False)
+    blocks = {}
+
+    class Old:
+        def log(self, name, _rate, variables, logged):
+            blocks[name] = variables, logged
+
+    telemetry.listen(Old(), log_hz=50.0, status_hz=10.0, ranges_hz=None)
+    blocks["status"][1](1.0, {"pm.vbat": 3.6, "pm.state": 3, "sys.canfly": 1, "sys.isFlying": 1, "sys.isTumbled": 0})
+    assert telemetry.info == Info.ARMED | Info.CAN_FLY | Info.FLYING
+    assert board.battery[0] == pytest.approx(0.5)
+    assert telemetry.low
+    assert telemetry.words() == "battery low"
 
 
 def test_two_at_one_address():

@@ -27,6 +27,7 @@ from tests.system.lab import Flight, RobotProcess, Watcher, until
 
 KEYS = Keys()
 PLACES = {"KH01": (-0.6, -0.5), "KH02": (0.6, -0.5), "CF01": (0.1, 0.6)}
+ALONE = {"TE01": (0.0, 0.0)}
 ROWS = {"CF01": "crazyflie", "TE01": "tello", "KH01": "khepera4"}
 
 
@@ -242,7 +243,8 @@ def test_every_setpoint_is_said_once_and_rows_of_nan_are_left_alone(body: Extern
     for row, name in ((0, "CF01"), (2, "KH01")):
         drives = far.actions(name, "drive")
         assert [command.setpoint for command in drives] == [tuple(values) for values in sent[:, row].tolist()]
-        assert [command.seq for command in drives] == list(range(1, 11))
+        assert [command.seq - drives[0].seq for command in drives] == list(range(10))
+        assert drives[0].seq > 1e3 * (time.time() - 60.0)  # and grow from one process to the next
         assert all(abs(command.stamp - time.time()) < 5.0 for command in drives)
     assert far.actions("TE01", "drive") == []
 
@@ -255,7 +257,8 @@ def test_orders_are_repeated_until_they_are_seen_to_be_obeyed(body: ExternalBody
     body.takeoff(rows, np.array([0.6, 0.8, 0.0]))
     drive.until(lambda: len(far.actions("CF01", "takeoff")) >= 3, "takeoff is repeated")
     assert drive.state.flying.tolist() == [True, True, False]
-    assert {(c.seq, c.height) for c in far.actions("CF01", "takeoff")} == {(1, 0.6)}
+    first = far.actions("CF01", "takeoff")[0].seq
+    assert {(c.seq, c.height) for c in far.actions("CF01", "takeoff")} == {(first, 0.6)}
     assert {c.height for c in far.actions("TE01", "takeoff")} == {0.8}
     assert far.actions("KH01", "takeoff") == []
     far.place["CF01"] = [0.0, 0.0, 0.3]
@@ -269,7 +272,7 @@ def test_orders_are_repeated_until_they_are_seen_to_be_obeyed(body: ExternalBody
     assert len(far.actions("CF01", "takeoff")) - silent <= 1
     assert len(far.actions("TE01", "takeoff")) - again <= 1
     assert drive.state.flying.tolist() == [True, True, False]
-    assert {c.seq for c in far.actions("CF01", "land")} == {2}
+    assert {c.seq for c in far.actions("CF01", "land")} == {first + 1}
     assert len(far.actions("KH01", "land")) >= 1
     far.place["CF01"] = [0.0, 0.0, 0.01]
     drive.until(lambda: not drive.state.flying[0], "one is down")
@@ -279,7 +282,7 @@ def test_orders_are_repeated_until_they_are_seen_to_be_obeyed(body: ExternalBody
     moving = np.ones((3, 4))
     drive.until(lambda: len(far.actions("TE01", "stop")) >= 5, "stop is repeated", moving)
     assert not drive.state.flying.any()
-    assert {c.seq for c in far.actions("TE01", "stop")} == {3}
+    assert {c.seq for c in far.actions("TE01", "stop")} == {first + 2}
     assert len(far.actions("KH01", "stop")) >= 5
     assert far.actions("TE01", "drive") == far.actions("KH01", "drive") == []  # a stop is the last word
     assert len(far.actions("CF01", "drive")) >= 5
@@ -324,7 +327,7 @@ class Simulator:
 
     def __init__(self, endpoint: str, *names: str) -> None:
         takes = {"KH": "twist", "CF": "position", "TE": "velocity"}
-        robots = [f"{n}:{takes[n[:2]]}:{PLACES[n][0]}:{PLACES[n][1]}:0" for n in names]
+        robots = [f"{n}:{takes[n[:2]]}:{':'.join(map(str, {**PLACES, **ALONE}[n]))}:0" for n in names]
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         self.process = subprocess.Popen(
             [sys.executable, str(Path(__file__).with_name("simulator.py")), endpoint, *robots],
@@ -402,4 +405,37 @@ def test_when_the_simulator_hangs_robots_land_and_the_others_stay(router: Router
         flying.process.send_signal(signal.SIGCONT)
         robots.end()
         flying.kill()
+        watcher.close()
+
+
+@pytest.mark.system
+def test_when_the_robots_process_dies_the_simulator_lands_it(router: RouterProcess, tmp_path: Path) -> None:
+    """What `docs/external-simulators.md` asks of a simulator, kept by ours."""
+    file = tmp_path / "alone.toml"
+    file.write_text(
+        'title = "alone"\n[arena]\nsize = [2.0, 2.0, 2.0]\n'
+        '[robots.TE01]\nkind = "tello"\nbody = "external"\nstart = [0.0, 0.0]\nhover = 0.6\n'
+    )
+    simulator = Simulator(router.endpoint, "TE01")
+    watcher = Watcher(router.endpoint)
+    positions = network.subscriber(watcher.session, KEYS.position("TE01"), 64)
+    height = [0.0]
+
+    def look() -> float:
+        for sample in network.received(positions.handler):
+            height[0] = json.loads(sample.payload.to_string())["position"][2]
+        return height[0]
+
+    robot = RobotProcess(router.endpoint, file, "TE01")
+    try:
+        watcher.until(lambda: watcher.phase("TE01") == "ready", "it is ready")
+        assert watcher.order("TE01", wire.Order("takeoff")).ok
+        watcher.until(lambda: watcher.phase("TE01") == "airborne", "it is up")
+        assert look() == pytest.approx(0.6, abs=0.06)
+        robot.kill()
+        until(lambda: look() < 0.02, "it is down")
+    finally:
+        if robot.process.returncode is None:
+            robot.end()
+        simulator.kill()
         watcher.close()

@@ -90,7 +90,7 @@ def test_takeoff_go_to_land():
 
 
 def test_it_lags_behind_the_planner():
-    """No feed-forward of velocity, and no more than 1 m/s: half a second behind, as the firmware's own controller is."""
+    """No feed-forward of velocity, and no more than 1 m/s: half a second behind, as the firmware itself."""
     wire = Wire().hovering()
     wire.go_to(2.0, 0.0, 1.0, 0.0, 4.0)
     worst, fastest = 0.0, 0.0

@@ -9,12 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.body import BodyError
+from agents.body import BodyError, Disturbance, Jitter
 from agents.protocols import crtp
 from agents.protocols.crtp import Log, Memory, Misc, Port, Safety, Status, Toc, header
 from tests.twins.crazyflie_wire import Wire
 from tests.twins.loopback import request
+from twins.body import TwinBody
 from twins.crazyflie import open_device
+from twins.crazyflie.flock import Flock
 from twins.crazyflie.memory import ANCHOR_PAGES, CALIBRATION, Memories
 from twins.crazyflie.tables import LOG_TABLE, LOGS, PARAMETER_TABLE, PARAMETERS
 from twins.device import DeviceRequest, Faults
@@ -327,6 +329,23 @@ def test_truth_and_lock_on_the_console():
         assert b"Locked" in said
         position, yaw = client.device.truth()
         assert (position.shape, yaw.shape) == ((1, 3), (1,))
+
+
+def test_nature_is_that_of_the_other_twin():
+    """Wobble and noise come out of the same models, with the same seeds, as in the robot's own process."""
+    nature = Disturbance(hover_jitter=Jitter(0.05), position_sigma=0.01, latency_s=0.1)
+    asked = request("crazyflie", ["x"], disturbance=nature)
+    flock, plain = Flock(asked, Faults()), TwinBody(asked)
+    plain.takeoff(np.array([0]), np.array([0.5]))
+    flock.planner.takeoff(0, 0.0, np.zeros(4), height=0.5, yaw=0.0, span=1.25)
+    noise = []
+    for tick in range(1, 401):
+        flock.advance(0.01 * tick)
+        state = plain.read(0.01 * tick)
+        noise.append(flock.estimate[0] - flock.place[0])
+    assert flock.place[0, :2] == pytest.approx(state.true_position[0, :2], abs=1e-3)
+    assert np.ptp([flock.place[0, 0], 0.0]) > 1e-3
+    assert np.std(noise) == pytest.approx(0.01, rel=0.1)
 
 
 def test_other_robots_and_wrong_settings():

@@ -145,7 +145,7 @@ class CrazyflieTwin:
 
     def truth(self) -> tuple[Array, Array]:
         """See `Device.truth`."""
-        return self.flock.quadrotor.position.copy(), self.flock.quadrotor.yaw.copy()
+        return self.flock.place.copy(), self.flock.quadrotor.yaw.copy()
 
     def close(self) -> None:
         """See `Device.close`."""

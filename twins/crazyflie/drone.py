@@ -188,7 +188,7 @@ class Drone:
         name, flock = PARAMETERS[number].name, self.flock
         if name == "kalman.resetEstimation" and value:
             place = np.array([self.value(f"kalman.initial{axis}") for axis in "XYZ"])
-            flock.estimator.reset(self.row, place - flock.quadrotor.position[self.row])
+            flock.estimator.reset(self.row, place - flock.place[self.row])
         elif name == "lighthouse.systemType" and value != before:
             flock.memories[self.row].forget_stations()
         elif name == "stabilizer.stop" and value:

@@ -10,14 +10,14 @@ from agents.body import BodyRequest
 from agents.protocols.crazyflie import Lighthouse, Loco, Outside, chosen
 from agents.protocols.crtp import Info, Power
 from agents.rows import Array, Mask
-from twins.body import CATCH_UP_S, ENDURANCE_S
+from twins.body import CATCH_UP_S, ENDURANCE_S, FULL_WOBBLE
 from twins.crazyflie.commander import Commander
 from twins.crazyflie.estimator import Estimator
 from twins.crazyflie.memory import Memories
 from twins.crazyflie.planner import Plan, Planner
 from twins.crazyflie.supervisor import Supervisor
 from twins.device import Faults
-from twins.disturbance import Measurement
+from twins.disturbance import HoverJitter, Latency, Measurement
 from twins.noise import Noise
 from twins.quadrotor import RESPONSES, Quadrotor
 
@@ -35,7 +35,8 @@ class Flock:
         quadrotor: Their motion.
         memories: Of each row.
         charge: (N,) of the batteries, 0 to 1.
-        estimate: (N, 3) where they believe to be [m].
+        place: (N, 3) where they are [m].
+        estimate: (N, 3) where they say to be [m].
         dt: Of a tick [s].
         t: Now [s].
     """
@@ -66,14 +67,18 @@ class Flock:
         spatial = np.ones((rows, 3))
         noise = Noise(request.names, request.seeds, "measurement", 4)
         self._measurement = Measurement(request.disturbance, spatial, noise)
+        wobble = Noise(request.names, request.seeds, "hover jitter", 2)
+        self._jitter = HoverJitter(request.disturbance, wobble, self.dt)
+        self._latency = Latency(request.disturbance, self.dt)
         response, kind = RESPONSES["crazyflie"], request.kinds[0]
         self._gain, self._turn_gain = np.array(response.position), kind.turn_response
         self.estimator.error[~self._on_board] = -self.quadrotor.position[~self._on_board]
-        self.estimate = self.quadrotor.position + self.estimator.error
+        self.place = self.quadrotor.position.copy()
+        self.estimate = self.place + self.estimator.error
 
     def pose(self, row: int) -> Array:
         """(4,) where a row believes to be: x, y, z [m], yaw [rad]."""
-        return np.append(self.estimate[row], self.quadrotor.yaw[row])
+        return np.append(self.quadrotor.position[row] + self.estimator.error[row], self.quadrotor.yaw[row])
 
     def voltage(self, row: int) -> float:
         """Of a row's battery [V]."""
@@ -137,19 +142,24 @@ class Flock:
         quadrotor.stop(np.flatnonzero(quadrotor.flying & ~self._spinning()))
         quadrotor.flying[self._spinning()] = True
         setpoint = commander.wanted(
-            self.estimate,
+            quadrotor.position + self.estimator.error,
             quadrotor.velocity,
             quadrotor.yaw,
             level=supervisor.level,
             gain=self._gain,
             turn_gain=self._turn_gain,
         )
-        setpoint[:, :3] -= self.estimate - quadrotor.position  # the controller flies the estimate, not the truth
-        quadrotor.command(setpoint)
+        setpoint[:, :3] -= self.estimator.error  # the controller flies the estimate, not the truth
+        quadrotor.command(self._latency.pass_on(setpoint) if self._latency.present else setpoint)
         quadrotor.advance()
+        self.place = quadrotor.position.copy()
+        if self._jitter.present:
+            self._jitter.advance()
+            share = np.minimum(quadrotor.position[:, 2] / FULL_WOBBLE, 1.0)
+            self.place[:, :2] += share[:, None] * self._jitter.displacement
         np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
-        self.estimator.advance(t, self.dt, quadrotor.position, self.ready())
-        self.estimate = quadrotor.position + self.estimator.error
+        self.estimator.advance(t, self.dt, self.place, self.ready())
+        self.estimate = self.place + self.estimator.error
         if self._measurement.present:
             self.estimate = self.estimate + self._measurement.draw()[:, :3]
         return locked

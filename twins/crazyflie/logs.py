@@ -135,8 +135,8 @@ def _variables(flock: Flock, row: int, parameter: Callable[[str], float]) -> dic
         "stabilizer.yaw": lambda: math.degrees(_wrap(quadrotor.yaw[row])),
         "stateEstimate.qz": lambda: math.sin(0.5 * quadrotor.yaw[row]),
         "stateEstimate.qw": lambda: math.cos(0.5 * quadrotor.yaw[row]),
-        "range.up": lambda: _in_reach(ROOM[2] - quadrotor.position[row, 2]),
-        "range.zrange": lambda: _in_reach(quadrotor.position[row, 2]),
+        "range.up": lambda: _in_reach(ROOM[2] - flock.place[row, 2]),
+        "range.zrange": lambda: _in_reach(flock.place[row, 2]),
         "pm.vbat": lambda: flock.voltage(row),
         "pm.vbatMV": lambda: crtp.SECONDS_MS * flock.voltage(row),
         "pm.batteryLevel": lambda: 100.0 * float(flock.charge[row]),
@@ -163,7 +163,7 @@ def _wrap(angle: float) -> float:
 
 def _distance(flock: Flock, row: int, bearing: float) -> float:
     """From a row to the wall in the direction `bearing` of its nose [mm]."""
-    x, y, _ = flock.quadrotor.position[row]
+    x, y, _ = flock.place[row]
     angle = float(flock.quadrotor.yaw[row]) + bearing
     ahead = []
     for place, way, wall in ((x, math.cos(angle), ROOM[0]), (y, math.sin(angle), ROOM[1])):

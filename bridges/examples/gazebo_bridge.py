@@ -1,0 +1,64 @@
+"""Untested: lends robots with differential drive in Gazebo (gz-transport 13) to zenpark as bodies `external`."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+PATIENCE_S = 0.5  # without a new setpoint a robot stops
+
+
+def heading(q: Any) -> float:  # noqa: ANN401 - a gz.msgs.Quaternion
+    """Yaw [rad] of a quaternion."""
+    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+
+
+def main(endpoint: str, world: str, names: Sequence[str]) -> None:
+    """Runs until it is interrupted; `names` are the models in Gazebo and the robots in the experiment."""
+    zenoh = importlib.import_module("zenoh")
+    node = importlib.import_module("gz.transport13").Node()
+    twist_type = importlib.import_module("gz.msgs10.twist_pb2").Twist
+    poses_type = importlib.import_module("gz.msgs10.pose_v_pb2").Pose_V
+    drives = {name: node.advertise(f"/model/{name}/cmd_vel", twist_type) for name in names}
+    config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}}))
+    with zenoh.open(config) as session:
+        ring = zenoh.handlers.RingChannel
+        commands = {name: session.declare_subscriber(f"park/{name}/setpoint", ring(100)) for name in names}
+        positions = {
+            name: session.declare_publisher(f"park/{name}/position", encoding="application/json") for name in names
+        }
+
+        def tell(message: Any) -> None:  # noqa: ANN401 - a gz.msgs.Pose_V
+            stamp = time.time()  # not the header's, which is the time of the simulation
+            for pose in message.pose:
+                if pose.name in positions:
+                    p = pose.position
+                    place = {"robot": pose.name, "stamp": stamp, "position": [p.x, p.y, p.z]}
+                    positions[pose.name].put(json.dumps({**place, "yaw": heading(pose.orientation)}))
+
+        node.subscribe(poses_type, f"/world/{world}/dynamic_pose/info", tell)
+        done, heard = dict.fromkeys(names, 0), dict.fromkeys(names, 0.0)
+        while True:
+            for name in names:
+                twist = None
+                while (sample := commands[name].handler.try_recv()) is not None:
+                    command = json.loads(sample.payload.to_string())
+                    if command["seq"] > done[name]:
+                        done[name], heard[name] = command["seq"], time.monotonic()
+                        twist = command["setpoint"][:2] if command["action"] == "drive" else (0.0, 0.0)
+                if twist is None and time.monotonic() - heard[name] > PATIENCE_S:
+                    twist = (0.0, 0.0)
+                if twist is not None:
+                    message = twist_type()
+                    message.linear.x, message.angular.z = twist
+                    drives[name].publish(message)
+            time.sleep(0.01)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], sys.argv[3:])
