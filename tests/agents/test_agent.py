@@ -470,8 +470,9 @@ def test_a_drone_whose_motors_stop_by_themselves_is_not_commanded_any_more():
     group.spoil = down
     swarm.step()
     assert (swarm.phase("F"), group.agent.life.reason) == (LANDING, ["it came down by itself"])
-    swarm.step()
+    swarm.step()  # the body is told to land, all the same
     assert np.isnan(swarm.row("F", "setpoint")).all()
+    swarm.step()
     assert swarm.phase("F") == DONE
 
 
