@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from agents.individual import Individual
 from agents.kinds import Kind
 from agents.lifecycle import AIRBORNE, RUNNING, Duties, Lifecycle, Phase
 from agents.planning import Itinerary, Leg
+from agents.plugins import PluginError
 from agents.rows import Array, Index, Mask, every, some
 from agents.safety import Limits, Safety
 from agents.triggers import Told, Trigger, View
@@ -101,6 +103,8 @@ class Actions:
     changed: Mask
 
 
+# what a mistake in a plug-in raises
+FAILURES: Final = (AttributeError, TypeError, ValueError, NameError, LookupError, ArithmeticError)
 NOBODY: Index = np.zeros(0, dtype=np.intp)
 
 
@@ -228,7 +232,7 @@ class Agent:
             self._asked = question
             self._see_errors(state.position)
             view = View(t, state.position, state.velocity, self.told, self.error)
-            speak = self.trigger.speaks(view, self._memory)
+            speak = self._ask(view)
             if len(speak):
                 seen = np.isfinite(state.position)
                 if not every(seen):
@@ -295,7 +299,10 @@ class Agent:
 
     def _formation_goal(self, t: float, state: BodyState, running: Mask) -> None:
         law, position = self.assignment.law, state.position
-        offset = law.offset(position, self.heard.position[self._live], self._live_links)
+        try:
+            offset = law.offset(position, self.heard.position[self._live], self._live_links)
+        except FAILURES as error:
+            raise PluginError(f"the law {type(law).__name__} failed: {_what(error)}") from error
         goal = position.copy()
         toward = np.full(len(position), np.nan)
         place = position.copy()
@@ -314,6 +321,13 @@ class Agent:
         goal[:, 2] = np.where(follows | ~self._flies, self._ground, goal[:, 2])
         self.goal = np.where(running[:, None], goal, self.goal)
         self.toward = np.where(running, toward, self.toward)
+
+    def _ask(self, view: View) -> Index:
+        """Who speaks now; a trigger that fails is named, for it may be somebody's first."""
+        try:
+            return self.trigger.speaks(view, self._memory)
+        except FAILURES as error:
+            raise PluginError(f"the trigger {type(self.trigger).__name__} failed: {_what(error)}") from error
 
     def _see_errors(self, position: Array) -> None:
         error = self.assignment.law.error(position, self.heard.position[self._live], self._live_links)
@@ -346,6 +360,10 @@ class Agent:
             if live.all()
             else Links(links.listener[live], links.speaker[live], links.distance[live], links.gain[live])
         )
+
+
+def _what(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 def links_by_speaker(links: Links, speakers: Sequence[str]) -> dict[str, Index]:

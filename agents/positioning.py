@@ -35,7 +35,7 @@ class External:
     def update(self, row: int, t: float, position: Array, yaw: float) -> bool:
         """Takes a pose in; False if it is old, or jumps farther than any robot moves."""
         since = t - self.time[row]
-        if since <= 0.0:
+        if not (since > 0.0 and np.isfinite(position).all()):
             return False
         if since < PATIENCE_S:
             moved = position - self.position[row]

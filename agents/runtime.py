@@ -32,6 +32,7 @@ from agents.rows import Index
 
 STATUS_S: Final = 1.0
 FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its launcher was lost has its motors cut
+GHOST_S: Final = 2.5  # so long may the token of a robot that hangs stand after its end
 REACH_M: Final = 1.0  # a neighbour said to be farther outside the arena than this is not believed
 
 
@@ -68,6 +69,10 @@ class _Neighbour:
     stamp: float = 0.0
     heard: int = 0
     lost: int = 0
+
+
+class NameTaken(RuntimeError):
+    """A robot of the same name is on the network already."""
 
 
 class Runtime:
@@ -118,17 +123,48 @@ class Runtime:
             try:
                 name = "+".join(self._names)
                 with network.open_session(self._setup.endpoints, name=name, stop=asked) as session:
+                    self._refuse_doubles(session)
                     self._join(session)
                     self._loop(lambda: rope.reason if lost.is_set() else ("told to end" if asked.is_set() else None))
             finally:
-                self._body.stop(np.arange(len(self._names)))  # down already, unless something broke on the way
+                self._come_down()
                 self._body.close()
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
         return 0
 
+    def _come_down(self) -> None:
+        """Motors off; what is still in the air, because something broke on the way, lands first."""
+        everyone = np.arange(len(self._names))
+        if self._body.read(self._now).flying.any():
+            self._body.land(everyone)
+            zero, begin = time.monotonic(), self._now
+            while self._body.read(self._now).flying.any() and self._now < begin + FAREWELL_S:
+                time.sleep(self._dt)
+                self._now = begin + time.monotonic() - zero
+        self._body.stop(everyone)
+
     # ------------------------------------------------------------------ the network
+
+    def _refuse_doubles(self, session: zenoh.Session) -> None:
+        """Two robots of one name would speak with one voice.
+
+        Raises:
+            NameTaken: If one is on the network already. One that was killed is given the time until that is noticed.
+        """
+        deadline = time.monotonic() + GHOST_S
+        while True:
+            replies = [session.liveliness().get(self._setup.keys.alive(name), timeout=1.0) for name in self._names]
+            taken = [name for name, there in zip(self._names, replies, strict=True) if list(there)]
+            if not taken:
+                return
+            if time.monotonic() > deadline:
+                raise NameTaken(
+                    f"{', '.join(taken)}: a robot of this name is on the network already; end it first "
+                    "(`zenpark keys` shows who is there), or choose another router with --connect"
+                )
+            time.sleep(0.1)
 
     def _join(self, session: zenoh.Session) -> None:
         keys, names = self._setup.keys, self._names
@@ -381,6 +417,8 @@ class Runtime:
             news = (life.phase[row], life.reason[row], tuple(missing[row]))
             if not everything and news == self._reported[row]:
                 continue
+            if news[:2] != self._reported[row][:2]:
+                print(f"{name}: {Phase(life.phase[row]).word}" + (f" ({news[1]})" if news[1] else ""), flush=True)
             self._reported[row] = news
             mine = [n for n in self._neighbours if (self._assignment.links.listener[n.links] == row).any()]
             battery = float(state.battery[row]) if state is not None else float("nan")

@@ -78,6 +78,8 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def speaks(self, view: View, memory: Array) -> Index:
         """Rows that speak now: what fires, no sooner than the minimum interval, no later than the maximum silence."""
         fired = self.fires(view, memory)
+        if np.shape(fired) != view.told.time.shape:
+            raise ValueError(f"`fires` must give one bool per row, {view.told.time.shape}, not {np.shape(fired)}")
         if self.minimum_interval_s > 0.0 or self.maximum_silence_s is not None:
             quiet = view.t - view.told.time
             if self.maximum_silence_s is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +13,8 @@ from agents import plugins
 from experiments import document, metrics
 from experiments.problem import DocumentError, Problem
 from experiments.progress import shown
-from experiments.run import SOURCE, Interrupts, Run, fly, load, new_folder, reopen, simulate_seeds
+from experiments.records import RecordingError
+from experiments.run import SOURCE, Interrupts, Run, chosen, fly, load, new_folder, reopen, simulate_seeds
 
 
 def run(
@@ -26,16 +28,23 @@ def run(
     as_json: bool,
     seeds: int,
     bodies: str | None,
+    anyway: bool,
     report: bool,
     open_report: bool,
 ) -> int:
-    """`zenpark run`; returns the exit code: 0, or 130 after Ctrl-C."""
+    """`zenpark run`; returns the exit code: 0, 2 if the check finds errors, or 130 after Ctrl-C."""
     changes = [*settings, *([] if seed is None else [f"seed={seed}"])]
     read = load(file, *changes)
     if seeds > 1 and not virtual:
         raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
     if bodies not in (None, "protocol"):
         raise DocumentError([Problem(f"--bodies {bodies}", 0, 0, "is not known", "the only choice is: protocol")])
+    if bodies is not None and virtual:
+        raise DocumentError([Problem("--bodies", 0, 0, "is for real time", "leave out --virtual")])
+    chosen(read, cases)
+    if not _sound(read, changes) and not anyway:
+        print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
+        return 2
     folder = new_folder(read, out)
     (folder / SOURCE).write_text(read.text, encoding="utf-8")
     interrupted = Interrupts()
@@ -46,7 +55,14 @@ def run(
         with interrupted:
             show = shown(quiet=as_json)
             protocol = bodies == "protocol"
-            runs = [fly(read, folder, cases=cases, show=show, interrupted=interrupted, protocol=protocol)]
+            try:
+                runs = [fly(read, folder, cases=cases, show=show, interrupted=interrupted, protocol=protocol)]
+            except KeyboardInterrupt:
+                print(f"\nended at once; `zenpark report {folder}` shows what was recorded", file=sys.stderr)
+                return 130
+    if not runs[0].traces:
+        print(f"interrupted before the common start: there is nothing to report; logs: {folder / 'logs'}")
+        return 130
     page = (
         _keep(runs, folder, _command(file, virtual=virtual, changes=changes, cases=cases, seeds=seeds))
         if report
@@ -64,19 +80,34 @@ def run(
     return 130 if interrupted.asked else 0
 
 
+def _sound(read: document.Document, changes: Sequence[str]) -> bool:
+    """Says on standard error what the check warns of; False if it finds errors."""
+    from experiments.check import check  # noqa: PLC0415
+
+    found = [finding for finding in check(read, changes) if finding.severity != "note"]
+    for finding in found:
+        mark = "✗" if finding.severity == "error" else "!"
+        remedy = f"; {finding.remedy}" if finding.remedy else ""
+        print(f"{mark} {finding.message}{remedy}", file=sys.stderr)
+    return all(finding.severity != "error" for finding in found)
+
+
 def report(folders: Sequence[str], *, out: str | None) -> int:
     """`zenpark report`: of one run again, or of several beside each other."""
     from experiments import report as pages  # noqa: PLC0415 - matplotlib takes 0.6 s
 
     runs = [reopen(Path(folder)) for folder in folders]
-    if len(runs) == 1:
-        assert runs[0].folder is not None
-        print(_keep(runs, Path(out) if out else runs[0].folder, f"zenpark report {folders[0]}"))
-    else:
-        target = Path(out or "comparison.html")
-        print(
-            pages.compare(target, [(Path(f).name, list(r.traces.values())) for f, r in zip(folders, runs, strict=True)])
-        )
+    target = Path(out or "comparison.html") if len(runs) > 1 else Path(out or folders[0])
+    try:
+        if len(runs) == 1:
+            print(_keep(runs, target, f"zenpark report {folders[0]}"))
+        else:
+            named = [(Path(f).name, list(r.traces.values())) for f, r in zip(folders, runs, strict=True)]
+            print(pages.compare(target, named))
+    except OSError as error:
+        raise RecordingError(
+            f"{target}: cannot be written: {error.strerror}; choose another place with --out"
+        ) from None
     return 0
 
 
@@ -137,12 +168,16 @@ def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> No
     across = summary.get("across")
     for name, case in summary["cases"].items():
         mean, ratio = case["mean"], case["ratio"]
+        spread = {"f_hz": "", "iae": "", "rmse": ""}
         if across is not None:
             means = across["cases"][name]
             mean, ratio = ({k: v["mean"] for k, v in means[what].items()} for what in ("mean", "ratio"))
+            spread = {k: f" ± {_figure(means['mean'][k]['std'])}" for k in spread}
         acquired = "never" if mean["acquired_s"] is None else f"{mean['acquired_s']:.1f} s"
-        line = f"{name:>12}: {_figure(mean['f_hz'])} messages/s, IAE {_figure(mean['iae'])}"
-        line += f", RMSE {_figure(mean['rmse'])} m"
+        line = (
+            f"{name:>12}: {_figure(mean['f_hz'])}{spread['f_hz']} messages/s, IAE {_figure(mean['iae'])}{spread['iae']}"
+        )
+        line += f", RMSE {_figure(mean['rmse'])}{spread['rmse']} m"
         line += f", acquired {acquired}, lost {sum(r['lost'] for r in case['robots'].values())}"
         if name != next(iter(summary["cases"])):
             line += f"   (ratios: f {_figure(ratio['f_hz'])}, IAE {_figure(ratio['iae'])})"

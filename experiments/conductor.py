@@ -275,6 +275,9 @@ class Conductor:
         keys = self._keys
         self._session = stack.enter_context(network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S))
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
+        if self._endpoints != [network.DEFAULT_ENDPOINT]:
+            there = self._endpoints[0]
+            self._say("router", "conductor", f"{there}: look with `zenpark keys --connect {there}`")
         self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
         self._told.put(self._file.read_bytes())
         self._statuses = network.pose_subscriber(self._session, keys.status("*"), 4096)

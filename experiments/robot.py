@@ -13,7 +13,7 @@ from agents import plugins
 from agents.body import BodyError
 from agents.fleet import assemble
 from agents.keys import Keys
-from agents.runtime import Runtime, Setup
+from agents.runtime import NameTaken, Runtime, Setup
 from agents.session import DEFAULT_ENDPOINT, EndpointError, Unreachable
 from experiments import assign, document
 from experiments.experiment import Experiment
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     try:
         return fly(chosen.file, chosen.names, case=chosen.case, connect=chosen.connect, lifeline=chosen.lifeline)
-    except (DocumentError, BodyError, plugins.PluginError, EndpointError, Unreachable) as error:
+    except (DocumentError, BodyError, NameTaken, plugins.PluginError, EndpointError, Unreachable) as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2
 

@@ -11,6 +11,7 @@ from typing import Final
 import msgspec
 
 from agents import plugins
+from experiments import assign
 from experiments.experiment import Experiment, Robot
 from experiments.launcher import Launcher, Process
 
@@ -107,7 +108,9 @@ def _positioning(
     started = []
     host = experiment.positioning.removeprefix(VICON)
     if experiment.positioning == VICON_TWIN:
-        arguments = ["--listen", "127.0.0.1:0", "--robots", *measured, *connect, "--lifeline"]
+        sigma = max(assign.disturbance(experiment, name).position_sigma or 0.0 for name in measured)
+        noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
+        arguments = ["--listen", "127.0.0.1:0", "--robots", *measured, *noise, *connect, "--lifeline"]
         twin = launcher.start(f"{prefix}-{VICON_TWIN}", "twins.vicon", *arguments)
         started.append(twin.name)
         host = _said(twin, r"^vicon (ready on) (\S+)$", 1, interrupted)["ready on"]

@@ -22,6 +22,7 @@ EXPLAINED: Final = (
     ("agents.session", "EndpointError"),
     ("agents.session", "Unreachable"),
     ("agents.body", "BodyError"),
+    ("agents.runtime", "NameTaken"),
     ("agents.plugins", "PluginError"),
     ("experiments.problem", "DocumentError"),
     ("experiments.records", "RecordingError"),
@@ -75,6 +76,7 @@ def run(
         str | None,
         typer.Option(metavar="protocol", help="Every robot behind its real bridge and a protocol twin (real time)."),
     ] = None,
+    anyway: Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")] = False,
     report: Annotated[bool, typer.Option(help="Writes the report.")] = True,
     open_report: Annotated[bool, typer.Option("--open", help="Opens the report in the browser.")] = False,
 ) -> None:
@@ -92,6 +94,7 @@ def run(
             as_json=as_json,
             seeds=seeds,
             bodies=bodies,
+            anyway=anyway,
             report=report,
             open_report=open_report,
         )
@@ -145,7 +148,7 @@ def twin(
     raise typer.Exit(command(kind, count, faults=faults, device=device, connect=connect or []))
 
 
-@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
 def bridge(
     context: typer.Context,
     what: Annotated[str, typer.Argument(metavar="vicon|ros2", help="`zenpark bridge vicon --help` says more.")],
@@ -153,6 +156,9 @@ def bridge(
     """Bring motion capture in (vicon), or show the robots to ROS 2 (ros2)."""
     from importlib import import_module  # noqa: PLC0415
 
+    if what in ("-h", "--help"):
+        typer.echo(context.get_help())
+        raise typer.Exit
     if what not in ("vicon", "ros2"):
         raise typer.BadParameter(f"'{what}' is neither vicon nor ros2")
     raise typer.Exit(import_module(f"bridges.{what}").main(context.args))
@@ -228,6 +234,19 @@ def bench(
     from tools.bench import command  # noqa: PLC0415
 
     raise typer.Exit(command(names or [], as_json=as_json))
+
+
+@app.command()
+def order(
+    what: Annotated[str, typer.Argument(metavar="ORDER", help="takeoff, start, hold, land or stop.")],
+    robots: Annotated[list[str] | None, typer.Argument(metavar="[ROBOT...]", help="All, if none is named.")] = None,
+    connect: Connect = None,
+    realm: Annotated[str, typer.Option(metavar="NAME", help="First chunk of the keys.")] = "park",
+) -> None:
+    """Tell robots that were started by hand what to do."""
+    from tools.order import command  # noqa: PLC0415
+
+    raise typer.Exit(command(what, robots or [], connect=connect or [], realm=realm))
 
 
 @app.command()

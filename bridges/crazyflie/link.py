@@ -50,8 +50,7 @@ def prepare() -> None:
         import cflib.crtp  # noqa: PLC0415 - an optional extra, under another licence
     except ModuleNotFoundError:
         raise BodyError(
-            "Crazyflies need cflib (GPL-3.0), which is an extra: uv sync --extra crazyflie, "
-            "or pip install 'zenpark[crazyflie]'"
+            "Crazyflies need cflib (GPL-3.0), which is an extra: uv pip install 'zenpark[crazyflie]'"
         ) from None
     if not cflib.crtp.CLASSES:  # a second call would register every driver twice
         cflib.crtp.init_drivers()

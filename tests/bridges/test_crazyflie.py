@@ -40,12 +40,12 @@ def lighthouse_file(folder: Path, *numbers: int) -> str:
     return str(path)
 
 
-def test_flight_and_next_session(capsys):
+def test_flight_and_next_session():
     """Take-off, a goal by streamed positions, landing; and again by another client, which the first must not hinder."""
     begin = time.monotonic()
     with flown() as (twin, process):
-        with capsys.disabled():
-            print(f"\n  connected, all parameters read: {time.monotonic() - begin:.2f} s")
+        print(f"connected, all parameters read: {time.monotonic() - begin:.2f} s")
+        assert time.monotonic() - begin < 5.0
         process.takeoff()
         process.setpoint = [(0.4, 0.3, 0.6, 0.5)]
         process.until(lambda: np.abs(truth(twin) - [0.4, 0.3, 0.6]).max() < 0.02, "goal")
@@ -92,7 +92,7 @@ def test_emergency_stop():
         assert truth(twin)[2] == 0.0
 
 
-def test_several_at_a_hundred_hertz(capsys):
+def test_several_at_a_hundred_hertz():
     """Several Crazyflies, one process, every one logged at 100 Hz."""
     with flown(rows=4, device={"log_hz": 100.0}) as (_, process):
         process.run(0.5)
@@ -103,8 +103,7 @@ def test_several_at_a_hundred_hertz(capsys):
             gaps = np.maximum(gaps, state.time - last)
             last = state.time.copy()
             stamps.add(float(state.time[0]))
-        with capsys.disabled():
-            print(f"\n  4 at 100 Hz: {len(stamps) / 1.5:.0f} new poses/s read, worst gap {1e3 * gaps.max():.0f} ms")
+        print(f"4 at 100 Hz: {len(stamps) / 1.5:.0f} new poses/s read, worst gap {1e3 * gaps.max():.0f} ms")
         assert len(stamps) > 40
         assert gaps.max() < 3.0
 

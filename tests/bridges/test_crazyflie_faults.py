@@ -1,6 +1,7 @@
 """What goes wrong between a Crazyflie bridge and its robot: the robot ends on the ground, the others go on."""
 
 import socket
+import sys
 import threading
 import time
 
@@ -164,6 +165,13 @@ def test_wrong_address(address):
 def test_wrong_settings(device, said):
     with pytest.raises(BodyError, match=said):
         open_crazyflie(request("crazyflie", [RADIO.format(1)], device=device))
+
+
+def test_library_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cflib", None)
+    monkeypatch.delitem(sys.modules, "cflib.crtp", raising=False)
+    with pytest.raises(BodyError, match=r"uv pip install 'zenpark\[crazyflie\]'"):
+        open_crazyflie(request("crazyflie", [RADIO.format(1)])).open()
 
 
 def test_firmware_without_supervisor():

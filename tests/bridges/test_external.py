@@ -413,7 +413,7 @@ def test_when_the_robots_process_dies_the_simulator_lands_it(router: RouterProce
     """What `docs/external-simulators.md` asks of a simulator, kept by ours."""
     file = tmp_path / "alone.toml"
     file.write_text(
-        'title = "alone"\n[arena]\nsize = [2.0, 2.0, 2.0]\n'
+        'title = "alone"\nduration_s = 30.0\n[arena]\nsize = [2.0, 2.0, 2.0]\n'
         '[robots.TE01]\nkind = "tello"\nbody = "external"\nstart = [0.0, 0.0]\nhover = 0.6\n'
     )
     simulator = Simulator(router.endpoint, "TE01")

@@ -44,6 +44,7 @@ def test_commands():
                 "echo",
                 "hz",
                 "twin",
+                "order",
                 "bridge",
             ]
         )

@@ -1,0 +1,49 @@
+"""`zenpark order`: tells robots what to do, by hand."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from typing import Final, get_args
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from experiments import orders
+
+LEAD_S: Final = 0.5  # a common start lies so far ahead, that every robot has it by then
+
+
+def command(what: str, robots: Sequence[str], *, connect: Sequence[str], realm: str) -> int:
+    """Gives an order to robots, to all that are there if none is named, and prints their replies.
+
+    Returns:
+        The exit code: 0, or 1 if one refused.
+
+    Raises:
+        EndpointError, Unreachable: If no router can be reached.
+    """
+    kinds = [kind for kind in get_args(wire.OrderKind) if kind not in ("get", "set")]
+    if what not in kinds:
+        print(f"zenpark: no order '{what}'; there are: {', '.join(kinds)}", file=sys.stderr)
+        return 2
+    keys = Keys(realm)
+    with network.open_session(list(connect) or [network.DEFAULT_ENDPOINT], name="order", wait_s=2.0) as session:
+        there = [
+            keys.robot(str(reply.ok.key_expr))
+            for reply in session.liveliness().get(keys.alive("*"), timeout=2.0)
+            if reply.ok is not None
+        ]
+        if not there:
+            print(f"zenpark: no robot is there in the realm '{realm}'; `zenpark keys` shows who is", file=sys.stderr)
+            return 2
+        at = time.time() + LEAD_S if what == "start" else None
+        refused = False
+        for robot in robots or sorted(there):
+            reply = orders.give(session, keys, robot, wire.Order(what, at=at))  # type: ignore[arg-type]
+            refused |= not reply.ok
+            print(
+                f"{robot}: {'yes' if reply.ok else 'no'}, {reply.phase}" + (f": {reply.reason}" if reply.reason else "")
+            )
+    return 1 if refused else 0
