@@ -13,6 +13,7 @@ from agents import session as network
 from agents.keys import Keys
 
 AFTER_S: Final = 20.0  # how long robots may take to land after the launcher is gone
+SETTLE_S: Final = 0.5  # the news of a robot that has just come may still be on its way
 
 
 class Farewell:
@@ -32,5 +33,8 @@ class Farewell:
                 self._alive[row] = sample.kind != zenoh.SampleKind.DELETE
         if not self._lost.is_set():
             return False
-        self._last = min(self._last, time.monotonic() + AFTER_S)
-        return not any(self._alive) or time.monotonic() > self._last
+        now = time.monotonic()
+        self._last = min(self._last, now + AFTER_S)
+        if now < self._last - AFTER_S + SETTLE_S:
+            return False
+        return not any(self._alive) or now > self._last

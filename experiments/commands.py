@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from agents import plugins
-from experiments import document, metrics
+from experiments import document, metrics, verdict
 from experiments.problem import DocumentError, Problem
 from experiments.progress import shown
 from experiments.records import RecordingError
@@ -97,10 +97,13 @@ def report(folders: Sequence[str], *, out: str | None) -> int:
     from experiments import report as pages  # noqa: PLC0415 - matplotlib takes 0.6 s
 
     runs = [reopen(Path(folder)) for folder in folders]
+    for folder, run in zip(folders, runs, strict=True):
+        if not run.traces:
+            raise RecordingError(f"{folder}: no case had begun; there is nothing to report")
     target = Path(out or "comparison.html") if len(runs) > 1 else Path(out or folders[0])
     try:
         if len(runs) == 1:
-            print(_keep(runs, target, f"zenpark report {folders[0]}"))
+            print(_keep(runs, target, ""))
         else:
             named = [(Path(f).name, list(r.traces.values())) for f, r in zip(folders, runs, strict=True)]
             print(pages.compare(target, named))
@@ -157,6 +160,8 @@ def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
         folder,
         traces,
         command=command,
+        date=pages.date_of(runs[0].made),
+        run=runs[0].folder,
         text=runs[0].source,
         measured=every,
         notes=[n for each in runs for n in each.notes],
@@ -165,6 +170,8 @@ def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
 
 def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> None:
     """The result in a few lines."""
+    for finding in verdict.interruptions([case for each in runs for case in each.metrics.values()]):
+        print(finding.text)
     across = summary.get("across")
     for name, case in summary["cases"].items():
         mean, ratio = case["mean"], case["ratio"]
@@ -178,7 +185,7 @@ def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> No
             f"{name:>12}: {_figure(mean['f_hz'])}{spread['f_hz']} messages/s, IAE {_figure(mean['iae'])}{spread['iae']}"
         )
         line += f", RMSE {_figure(mean['rmse'])}{spread['rmse']} m"
-        line += f", acquired {acquired}, lost {sum(r['lost'] for r in case['robots'].values())}"
+        line += f", acquired {acquired} (mean), lost {sum(r['lost'] for r in case['robots'].values())}"
         if name != next(iter(summary["cases"])):
             line += f"   (ratios: f {_figure(ratio['f_hz'])}, IAE {_figure(ratio['iae'])})"
         print(line)

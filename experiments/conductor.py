@@ -173,6 +173,11 @@ class Conductor:
                         start = self._start()
                         self._walk(start)
                 self._land()
+        except RunFailed as failure:
+            self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: say it now
+            self._progress.events.append(wire.Event(time.time(), "failed", "conductor", self._progress.phase))
+            self._show(self._progress)
+            raise
         finally:
             self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
             self._launcher.end([f"{self._case}-recorder"], grace_s=5.0)

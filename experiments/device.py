@@ -24,6 +24,7 @@ import zenoh
 from agents import plugins, wire
 from agents import session as network
 from agents.body import BodyError
+from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.kinds import KINDS
 from agents.lifeline import Lifeline
@@ -40,26 +41,32 @@ EXPLAINED: Final = (
     network.Unreachable,
     OSError,
 )
-AFTER_S: Final = 20.0  # how long robots may take to land after the launcher is gone
 
 
 class DeviceProcess:
     """Runs a device: waits on its sockets, moves it on, publishes the truth."""
 
     def __init__(
-        self, device: Device, names: Sequence[str], session: zenoh.Session | None, keys: Keys, rate_hz: float
+        self,
+        device: Device,
+        names: Sequence[str],
+        session: zenoh.Session | None,
+        *,
+        keys: Keys,
+        rate_hz: float,
+        lost: threading.Event,
     ) -> None:
-        """Without a session nobody is told the truth."""
+        """Without a session nobody is told the truth; `lost` is set when the launcher is gone."""
         self._device, self._names, self._dt = device, names, 1.0 / rate_hz
         known = names if session is not None else ()
         self._truths = [network.publisher(session, keys.truth(name), wire.JSON) for name in known if session]
-        self._watches = [network.alive_watch(session, keys.alive(name)) for name in known if session]
-        self._alive = [False] * len(names)
+        self._lost = lost
+        self._farewell = Farewell(session, keys, names, lost) if session is not None else None
 
-    def run(self, over: threading.Event, lost: threading.Event) -> None:
+    def run(self, over: threading.Event) -> None:
         """Until told to end, or until the launcher and then the robots are gone."""
         zero, utc = time.monotonic(), time.time()
-        due, last = 0.0, float("inf")
+        due = 0.0
         with selectors.DefaultSelector() as waiting:
             while not over.is_set():
                 self._register(waiting)
@@ -71,10 +78,8 @@ class DeviceProcess:
                     self._device.advance(now)
                     self._tell(utc + now)
                     due = max(due + self._dt, now - 10.0 * self._dt)  # after a long stop it does not hurry
-                    if lost.is_set():
-                        last = min(last, now + AFTER_S)
-                        if now > last or not self._flown():
-                            return
+                    if self._farewell.over() if self._farewell is not None else self._lost.is_set():
+                        return
 
     def _register(self, waiting: selectors.DefaultSelector) -> None:
         wanted = {sock.fileno(): sock for sock in self._device.sockets()}
@@ -92,13 +97,6 @@ class DeviceProcess:
             self._names, self._truths, position.tolist(), yaw.tolist(), strict=False
         ):
             publisher.put(wire.encode(wire.Position(name, stamp, tuple(where), toward)))
-
-    def _flown(self) -> bool:
-        """Whether a robot process still uses the device."""
-        for row, watch in enumerate(self._watches):
-            for sample in network.received(watch.handler):
-                self._alive[row] = sample.kind != zenoh.SampleKind.DELETE
-        return any(self._alive)
 
 
 def stand_in(file: str, names: Sequence[str], *, faults: Faults, connect: Sequence[str], lifeline: bool) -> int:
@@ -173,7 +171,7 @@ def _serve(
         stack.callback(device.close)
         for name, address in zip(names, device.addresses, strict=True):
             print(f"address {name} {address}", flush=True)
-        DeviceProcess(device, names, session, keys, rate_hz).run(over, lost)
+        DeviceProcess(device, names, session, keys=keys, rate_hz=rate_hz, lost=lost).run(over)
     return 0
 
 

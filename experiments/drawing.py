@@ -29,6 +29,7 @@ Line = dict[str, Any]  # keyword arguments of a curve
 
 WIDTH: Final = 3.5  # [in] one column
 TALLEST: Final = 8.8  # [in] one page
+SHORTEST_S: Final = 0.1  # of a time axis, which a single sample would not have
 POINTS: Final = 1500  # of a curve; more than a printed column can show
 ALL_POINTS: Final = 40_000  # of all curves of a figure, so that many robots do not make a file of megabytes
 INK: Final = "#000000"
@@ -111,7 +112,7 @@ def svg(figure: Figure) -> str:
 
 def panel_height(panels: int, wanted: float) -> float:
     """Height of one of several stacked panels [in] that together fit a page."""
-    return min(wanted, (TALLEST - 1.0) / panels)
+    return min(wanted, (TALLEST - 1.0) / max(1, panels))
 
 
 def plain(name: str) -> str:
@@ -121,7 +122,7 @@ def plain(name: str) -> str:
 
 def thinned(trace: Trace, panels: int) -> slice:
     """Every how many samples of a trace are drawn, given how many panels there are."""
-    points = min(POINTS, ALL_POINTS // (panels * len(trace.robots)))
+    points = min(POINTS, ALL_POINTS // max(1, panels * len(trace.robots)))
     return slice(None, None, max(1, math.ceil(len(trace.time) / max(points, 100))))
 
 
@@ -164,7 +165,8 @@ def name_ticks(axes: Axes, names: Sequence[str]) -> None:
 
 def time_axis(axes: Axes, traces: Sequence[Trace]) -> None:
     """The x axis as time, as long as the longest trace."""
-    axes.set_xlim(min(float(trace.time[0]) for trace in traces), max(float(trace.time[-1]) for trace in traces))
+    begin, end = min(float(trace.time[0]) for trace in traces), max(float(trace.time[-1]) for trace in traces)
+    axes.set_xlim(begin, max(end, begin + SHORTEST_S))
     axes.set_xlabel("$t$ [s]")
 
 

@@ -30,6 +30,7 @@ from experiments.drawing import (
     MAGENTA,
     MANY,
     PAPER,
+    SHORTEST_S,
     WIDTH,
     Line,
     boxes,
@@ -62,20 +63,25 @@ __all__ = [
 def every(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> dict[str, Figure]:
     """All figures of a run by name, in the order of the paper; motions of the first seed.
 
-    Without a leg in the timeline there is no `formation_after`: it would show the same as `formation_before`.
+    What there is nothing for is left out: all without a trace; `formation_after` without a leg in the timeline, where
+    it would show the same as `formation_before`; pictures of space where no position is known.
     """
-    first = list({trace.case: trace for trace in reversed(traces)}.values())[::-1]
-    figures = {
-        "global_bars": global_bars(cases),
-        "formation_before": formation_before(first),
-        "formation_after": formation_after(first) if any(len(phase_starts(trace)) > 1 for trace in first) else None,
-        "robot_bars": robot_bars(cases),
-        "errors": errors(first),
-        "events": events(first),
-        "intervals": intervals(first),
-        "plan_view": plan_view(first),
-    }
-    return {name: figure for name, figure in figures.items() if figure is not None}
+    first = [trace for trace in _first_seed(traces) if len(trace.time)]
+    figures: dict[str, Figure] = {}
+    if cases:
+        figures["global_bars"] = global_bars(cases)
+    if any(_seen(trace, _before(trace)) for trace in first):
+        figures["formation_before"] = formation_before(first)
+    if any(len(phase_starts(trace)) > 1 and _seen(trace, _after(trace)) for trace in first):
+        figures["formation_after"] = formation_after(first)
+    if cases:
+        figures["robot_bars"] = robot_bars(cases)
+    if first:
+        figures["errors"], figures["events"] = errors(first), events(first)
+        figures["intervals"] = intervals(first)
+    if any(_seen(trace) for trace in first):
+        figures["plan_view"] = plan_view(first)
+    return figures
 
 
 @styled
@@ -146,13 +152,13 @@ def robot_bars(cases: Sequence[CaseMetrics]) -> Figure:
 @styled
 def formation_before(traces: Sequence[Trace]) -> Figure:
     """The way from the start into the formation, before the first leg of the timeline (paper, figure 13)."""
-    return _spatial(traces, lambda trace: (0.0, _first_leg(trace)))
+    return _spatial(traces, _before)
 
 
 @styled
 def formation_after(traces: Sequence[Trace]) -> Figure:
     """The way from the first leg of the timeline to the end (paper, figure 14); the whole run if there is no leg."""
-    return _spatial(traces, lambda trace: ((*phase_starts(trace), 0.0)[1], float(trace.time[-1])))
+    return _spatial(traces, _after)
 
 
 @styled
@@ -178,14 +184,14 @@ def errors(traces: Sequence[Trace]) -> Figure:
 @styled
 def events(traces: Sequence[Trace]) -> Figure:
     """When each robot transmitted: one row per robot, one panel per case; what would touch in print is one bar."""
-    rows = max(len(trace.robots) for trace in traces)
+    rows = max((len(trace.robots) for trace in traces), default=0)
     height = panel_height(len(traces), min(max(0.6, 0.13 * rows), 3.2))
     figure = Figure(figsize=(WIDTH, height * len(traces) + 0.5 + 0.14 * len(traces)), layout="constrained")
     panels = figure.subplots(len(traces), 1, sharex=True, squeeze=False)[:, 0]
     for axes, trace in zip(panels, traces, strict=True):
         colours = [line["color"] for line in robot_lines(trace)]
         columns = 900 if rows * len(traces) <= 40 else 450  # a printed column shows no more
-        pixel = float(trace.time[-1] - trace.time[0]) / columns
+        pixel = max(float(trace.time[-1] - trace.time[0]), SHORTEST_S) / columns
         for i in range(len(trace.robots)):
             begin, end = merged(np.sort(trace.sent.time[trace.sent.robot == i]), pixel)
             axes.add_patch(PathPatch(boxes(begin, end + pixel, i), facecolor=colours[i], linewidth=0.0))
@@ -293,9 +299,30 @@ def _bars(
     return height, error
 
 
-def _first_leg(trace: Trace) -> float:
+def _first_seed(traces: Sequence[Trace]) -> list[Trace]:
+    """The first trace of each case."""
+    return list({trace.case: trace for trace in reversed(traces)}.values())[::-1]
+
+
+def _before(trace: Trace) -> slice:
+    """Rows until the first leg of the timeline; all if there is none."""
     starts = phase_starts(trace)
-    return starts[1] if len(starts) > 1 else float(trace.time[-1])
+    return slice(0, _row(trace, starts[1]) if len(starts) > 1 else len(trace.time))
+
+
+def _after(trace: Trace) -> slice:
+    """Rows from the first leg of the timeline on; all if there is none."""
+    starts = phase_starts(trace)
+    return slice(_row(trace, starts[1]) if len(starts) > 1 else 0, len(trace.time))
+
+
+def _row(trace: Trace, at: float) -> int:
+    return int(np.searchsorted(trace.time, at - 1e-9))
+
+
+def _seen(trace: Trace, rows: slice = slice(None)) -> bool:
+    """Whether the position of any robot is known there."""
+    return bool(np.isfinite(trace.true_position[rows]).all(axis=2).any())
 
 
 def _steps(waits: Array) -> tuple[Array, Array]:
@@ -306,7 +333,7 @@ def _steps(waits: Array) -> tuple[Array, Array]:
     return np.concatenate([x[:1], x[few]]), np.concatenate([[0.0], share[few]])
 
 
-def _spatial(traces: Sequence[Trace], span: Callable[[Trace], tuple[float, float]]) -> Figure:
+def _spatial(traces: Sequence[Trace], rows_of: Callable[[Trace], slice]) -> Figure:
     """Trajectories in space over a span of time, one panel per case, with the links at its start and its end."""
     columns = 1 if len(traces) <= 2 else 2
     rows = math.ceil(len(traces) / columns)
@@ -318,8 +345,11 @@ def _spatial(traces: Sequence[Trace], span: Callable[[Trace], tuple[float, float
         box = ((column - 0.02) / columns, 1.0 - (0.3 + height * (row + 1)) / whole, 1.0 / columns, height / whole)
         axes = figure.add_axes(box, projection="3d", computed_zorder=False)
         assert isinstance(axes, Axes3D)
-        begin, end = np.searchsorted(trace.time, np.array(span(trace)) - 1e-9)
-        _draw_spatial(axes, trace, trace.true_position[begin : max(end, begin + 2)], columns)
+        if _seen(trace, rows_of(trace)):
+            _draw_spatial(axes, trace, trace.true_position[rows_of(trace)], columns)
+        else:
+            axes.set_axis_off()
+            axes.text2D(0.5, 0.5, "nothing is known", transform=axes.transAxes, fontsize=7, ha="center")
         if len(traces) > 1:
             axes.text2D(0.06, 0.93, plain(trace.case), transform=axes.transAxes, fontsize=8)
     black, magenta = to_rgb(INK), to_rgb(MAGENTA)
@@ -355,7 +385,7 @@ def _draw_spatial(axes: Axes3D, trace: Trace, place: Array, columns: int) -> Non
         if len(trace.robots) <= MANY and columns == 1:
             halo = [withStroke(linewidth=1.5, foreground=PAPER)]
             axes.text(*(ends[i] + [0.0, 0.0, 0.05]), trace.robots[i], fontsize=6, zorder=7, path_effects=halo)
-    low, high = np.nanmin(place, axis=(0, 1)), np.nanmax(place, axis=(0, 1))
+    low, high = place[known].min(axis=0), place[known].max(axis=0)
     low[2] = min(0.0, low[2])
     size = np.maximum(high - low, 0.4)
     middle = 0.5 * (low + high)

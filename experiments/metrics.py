@@ -1,7 +1,8 @@
 """What a run comes to in numbers: the indices of the paper (section IV-B), and what says whether to believe them.
 
 All errors are taken on true positions. A robot that died has NaN positions from then on: its links are left out from
-that moment, integrals cover what is known (`coverage` says how much), and the means leave that robot out.
+that moment, integrals cover what is known (`coverage` says how much), and the means leave that robot out. The figures
+of a run that was interrupted cover the time until then.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ INDICES: Final = ("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_
 WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
 BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
 KNOWN: Final = 0.95  # a robot whose position is known for less of the run counts as died
+SUMS: Final = ("messages", "bytes", "iae", "itae", "lost", "missed_deadlines")  # grow with the length of a run
 
 
 class Phase(msgspec.Struct, frozen=True):
@@ -128,6 +130,8 @@ class CaseMetrics(msgspec.Struct, frozen=True):
         seed: Seed of the run.
         clock: "real" or "virtual".
         duration_s: Length of the trace [s].
+        planned_s: Length that the experiment was to have [s].
+        interrupted: Whether the run ended before that.
         tolerance: Of the acquisition [m].
         starts_s: Start of each phase [s].
         robots: One entry per robot.
@@ -154,6 +158,8 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     seed: int
     clock: str
     duration_s: float
+    planned_s: float
+    interrupted: bool
     tolerance: float
     starts_s: tuple[float, ...]
     robots: tuple[RobotMetrics, ...]
@@ -220,11 +226,14 @@ def measure(trace: Trace) -> CaseMetrics:
     beyond = outside_arena(trace)
     farthest = int(beyond.argmax())
     ticks = int(trace.ticks.sum())
+    planned, step = trace.experiment.duration_s, float(trace.time[1] - trace.time[0])
     return CaseMetrics(
         case=trace.case,
         seed=trace.seed,
         clock=trace.clock,
         duration_s=float(trace.time[-1] - trace.time[0]),
+        planned_s=planned,
+        interrupted=float(trace.time[-1]) < planned - 1.5 * step,  # a whole one may end one sample short
         tolerance=trace.experiment.tolerance,
         starts_s=tuple(start for start, _, _ in bounds),
         robots=robots,
@@ -330,7 +339,6 @@ def _all(times: Sequence[float | None]) -> float | None:
 
 def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[str, Any]:
     """The figures of one run for scripts: per case and robot the indices, their means, and ratios to the first case."""
-    reference = cases[0].mean if cases else {}
     return {
         "run": run_folder,
         "seed": seed,
@@ -338,7 +346,8 @@ def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[s
             case.case: {
                 "robots": {robot.robot: {index: getattr(robot, index) for index in INDICES} for robot in case.robots},
                 "mean": dict(case.mean),
-                "ratio": {index: ratio(case.mean[index], reference[index]) for index in INDICES},
+                "ratio": {index: next(iter(ratios([case], cases[:1], index))) for index in INDICES},
+                **({"duration_s": case.duration_s, "interrupted": True} if case.interrupted else {}),
             }
             for case in cases
         },
@@ -351,12 +360,23 @@ def ratio(value: float | None, reference: float | None) -> float | None:
 
 
 def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index: str) -> list[float | None]:
-    """An index of each run over the reference: of the same seed if all seeds are the same, else over its mean."""
+    """An index of each run over the reference: of the same seed if all seeds are the same, else over its mean.
+
+    None for what grows with the length of a run if the runs are of different length: one was interrupted.
+    """
+    if index in SUMS and not same_length([*runs, *reference]):
+        return [None] * len(runs)
     if sorted(run.seed for run in runs) == sorted(run.seed for run in reference):
         of_seed = {run.seed: run.mean[index] for run in reference}
         return [ratio(run.mean[index], of_seed[run.seed]) for run in runs]
     mean = spread([run.mean[index] for run in reference]).mean
     return [ratio(run.mean[index], mean) for run in runs]
+
+
+def same_length(runs: Sequence[CaseMetrics]) -> bool:
+    """Whether runs can be compared: equally long within 2 %, or as long as each was to be."""
+    lengths = [run.duration_s for run in runs]
+    return not any(run.interrupted for run in runs) or max(lengths) - min(lengths) <= 0.02 * max(lengths)
 
 
 def by_case(cases: Sequence[CaseMetrics]) -> dict[str, list[CaseMetrics]]:

@@ -12,6 +12,7 @@ from typing import Final, TypeVar
 import msgspec
 import numpy as np
 
+from agents.lifecycle import Phase
 from agents.rows import Array, Index, Mask
 from agents.wire import Event, State, Status
 from experiments.cdr import Undecodable, codec
@@ -24,6 +25,8 @@ ROUNDING_S: Final = 1e-6  # UTC seconds in a float are exact to a quarter of a m
 HOLD_PERIODS: Final = 2.0  # for so many state periods a robot is where it last said; then nobody knows
 HOLE_S: Final = 1.0  # telemetry that is silent for longer is not interpolated over
 STATUS_S: Final = 1.0  # what happened in the run is counted by a status at most this much after its end
+EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the whole run are not that much early
+LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
 NOWHERE: Final = (math.nan, math.nan, math.nan)
 NO_SETPOINT: Final = (*NOWHERE, math.nan)
 
@@ -31,17 +34,23 @@ S = TypeVar("S", bound=msgspec.Struct)
 M = TypeVar("M", State, SentPose, Status)
 
 
+class NotStarted(RecordingError):
+    """The recording of a run that ended before its common start, so that there is nothing to show."""
+
+
 @dataclass(frozen=True)
 class Playback:
     """A recording, read.
 
     Attributes:
-        trace: What happened.
+        trace: What happened, until the end of the run.
+        started: The common start, UTC [s]; of a virtual run the one that it pretends.
         complete: The recorder finished the file and nothing in it is damaged.
         messages: How many the file holds, those of other programs included.
     """
 
     trace: Trace
+    started: float
     complete: bool
     messages: int
 
@@ -59,8 +68,13 @@ def read(path: Path) -> Playback:
     same process counted before the common start. A pose that two listeners and the recorder missed counts three times:
     each of them was owed it.
 
+    The trace of a run that did not last as long as its experiment ends with the run: where the conductor began to land
+    everybody (interrupted by the user, or all robots had come down before), else, when the recorder or the conductor
+    was killed, with the last that is known of the robots while they ran. Nothing of a landing is in the trace.
+
     Raises:
-        RecordingError: If the file is no recording of zenpark, of another version, or of a run that never started.
+        NotStarted: If the run ended before its common start.
+        RecordingError: If the file is no recording of zenpark, or of another version.
     """
     content = _Content(Records(path))
     messages = content.fill()
@@ -75,8 +89,12 @@ def read(path: Path) -> Playback:
         raise RecordingError(f"{path}: holds no experiment that this version of zenpark can read ({error})") from None
     start = content.start(announced)
     if start is None:
-        raise RecordingError(f"{path}: no robot had started when the recording ended; there is nothing to show")
-    return Playback(_trace(content, experiment, start, (case, seed, clock)), records.complete, messages)
+        raise NotStarted(f"{path}: no robot had started when the recording ended; there is nothing to show")
+    length = content.length(start, experiment.duration_s)
+    if length * experiment.rates.state_hz < 1.0 - ROUNDING_S:
+        raise NotStarted(f"{path}: the run ended before the common start; there is nothing to show")
+    trace = _trace(content, experiment, (start, length), (case, seed, clock))
+    return Playback(trace, start, records.complete, messages)
 
 
 @dataclass
@@ -121,6 +139,28 @@ class _Content:
             return said[0] if said else announced
         return min(began, default=None)
 
+    def length(self, start: float, duration: float) -> float:
+        """How long the run lasted from the common start on [s], at most as long as it was to last."""
+        said = [
+            (event.stamp - start, event.text != "landing")
+            for event in self.events
+            if (event.kind, event.source) == ("phase", "conductor")
+            and event.text.startswith("landing")
+            and math.isfinite(event.stamp)
+        ]
+        if said:
+            end, interrupted = min(said)
+            return min(end, duration) if interrupted or end < duration - EARLY_S else duration
+        last: dict[str, float] = {}
+        for state in self.states:
+            if state.phase not in LANDED and math.isfinite(state.stamp):
+                last[state.robot] = max(last.get(state.robot, -math.inf), state.stamp - start)
+        end = max(last.values(), default=duration)
+        # robots that were there until the end are known until the first of them falls silent: some messages of the
+        # others only came later into the file, which is no reason to call them dead
+        end = min((at for at in last.values() if at > end - HOLE_S), default=end)
+        return duration if end > duration - EARLY_S else end
+
     def _choose(self, channel: int, known: dict[str, _Reader]) -> Callable[[bytes], None] | None:
         about = self.records.channels[channel]
         schema = self.records.schemas.get(about.schema_id)
@@ -144,14 +184,15 @@ def _reader(kind: type[S], sink: list[S]) -> tuple[str, _Reader]:
     return made.name, (made.schema, lambda data: append(decode(data)))
 
 
-def _trace(content: _Content, experiment: Experiment, start: float, about: tuple[str, int, str]) -> Trace:
+def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], about: tuple[str, int, str]) -> Trace:
+    """The trace of a run by its common start, UTC, and its length [s]."""
     robots = tuple(experiment.robots)
-    rate, duration = experiment.rates.state_hz, experiment.duration_s
+    rate, (start, duration) = experiment.rates.state_hz, run
     time = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
     states = _by_robot(content.states, robots)
     poses = [list({(pose.stamp, pose.seq): pose for pose in own}.values()) for own in _by_robot(content.poses, robots)]
     statuses = _by_robot(content.statuses, robots)
-    last = [own[-1] if own else None for own in statuses]
+    last = [_by_the_end(own, start + duration) for own in statuses]
     sampled = [_sampled(own, start, time, HOLD_PERIODS / rate) for own in states]
     position, yaw, true_position, goal, setpoint = (np.stack(columns, axis=1) for columns in zip(*sampled, strict=True))
     return Trace(
@@ -177,6 +218,11 @@ def _trace(content: _Content, experiment: Experiment, start: float, about: tuple
             for event in sorted(content.events, key=lambda event: event.stamp)
         ),
     )
+
+
+def _by_the_end(said: list[Status], end: float) -> Status | None:
+    """The last status that counts for the run; the first one after it if there is none."""
+    return next((status for status in reversed(said) if status.stamp <= end + STATUS_S), next(iter(said), None))
 
 
 def _by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:

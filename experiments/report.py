@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -27,7 +29,7 @@ from experiments.report_tables import (
     whole_table,
 )
 from experiments.trace import Trace
-from experiments.verdict import Finding, findings, left_out
+from experiments.verdict import Finding, findings, interruptions, left_out
 
 TEMPLATE: Final = "report.html.jinja"
 PROOF: Final = (
@@ -35,6 +37,19 @@ PROOF: Final = (
     "sent in the last instant of the run may still be under way."
 )
 MOST_LINKS: Final = 60  # longer tables are folded
+ORIGIN: Final = "run.json"  # how and when a run was made, for when its report is made again
+
+
+class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the numbers come from.
+
+    Attributes:
+        command: How to do the run again.
+        date: When it was.
+    """
+
+    command: str
+    date: str
 
 
 @dataclass(frozen=True)
@@ -69,34 +84,43 @@ def write(
     name: str = "report.html",
     measured: Sequence[CaseMetrics] | None = None,
     notes: Sequence[str] = (),
+    run: Path | None = None,
 ) -> Path:
     """Writes the report of one run.
+
+    The first time it also writes how and when the run was made into `run.json` in the folder of the run; a report that
+    is made again says the same.
 
     Args:
         folder: Where to; made if it does not exist.
         traces: The cases of the run, the reference first; several seeds of a case become means with 95 % intervals,
             and the figures of motions show the first seed.
-        command: How to do the run again.
+        command: How to do the run again; not shown if left out.
         text: The experiment file; the experiment of the first trace as JSON if left out.
-        date: When the run was; now if left out.
+        date: When the run was, see `date_of`; now if left out.
         name: Of the file.
         measured: `measure` of each trace, if that was done already.
-        notes: What the reader should know besides: interrupted, damaged recording.
+        notes: What the reader should know besides: a damaged recording, robots that were lost. That runs were
+            interrupted is seen from the traces.
+        run: Folder of the run; the same as `folder` if left out.
 
     Raises:
-        ValueError: If there is no trace, or one of less than two samples.
+        ValueError: If there is no trace (no robot had started: there is nothing to report), or one of less than two
+            samples.
     """
     if not traces:
-        raise ValueError("there is no case to report")
+        raise ValueError("there is no case to report: no robot had started")
     cases = [measure(trace) for trace in traces] if measured is None else measured
     first = _first_seed(traces)
     experiment = traces[0].experiment
     seeds = sorted({trace.seed for trace in traces})
+    folder.mkdir(parents=True, exist_ok=True)
+    made = _origin(folder if run is None else run, Origin(command, date or date_of(time.time())))
     facts = [
-        ("Date", date or f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
+        ("Date", made.date),
         ("Clock", _words(trace.clock for trace in traces)),
         ("Seed" if len(seeds) == 1 else "Seeds", _seeds(seeds)),
-        ("Duration", f"{cases[0].duration_s:g} s"),
+        ("Duration", _words(_length(case) for case in cases)),
         ("Robots", str(len(traces[0].robots))),
         ("Cases", ", ".join(by_case(cases))),
     ]
@@ -121,14 +145,14 @@ def write(
         Section("The experiment", listing=listing, folded="Show the file"),
         Section("Definitions", terms=DEFINITIONS),
     ]
-    folder.mkdir(parents=True, exist_ok=True)
+    cut, verdict = interruptions(cases), findings(cases)
     return _render(
         folder / name,
         title=experiment.title,
         source=experiment.source,
         facts=facts,
-        command=command,
-        verdict=[*(Finding("fair", note) for note in notes), *findings(cases)],
+        command=made.command,
+        verdict=[*cut, *(Finding("fair", note) for note in notes), *verdict[len(cut) :]],
         sections=sections,
     )
 
@@ -145,7 +169,8 @@ def compare(
 
     Args:
         target: The file.
-        runs: Name and traces of each run; several seeds of a case become means with 95 % intervals.
+        runs: Name and traces of each run; several seeds of a case within one run become means with 95 % intervals.
+            Runs of the same name are numbered.
         title: Of the page.
         command: How to do it again.
         date: Now if left out.
@@ -153,9 +178,10 @@ def compare(
     Raises:
         ValueError: If there is no trace, or one of less than two samples.
     """
+    names = _distinct([name for name, _ in runs])
     cases = [
         msgspec.structs.replace(measure(trace), case=_label(name, trace, traces))
-        for name, traces in runs
+        for name, (_, traces) in zip(names, runs, strict=True)
         for trace in traces
     ]
     if not cases:
@@ -163,8 +189,8 @@ def compare(
     drawn = [figures.global_bars(cases), figures.robot_bars(cases)]
     captions = (_global_caption(cases), _robot_caption(cases))
     facts = [
-        ("Date", date or f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
-        ("Runs", ", ".join(name for name, _ in runs)),
+        ("Date", date or date_of(time.time())),
+        ("Runs", ", ".join(names)),
         ("Reference", cases[0].case),
     ]
     experiments = dict.fromkeys(trace.experiment.title for _, traces in runs for trace in traces)
@@ -186,6 +212,24 @@ def compare(
         verdict=findings(cases),
         sections=sections,
     )
+
+
+def date_of(at: float) -> str:
+    """A UTC time [s], such as `Playback.started`, as reports show it."""
+    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def _origin(folder: Path, now: Origin) -> Origin:
+    """What is kept of the making of the run in its folder; kept now if nothing was, and there is a command."""
+    file = folder / ORIGIN
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=Origin)
+    except FileNotFoundError:
+        if now.command:
+            file.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
+        return now
+    except ValueError:  # another file of this name: a case may be called "run"
+        return now
 
 
 def _render(
@@ -267,6 +311,19 @@ def inline(svg: str, prefix: str, label: str) -> str:
     words = label.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
     head = f'<svg {box[0] if box else ""} role="img" aria-label="{words}">'
     return re.sub(r"\n\s*", "\n", head + svg[svg.index(">") + 1 :]).strip()
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names, with a number behind those that were there before."""
+    found: list[str] = []
+    for name in names:
+        tries = (name if k == 1 else f"{name} ({k})" for k in itertools.count(1))
+        found.append(next(each for each in tries if each not in found))
+    return found
+
+
+def _length(case: CaseMetrics) -> str:
+    return f"{case.duration_s:.1f} s of {case.planned_s:g} s" if case.interrupted else f"{case.duration_s:g} s"
 
 
 def _label(name: str, trace: Trace, traces: Sequence[Trace]) -> str:

@@ -22,7 +22,7 @@ SUMMARY: Final = (
     ("iae", "IAE [m s]"),
     ("itae", "ITAE [m s²]"),
     ("rmse", "RMSE [m]"),
-    ("acquired_s", "Acquired after [s]"),
+    ("acquired_s", "Acquired, mean over followers [s]"),
     ("lost", "Lost samples"),
     ("missed_deadlines", "Missed deadlines"),
 )
@@ -34,7 +34,8 @@ DEFINITIONS: Final = (
     ("ITAE", "Integral of t · e(t); t counts from the common start."),
     ("RMSE", "Root of the mean of e(t)²."),
     ("Acquired", "From when on the moving mean over one second of the error of each link stays within the tolerance,"
-     " until the next phase; 0 if it never left. In the means only if every robot acquired."),
+     " until the next phase or the end; 0 if it never left. \"By all\" is when the last follower was there; the mean"
+     " over followers is of their own times, and is given only if every follower acquired."),
     ("Phase", "From the start, or from a leg of the timeline, to the next leg or the end."),
     ("Worst link", "Of each robot the link with the largest error, averaged over the last second of a phase."),
     ("Net rotation", "How fast the formation turns about its centroid, seen from above, after it was acquired: the"
@@ -132,7 +133,7 @@ def whole_table(cases: Sequence[CaseMetrics]) -> Table:
     rows = []
     for k in range(phases):
         rows += [
-            row(f"Acquired by all{_phase(cases, k)} [s]", lambda case, k=k: _at(case.acquired_s, k)),  # type: ignore[misc]
+            row(f"Acquired by all followers{_phase(cases, k)} [s]", lambda case, k=k: _at(case.acquired_s, k)),  # type: ignore[misc]
             row(f"Worst link{_phase_end(cases, k, phases)} [cm]", lambda case, k=k: _worst(case, k), 100.0),  # type: ignore[misc]
             row(f"Net rotation{_phase(cases, k)} [mrad/s]", lambda case, k=k: _at(case.rotation_rad_s, k), 1000.0),  # type: ignore[misc]
         ]
@@ -157,7 +158,7 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
     names = [robot.robot for robot in runs[0].robots]
     kinds = {robot.robot: robot.kind for robot in runs[0].robots}
     kept = [name for name in names if name not in out]
-    later = range(len(runs[0].starts_s) - 1)
+    later = range(max(len(run.starts_s) for run in runs) - 1)
     columns: list[tuple[str, Callable[[RobotMetrics], float | None], float]] = [
         ("f [Hz]", lambda robot: robot.f_hz, 1.0),
         ("Sent", lambda robot: robot.messages, 1.0),
@@ -165,7 +166,7 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
         ("ITAE [m s²]", lambda robot: robot.itae, 1.0),
         ("RMSE [m]", lambda robot: robot.rmse, 1.0),
         ("Acquired [s]", lambda robot: robot.acquired_s, 1.0),
-        *((f"{_phase(runs, k + 1).strip()} [s]", lambda robot, k=k: robot.phases[k].acquired_s, 1.0) for k in later),
+        *((f"{_phase(runs, k + 1).strip()} [s]", lambda robot, k=k: _later(robot, k), 1.0) for k in later),
         ("Worst link [cm]", lambda robot: robot.by_the_end[0], 100.0),
     ]
     if any(robot.coverage < 1.0 for run in runs for robot in run.robots):
@@ -264,6 +265,10 @@ def _of(what: Callable[[Iterable[float]], float], values: Iterable[float | None]
 
 def _at(values: Sequence[float | None], k: int) -> float | None:
     return values[k] if k < len(values) else None
+
+
+def _later(robot: RobotMetrics, k: int) -> float | None:
+    return robot.phases[k].acquired_s if k < len(robot.phases) else None
 
 
 def _worst(case: CaseMetrics, k: int) -> float | None:

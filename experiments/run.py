@@ -12,8 +12,9 @@ In a notebook:
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
@@ -50,7 +51,8 @@ class Run:
         metrics: What it comes to, per case.
         folder: Where the recordings are; None if none were made.
         source: The experiment file.
-        notes: What the reader should know: interrupted, robots lost, a damaged recording.
+        notes: What the reader should know: robots lost, a damaged recording, a case that never began.
+        made: When, UTC [s].
     """
 
     title: str
@@ -60,6 +62,7 @@ class Run:
     folder: Path | None = None
     source: str = ""
     notes: tuple[str, ...] = ()
+    made: float = field(default_factory=time.time)
 
     def figures(self) -> dict[str, Figure]:
         """The figures of the report, by name."""
@@ -175,14 +178,13 @@ def fly(
                     show=show,
                     interrupted=interrupted,
                 ).run()
-    notes = [f"{case}: interrupted" for case, result in results.items() if result.interrupted]
-    notes += [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost]
+    notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost]
     begun = {case: result.recording for case, result in results.items() if result.start is not None}
     return _read_back(folder, begun, notes)
 
 
 def reopen(folder: Path) -> Run:
-    """The run in a folder, read back from its recordings.
+    """The run in a folder, read back from its recordings; without traces if no case had begun.
 
     Raises:
         RecordingError: If there is no recording, or one cannot be read.
@@ -199,16 +201,22 @@ def reopen(folder: Path) -> Run:
 
 def _read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]) -> Run:
     """Traces from recordings; those of killed recorders too, as far as they go."""
-    traces, remarks = {}, list(notes)
+    traces: dict[str, Trace] = {}
+    remarks, made = list(notes), []
     for case, file in recordings.items():
-        played = playback.read(file)
+        try:
+            played = playback.read(file)
+        except playback.NotStarted as nothing:
+            remarks.append(f"{case}: {nothing}")
+            continue
         traces[played.trace.case] = played.trace
+        made.append(played.started if played.trace.clock == "real" else file.stat().st_mtime)
         if not played.complete:
             remarks.append(f"{case}: the recording was cut off; `zenpark recover {file}` mends it")
     source = folder / SOURCE
     text = source.read_text("utf-8") if source.exists() else ""
     title = next((trace.experiment.title for trace in traces.values()), "")
-    return _measured(title, traces, folder, text, remarks)
+    return replace(_measured(title, traces, folder, text, remarks), made=min(made, default=0.0))
 
 
 def _measured(

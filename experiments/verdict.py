@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from experiments.metrics import CaseMetrics, by_case, ratios, spread
+from experiments.metrics import CaseMetrics, by_case, ratios, same_length, spread
 from experiments.report_tables import interval, number
 
 Mark = Literal["good", "fair", "bad", "plain"]
@@ -24,6 +24,7 @@ class Finding:
 def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """The verdict over all cases, the first one being the reference."""
     return [
+        *interruptions(cases),
         *_nothing_lost(cases),
         *_deadlines(cases),
         *_died(cases),
@@ -32,6 +33,19 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *_against_the_first(cases),
         *_room(cases),
     ]
+
+
+def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Which runs ended before their time; the first thing that a reader must know."""
+    found, several = [], len(by_case(cases)) > 1
+    for run in cases:
+        if run.interrupted:
+            where = f"{run.case} was interrupted" if several else "Interrupted"
+            text = (
+                f"{where} after {run.duration_s:.1f} s of {run.planned_s:g} s: all {'its ' if several else ''}figures"
+            )
+            found.append(Finding("fair", f"{text} are up to there."))
+    return found
 
 
 def left_out(cases: Sequence[CaseMetrics]) -> str:
@@ -84,24 +98,33 @@ def _died(cases: Sequence[CaseMetrics]) -> list[Finding]:
 def _acquired(cases: Sequence[CaseMetrics]) -> list[Finding]:
     found = []
     tolerance = f"{100.0 * cases[0].tolerance:g} cm"
-    for k, start in enumerate(cases[0].starts_s):
-        reached, missing = [], []
-        for name, runs in by_case(cases).items():
-            when = spread([run.acquired_s[k] if k < len(run.acquired_s) else None for run in runs])
+    longest = max(cases, key=lambda case: len(case.starts_s))
+    for k, start in enumerate(longest.starts_s):
+        reached: list[str] = []
+        missing: list[str] = []
+        cut: list[str] = []
+        for name, every in by_case(cases).items():
+            runs = [run for run in every if k < len(run.acquired_s)]  # others ended before this phase
+            when = spread([run.acquired_s[k] for run in runs])
             if when.n:
                 reached.append(f"{interval(when)} s ({name})")
             if when.n < len(runs):
-                missing.append(name if len(runs) == 1 else f"{name} ({len(runs) - when.n} of {len(runs)} seeds)")
+                short = cut if any(run.interrupted for run in runs) else missing
+                short.append(name if len(runs) == 1 else f"{name} ({len(runs) - when.n} of {len(runs)} seeds)")
         which = (
-            f"The formation was acquired to {tolerance}"
+            f"The formation was acquired by all to {tolerance}"
             if k == 0
-            else f"After the leg at {start:g} s it was acquired again"
+            else f"After the leg at {start:g} s it was acquired by all again"
         )
         if reached:
             found.append(Finding("good" if not missing else "fair", f"{which} after {_list(reached)}."))
         if missing:
             once = "The formation" if k == 0 else f"After the leg at {start:g} s it"
             found.append(Finding("bad", f"{once} never stayed within {tolerance} in {_list(missing)}."))
+        if cut:
+            once = "The formation" if k == 0 else f"After the leg at {start:g} s it"
+            text = f"{once} was not within {tolerance} when {_list(cut)} {_was(cut)} interrupted."
+            found.append(Finding("plain", text))
     return found
 
 
@@ -117,9 +140,10 @@ def _worst_link(cases: Sequence[CaseMetrics]) -> Finding:
         words.append(f"{number(error, 100.0)} cm ({robot}–{other}, {name})")
     if not words:
         return Finding("plain", "No link could be measured at the end.")
-    return Finding(
-        "good" if largest <= cases[0].tolerance else "bad", f"By the end the worst link was off by {_list(words)}."
-    )
+    mark: Mark = "good" if largest <= cases[0].tolerance else "bad"
+    if mark == "bad" and any(case.interrupted for case in cases):
+        mark = "plain"  # it may have been on its way
+    return Finding(mark, f"By the end the worst link was off by {_list(words)}.")
 
 
 def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -139,14 +163,17 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
             for index, label in (("iae", "IAE"), ("itae", "ITAE"), ("rmse", "RMSE"))
         ]
         known = [(label, each) for label, each in errors if each.mean is not None]
-        if known:
+        if not same_length([*runs, *first]):
+            text = f"{name} and {reference} are of different length: their errors are not compared."
+            found.append(Finding("plain", text))
+        elif known:
             parts = [
                 f"{label} {each.mean:.3f}" + (f" ± {each.ci95:.3f}" if each.ci95 is not None else "")
                 for label, each in known
             ]
             worse = max(each.mean for _, each in known if each.mean is not None)
             text = f"Its errors relative to {reference}: {_list(parts)}."
-            found.append(Finding("good" if worse <= 1.0 else "fair" if worse <= 1.25 else "bad", text))
+            found.append(Finding("good" if worse <= 1.0 else "plain" if worse < 1.25 else "fair", text))
     return found
 
 
@@ -167,6 +194,10 @@ def _room(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 def _list(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _was(names: Sequence[str]) -> str:
+    return "was" if len(names) == 1 else "were"
 
 
 def _is(names: Sequence[str]) -> str:

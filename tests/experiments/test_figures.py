@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from experiments import figures
 from experiments.metrics import measure
 from experiments.signals import formation_errors
-from tests.experiments.traces import crowd, experiment, park, trace
+from tests.experiments.traces import crowd, cut, experiment, park, trace
 
 OF_TRACES = (
     figures.formation_before,
@@ -132,6 +132,67 @@ def test_a_robot_that_died_or_never_spoke_can_be_drawn(draw):
     place[:, 5] = np.nan
     silent = dataclasses.replace(known.sent, time=known.sent.time[:0], robot=known.sent.robot[:0])
     assert "<svg" in figures.svg(draw([dataclasses.replace(known, true_position=place, sent=silent)]))
+
+
+def drawn(traces):
+    """All figures, rendered."""
+    measured = [measure(each) for each in traces if len(each.time) > 1]
+    made = figures.every(measured, traces)
+    for figure in made.values():
+        assert "<svg" in figures.svg(figure)
+    return list(made)
+
+
+def unknown(known, rows):
+    place = known.true_position.copy()
+    place[rows] = np.nan
+    return dataclasses.replace(known, true_position=place, position=place)
+
+
+WITHOUT_SPACE = ["global_bars", "robot_bars", "errors", "events", "intervals"]
+
+
+def test_no_trace_gives_no_figure():
+    assert figures.every([], []) == {}
+
+
+def test_a_trace_that_ends_before_the_first_leg():
+    known = cut(park(), 8.0)
+    assert drawn([known]) == [*WITHOUT_SPACE[:1], "formation_before", *WITHOUT_SPACE[1:], "plan_view"]
+
+
+def test_a_robot_less_span_is_left_out():
+    names = drawn([unknown(park(duration=23.0), np.s_[300:])])
+    assert "formation_before" in names
+    assert "formation_after" not in names
+    names = drawn([unknown(park(duration=23.0), np.s_[:1100])])
+    assert "formation_before" not in names
+    assert "formation_after" in names
+
+
+def test_one_case_of_two_that_is_unknown_after_the_leg():
+    names = drawn([park("a", duration=23.0), unknown(park("b", duration=23.0), np.s_[300:])])
+    assert "formation_after" in names
+
+
+@pytest.mark.parametrize("samples", [2, 1])
+def test_nothing_known_and_hardly_any_time(samples):
+    known = cut(park(), 0.02 * (samples - 1))
+    assert len(known.time) == samples
+    assert "plan_view" in drawn([known])
+    assert drawn([unknown(known, np.s_[:])]) == (WITHOUT_SPACE if samples > 1 else WITHOUT_SPACE[2:])
+
+
+def test_no_sample_gives_no_picture():
+    known = cut(park(), -1.0)
+    assert figures.every([], [known]) == {}
+
+
+@pytest.mark.parametrize("draw", OF_TRACES, ids=lambda draw: draw.__name__)
+def test_whatever_is_unknown_can_be_drawn(draw):
+    known = park(duration=23.0)
+    for rows in (np.s_[:], np.s_[300:], np.s_[:1100], np.s_[1:]):
+        assert "<svg" in figures.svg(draw([unknown(known, rows)]))
 
 
 def test_saved_files_are_vector_with_real_fonts_and_the_same_every_time(tmp_path):

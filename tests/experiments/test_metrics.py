@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from experiments import metrics
 from experiments.signals import formation_errors, net_rotation
 from experiments.trace import Trace
-from tests.experiments.traces import STEP, experiment, pair, park, trace
+from tests.experiments.traces import STEP, cut, experiment, pair, park, trace
 
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
 
@@ -217,6 +217,8 @@ def test_document_has_the_shape_for_scripts():
     assert (found["run"], found["seed"], list(found["cases"])) == ("runs/7", 4, ["a", "b"])
     b = found["cases"]["b"]
     assert set(b) == {"robots", "mean", "ratio"}
+    short = metrics.document("runs/7", 4, [metrics.measure(cut(park("a", seed=4), 8.0))])["cases"]["a"]
+    assert (short["duration_s"], short["interrupted"]) == (8.0, True)
     assert set(b["robots"]["TB01"]) == set(b["mean"]) == set(b["ratio"]) == set(metrics.INDICES)
     followers = [b["robots"][name]["iae"] for name in b["robots"] if name != "TB01"]
     assert b["mean"]["iae"] == pytest.approx(np.mean(followers))
@@ -224,6 +226,42 @@ def test_document_has_the_shape_for_scripts():
     assert found["cases"]["a"]["ratio"]["iae"] == 1.0
     assert b["ratio"]["lost"] is None  # the reference lost nothing
     assert msgspec.json.decode(msgspec.json.encode(found)) == found
+
+
+def test_an_interrupted_run_is_measured_by_its_own_length():
+    measured = metrics.measure(cut(park(), 8.0))
+    whole = metrics.measure(park())
+    assert (measured.duration_s, measured.planned_s, measured.interrupted) == (8.0, 45.0, True)
+    assert not whole.interrupted
+    assert measured.died == ()
+    assert measured.starts_s == (0.0,)
+    robot = measured.robots[1]
+    assert robot.messages == 400
+    assert robot.f_hz == pytest.approx(50.0)
+    assert robot.known == 1.0
+    assert robot.iae < whole.robots[1].iae
+    assert [index for index, value in measured.mean.items() if value is None] == ["acquired_s"]
+    assert measured.acquired_s == (None,)  # it came later
+    assert metrics.measure(cut(park(), 20.0)).acquired_s[0] == pytest.approx(whole.acquired_s[0])
+
+
+def test_who_died_before_the_interruption_died():
+    place = park().true_position.copy()
+    place[200:, 6] = np.nan
+    measured = metrics.measure(cut(dataclasses.replace(park(), true_position=place), 8.0))
+    assert measured.died == ("CF03",)
+
+
+def test_what_grows_with_time_is_not_compared_with_an_interrupted_run():
+    whole, half = metrics.measure(park("a")), metrics.measure(cut(park("b"), 20.0))
+    assert metrics.ratios([half], [whole], "iae") == metrics.ratios([half], [whole], "messages") == [None]
+    assert metrics.ratios([half], [whole], "f_hz") == [pytest.approx(1.0)]
+    assert metrics.document("x", 1, [whole, half])["cases"]["b"]["ratio"]["itae"] is None
+
+
+def test_a_whole_run_may_end_one_sample_before_its_time():
+    assert not metrics.measure(pair(np.ones(16), step=1.0, planned=15.5)).interrupted
+    assert metrics.measure(pair(np.ones(14), step=1.0, planned=15.5)).interrupted
 
 
 def test_spread_over_seeds():

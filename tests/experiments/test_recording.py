@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 
 from agents.wire import Event, Heard, Pose, State, Status
 from experiments.experiment import Experiment, Rates, Robot
-from experiments.playback import read
+from experiments.playback import NotStarted, read
 from experiments.recording import Recording
 from experiments.records import RecordingError
 from experiments.recover import Recovered, recover, recover_command
@@ -82,6 +82,10 @@ def status(robot="TB01", at=1.0, *, sent=0, lost=None, started=START, pid=7, tic
 
 def begun(at=0.0):
     return Event(START + at, "start", "conductor", "go")
+
+
+def landed(at=1.0, text="landing"):
+    return Event(START + at, "phase", "conductor", text)
 
 
 def write(path, *messages, experiment=PAIR, **more):
@@ -235,7 +239,7 @@ def test_yaw_keeps_the_branch_it_was_recorded_on(path):
 
 
 def test_silence_is_nan_and_never_extrapolated(path):
-    write(path, begun(), *[state(at=k / 10, x=k / 10) for k in range(6)])
+    write(path, begun(), landed(), *[state(at=k / 10, x=k / 10) for k in range(6)])
     trace = read(path).trace
     np.testing.assert_allclose(trace.position[:8, 0, 0], [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.5], atol=1e-6)
     for array in (trace.position, trace.yaw, trace.true_position, trace.goal, trace.setpoint):
@@ -294,7 +298,7 @@ def test_numbers_that_nobody_knows(path):
     ],
 )
 def test_lost(path, messages, lost):
-    write(path, begun(), state(), *messages)
+    write(path, begun(), state(), *messages, landed())
     assert read(path).trace.lost.tolist() == [lost, 0]
 
 
@@ -306,12 +310,77 @@ def test_only_poses_of_the_run_are_sent(path):
 
 
 def test_the_start_is_the_conductors_else_the_robots(path, tmp_path):
-    write(path, state(at=0.0), state(at=0.5), status(started=START + 0.5), status("CF01", started=0.0))
+    write(path, state(at=0.0), state(at=0.5), status(started=START + 0.5), status("CF01", started=0.0), landed(1.5))
     assert np.isfinite(read(path).trace.position[:, 0, 0]).tolist() == [True] * 3 + [False] * 8
     both = tmp_path / "both.mcap"
-    write(both, state(at=0.0), begun(0.2), status(started=START + 0.5), state(at=0.5, x=1.0))
+    write(both, state(at=0.0), begun(0.2), status(started=START + 0.5), state(at=0.5, x=1.0), landed(1.2))
     np.testing.assert_allclose(read(both).trace.position[3, 0, 0], 1.0)
     assert read(both).trace.events[0].stamp == 0.0
+
+
+def seconds(count, phase="running"):
+    """States of two robots at 10 Hz."""
+    return [state(name, k, k / 10, phase=phase) for k in range(count) for name in ("TB01", "CF01")]
+
+
+def test_the_trace_of_an_interrupted_run_ends_with_the_interruption(path):
+    sends = [pose(seq=k + 1, at=k / 10, x=k / 10) for k in range(11)]
+    said = [status(at=0.6, sent=7, ticks=60, decisions=6), status(at=2.5, sent=11, ticks=250, decisions=25)]
+    write(path, begun(), *seconds(11), *sends, *said, landed(0.75, "landing (interrupted)"))
+    trace = read(path).trace
+    assert trace.time[-1] == pytest.approx(0.7)
+    assert trace.position.shape == (8, 2, 3)
+    assert np.isfinite(trace.position).all()
+    assert trace.sent.seq.tolist() == list(range(1, 9))
+    assert trace.lost.tolist() == [0, 0]
+    assert trace.events[-1].stamp == pytest.approx(0.75)
+
+
+def test_a_run_that_the_user_ended_after_its_end_is_whole(path):
+    write(path, begun(), *seconds(11), landed(1.3, "landing (interrupted)"))
+    assert read(path).trace.time[-1] == 1.0
+
+
+def test_a_run_in_which_all_came_down_ends_there(path):
+    long = msgspec.structs.replace(PAIR, duration_s=5.0)
+    write(path, begun(), *seconds(31), landed(3.0), experiment=long)
+    assert read(path).trace.time[-1] == 3.0
+
+
+def test_robots_land_a_little_early_by_their_own_clocks(path):
+    write(path, begun(), *seconds(11), landed(0.98))
+    assert read(path).trace.time[-1] == 1.0
+
+
+def test_without_a_word_of_the_conductor_the_run_ends_with_the_robots(path):
+    long = msgspec.structs.replace(PAIR, duration_s=20.0)
+    down = [state("TB01", k, k / 10, phase="landing") for k in range(41, 60)]
+    more = [state("TB01", k, k / 10, phase="running") for k in range(31, 36)]
+    write(path, begun(), *seconds(31), *more, *down, experiment=long)
+    trace = read(path).trace
+    assert trace.time[-1] == pytest.approx(3.0)
+    assert np.isfinite(trace.position).all()
+
+
+def test_a_robot_that_fell_silent_long_before_does_not_end_the_run(path):
+    long = msgspec.structs.replace(PAIR, duration_s=20.0)
+    more = [state("TB01", k, k / 10, phase="running") for k in range(31, 100)]
+    write(path, begun(), *seconds(31), *more, experiment=long)
+    trace = read(path).trace
+    assert trace.time[-1] == pytest.approx(9.9)
+    assert np.isnan(trace.position[-1, 1]).all()
+
+
+@pytest.mark.parametrize("end", [-0.5, 0.0, 0.05])
+def test_a_run_interrupted_before_its_start(path, end):
+    write(path, state(), begun(), landed(end, "landing (interrupted)"))
+    with pytest.raises(NotStarted, match="ended before the common start"):
+        read(path)
+
+
+def test_when_the_run_began(path):
+    write(path, *whole_run())
+    assert read(path).started == START
 
 
 def test_a_run_that_never_started(path):
@@ -337,10 +406,11 @@ def test_what_cannot_be_a_message_is_counted_and_left_out(path):
 
 @pytest.mark.parametrize("stamp", [math.nan, math.inf, -1.0, 1e19])
 def test_a_broken_clock_does_not_stretch_the_time_line(path, stamp):
-    write(path, begun(), msgspec.structs.replace(state(), stamp=stamp))
+    write(path, begun(), landed(), msgspec.structs.replace(state(), stamp=stamp))
     with path.open("rb") as file:
         statistics = make_reader(file).get_summary().statistics
-    assert statistics.message_start_time == statistics.message_end_time == round(START * 1e9)
+    assert statistics.message_start_time == round(START * 1e9)
+    assert statistics.message_end_time == round((START + 1.0) * 1e9)
     assert np.isnan(read(path).trace.position).all()
 
 

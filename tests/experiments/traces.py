@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
+import msgspec
 import numpy as np
 
 from agents.graph import links
@@ -13,7 +16,9 @@ from experiments.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.links import parse_links
 from experiments.trace import HeardPoses, Sent, Trace
 
+Said = TypeVar("Said", Sent, HeardPoses)
 STEP = 0.02
+TIMED = ("position", "yaw", "true_position", "goal", "setpoint")
 
 
 def experiment(
@@ -42,10 +47,15 @@ def trace(
     case: str = "only",
     seed: int = 1,
     events: Sequence[Event] = (),
+    planned: float | None = None,
 ) -> Trace:
-    """A trace of given positions (T, N, 3); robots in `sent` send their pose at those times, heard by all listeners."""
+    """A trace of given positions (T, N, 3); robots in `sent` send their pose at those times, heard by all listeners.
+
+    It is as long as the run was to be, unless another length was `planned` [s].
+    """
     names = tuple(what.robots)
     count = len(position)
+    what = msgspec.structs.replace(what, duration_s=max(count - 1, 1) * step if planned is None else planned)
     row = {name: i for i, name in enumerate(names)}
     time = np.arange(count) * step
     sends = sorted((at, row[name], k) for name, times in (sent or {}).items() for k, at in enumerate(times, start=1))
@@ -86,6 +96,20 @@ def trace(
         decisions=np.full(rows, count // 5),
         events=tuple(events),
     )
+
+
+def cut(whole: Trace, end: float) -> Trace:
+    """The trace of the same run, interrupted."""
+    count = int(np.searchsorted(whole.time, end + 1e-9))
+    parts = {name: getattr(whole, name)[:count] for name in TIMED}
+    return dataclasses.replace(
+        whole, **parts, sent=_until(whole.sent, end), heard=_until(whole.heard, end), time=whole.time[:count]
+    )
+
+
+def _until(said: Said, end: float) -> Said:
+    kept = said.time < end - 1e-9
+    return dataclasses.replace(said, **{each.name: getattr(said, each.name)[kept] for each in dataclasses.fields(said)})
 
 
 def pair(distance: Array, *, legs: Sequence[float] = (), target: float = 1.0, **rest: object) -> Trace:

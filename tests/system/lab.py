@@ -155,7 +155,17 @@ class Flight:
         return Path(self._errors.name).read_text()
 
     def until_said(self, pattern: str, limit_s: float = PATIENCE_S) -> None:
-        until(lambda: re.search(pattern, self.said()), f"{pattern!r} in {self.said()!r}", limit_s)
+        deadline = time.monotonic() + limit_s
+        pause = threading.Event()
+        while not re.search(pattern, self.said()):
+            waiting = self.process.poll() is None and time.monotonic() < deadline
+            assert waiting, f"{pattern!r} not in {limit_s:g} s; it said:\n{self.said()}\n{self.logs()}"
+            pause.wait(0.02)
+
+    def logs(self) -> str:
+        """What its processes said."""
+        files = sorted((self.folder / "logs").glob("*.log"))
+        return "\n".join(f"{file.name}: {file.read_text()[-500:]}" for file in files)
 
     def signal(self, number: signal.Signals) -> None:
         self.process.send_signal(number)

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from experiments import playback
 from experiments.launcher import LAND_S
-from tests.system.lab import Flight, gone, until
+from tests.system.lab import ROOT, Flight, gone, until
 
 pytestmark = pytest.mark.system
 
@@ -49,3 +51,44 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> N
         apart = np.linalg.norm(trace.true_position[last, rows[one]] - trace.true_position[last, rows[other]], axis=1)
         distance = link if isinstance(link, float) else link.distance
         assert np.abs(apart - distance).mean() < 0.05, text
+
+
+def test_two_tellos_and_three_crazyflies_fly_one_formation(tmp_path: Path) -> None:
+    file = str(ROOT / "tests" / "system" / "flock.toml")
+    flight = Flight(tmp_path / "run", file, "--bodies", "protocol", "--json", "--no-report")
+    code, out = flight.finish(90.0)
+    assert code == 0, flight.said
+    robots = json.loads(out)["cases"]["event"]["robots"]
+    assert set(robots) == {"CF01", "CF02", "CF03", "TE01", "TE02"}
+    assert all(robot["acquired_s"] is not None and robot["lost"] == 0 for robot in robots.values()), robots
+    trace = playback.read(tmp_path / "run" / "event.mcap").trace
+    last = trace.true_position[trace.time > trace.time[-1] - 1.0]
+    centre = last.mean(axis=1, keepdims=True)
+    assert np.abs(np.linalg.norm((last - centre)[..., :2], axis=2).mean(axis=0) - 0.6).max() < 0.05
+
+
+def heard_of(folder: Path) -> dict[str, object]:
+    """What the neighbours of a run hear: keys, structs, how often; and nothing of what the robots are."""
+    with (folder / "periodic.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None
+        topics = {c.topic: summary.schemas[c.schema_id].data for c in summary.channels.values()}
+        poses = [message for *_, message in reader.iter_decoded_messages([t for t in topics if t.endswith("/pose")])]
+    trace = playback.read(folder / "periodic.mcap").trace
+    rates = np.bincount(trace.sent.robot, minlength=3) / trace.time[-1]
+    return {"topics": topics, "fields": {tuple(pose.__slots__) for pose in poses}, "rates": rates.round(0).tolist()}
+
+
+def test_a_swap_is_one_word_and_neighbours_hear_no_difference(tmp_path: Path) -> None:
+    twins, protocol = tmp_path / "twins", tmp_path / "protocol"
+    short = ("--case", "periodic", "--no-report", "--set", "duration_s=4")
+    assert Flight(twins, "triangle", *short).finish()[0] == 0
+    one_word = ("--set", "robots.CF01.body=crazyflie-twin")
+    assert Flight(protocol, "triangle", *short, *one_word).finish()[0] == 0
+    addressed = json.loads((protocol / "periodic-addressed.json").read_text())["robots"]
+    plain = json.loads((protocol / "periodic.json").read_text())["robots"]
+    assert addressed["CF01"].pop("body").startswith("udp://127.0.0.1:")
+    assert plain["CF01"].pop("body") == "crazyflie-twin"
+    assert addressed == plain, "only the address differs"
+    assert heard_of(twins) == heard_of(protocol)
