@@ -68,6 +68,7 @@ class Robots:
         return ""
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(
     st.lists(st.booleans(), min_size=1, max_size=3),

@@ -324,6 +324,7 @@ def test_an_empty_struct_is_no_message():
         codec(msgspec.defstruct("Nothing", []))
 
 
+@pytest.mark.slow
 @given(st.floats(0, 2**31 - 1), vector, st.floats(-10, 10), st.text("abcdefgh/", max_size=9))
 def test_pose_stamped_is_what_rosbags_writes(stamp, position, yaw, frame):
     data = pose_stamped(frame)(stamp, position, yaw)

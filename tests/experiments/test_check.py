@@ -222,6 +222,7 @@ def test_a_plan_for_ever_is_not_cut_off():
     assert ground({}, timeline=[Leg(at_s=1.0, robot="D", plan=plan)]) == {}
 
 
+@pytest.mark.slow
 def test_a_long_run_is_predicted_in_part():
     made = Experiment(title="made", robots=GROUND, duration_s=86400.0)
     assert figures(made).predicted_s == 600.0
@@ -336,6 +337,7 @@ def experiments(draw: st.DrawFn) -> Experiment:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(experiments())
 def test_every_error_and_warning_has_a_remedy_and_a_place(made):

@@ -69,12 +69,14 @@ def mutated(draw, lines):
     return "\n".join(lines)
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(mutated(LINES))
 def test_mutations_of_a_good_file(text):
     reads_or_refuses(text.encode())
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(mutated(RESOLVED.split("\n")))
 def test_mutations_of_a_good_json_file(text):
@@ -93,6 +95,7 @@ def test_any_bytes(content, suffix):
     reads_or_refuses(content, suffix)
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(
     st.lists(

@@ -29,7 +29,11 @@ RUNS = {
 }
 
 
-@pytest.fixture(scope="module", params=list(RUNS))
+LARGE = "40 robots, 5 cases"
+EVERY = [pytest.param(name, marks=pytest.mark.slow if name == LARGE else ()) for name in RUNS]
+
+
+@pytest.fixture(scope="module", params=EVERY)
 def run(request):
     return RUNS[request.param]()
 

@@ -99,6 +99,7 @@ def test_report_of_a_run_stands_alone(tmp_path, run):
     assert path.stat().st_size < 1_500_000
 
 
+@pytest.mark.slow
 def test_report_is_the_same_every_time(tmp_path, run):
     texts = [report.write(tmp_path, run, date="x", name=name).read_bytes() for name in ("a.html", "b.html")]
     assert texts[0] == texts[1]
@@ -127,6 +128,7 @@ def test_many_events_are_cut(tmp_path):
     assert "50 more are in the recording." in page.words
 
 
+@pytest.mark.slow
 def test_report_over_seeds_gives_intervals(tmp_path):
     runs = [park(name, size, seed=seed, duration=8.0) for name, size in (("a", 0.0), ("b", 0.02)) for seed in (1, 2, 3)]
     page = checked(report.write(tmp_path, runs).read_text(encoding="utf-8"))
