@@ -29,6 +29,7 @@ CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
 ROUTER_S: Final = 10.0
 FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
+GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
 ROUTERS: Final = 5  # a router that dies more often is not helped by starting it again
 
 M = TypeVar("M", wire.Status, wire.State)
@@ -165,7 +166,7 @@ class Conductor:
                 self._launcher.start(process, "experiments.robot", str(addressed), *names, *connect, "--lifeline")
             with ExitStack() as stack:
                 self._join(stack)
-                if self._until("ready", self._experiment.start.deadline_s, recorder=True):
+                if self._until("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
                     self._say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
                     self._order(wire.Order("takeoff"))
@@ -228,6 +229,11 @@ class Conductor:
                     self._say("late", name, f"not {phase} after {limit_s:g} s: {self._why(name)}")
                 return True
             time.sleep(POLL_S)
+
+    def _patience(self) -> float:
+        """How long to wait until all are ready [s]: robots that go on without a neighbour say so after the deadline."""
+        begin = self._experiment.start
+        return begin.deadline_s + (GO_ON_S if begin.missing == "go-on" else 0.0)
 
     def _start(self) -> float:
         """One start time for all, in UTC; returns it."""
@@ -387,7 +393,9 @@ class Conductor:
             log = self._recording.parent / "logs" / f"{self._process(group)}.log"
             text = log.read_text(errors="replace").strip() if log.exists() else ""
             lines.append(f"  {name}: {self._why(name)}" + (f"\n    {text.splitlines()[-1]}" if text else ""))
-        lines.append("  give them more time with start.deadline_s, or go on without them with start.missing = 'go-on'")
+        ended = all(self._robots[name].gone for name in names)
+        remedy = "mend that" if ended else "give them more time with start.deadline_s"
+        lines.append(f"  {remedy}, or go on without them with start.missing = 'go-on'")
         return "\n".join(lines)
 
 

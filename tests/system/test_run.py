@@ -181,3 +181,22 @@ def test_a_killed_recorder_costs_the_rest_of_the_recording_only(tmp_path: Path) 
     found = recover(folder / "event.mcap", tmp_path / "mended.mcap")
     assert set(found.robots) == {"KH01", "KH02", "CF01"}
     assert playback.read(tmp_path / "mended.mcap").complete
+
+
+def test_a_robot_that_cannot_start_ends_the_run_or_not_as_the_file_says(tmp_path: Path) -> None:
+    absent = ("--case", "event", "--json", "--set", "robots.CF01.body=udp://127.0.0.1:9", "--set", "duration_s=4")
+    flight = Flight(tmp_path / "abort", "triangle", *absent)
+    flight.until_said(r"CF01: could not start; nothing has moved")
+    said = flight.said()
+    assert "is the simulation running there?" in said
+    assert "start.missing = 'go-on'" in said
+    assert "Traceback" not in said
+    assert flight.finish()[0] == 2
+    flight = Flight(
+        tmp_path / "go-on", "triangle", *absent, "--set", "start.missing=go-on", "--set", "start.deadline_s=3"
+    )
+    code, out = flight.finish(60.0)
+    assert code == 0
+    robots = json.loads(out)["cases"]["event"]["robots"]
+    assert robots["KH01"]["messages"] > 5, "the others fly"
+    assert robots["CF01"]["messages"] == 0
