@@ -71,11 +71,6 @@ class Keys:
         """Liveliness token of the recorder."""
         return f"{self.realm}/run/recorder"
 
-    @property
-    def everything(self) -> str:
-        """All keys of the realm (not its verbatim `@` chunks)."""
-        return f"{self.realm}/**"
-
     def robot(self, key: str) -> str:
         """The robot that a key of this realm belongs to.
 
