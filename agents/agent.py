@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from agents import coordination
+from agents.avoidance import Avoidance, Nearby, Self
 from agents.body import BodyState
 from agents.graph import Links
 from agents.individual import Individual
@@ -21,7 +22,8 @@ from agents.lifecycle import AIRBORNE, RUNNING, Duties, Lifecycle, Phase
 from agents.planning import Itinerary, Leg
 from agents.plugins import PluginError
 from agents.rows import Array, Index, Mask, every, some
-from agents.safety import Limits, Safety
+from agents.safety import Limits, Safety, Verdict
+from agents.sight import Sight
 from agents.triggers import Told, Trigger, View
 
 
@@ -41,6 +43,9 @@ class Assignment:
         tracking_gain: k of (7) [1/(m² decision)].
         legs: Plans: rows, and the legs that they follow.
         limits: For `agents.safety`.
+        avoidance: How the rows keep clear of what they see and hear; None: they do not.
+        speaker_kinds: Kinds of all robots of the experiment.
+        watched: (E,) links that are only for avoidance: the law knows nothing of them; None: there are none.
         body_hz: Rate of ticks.
         pose_every: The trigger is asked on every so many ticks.
         decide_every: A goal is decided on every so many ticks.
@@ -64,6 +69,9 @@ class Assignment:
     decide_every: int
     duration: float
     patience_s: float | None = None
+    avoidance: Avoidance | None = None
+    speaker_kinds: tuple[Kind, ...] = ()
+    watched: Mask | None = None
 
 
 @dataclass
@@ -95,12 +103,14 @@ class Actions:
         setpoint: (N, 4) for the body, NaN rows for those that act by themselves.
         duties: Take-offs, landings, stops; None on nearly every tick.
         changed: (N,) safety had to change what was decided.
+        avoided: (N,) avoidance did.
     """
 
     speak: Index
     setpoint: Array
     duties: Duties | None
     changed: Mask
+    avoided: Mask
 
 
 # what a mistake in a plug-in raises
@@ -142,12 +152,16 @@ class Agent:
         self._flies = flies
         self._ground = np.where(flies, assignment.hover, 0.0)
         self._listens = np.zeros(rows, dtype=bool)
-        self._listens[assignment.links.listener] = True
+        watched = assignment.watched
+        self._listens[assignment.links.listener if watched is None else assignment.links.listener[~watched]] = True
         self._ordered = np.zeros(rows, dtype=bool)
         self._held = np.zeros(rows, dtype=bool)
         self._hold_at = np.full((rows, 3), np.nan)
         self._individual = Individual(assignment.kinds)
         self._safety = Safety(assignment.kinds, assignment.limits)
+        self._sight = Sight(assignment.kinds, assignment.speaker_kinds, assignment.links)
+        self._nobody: Mask = np.zeros(rows, dtype=bool)
+        self._blind_since, self._any_blind = np.full(rows, np.inf), False
         planned = np.zeros(rows, dtype=bool)
         itineraries = []
         for group, legs in assignment.legs:
@@ -238,17 +252,27 @@ class Agent:
                 if not every(seen):
                     speak = speak[seen[speak].all(axis=1)]
                 self.told.tell(speak, t, state.position, state.velocity)
-        setpoint = self._individual.setpoint(self.goal, self.toward, state.position, state.yaw)
-        verdict = self._safety.check(setpoint, state.position, state.yaw, t - state.time)
-        self._escalate(verdict.blind, verdict.escaped, self._flies & ~state.flying)
+        goal, avoided = self.goal, self._nobody
+        age = t - state.time
+        avoidance = self.assignment.avoidance
+        if avoidance is None:
+            setpoint = self._individual.setpoint(goal, self.toward, state.position, state.yaw)
+            verdict = self._safety.check(setpoint, state.position, state.yaw, age)
+        else:
+            own, near = self._sight.see(t, state, self.heard)
+            goal = self._deviate(avoidance, own, near)
+            setpoint = self._individual.setpoint(goal, self.toward, state.position, state.yaw)
+            verdict = self._safety.check(setpoint, state.position, state.yaw, age, avoidance, own, near)
+            avoided = verdict.avoided | (np.abs(goal - self.goal) > 0.0).any(axis=1)
+        self._escalate(t, state, verdict)
         setpoint, changed = verdict.setpoint, verdict.changed
         if not self.life.all_running:
             phase = self.life.phase
             passive = (phase < AIRBORNE) | (phase > RUNNING)
             setpoint = np.where(passive[:, None], np.where(self._flies, np.nan, 0.0)[:, None], setpoint)
-            changed = changed & ~passive
+            changed, avoided = changed & ~passive, avoided & ~passive
         self.tick += 1
-        return Actions(speak, setpoint, duties, changed)
+        return Actions(speak, setpoint, duties, changed, avoided)
 
     def _ready(self, t: float, state: BodyState) -> Mask:
         if not self.life.waiting:
@@ -333,13 +357,26 @@ class Agent:
         error = self.assignment.law.error(position, self.heard.position[self._live], self._live_links)
         self.error = self._live_links.onto_listeners(error[:, None], len(position))[:, 0]
 
-    def _escalate(self, blind: Mask, escaped: Mask, grounded: Mask) -> None:
-        """A flying robot that does not know where it is lands; one that left the arena lands or halts.
+    def _deviate(self, avoidance: Avoidance, own: Self, near: Nearby) -> Array:
+        """The goals that are pursued; an avoidance that fails is named, for it may be somebody's first."""
+        try:
+            return avoidance.deviate(self.goal, own, near, 1.0 / self.assignment.body_hz)
+        except FAILURES as error:
+            raise PluginError(f"the avoidance {type(avoidance).__name__} failed: {_what(error)}") from error
+
+    def _escalate(self, t: float, state: BodyState, verdict: Verdict) -> None:
+        """A flying robot that does not know where it is holds, then lands; one that left the arena lands or halts.
 
         One whose motors are off in mid-run has come down by itself: it must not be commanded as if it flew.
         """
+        blind, escaped, grounded = verdict.blind, verdict.escaped, self._flies & ~state.flying
         if not (some(blind) or some(escaped) or some(grounded)):
+            if self._any_blind:
+                self._blind_since, self._any_blind = np.full(len(self._flies), np.inf), False
             return
+        self._any_blind = True
+        self._blind_since = np.where(blind, np.minimum(self._blind_since, t), np.inf)
+        blind = blind & (t - self._blind_since >= self.assignment.limits.blind_s - 1e-9)
         active, phase = self.life.active, self.life.phase
         for row in np.flatnonzero(grounded & (phase >= AIRBORNE) & (phase <= RUNNING)).tolist():
             self.life.land(row, "it came down by itself")
@@ -354,6 +391,8 @@ class Agent:
         known, here = np.isfinite(heard.stamp), np.isinf(heard.gone)
         self._unsettled = not (known & here).all()
         live = known & (t - heard.gone <= self.assignment.limits.link_silence_s)
+        if self.assignment.watched is not None:
+            live &= ~self.assignment.watched
         self._live = np.flatnonzero(live)
         self._live_links = (
             links

@@ -6,11 +6,12 @@ The runtime finds bodies by the entry-point group `zenpark.bodies`: the word bef
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import msgspec
+import numpy as np
 
 from agents.keys import Keys
 from agents.kinds import Kind
@@ -86,13 +87,67 @@ class RangeScan:
         time: When, on the clock of `Body.read` [s]; a newer scan has a newer time.
         bearing: (m,) from the robot's nose, to the left [rad].
         elevation: (m,) up [rad].
-        distance: (m,) [m]; NaN where nothing is in reach.
+        distance: (m,) from the robot's centre [m]; NaN where nothing is in reach.
     """
 
     time: float
     bearing: Array
     elevation: Array
     distance: Array
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The newest readings of the range sensors of any rows, one entry per ray (R).
+
+    Attributes:
+        row: (R,) whose ray it is; rays of one row follow one another.
+        time: (R,) when it was measured, on the clock of `Body.read` [s].
+        bearing: (R,) from the robot's nose, to the left [rad].
+        elevation: (R,) up [rad].
+        distance: (R,) from the robot's centre [m]; NaN where nothing is in reach.
+    """
+
+    row: Index
+    time: Array
+    bearing: Array
+    elevation: Array
+    distance: Array
+
+    @classmethod
+    def gather(cls, scans: Sequence[RangeScan | None]) -> Rays | None:
+        """The scans of all rows; None if no row has one."""
+        seen = [(row, scan) for row, scan in enumerate(scans) if scan is not None]
+        if not seen:
+            return None
+        counts = [len(scan.distance) for _, scan in seen]
+        return cls(
+            np.repeat(np.array([row for row, _ in seen], dtype=np.intp), counts),
+            np.repeat(np.array([scan.time for _, scan in seen]), counts),
+            np.concatenate([scan.bearing for _, scan in seen]),
+            np.concatenate([scan.elevation for _, scan in seen]),
+            np.concatenate([scan.distance for _, scan in seen]),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[tuple[Index, Rays | None]]) -> Rays | None:
+        """Those of several bodies, whose rows are rows `group` of the whole; None if none has any."""
+        there = [(group, rays) for group, rays in parts if rays is not None]
+        if not there:
+            return None
+        columns = ("time", "bearing", "elevation", "distance")
+        return cls(
+            np.concatenate([group[rays.row] for group, rays in there]),
+            *(np.concatenate([getattr(rays, column) for _, rays in there]) for column in columns),
+        )
+
+    def of(self, row: int) -> RangeScan | None:
+        """What one row sees; None if it has no rays."""
+        mine = self.row == row
+        if not mine.any():
+            return None
+        time = float(self.time[mine].max())
+        return RangeScan(time, self.bearing[mine], self.elevation[mine], self.distance[mine])
 
 
 @dataclass
@@ -109,7 +164,11 @@ class BodyState:
         battery: (n,) charge, 0 to 1.
         flying: (n,) motors on, off the ground or about to be.
         notes: What each row's hardware says of itself (supervisor, link), for people; empty if nothing.
-        ranges: The newest scan of each row; empty if the body has no range sensors.
+        rays: What the rows' range sensors see; None if they have none.
+        attitude: (n, 4) unit quaternion w, x, y, z from the robot to the room, where a body knows more than yaw.
+        shadow_position: (n, 3) of the twin that runs beside each row [m], NaN for rows without one; None if there is
+            none at all (see `agents.shadow`).
+        shadow_yaw: (n,) of that twin [rad].
     """
 
     time: Array
@@ -121,7 +180,10 @@ class BodyState:
     battery: Array
     flying: Mask
     notes: tuple[str, ...] = ()
-    ranges: tuple[RangeScan | None, ...] = ()
+    rays: Rays | None = None
+    attitude: Array | None = None
+    shadow_position: Array | None = None
+    shadow_yaw: Array | None = None
 
 
 class Body(Protocol):

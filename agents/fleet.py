@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from agents import plugins
-from agents.body import Body, BodyRequest, BodyState
+from agents.body import Body, BodyRequest, BodyState, Rays
 from agents.rows import Array, Index
-
-PER_ROW: Final[dict[str, object]] = {"notes": "", "ranges": None}  # fields that are tuples, and what stands for none
 
 
 class Fleet:
@@ -45,25 +43,29 @@ class Fleet:
         states = [(group, body.read(t)) for group, body in self._parts]
         merged: dict[str, Any] = {}
         for field in fields(BodyState):
-            if field.name in PER_ROW:
-                merged[field.name] = self._gathered(field.name, states)
-                continue
-            first = getattr(states[0][1], field.name)
-            column = np.empty((self._rows, *first.shape[1:]), dtype=first.dtype)
-            for group, state in states:
-                column[group] = getattr(state, field.name)
-            merged[field.name] = column
+            merged[field.name] = self._merged(
+                field.name, [(group, getattr(state, field.name)) for group, state in states]
+            )
         return BodyState(**merged)
 
-    def _gathered(self, name: str, states: Sequence[tuple[Index, BodyState]]) -> tuple[object, ...]:
-        """A tuple with an entry per row from bodies of which some give none."""
-        if not any(getattr(state, name) for _, state in states):
-            return ()
-        found: list[object] = [PER_ROW[name]] * self._rows
-        for group, state in states:
-            for row, value in zip(group, getattr(state, name), strict=False):
-                found[row] = value
-        return tuple(found)
+    def _merged(self, name: str, parts: Sequence[tuple[Index, Any]]) -> Any:  # noqa: ANN401 - the type of that field
+        """One field of the whole from the bodies, of which some may say nothing on it."""
+        if name == "rays":
+            return Rays.joined(parts)
+        if name == "notes":
+            notes = [""] * self._rows
+            for group, said in parts:
+                for row, note in zip(group, said, strict=False):
+                    notes[row] = note
+            return tuple(notes) if any(notes) else ()
+        first = next((value for _, value in parts if value is not None), None)
+        if first is None:
+            return None
+        column = np.full((self._rows, *first.shape[1:]), np.nan if first.dtype == float else 0, dtype=first.dtype)
+        for group, value in parts:
+            if value is not None:
+                column[group] = value
+        return column
 
     def command(self, setpoint: Array) -> None:
         """See `Body.command`."""

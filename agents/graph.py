@@ -62,6 +62,11 @@ class Links:
             np.tile(self.gain, times),
         )
 
+    def and_then(self, others: Links) -> Links:
+        """These and others behind them: no longer sorted, so only a sorted part of it may be summed."""
+        mine = ("listener", "speaker", "distance", "gain")
+        return Links(*(np.concatenate([getattr(self, name), getattr(others, name)]) for name in mine))
+
 
 def links(pairs: Sequence[tuple[int, int]], distance: Sequence[float], gain: Sequence[float]) -> Links:
     """Links from (listener, speaker) pairs in any order."""

@@ -52,6 +52,26 @@ class Keys:
         return f"{self.realm}/{robot}/truth"
 
     @property
+    def world(self) -> str:
+        """What the world says of itself: pace, pauses, contacts."""
+        return f"{self.realm}/world/state"
+
+    @property
+    def world_order(self) -> str:
+        """Queryable of the world: pause, step, reset, spawn, remove."""
+        return f"{self.realm}/world/order"
+
+    @property
+    def contact(self) -> str:
+        """Every contact in the world, when it begins."""
+        return f"{self.realm}/world/contact"
+
+    @property
+    def world_alive(self) -> str:
+        """Liveliness token of the world."""
+        return f"{self.realm}/world/alive"
+
+    @property
     def estop(self) -> str:
         """Emergency stop for everyone."""
         return f"{self.realm}/estop"

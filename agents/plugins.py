@@ -1,6 +1,6 @@
-"""Plug-ins by name: bodies, triggers, laws and planners, found through entry points.
+"""Plug-ins by name: bodies, triggers, laws, planners, avoidances and engines, found through entry points.
 
-A trigger, law or planner is a frozen `msgspec.Struct` of its parameters; a body is a function, a
+A trigger, law, planner, avoidance or engine is a frozen `msgspec.Struct` of its parameters; a body is a function, a
 `agents.body.BodyFactory`. Anybody's distribution may add one, for example under
 `[project.entry-points."zenpark.triggers"]` in its pyproject.toml.
 """
@@ -19,6 +19,8 @@ BODIES: Final = "zenpark.bodies"
 TRIGGERS: Final = "zenpark.triggers"
 LAWS: Final = "zenpark.laws"
 PLANNERS: Final = "zenpark.planners"
+AVOIDANCES: Final = "zenpark.avoidances"
+ENGINES: Final = "zenpark.engines"  # what moves the twins of a world
 DEVICES: Final = "zenpark.devices"  # protocol twins: what stands in for hardware at the far end of a body's wire
 
 

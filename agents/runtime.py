@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import floor, inf, isfinite, nan
 from types import FrameType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import zenoh
@@ -28,7 +28,7 @@ from agents.keys import Keys
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
 from agents.orders import carry_out
-from agents.rows import Index
+from agents.rows import Array, Index
 
 STATUS_S: Final = 1.0
 FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its launcher was lost has its motors cut
@@ -89,7 +89,7 @@ class Runtime:
         self._sent = [0] * rows
         self._state_slot = self._states = 0
         self._news: list[list[wire.Heard]] = [[] for _ in range(rows)]
-        self._interventions = np.zeros(rows, dtype=np.intp)
+        self._interventions, self._avoided = np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
         self._malformed = self._refused = 0
         self._ticks = self._missed = 0
         self._late = 0.0
@@ -324,9 +324,10 @@ class Runtime:
         self._act(actions)
         if not begun and self.agent.decisions:
             self._ticks = self._missed = 0  # counted from the common start
-            self._interventions[:] = 0
+            self._interventions[:] = self._avoided[:] = 0
         self._ticks += 1
         self._interventions += actions.changed
+        self._avoided += actions.avoided
         for row in actions.speak:
             self._say(int(row), state, t)
         slot = (self.agent.tick - 1) // self._state_every
@@ -386,13 +387,19 @@ class Runtime:
                 tuple(truth[row]) if known else None,
                 float(state.true_yaw[row]) if known else None,
                 self._news[row],
+                _known_row(state.attitude, row),
+                _known_row(state.shadow_position, row),
+                _known_row(state.shadow_yaw, row),
             )
             self._telemetry[row].put(wire.encode(message, self._setup.encoding))
             self._news[row] = []
 
     def _scan(self, state: BodyState) -> None:
         """Sends the range readings that are new."""
-        for row, scan in enumerate(state.ranges):
+        if state.rays is None:
+            return
+        for row in np.unique(state.rays.row).tolist():
+            scan = state.rays.of(row)
             if scan is not None and scan.time > self._scanned[row]:
                 self._scanned[row] = scan.time
                 distance = [value if isfinite(value) else None for value in scan.distance.tolist()]
@@ -439,6 +446,7 @@ class Runtime:
                 missed=self._missed,
                 decisions=self.agent.decisions,
                 interventions=int(self._interventions[row]),
+                avoided=int(self._avoided[row]),
                 late_s=self._late,
                 started=self._utc + start if isfinite(start) else 0.0,
                 missing=missing[row],
@@ -449,6 +457,14 @@ class Runtime:
             self._statuses[row].put(wire.encode(status, self._setup.encoding))
         if everything:
             self._late = 0.0
+
+
+def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it
+    """A row of what a body may know or not, for the wire; None if it does not."""
+    if column is None or not np.isfinite(column[row]).all():
+        return None
+    value = column[row].tolist()
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _resident_mb() -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from agents.avoidance import Avoidance, Nearby, Self
 from agents.kinds import Kind
 from agents.rows import Array, Mask, Rows, clamp, every, norm, some, span
 
@@ -26,6 +27,7 @@ class Limits:
         speed: [m/s]; the kind's own where that is lower.
         goal_step: Farthest goal from where the robot is [m].
         own_silence_s: Own position older than this is none.
+        blind_s: A flying row that has no position of its own for this long lands; one number, or one for each row.
         link_silence_s: A neighbour gone for this long is left out.
     """
 
@@ -35,6 +37,7 @@ class Limits:
     speed: float = np.inf
     goal_step: float = 0.5
     own_silence_s: float = 0.5
+    blind_s: float | Array = 0.3
     link_silence_s: float = 1.0
 
 
@@ -47,12 +50,14 @@ class Verdict:
         changed: (N,) the setpoint was not what had been decided.
         blind: (N,) own position missing, stale or not finite: no closed loop is possible.
         escaped: (N,) outside the arena beyond any doubt.
+        avoided: (N,) avoidance changed the setpoint.
     """
 
     setpoint: Array
     changed: Mask
     blind: Mask
     escaped: Mask
+    avoided: Mask
 
 
 class Safety:
@@ -77,7 +82,16 @@ class Safety:
         self._centre = 0.5 * (limits.low + limits.high)
         self._lost = 0.5 * (limits.high - limits.low) + ESCAPED
 
-    def check(self, setpoint: Array, position: Array, yaw: Array, age: Array) -> Verdict:
+    def check(  # noqa: PLR0917 - the four that always are, and those of avoidance
+        self,
+        setpoint: Array,
+        position: Array,
+        yaw: Array,
+        age: Array,
+        avoidance: Avoidance | None = None,
+        own: Self | None = None,
+        nearby: Nearby | None = None,
+    ) -> Verdict:
         """The last word.
 
         Args:
@@ -85,6 +99,9 @@ class Safety:
             position: (N, 3) measured [m].
             yaw: (N,) measured [rad].
             age: (N,) of that measurement [s].
+            avoidance: Has its say after all limits.
+            own: For it.
+            nearby: For it.
         """
         limits = self.limits
         near = np.abs(position - self._centre) <= self._lost
@@ -110,13 +127,17 @@ class Safety:
         if self._any_twist:
             rows = self._twist
             safe[rows, :2] = self._drive(safe[rows, :2], here[rows, :2], yaw[rows], rows)
+        avoided = nobody
+        if avoidance is not None and own is not None and nearby is not None:
+            limited, safe = safe, avoidance.restrain(safe, own, nearby)
+            avoided = np.asarray((np.abs(safe - limited) > ROUNDING).any(axis=1))
         other = np.abs(safe - setpoint) > ROUNDING
         changed = np.asarray(other.any(axis=1)) if some(other) else nobody
         if troubled:
             changed = (changed | wild) & ~blind
             # a body that controls its position on board keeps its last setpoint while the position is not known here
             safe[blind & self._takes_position] = np.nan
-        return Verdict(safe, changed, blind, escaped)
+        return Verdict(safe, changed, blind, escaped, avoided)
 
     def _near(self, target: Array, here: Array, rows: Rows) -> Array:
         """Goals inside the arena and not too far ahead of the robot."""

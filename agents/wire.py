@@ -57,7 +57,8 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `setpoint` is x, y, z, yaw [m, rad] for a body that takes positions, v_x, v_y, v_z [m/s], yaw rate [rad/s] for
     velocities, and v [m/s], ω [rad/s], 0, 0 for twists; goal and setpoint are None while a robot has none. `error` [m]
     is Σ|d − distance| over the robot's links as the robot itself sees it. `true_position` and `true_yaw` are known of
-    twins only.
+    twins only, `attitude` (quaternion w, x, y, z) of bodies that know more than yaw, the shadow's pose of robots that
+    have a twin beside them.
     """
 
     robot: str
@@ -73,6 +74,9 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     true_position: Vector | None = None
     true_yaw: float | None = None
     heard: list[Heard] = []
+    attitude: Setpoint | None = None
+    shadow_position: Vector | None = None
+    shadow_yaw: float | None = None
 
 
 class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -81,7 +85,8 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `missing` names neighbours that were never heard or are gone; `lost` counts, per neighbour, samples that the
     sequence numbers prove were sent and never heard. `late_s` is the largest lateness of a tick since the last status.
     `started` is the UTC time at which the robot began to run the experiment (0 before), `decisions` and `ticks` count
-    from there.
+    from there. `interventions` are ticks on which safety changed what had been decided, `avoided` those of them, and
+    of changed goals, that kept clear of something.
     """
 
     robot: str
@@ -99,6 +104,7 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     missed: int
     decisions: int
     interventions: int
+    avoided: int
     late_s: float
     started: float
     missing: list[str]
@@ -140,6 +146,64 @@ class Ranges(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distance: list[float | None]
 
 
+class Contact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The beginning of a contact in the world: robots or obstacles by name ("wall" is the arena's), [N s], [m]."""
+
+    stamp: float
+    first: str
+    second: str
+    impulse: float
+    overlap: float
+
+
+class WorldState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a world says of itself, at 1 Hz and on every change.
+
+    `factor` is simulated over real time of the last second, `load` the share of it that the work took; `time` is
+    simulated since it began [s]. `robots` are carried, `mirrored` are elsewhere and seen here; `obstacles` by name
+    with x, y [m], yaw [rad].
+    """
+
+    stamp: float
+    engine: str
+    time: float
+    factor: float
+    load: float
+    paused: bool
+    robots: list[str]
+    mirrored: list[str]
+    obstacles: dict[str, Vector]
+    contacts: int
+    refused: int
+    malformed: int
+    trouble: str = ""
+
+
+class WorldOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What an operator asks of a world.
+
+    `steps` belongs to step (ticks, then it is paused again); `name` to spawn and remove, and to reset (left out: all);
+    `kind`, `at` (x, y [m]) and `yaw` to spawn of a robot, `obstacle` (as in the experiment file) to one of an obstacle.
+    """
+
+    order: Literal["pause", "resume", "step", "reset", "spawn", "remove"]
+    steps: int = 1
+    name: str | None = None
+    kind: str | None = None
+    at: tuple[float, float] | None = None
+    yaw: float = 0.0
+    obstacle: dict[str, object] | None = None
+
+
+class WorldReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A world's answer to an order."""
+
+    ok: bool
+    paused: bool
+    time: float
+    reason: str = ""
+
+
 class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What an operator asks of a robot: `at` is a UTC start time [s]; `name` and `value` belong to get and set."""
 
@@ -175,8 +239,39 @@ class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     text: str
 
 
-Message = Pose | State | Status | Position | Command | Ranges | Order | Reply | Stop | Event
-M = TypeVar("M", Pose, State, Status, Position, Command, Ranges, Order, Reply, Stop, Event)
+Message = (
+    Pose
+    | State
+    | Status
+    | Position
+    | Command
+    | Ranges
+    | Order
+    | Reply
+    | Stop
+    | Event
+    | Contact
+    | WorldState
+    | WorldOrder
+    | WorldReply
+)
+M = TypeVar(
+    "M",
+    Pose,
+    State,
+    Status,
+    Position,
+    Command,
+    Ranges,
+    Order,
+    Reply,
+    Stop,
+    Event,
+    Contact,
+    WorldState,
+    WorldOrder,
+    WorldReply,
+)
 
 _json = msgspec.json.Encoder()
 _msgpack = msgspec.msgpack.Encoder()

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.body import BodyError, BodyRequest, BodyState, RangeScan
+from agents.body import BodyError, BodyRequest, BodyState, RangeScan, Rays
 from agents.positioning import External
 from agents.protocols import khepera4 as protocol
 from agents.protocols.settings import settings
@@ -65,7 +65,7 @@ class KheperaBody:
             np.array([link.battery for link in self._links]),
             np.zeros(rows, dtype=bool),
             tuple(self._note(link, now) for link in self._links),
-            tuple(self._scan(link, now, t) for link in self._links),
+            Rays.gather([self._scan(link, now, t) for link in self._links]),
         )
         if len(self._outside):
             state.time = time_heard.copy()

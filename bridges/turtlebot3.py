@@ -11,7 +11,7 @@ import numpy as np
 import zenoh
 
 from agents import session as network
-from agents.body import Body, BodyError, BodyRequest, BodyState
+from agents.body import Body, BodyError, BodyRequest, BodyState, Rays
 from agents.positioning import External
 from agents.protocols import ros2, turtlebot3
 from agents.rosnode import Participant
@@ -131,7 +131,7 @@ class TurtleBot3:
             battery=np.array([robot.battery for robot in robots]),
             flying=np.zeros(rows, dtype=bool),
             notes=tuple(robot.note(now, linked[robot.endpoints]) for robot in robots),
-            ranges=tuple(robot.scan for robot in robots),
+            rays=Rays.gather([robot.scan for robot in robots]),
         )
         if len(self._outside):
             odometry = state.time.copy()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import msgspec
 import numpy as np
 
 from agents import plugins
 from agents.agent import Assignment
+from agents.avoidance import Avoidance
 from agents.body import BodyRequest, Disturbance
 from agents.graph import Links, links
 from agents.keys import Keys
@@ -18,6 +20,13 @@ from agents.rows import Array, Index
 from agents.safety import Limits
 from experiments.experiment import Experiment
 from experiments.links import parse_links
+from twins.scene import Scene
+from twins.sensors import OF_KIND
+from twins.world import World
+
+TRIES: Final = 200  # places that are drawn for a robot before it stays where the file puts it
+CLEAR: Final = 0.02  # [m] between robots that are scattered
+WORLD: Final = "world"  # the body of a robot that lives in the twin service
 
 
 def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
@@ -36,6 +45,30 @@ def all_links(experiment: Experiment) -> Links:
     )
 
 
+def heard_links(experiment: Experiment) -> Links:
+    """Every link on which something is heard: those of the formation, then those that only avoidance needs."""
+    return all_links(experiment).and_then(watch_links(experiment))
+
+
+def watch_links(experiment: Experiment) -> Links:
+    """Links that only avoidance needs: between all robots that the formation does not link, if it hears all."""
+    avoidance = _avoidance(experiment)
+    nobody = links([], [], [])
+    if avoidance is None or avoidance.hears != "all":
+        return nobody
+    there = {(listener, speaker) for listener, speaker, _, _ in parse_links(experiment)}
+    robots = list(enumerate(experiment.robots))
+    pairs = [(i, j) for i, a in robots for j, b in robots if i != j and (a, b) not in there]
+    return links(pairs, [1.0] * len(pairs), [1.0] * len(pairs)) if pairs else nobody
+
+
+def _avoidance(experiment: Experiment) -> Avoidance | None:
+    if experiment.avoidance is None:
+        return None
+    built: Avoidance = plugins.build(plugins.AVOIDANCES, experiment.avoidance)
+    return built
+
+
 def leaders(experiment: Experiment) -> list[str]:
     """The leader of the file, or every robot that listens to nobody (none, if that would be all of them)."""
     if experiment.formation.leader is not None:
@@ -52,12 +85,73 @@ def start(experiment: Experiment, names: Sequence[str]) -> tuple[Array, Array]:
     return np.concatenate([pose[:, :2], np.zeros((len(pose), 1))], axis=1), pose[:, 2]
 
 
+def scattered(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[Array, Array]:
+    """As `start`, scattered by the seed as the file asks; robots that are scattered do not overlap others.
+
+    A place is drawn for each robot of the experiment, in the order of the file, whoever asks: all processes agree.
+    """
+    position, yaw = start(experiment, tuple(experiment.robots))
+    begin = experiment.start
+    if begin.scatter > 0.0 or begin.scatter_yaw > 0.0:
+        rng = np.random.default_rng([seed, 0x73746172])
+        radius = np.array([KINDS[robot.kind].radius for robot in experiment.robots.values()])
+        half = 0.5 * np.array(experiment.arena.size[:2]) - experiment.safety.margin
+        given = position[:, :2].copy()
+        for row in range(len(position)):
+            yaw[row] += begin.scatter_yaw * rng.uniform(-1.0, 1.0)
+            for _ in range(TRIES):
+                place = np.clip(
+                    given[row] + begin.scatter * rng.uniform(-1.0, 1.0, 2), radius[row] - half, half - radius[row]
+                )
+                gap = np.hypot(*(position[:, :2] - place).T) - radius - radius[row]
+                gap[row] = np.inf
+                if (gap > CLEAR).all():
+                    position[row, :2] = place
+                    break
+    rows = [list(experiment.robots).index(name) for name in names]
+    return position[rows], yaw[rows]
+
+
+def world(experiment: Experiment, names: Sequence[str], copies: int = 1, *, sensing: bool | None = None) -> World:
+    """The place that `names` share, in so many copies; with range sensors if somebody uses them, or as `sensing` says."""
+    used = experiment.avoidance is not None if sensing is None else sensing
+    carried = []
+    for name in names:
+        robot = experiment.robots[name]
+        own = OF_KIND[robot.kind] if robot.sensors is None else tuple(robot.sensors)
+        carried.append(own if used or robot.sensors else ())
+    return World(
+        copy=np.repeat(np.arange(copies), len(names)),
+        scene=scene(experiment),
+        engine=experiment.world.engine,
+        sensors=tuple(carried) * copies,
+        sensor_noise=experiment.world.sensor_noise,
+        mirrored=np.zeros(len(names) * copies, dtype=bool),
+    )
+
+
+def scene(experiment: Experiment) -> Scene:
+    """What stands in the arena."""
+    arena = experiment.arena
+    plans = {
+        name: plugins.build(plugins.PLANNERS, obstacle.plan)
+        for name, obstacle in arena.obstacles.items()
+        if obstacle.plan is not None
+    }
+    return Scene.furnished(arena.size, arena.obstacles, plans, walled=arena.walls)
+
+
 def hover(experiment: Experiment, names: Sequence[str]) -> Array:
     """Heights that robots hold (n,) [m], NaN for ground robots."""
     return np.array([experiment.robots[name].hover or np.nan for name in names])
 
 
-def limits(experiment: Experiment) -> Limits:
+def _patience(experiment: Experiment, name: str) -> float:
+    """How long a robot holds without a position [s]: one whose world is gone cannot move, and may wait for it."""
+    return experiment.world.patience_s if experiment.robots[name].body == WORLD else experiment.safety.blind_s
+
+
+def limits(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Limits:
     """For `agents.safety`."""
     x, y, z = experiment.arena.size
     safety = experiment.safety
@@ -68,6 +162,7 @@ def limits(experiment: Experiment) -> Limits:
         speed=np.inf if safety.speed is None else safety.speed,
         goal_step=safety.goal_step,
         own_silence_s=safety.own_silence_s,
+        blind_s=np.array([_patience(experiment, name) for name in names] * copies),
         link_silence_s=safety.link_silence_s,
     )
 
@@ -96,8 +191,11 @@ def assign(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Ass
     if copies > 1 and tuple(names) != everyone:
         raise ValueError("only the whole experiment can be repeated")
     rows = np.array([everyone.index(name) for name in names], dtype=np.intp)
-    net = all_links(experiment).of(rows)
+    net, watched = all_links(experiment).of(rows), watch_links(experiment).of(rows)
+    only_watched = np.repeat([False, True], [len(net), len(watched)])
     legs = _legs(experiment, names)
+    if len(watched):
+        net = net.and_then(watched)
     if copies > 1:
         net = net.repeated(copies, len(names))
         legs = tuple(
@@ -115,7 +213,10 @@ def assign(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Ass
         clamp=experiment.formation.clamp,
         tracking_gain=experiment.formation.tracking_gain,
         legs=legs,
-        limits=limits(experiment),
+        limits=limits(experiment, names, copies),
+        avoidance=_avoidance(experiment),
+        speaker_kinds=kinds(experiment, everyone) * copies,
+        watched=np.tile(only_watched, copies) if len(watched) else None,
         body_hz=rates.body_hz,
         pose_every=round(rates.body_hz / rates.pose_hz),
         decide_every=round(rates.body_hz / rates.coordination_hz),
@@ -137,15 +238,18 @@ def disturbance(experiment: Experiment, name: str) -> Disturbance:
 def request(
     experiment: Experiment, names: Sequence[str], seeds: Sequence[int], endpoints: Sequence[str] = ()
 ) -> BodyRequest:
-    """What the bodies of `names` are opened with, one repetition for each seed; `endpoints` are the routers."""
-    position, yaw = start(experiment, names)
+    """What the bodies of `names` are opened with, one repetition for each seed; `endpoints` are the routers.
+
+    Twins start where `scattered` puts them; hardware is where it is.
+    """
     copies = len(seeds)
+    placed = [scattered(experiment, names, seed) for seed in seeds]
     return BodyRequest(
         names=tuple(names) * copies,
         kinds=kinds(experiment, names) * copies,
         addresses=tuple(experiment.robots[name].body for name in names) * copies,
-        start=np.tile(position, (copies, 1)),
-        yaw=np.tile(yaw, copies),
+        start=np.concatenate([position for position, _ in placed]),
+        yaw=np.concatenate([yaw for _, yaw in placed]),
         rate_hz=experiment.rates.body_hz,
         seeds=tuple(seed for seed in seeds for _ in names),
         disturbance=tuple(disturbance(experiment, name) for name in names) * copies,

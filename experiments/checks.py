@@ -13,7 +13,7 @@ from experiments.experiment import Experiment, Robot
 from experiments.links import FORM, pairs
 from experiments.problem import Fault
 
-_RESERVED: Final = ("all", "estop", "run", *KINDS)  # they mean something in keys and in [disturbance]
+_RESERVED: Final = ("all", "estop", "run", "world", *KINDS)  # they mean something in keys and in [disturbance]
 
 
 def faults(experiment: Experiment) -> Iterator[Fault]:

@@ -11,6 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from agents.body import Disturbance
+from twins.scene import Obstacle
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -25,10 +26,34 @@ class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """A table of the experiment file."""
 
 
+class StartBox(Part, frozen=True):
+    """A part of the floor where robots may start."""
+
+    at: Annotated[Planar, Meta(description="its middle, x, y [m]")]
+    size: Annotated[tuple[Positive, Positive], Meta(description="x, y [m]")]
+
+
+class Shadow(Part, frozen=True):
+    """A twin that runs beside a robot and gets the same setpoints, to see how far they agree."""
+
+    restart_s: Annotated[
+        Positive | None,
+        Meta(description="the twin is put onto the robot this often [s]; left out: once, at the common start"),
+    ] = 5.0
+
+
 class Arena(Part, frozen=True):
     """The box that the robots must not leave: centred on the origin, floor at z = 0."""
 
     size: Annotated[Spatial, Meta(description="x, y, z [m]")] = (4.0, 4.0, 2.5)
+    file: Annotated[
+        str | None, Meta(description="an arena file whose [arena] this one begins with; beside the experiment file")
+    ] = None
+    walls: Annotated[bool, Meta(description="its border is a wall: robots touch it, range sensors see it")] = True
+    obstacles: Annotated[dict[Name, Obstacle], Meta(description="what stands in it")] = {}
+    starts: Annotated[
+        dict[Name, StartBox], Meta(description="where robots may be put before a run; none given: anywhere")
+    ] = {}
 
 
 class Rates(Part, frozen=True):
@@ -45,13 +70,22 @@ class Robot(Part, frozen=True):
 
     kind: Annotated[str, Meta(description="crazyflie, tello, khepera4 or turtlebot3")]
     start: Annotated[list[float], Meta(min_length=2, max_length=3, description="x, y [m] and, if wanted, yaw [rad]")]
-    body: Annotated[str, Meta(description="twin, or the address of the real one")] = "twin"
+    body: Annotated[
+        str, Meta(description="twin (in its own process), world (in the twin service), or the address of the real one")
+    ] = "twin"
     hover: Annotated[Positive | None, Meta(description="height that a flying robot holds [m]")] = None
     position: Annotated[
         Literal["body", "external"], Meta(description="its own estimate, or what is published on its key `position`")
     ] = "body"
     device: Annotated[dict[str, Any], Meta(description="settings of its hardware; the body knows them")] = {}
     process: Annotated[Name | None, Meta(description="robots of one name share one process")] = None
+    sensors: Annotated[
+        list[str] | None, Meta(description="range sensors of its twin; left out: those that its kind has")
+    ] = None
+    ranges: Annotated[
+        Literal["body", "world"], Meta(description="its own range sensors, or what the world says it would see")
+    ] = "body"
+    shadow: Annotated[Shadow | None, Meta(description="a twin beside it")] = None
 
 
 class Link(Part, frozen=True):
@@ -106,8 +140,21 @@ class Safety(Part, frozen=True):
     speed: Annotated[Positive | None, Meta(description="[m/s], if lower than the kind's own")] = None
     goal_step: Annotated[Positive, Meta(description="farthest goal from where the robot is [m]")] = 0.5
     margin: Annotated[NotNegative, Meta(description="how far inside the walls goals stay [m]")] = 0.05
-    own_silence_s: Annotated[Positive, Meta(description="own position older than this: stop or land [s]")] = 0.5
+    own_silence_s: Annotated[Positive, Meta(description="own position older than this is none: hold [s]")] = 0.5
+    blind_s: Annotated[
+        NotNegative, Meta(description="a flying robot that has no position of its own for this long lands [s]")
+    ] = 0.3
     link_silence_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
+
+
+class World(Part, frozen=True):
+    """The place that all twins share in virtual time, and those with `body = "world"` in real time."""
+
+    engine: Annotated[Choice, Meta(description="a registered engine")] = "point-mass"
+    sensor_noise: Annotated[NotNegative, Meta(description="of range sensors, as a multiple of the real ones'")] = 1.0
+    patience_s: Annotated[
+        Positive, Meta(description="a robot whose world is gone holds for this long, then lands [s]")
+    ] = 30.0
 
 
 class Start(Part, frozen=True):
@@ -115,6 +162,10 @@ class Start(Part, frozen=True):
 
     deadline_s: Annotated[Positive, Meta(description="how long to wait for all robots to be ready [s]")] = 20.0
     missing: Annotated[Literal["abort", "go-on"], Meta(description="when one is not ready by then")] = "abort"
+    scatter: Annotated[
+        NotNegative, Meta(description="twins start up to this far from `start`, on each axis, by the seed [m]")
+    ] = 0.0
+    scatter_yaw: Annotated[NotNegative, Meta(description="and turned by up to this, by the seed [rad]")] = 0.0
 
 
 class Experiment(Part, frozen=True):
@@ -137,6 +188,10 @@ class Experiment(Part, frozen=True):
     disturbance: Annotated[
         dict[str, Disturbance], Meta(description='by kind or by robot; "all" for every one; the narrower wins')
     ] = {}
+    avoidance: Annotated[
+        Choice | None, Meta(description="how robots keep clear of what they see and hear; left out: they do not")
+    ] = None
+    world: World = World()
     channel: Channel = Channel()
     network: Network = Network()
     safety: Safety = Safety()

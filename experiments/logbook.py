@@ -31,7 +31,7 @@ class Logbook:
         self._log, self._experiment, self._case = log, experiment, case
         self._mine = slice(copy * rows, (copy + 1) * rows)
         self._seed = log.seeds[copy]
-        self._links: Links = assign.all_links(experiment)
+        self._links: Links = assign.heard_links(experiment)
         time, row, seq, position, velocity, yaw = log.sent
         own = (row >= copy * rows) & (row < (copy + 1) * rows)
         self._sent = (time[own], row[own] - copy * rows, seq[own], position[own], velocity[own], yaw[own])
@@ -205,6 +205,7 @@ class Logbook:
                     missed=0,
                     decisions=log.decisions,
                     interventions=int(log.interventions[self._mine][row]),
+                    avoided=int(log.avoided[self._mine][row]),
                     late_s=0.0,
                     started=EPOCH,
                     missing=[],

@@ -21,6 +21,7 @@ from experiments import assign
 from experiments.channel import Channel
 from experiments.experiment import Experiment
 from twins.body import TwinBody
+from twins.engine import Touch
 
 LEAD_S = 0.5  # from the order to the common start
 ORDERS_S = 0.5  # orders before the start fall on multiples of this, so that repetitions a few ticks apart get the same
@@ -48,6 +49,8 @@ class Log:
         lost: (E,) samples lost on each link of all repetitions, from the common start to the landing.
         decisions: Coordination decisions of each row.
         interventions: (R,) ticks on which safety changed what was decided.
+        avoided: (R,) ticks on which avoidance did.
+        touches: Contacts that began, at times since the common start.
         ticks: Ticks from the common start to the end.
         airborne: When all robots were up (negative), and `ended` when all were done.
         ended: See `airborne`.
@@ -70,6 +73,8 @@ class Log:
     lost: Index
     decisions: int
     interventions: Index
+    avoided: Index
+    touches: tuple[Touch, ...]
     ticks: int
     airborne: float
     ended: float
@@ -95,7 +100,7 @@ class _Samples:
         return tuple(np.concatenate(column) for column in zip(*self._columns, strict=True))
 
 
-def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
+def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:  # noqa: PLR0915 - one loop, told in order
     """Flies one case of an experiment once for each seed.
 
     Raises:
@@ -105,13 +110,15 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
     assignment = assign.assign(experiment, names, copies=len(seeds))
     agent = Agent(assignment)
     request = assign.request(experiment, names, seeds)
-    body = TwinBody(replace(request, external=(False,) * len(request.names)))  # nobody measures in virtual time
+    request = replace(request, external=(False,) * len(request.names))  # nobody measures in virtual time
+    body = TwinBody(request, assign.world(experiment, names, len(seeds)))
     channel = Channel(assignment.links, experiment.channel, seeds)
     rows = len(assignment.names)
     dt = 1.0 / assignment.body_hz
     log_every = round(assignment.body_hz / experiment.rates.state_hz)
     seq = np.zeros(rows, dtype=np.intp)
-    interventions = np.zeros(rows, dtype=np.intp)
+    interventions, avoided = np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
+    touches: list[Touch] = []
     states, sent, heard = _Samples(), _Samples(), _Samples()
     lost_before = lost_after = channel.lost
     conductor = _Conductor(agent, names)
@@ -136,6 +143,9 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
         body.command(actions.setpoint)
         if some(actions.changed):
             interventions += actions.changed
+        if some(actions.avoided):
+            avoided += actions.avoided
+        touches += body.touches()
         if (agent.tick - 1) % log_every == 0:  # the agent's count begins anew at the common start
             states.add(t, agent.life.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
         if len(speak := actions.speak):
@@ -144,6 +154,7 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
             sent.add(np.full(len(speak), t), speak, seq[speak], *said)
             channel.send(t, speak, seq, state.position, state.velocity, surely=agent.decisions == 0)
         conductor.look(t, dt)
+        body.begun_at = conductor.start_at
         tick += 1
     begin = conductor.start_at
     time, phase, position, velocity, yaw, true_position, true_yaw, goal, setpoint, error = states.stacked()
@@ -167,6 +178,8 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:
         lost=lost_after - lost_before,
         decisions=agent.decisions,
         interventions=interventions,
+        avoided=avoided,
+        touches=tuple(replace(touch, time=touch.time - begin) for touch in touches),
         ticks=round(experiment.duration_s / dt),
         airborne=conductor.airborne_at - begin,
         ended=tick * dt - begin,

@@ -1,17 +1,21 @@
-"""The twin: a simulated body in the robot's own process, behind the same seam as the hardware."""
+"""The twin: simulated bodies behind the same seam as the hardware, alone in a process or together in a world."""
 
 from __future__ import annotations
 
+from math import inf, isfinite
+
 import numpy as np
 
-from agents.body import BodyError, BodyRequest, BodyState
-from agents.kinds import Kind
+from agents import plugins
+from agents.body import BodyRequest, BodyState
 from agents.positioning import External
-from agents.rows import Array, Index, span
-from twins.differential import DRIVES, Differential
+from agents.rows import Array, Index, Mask
 from twins.disturbance import Drift, HoverJitter, Latency, Measurement
+from twins.engine import Engine, EngineFactory, Stage, Touch
 from twins.noise import Noise
-from twins.quadrotor import RESPONSES, Quadrotor
+from twins.pointmass import PointMass
+from twins.sensors import RangeSensors
+from twins.world import World
 
 CATCH_UP_S = 1.0  # a process that was frozen for longer resumes where it was: time it could not see did not pass
 FULL_WOBBLE = 0.2  # [m] from the ground up to here hover jitter grows: a robot that stands does not wobble
@@ -19,40 +23,51 @@ ENDURANCE_S = {"crazyflie": 420.0, "tello": 780.0, "khepera4": 18000.0, "turtleb
 
 
 class TwinBody:
-    """Rows of any simulated kinds; implements `agents.body.Body`. Advances itself to the time at which it is read."""
+    """Rows of any simulated kinds; implements `agents.body.Body`. Advances itself to the time at which it is read.
 
-    def __init__(self, request: BodyRequest) -> None:
+    Attributes:
+        engine: What moves the rows.
+        begun_at: Time of the common start on the clock of `read` [s], NaN while that is not known: what moves by a plan begins
+            then.
+    """
+
+    def __init__(self, request: BodyRequest, world: World | None = None) -> None:
+        """Without a world every row is by itself.
+
+        Raises:
+            BodyError: If there is no twin of one of the kinds, or the engine cannot be had.
+            plugins.PluginError: If there is no such engine.
+        """
         kinds = request.kinds
-        unknown = sorted({k.name for k in kinds} - DRIVES.keys() - RESPONSES.keys())
-        if unknown:
-            raise BodyError(f"there is no twin of a {', '.join(unknown)}; name another body")
+        rows = len(kinds)
         self._dt = 1.0 / request.rate_hz
         self._t = 0.0
+        self.begun_at = np.nan
+        self._world = world if world is not None else World.alone(rows)
+        stage = Stage(
+            kinds, request.start, request.yaw, self._dt, self._world.copy, self._world.mirrored, self._world.scene
+        )
+        factory: EngineFactory = PointMass() if world is None else plugins.build(plugins.ENGINES, self._world.engine)
+        self.engine: Engine = factory.build(stage)
         flies = np.array([k.flies for k in kinds])
-        air, floor = np.flatnonzero(flies), np.flatnonzero(~flies)
-        self._in_air, self._on_floor = air, floor
-        self._air, self._floor = span(air), span(floor)
-        self._quadrotor = Quadrotor(*self._part(request, air), self._dt)
-        self._differential = Differential(*self._part(request, floor), self._dt)
         names, seeds, nature = request.names, request.seeds, request.disturbance
+        air = self._in_air = np.flatnonzero(flies)
         aloft = [nature[i] for i in air]
         air_names, air_seeds = [names[i] for i in air], [seeds[i] for i in air]
         self._jitter = HoverJitter(aloft, Noise(air_names, air_seeds, "hover jitter", 2), self._dt)
+        self._wobble = np.zeros((rows, 2))
         axes = np.where(flies[:, None], 1.0, [1.0, 1.0, 0.0])
         self._measurement = Measurement(nature, axes, Noise(names, seeds, "measurement", 4))
         self._drift = Drift(nature, Noise(names, seeds, "odometry", 2))
         self._latency = Latency(nature, self._dt)
-        self._command = np.full((len(kinds), 4), np.nan)
-        self._truth = np.array(request.start, dtype=float)
+        self._command = np.full((rows, 4), np.nan)
+        self._sensors = RangeSensors(request, self._world) if any(self._world.sensors) else None
         self._endurance = np.array([ENDURANCE_S[k.name] for k in kinds])
-        self._used = np.zeros(len(kinds))
+        self._used = np.zeros(rows)
+        self._on_floor = np.flatnonzero(~flies)
         self._outside = np.flatnonzero(request.external)
-        self._external = External(len(kinds))
+        self._external = External(rows)
         self._state = self._measure()
-
-    @staticmethod
-    def _part(request: BodyRequest, rows: Index) -> tuple[list[Kind], Array, Array]:
-        return [request.kinds[i] for i in rows], request.start[rows], request.yaw[rows]
 
     def open(self) -> None:
         """See `Body.open`."""
@@ -62,8 +77,8 @@ class TwinBody:
         steps = round((t - self._t) / self._dt)
         if steps * self._dt > CATCH_UP_S:
             steps = 1
-        for _ in range(steps):
-            self._advance()
+        for k in range(steps):
+            self._advance(t - (steps - 1 - k) * self._dt)
         self._t = t
         if steps > 0:
             self._state = self._measure()
@@ -74,68 +89,62 @@ class TwinBody:
         if self._latency.present:
             self._command = np.where(np.isnan(setpoint), self._command, setpoint)
         else:
-            self._apply(setpoint)
+            self.engine.command(setpoint)
 
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Body.takeoff`."""
-        flies = np.isin(rows, self._in_air)
-        self._quadrotor.takeoff(np.searchsorted(self._in_air, rows[flies]), height[flies])
+        self.engine.takeoff(rows, height)
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
-        self._quadrotor.land(self._among(self._in_air, rows))
-        self._differential.halt(self._among(self._on_floor, rows))
+        self.engine.land(rows)
 
     def stop(self, rows: Index) -> None:
         """See `Body.stop`."""
-        self._quadrotor.stop(self._among(self._in_air, rows))
-        self._differential.halt(self._among(self._on_floor, rows))
-
-    @staticmethod
-    def _among(part: Index, rows: Index) -> Index:
-        """Where in `part` those of `rows` stand that belong to it."""
-        return np.searchsorted(part, rows[np.isin(rows, part)])
+        self.engine.stop(rows)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
         """See `Body.locate`."""
         self._external.update(row, t, position, yaw)
 
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
+        """Puts rows somewhere, at rest: (len(rows), 3) [m], (len(rows),) [rad]; flying rows hold that place."""
+        self.engine.place(rows, position, yaw, flying)
+        self._state = self._measure()
+
+    def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
+        """Where mirrored rows are: (len(rows), 3) [m], (len(rows),) [rad], (len(rows), 3) [m/s]; NaN: not there."""
+        self.engine.mirror(rows, position, yaw, velocity)
+
+    def touches(self) -> list[Touch]:
+        """Contacts that began since this was asked last."""
+        return self.engine.touches()
+
     def close(self) -> None:
         """See `Body.close`."""
 
-    def _apply(self, setpoint: Array) -> None:
-        if len(self._in_air):
-            self._quadrotor.command(setpoint[self._air])
-        if len(self._on_floor):
-            self._differential.command(setpoint[self._floor, :2])
-
-    def _advance(self) -> None:
+    def _advance(self, t: float) -> None:
+        engine = self.engine
         if self._latency.present:
-            self._apply(self._latency.pass_on(self._command))
+            engine.command(self._latency.pass_on(self._command))
             self._command = np.full_like(self._command, np.nan)  # one command moves a body once: silence must show
-        before = self._truth[:, :2].copy() if self._drift.present else None
-        if len(self._on_floor):
-            self._differential.advance()
-            self._truth[self._floor] = self._differential.position
-            self._used[self._floor] += self._dt
-        if len(self._in_air):
-            self._quadrotor.advance()
-            self._truth[self._air] = self._quadrotor.position
-            self._used[self._air] += self._dt * self._quadrotor.flying
-            if self._jitter.present:
-                self._jitter.advance()
-                share = np.minimum(self._quadrotor.position[:, 2] / FULL_WOBBLE, 1.0)
-                self._truth[self._air, :2] += share[:, None] * self._jitter.displacement
+        before = engine.position[:, :2].copy() if self._drift.present else None
+        if self._jitter.present:
+            self._jitter.advance()
+            share = np.minimum(engine.position[self._in_air, 2] / FULL_WOBBLE, 1.0)
+            self._wobble = np.zeros_like(self._wobble)
+            self._wobble[self._in_air] = share[:, None] * self._jitter.displacement
+        engine.advance(t - self.begun_at if isfinite(self.begun_at) else -inf, self._wobble)
+        self._used[self._on_floor] += self._dt
+        self._used[self._in_air] += self._dt * engine.flying[self._in_air]
         if before is not None:
-            self._drift.advance(self._truth[:, :2] - before)
+            self._drift.advance(engine.position[:, :2] - before)
+        if self._sensors is not None:
+            self._sensors.sweep(t, engine)
 
     def _measure(self) -> BodyState:
-        rows = len(self._truth)
-        truth = self._truth.copy()
-        velocity, yaw, flying = np.zeros((rows, 3)), np.zeros(rows), np.zeros(rows, dtype=bool)
-        velocity[self._floor], yaw[self._floor] = self._differential.velocity, self._differential.yaw
-        velocity[self._air], yaw[self._air] = self._quadrotor.velocity, self._quadrotor.yaw
-        flying[self._air] = self._quadrotor.flying
+        engine = self.engine
+        truth, velocity, yaw = engine.position.copy(), engine.velocity.copy(), engine.yaw.copy()
         measured, heading = truth, yaw
         if self._measurement.present:
             noise = self._measurement.draw()
@@ -143,8 +152,19 @@ class TwinBody:
         if self._drift.present:
             measured = measured.copy()
             measured[:, :2] += self._drift.error
-        battery = 1.0 - self._used / self._endurance
-        state = BodyState(np.full(rows, self._t), measured, velocity, heading, truth, yaw, battery, flying)
+        rows = len(truth)
+        state = BodyState(
+            time=np.full(rows, self._t),
+            position=measured,
+            velocity=velocity,
+            yaw=heading,
+            true_position=truth,
+            true_yaw=yaw,
+            battery=1.0 - self._used / self._endurance,
+            flying=engine.flying.copy(),
+            rays=None if self._sensors is None else self._sensors.rays,
+            attitude=engine.attitude,
+        )
         if len(self._outside):
             state.position, state.yaw = measured.copy(), heading.copy()
             self._external.fill(state, self._outside)

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from agents.kinds import Kind
-from agents.rows import Array, Index, clamp
+from agents.rows import Array, Index, Mask, clamp
 
 COMMAND_TIMEOUT_S: Final = 0.5  # without a new command the wheels stop, as the robots' own firmware does it
 
@@ -64,6 +64,11 @@ class Differential:
     def halt(self, rows: Index) -> None:
         """Wheels to zero speed."""
         self._wanted[:, rows] = 0.0
+
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
+        """Puts rows at (len(rows), 3) [m] with yaw [rad], at rest."""
+        self.position[rows], self.yaw[rows], self.velocity[rows] = position, yaw, 0.0
+        self._wanted[:, rows] = self._wheels[:, rows] = 0.0
 
     def advance(self) -> None:
         """One step of dt, along an arc: no side-slip (paper, eq. (1))."""

@@ -96,6 +96,14 @@ class Quadrotor:
         self.flying[rows] = False
         self._landing[rows] = False
 
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
+        """Puts rows at (len(rows), 3) [m] with yaw [rad], at rest; those that fly hold that place."""
+        self.position[rows], self._target[rows], self.velocity[rows] = position, position, 0.0
+        self.yaw[rows], self._heading[rows] = yaw, yaw
+        self._wanted[rows], self._yaw_rate[rows] = 0.0, 0.0
+        self.flying[rows], self._landing[rows] = flying, False
+        self._elapsed[rows] = np.inf
+
     def advance(self) -> None:
         """One step of dt: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v)."""
         climbing = np.isfinite(self._elapsed)

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.body import BodyError, BodyRequest, BodyState, RangeScan
+from agents.body import BodyError, BodyRequest, BodyState, RangeScan, Rays
 from agents.positioning import External
 from agents.protocols.crazyflie import Lighthouse, address, chosen, crowded
 from agents.rows import Array, Index
@@ -91,7 +91,7 @@ class CrazyflieBody:
             battery=board.battery.copy(),
             flying=board.airborne.copy(),
             notes=tuple(self._note(row, now) for row in range(len(self._pilots))),
-            ranges=tuple(self._scan(row) for row in range(len(self._pilots))) if self._ranging else (),
+            rays=Rays.gather([self._scan(row) for row in range(len(self._pilots))]) if self._ranging else None,
         )
         if len(self._outside):
             rows, heard = self._outside, state.time.copy()

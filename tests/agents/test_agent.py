@@ -414,7 +414,7 @@ def blinded(swarm, what, value):
     group.spoil = spoil
 
 
-@pytest.mark.parametrize(("what", "grace"), [("old", 51), ("nowhere", 1)])
+@pytest.mark.parametrize(("what", "grace"), [("old", 81), ("nowhere", 31)])  # 0.3 s of holding
 @pytest.mark.parametrize("moment", ["climbing", "waiting", "running"])
 def test_a_drone_that_does_not_know_where_it_is_lands(what, grace, moment):
     swarm = drone()

@@ -154,8 +154,8 @@ def test_drives_to_goals(hub, style, distro):
         assert (state.notes, state.flying.any()) == (("", ""), False)
         assert (stage.t - state.time < 0.2).all()
         assert (state.battery > 0.99).all()
-        assert [len(scan.distance) for scan in state.ranges] == [360, 360]
-        assert np.isnan(state.ranges[0].distance).all()
+        assert np.bincount(state.rays.row).tolist() == [360, 360]
+        assert np.isnan(state.rays.of(0).distance).all()
 
 
 @pytest.mark.system

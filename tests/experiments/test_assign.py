@@ -111,12 +111,13 @@ def test_starts_are_on_the_floor_with_a_yaw():
 
 
 def test_limits_are_the_arena_and_the_safety_of_the_file():
-    made = assign.limits(experiment(arena=Arena((2.0, 3.0, 4.0)), safety=Safety(speed=0.3, goal_step=0.2, margin=0.1)))
+    given = experiment(arena=Arena(size=(2.0, 3.0, 4.0)), safety=Safety(speed=0.3, goal_step=0.2, margin=0.1))
+    made = assign.limits(given, [])
     np.testing.assert_array_equal(made.low, [-1.0, -1.5, 0.0])
     np.testing.assert_array_equal(made.high, [1.0, 1.5, 4.0])
     assert (made.speed, made.goal_step, made.margin) == (0.3, 0.2, 0.1)
     assert (made.own_silence_s, made.link_silence_s) == (0.5, 1.0)
-    assert assign.limits(experiment()).speed == np.inf
+    assert assign.limits(experiment(), []).speed == np.inf
 
 
 def test_links_may_have_gains_of_their_own():

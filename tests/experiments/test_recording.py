@@ -71,6 +71,7 @@ def status(robot="TB01", at=1.0, *, sent=0, lost=None, started=START, pid=7, tic
         missed=missed,
         decisions=decisions,
         interventions=0,
+        avoided=0,
         late_s=0.0,
         started=started,
         missing=[],

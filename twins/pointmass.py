@@ -1,0 +1,134 @@
+"""The point-mass engine: every row moves by its own model and nothing is in anything's way. For thousands of robots."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from agents.body import BodyError
+from agents.rows import Array, Index, Mask, span
+from twins.differential import DRIVES, Differential
+from twins.engine import Stage, Touch
+from twins.quadrotor import RESPONSES, Quadrotor
+
+
+class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Its parameters: none."""
+
+    def build(self, stage: Stage) -> PointMassEngine:
+        """See `EngineFactory.build`."""
+        return PointMassEngine(stage)
+
+
+class Models:
+    """The models of rows of any kinds: quadrotors for those that fly, differential drives for the others.
+
+    Attributes:
+        air: Rows that fly.
+        floor: Rows that drive.
+        quadrotor: Of the rows `air`.
+        differential: Of the rows `floor`.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        kinds = stage.kinds
+        unknown = sorted({kind.name for kind in kinds} - DRIVES.keys() - RESPONSES.keys())
+        if unknown:
+            raise BodyError(f"there is no twin of a {', '.join(unknown)}; name another body")
+        flies = np.array([kind.flies for kind in kinds])
+        air, floor = np.flatnonzero(flies), np.flatnonzero(~flies)
+        self.in_air, self.on_floor = air, floor
+        self.air, self.floor = span(air), span(floor)
+        self.quadrotor = Quadrotor([kinds[i] for i in air], stage.start[air], stage.yaw[air], stage.dt)
+        self.differential = Differential([kinds[i] for i in floor], stage.start[floor], stage.yaw[floor], stage.dt)
+
+    def command(self, setpoint: Array) -> None:
+        """See `Engine.command`."""
+        if len(self.in_air):
+            self.quadrotor.command(setpoint[self.air])
+        if len(self.on_floor):
+            self.differential.command(setpoint[self.floor, :2])
+
+    def takeoff(self, rows: Index, height: Array) -> None:
+        """See `Engine.takeoff`."""
+        flies = np.isin(rows, self.in_air)
+        self.quadrotor.takeoff(np.searchsorted(self.in_air, rows[flies]), height[flies])
+
+    def land(self, rows: Index) -> None:
+        """See `Engine.land`."""
+        self.quadrotor.land(self._among(self.in_air, rows))
+        self.differential.halt(self._among(self.on_floor, rows))
+
+    def stop(self, rows: Index) -> None:
+        """See `Engine.stop`."""
+        self.quadrotor.stop(self._among(self.in_air, rows))
+        self.differential.halt(self._among(self.on_floor, rows))
+
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
+        """See `Engine.place`."""
+        for part, model in ((self.in_air, self.quadrotor), (self.on_floor, self.differential)):
+            which = np.isin(rows, part)
+            at = np.searchsorted(part, rows[which])
+            model.place(at, position[which], yaw[which], flying[which])
+
+    @staticmethod
+    def _among(part: Index, rows: Index) -> Index:
+        """Where in `part` those of `rows` stand that belong to it."""
+        return np.searchsorted(part, rows[np.isin(rows, part)])
+
+
+class PointMassEngine(Models):
+    """Implements `twins.engine.Engine`."""
+
+    attitude = None
+
+    def __init__(self, stage: Stage) -> None:
+        """Raises BodyError for a kind without a twin."""
+        super().__init__(stage)
+        rows = len(stage.kinds)
+        self._scene, self._copies = stage.scene, int(stage.copy.max(initial=0)) + 1
+        self._moves = len(stage.scene.moving) > 0
+        self._mirrored = np.flatnonzero(stage.mirrored)
+        count = len(self._mirrored)
+        self._seen = np.full((count, 3), np.nan), np.zeros((count, 3)), np.zeros(count)
+        self.position = np.array(stage.start, dtype=float)
+        self.velocity, self.yaw = np.zeros((rows, 3)), np.array(stage.yaw, dtype=float)
+        self.flying = np.zeros(rows, dtype=bool)
+        self.obstacles = np.tile(stage.scene.pose, (self._copies, 1, 1))
+        if len(self._mirrored):
+            self.position[self._mirrored] = np.nan
+
+    def advance(self, t: float, wobble: Array) -> None:
+        """See `Engine.advance`."""
+        self.position, self.velocity, self.yaw = self.position.copy(), self.velocity.copy(), self.yaw.copy()
+        if len(self.on_floor):
+            drive = self.differential
+            drive.advance()
+            floor = self.floor
+            self.position[floor], self.velocity[floor], self.yaw[floor] = drive.position, drive.velocity, drive.yaw
+        if len(self.in_air):
+            flight = self.quadrotor
+            flight.advance()
+            air = self.air
+            self.position[air], self.velocity[air], self.yaw[air] = flight.position, flight.velocity, flight.yaw
+            self.position[air, :2] += wobble[air]
+            self.flying[air] = flight.flying
+        if len(self._mirrored):
+            rows = self._mirrored
+            self.position[rows], self.velocity[rows], self.yaw[rows] = self._seen
+        if self._moves:
+            self.obstacles = np.tile(self._scene.at(t), (self._copies, 1, 1))
+
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
+        """See `Engine.place`."""
+        super().place(rows, position, yaw, flying)
+        self.position[rows], self.yaw[rows], self.velocity[rows], self.flying[rows] = position, yaw, 0.0, flying
+
+    def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
+        """See `Engine.mirror`."""
+        at = np.searchsorted(self._mirrored, rows)
+        self._seen[0][at], self._seen[1][at], self._seen[2][at] = position, velocity, yaw
+
+    def touches(self) -> list[Touch]:
+        """See `Engine.touches`: nothing touches."""
+        return []

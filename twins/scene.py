@@ -1,0 +1,155 @@
+"""What stands in an arena besides robots: walls, boxes and cylinders, at rest, on a path, or to be pushed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from agents.planning import Planner
+from agents.rows import Array, Index
+
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Planar = tuple[float, float]
+Points = Annotated[list[Planar], Meta(min_length=2)]
+
+
+class Obstacle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """One obstacle: a box, a cylinder, or a thin wall along points; exactly one of the three."""
+
+    box: Annotated[tuple[Positive, Positive] | None, Meta(description="size along its own x and y [m]")] = None
+    radius: Annotated[Positive | None, Meta(description="of a cylinder [m]")] = None
+    wall: Annotated[
+        Annotated[list[Planar], Meta(min_length=2)] | None, Meta(description="points of a thin wall, x, y [m]")
+    ] = None
+    at: Annotated[Planar, Meta(description="its middle, x, y [m]; a wall's points are counted from there")] = (0.0, 0.0)
+    yaw: Annotated[float, Meta(description="[rad]")] = 0.0
+    height: Annotated[Positive | None, Meta(description="[m]; left out: up to the ceiling")] = None
+    bottom: Annotated[NotNegative, Meta(description="how high over the floor it begins [m]")] = 0.0
+    mass: Annotated[Positive | None, Meta(description="[kg]: it can be pushed; left out: it stands fast")] = None
+    friction: Annotated[NotNegative, Meta(description="with the floor, of one that can be pushed")] = 0.5
+    plan: Annotated[str | dict[str, Any] | None, Meta(description="a planner that moves it")] = None
+
+    def __post_init__(self) -> None:
+        if sum(part is not None for part in (self.box, self.radius, self.wall)) != 1:
+            raise ValueError("an obstacle has exactly one of box, radius and wall")
+        if self.mass is not None and (self.plan is not None or self.wall is not None):
+            raise ValueError("only a box or a cylinder without a plan can have a mass")
+        if self.plan is not None and self.wall is not None:
+            raise ValueError("a wall cannot move: use a box")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """An arena as engines and sensors see it; obstacles (M), their poses in rows of x, y, yaw.
+
+    Attributes:
+        low: (3,) corner of the arena [m].
+        high: (3,) the other corner [m].
+        walled: The arena's border is a wall.
+        names: Of the obstacles (M).
+        outline: Corners (k, 2) of each box in its own frame, against the clock; points of a wall; None of a cylinder.
+        closed: Whether the outline is one of a box (a wall is open).
+        radius: (M,) of cylinders [m], 0 of the others.
+        pose: (M, 3) x, y [m], yaw [rad] at the common start.
+        bottom: (M,) [m].
+        top: (M,) [m].
+        mass: (M,) [kg], infinite where it cannot be pushed.
+        friction: (M,) with the floor.
+        plans: What moves each; None: nothing.
+    """
+
+    low: Array
+    high: Array
+    walled: bool
+    names: tuple[str, ...]
+    outline: tuple[Array | None, ...]
+    closed: tuple[bool, ...]
+    radius: Array
+    pose: Array
+    bottom: Array
+    top: Array
+    mass: Array
+    friction: Array
+    plans: tuple[Planner | None, ...]
+
+    @classmethod
+    def furnished(
+        cls, size: Sequence[float], obstacles: Mapping[str, Obstacle], plans: Mapping[str, Planner], *, walled: bool
+    ) -> Scene:
+        """An arena of `size` (3) [m], centred on the origin, with obstacles; `plans` of those that move."""
+        x, y, z = size
+        given = tuple(obstacles.values())
+        return cls(
+            low=np.array([-x / 2, -y / 2, 0.0]),
+            high=np.array([x / 2, y / 2, z]),
+            walled=walled,
+            names=tuple(obstacles),
+            outline=tuple(_outline(obstacle) for obstacle in given),
+            closed=tuple(obstacle.wall is None for obstacle in given),
+            radius=np.array([obstacle.radius or 0.0 for obstacle in given]),
+            pose=np.array([(*obstacle.at, obstacle.yaw) for obstacle in given], dtype=float).reshape(-1, 3),
+            bottom=np.array([obstacle.bottom for obstacle in given]),
+            top=np.array([z if o.height is None else o.bottom + o.height for o in given]),
+            mass=np.array([obstacle.mass or np.inf for obstacle in given]),
+            friction=np.array([obstacle.friction for obstacle in given]),
+            plans=tuple(plans.get(name) for name in obstacles),
+        )
+
+    @classmethod
+    def empty(cls, size: Sequence[float] = (1e3, 1e3, 1e3)) -> Scene:
+        """Room without walls or obstacles."""
+        return cls.furnished(size, {}, {}, walled=False)
+
+    @property
+    def moving(self) -> Index:
+        """Obstacles that have a plan."""
+        return np.array([k for k, plan in enumerate(self.plans) if plan is not None], dtype=np.intp)
+
+    def at(self, t: float) -> Array:
+        """(M, 3) poses at `t` [s] after the common start; what can be pushed is where it stood at the start."""
+        pose = self.pose.copy()
+        elapsed = np.array([max(t, 0.0)])
+        for k, plan in enumerate(self.plans):
+            if plan is not None:
+                anchor = np.array([[*self.pose[k, :2], 0.0]])
+                position, yaw = plan.target(elapsed, anchor, self.pose[k, 2:])
+                pose[k, :2] = position[0, :2]
+                if np.isfinite(yaw[0]):
+                    pose[k, 2] = yaw[0]
+        return pose
+
+    def edges(self) -> tuple[Array, Index]:
+        """Straight edges (S, 2, 2), each in the frame of its obstacle, and the number (S,) of that obstacle.
+
+        The arena's own walls come last, in the frame of the room, under the number −1.
+        """
+        edges: list[Array] = []
+        owners: list[int] = []
+        for k, (outline, closed) in enumerate(zip(self.outline, self.closed, strict=True)):
+            if outline is not None:
+                ends = np.roll(outline, -1, axis=0)
+                pairs = np.stack([outline, ends], axis=1)
+                pairs = pairs if closed else pairs[:-1]
+                edges.append(pairs)
+                owners += [k] * len(pairs)
+        if self.walled:
+            (x0, y0), (x1, y1) = self.low[:2], self.high[:2]
+            corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+            edges.append(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
+            owners += [-1] * 4
+        if not edges:
+            return np.zeros((0, 2, 2)), np.zeros(0, dtype=np.intp)
+        return np.concatenate(edges), np.array(owners, dtype=np.intp)
+
+
+def _outline(obstacle: Obstacle) -> Array | None:
+    if obstacle.box is not None:
+        x, y = 0.5 * obstacle.box[0], 0.5 * obstacle.box[1]
+        return np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
+    return np.array(obstacle.wall, dtype=float) if obstacle.wall is not None else None
