@@ -1,8 +1,8 @@
 """Avoidance: how robots keep clear of what their range sensors see and of whom they hear.
 
 An avoidance is a frozen struct of its parameters, found by the entry-point group `zenpark.avoidances`. It may act at
-two levels: `deviate` shifts a goal (individual level; the potential of the paper), `restrain` has a say in the last word
-before the body (safety level; the barrier).
+two levels: `deviate` shifts a goal (individual level; the potential of the paper), `restrain` has a say in the last
+word before the body (safety level; the barrier).
 """
 
 from __future__ import annotations

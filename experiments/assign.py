@@ -113,7 +113,7 @@ def scattered(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[
 
 
 def world(experiment: Experiment, names: Sequence[str], copies: int = 1, *, sensing: bool | None = None) -> World:
-    """The place that `names` share, in so many copies; with range sensors if somebody uses them, or as `sensing` says."""
+    """The place that `names` share, in `copies`; with range sensors if somebody uses them, or as `sensing` says."""
     used = experiment.avoidance is not None if sensing is None else sensing
     carried = []
     for name in names:

@@ -27,8 +27,8 @@ class TwinBody:
 
     Attributes:
         engine: What moves the rows.
-        begun_at: Time of the common start on the clock of `read` [s], NaN while that is not known: what moves by a plan begins
-            then.
+        begun_at: Time of the common start on the clock of `read` [s], NaN while that is not known: what moves
+            by a plan begins then.
     """
 
     def __init__(self, request: BodyRequest, world: World | None = None) -> None:
