@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from agents.individual import Individual
 from agents.kinds import Kind
 from agents.lifecycle import AIRBORNE, RUNNING, Duties, Lifecycle, Phase
 from agents.planning import Itinerary, Leg
-from agents.plugins import PluginError
+from agents.plugins import FAILURES, PluginError
 from agents.rows import Array, Index, Mask, every, some
 from agents.safety import Limits, Safety, Verdict
 from agents.sight import Sight
@@ -46,6 +45,7 @@ class Assignment:
         avoidance: How the rows keep clear of what they see and hear; None: they do not.
         speaker_kinds: Kinds of all robots of the experiment.
         watched: (E,) links that are only for avoidance: the law knows nothing of them; None: there are none.
+        avoids: (N,) rows that keep clear at all; None: all.
         body_hz: Rate of ticks.
         pose_every: The trigger is asked on every so many ticks.
         decide_every: A goal is decided on every so many ticks.
@@ -72,6 +72,7 @@ class Assignment:
     avoidance: Avoidance | None = None
     speaker_kinds: tuple[Kind, ...] = ()
     watched: Mask | None = None
+    avoids: Mask | None = None
 
 
 @dataclass
@@ -113,8 +114,6 @@ class Actions:
     avoided: Mask
 
 
-# what a mistake in a plug-in raises
-FAILURES: Final = (AttributeError, TypeError, ValueError, NameError, LookupError, ArithmeticError)
 NOBODY: Index = np.zeros(0, dtype=np.intp)
 
 
@@ -159,7 +158,7 @@ class Agent:
         self._hold_at = np.full((rows, 3), np.nan)
         self._individual = Individual(assignment.kinds)
         self._safety = Safety(assignment.kinds, assignment.limits)
-        self._sight = Sight(assignment.kinds, assignment.speaker_kinds, assignment.links)
+        self._sight = _sight(assignment)
         self._nobody: Mask = np.zeros(rows, dtype=bool)
         self._blind_since, self._any_blind = np.full(rows, np.inf), False
         planned = np.zeros(rows, dtype=bool)
@@ -255,7 +254,7 @@ class Agent:
         goal, avoided = self.goal, self._nobody
         age = t - state.time
         avoidance = self.assignment.avoidance
-        if avoidance is None:
+        if avoidance is None or self._sight is None:
             setpoint = self._individual.setpoint(goal, self.toward, state.position, state.yaw)
             verdict = self._safety.check(setpoint, state.position, state.yaw, age)
         else:
@@ -263,7 +262,9 @@ class Agent:
             goal = self._deviate(avoidance, own, near)
             setpoint = self._individual.setpoint(goal, self.toward, state.position, state.yaw)
             verdict = self._safety.check(setpoint, state.position, state.yaw, age, avoidance, own, near)
-            avoided = verdict.avoided | (np.abs(goal - self.goal) > 0.0).any(axis=1)
+            avoided = verdict.avoided
+            if goal is not self.goal:
+                avoided = avoided | (np.abs(goal - self.goal) > 0.0).any(axis=1)
         self._escalate(t, state, verdict)
         setpoint, changed = verdict.setpoint, verdict.changed
         if not self.life.all_running:
@@ -359,10 +360,16 @@ class Agent:
 
     def _deviate(self, avoidance: Avoidance, own: Self, near: Nearby) -> Array:
         """The goals that are pursued; an avoidance that fails is named, for it may be somebody's first."""
+        name = type(avoidance).__name__
         try:
-            return avoidance.deviate(self.goal, own, near, 1.0 / self.assignment.body_hz)
+            goal = avoidance.deviate(self.goal, own, near, 1.0 / self.assignment.body_hz)
         except FAILURES as error:
-            raise PluginError(f"the avoidance {type(avoidance).__name__} failed: {_what(error)}") from error
+            raise PluginError(f"the avoidance {name} failed: {_what(error)}") from error
+        if np.shape(goal) != self.goal.shape:
+            raise PluginError(
+                f"`deviate` of the avoidance {name} must give a goal per row, {self.goal.shape}, not {np.shape(goal)}"
+            )
+        return goal
 
     def _escalate(self, t: float, state: BodyState, verdict: Verdict) -> None:
         """A flying robot that does not know where it is holds, then lands; one that left the arena lands or halts.
@@ -403,6 +410,14 @@ class Agent:
 
 def _what(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
+
+
+def _sight(assignment: Assignment) -> Sight | None:
+    avoidance = assignment.avoidance
+    if avoidance is None:
+        return None
+    kinds, speakers, limits = assignment.kinds, assignment.speaker_kinds, assignment.limits
+    return Sight(kinds, speakers, assignment.links, limits, avoidance.clearance, assignment.avoids)
 
 
 def links_by_speaker(links: Links, speakers: Sequence[str]) -> dict[str, Index]:

@@ -53,8 +53,8 @@ class Keys:
 
     @property
     def world(self) -> str:
-        """What the world says of itself: pace, pauses, contacts."""
-        return f"{self.realm}/world/state"
+        """What the world says of itself: pace, pauses, contacts. Not `state`: only robots have one."""
+        return f"{self.realm}/world/report"
 
     @property
     def world_order(self) -> str:
@@ -68,8 +68,8 @@ class Keys:
 
     @property
     def world_alive(self) -> str:
-        """Liveliness token of the world."""
-        return f"{self.realm}/world/alive"
+        """Liveliness token of the world. Not `alive`: whoever counts robots asks for that of everybody."""
+        return f"{self.realm}/world/here"
 
     @property
     def estop(self) -> str:

@@ -23,6 +23,7 @@ class Kind:
         turn_rate: Largest yaw rate [rad/s].
         response: Rate at which its position controller closes a position error [1/s].
         turn_response: Rate at which it closes a yaw error [1/s].
+        lag: Time constant with which its velocity follows what is commanded [s].
     """
 
     name: str
@@ -34,6 +35,7 @@ class Kind:
     turn_rate: float
     response: float
     turn_response: float
+    lag: float = 0.1  # of a robot on wheels at 2 m/s², from 0.3 m/s, and a tick or two
 
 
 CRAZYFLIE: Final = Kind(
@@ -46,6 +48,7 @@ CRAZYFLIE: Final = Kind(
     turn_rate=math.radians(200.0),
     response=2.0,  # position P of the firmware
     turn_response=3.0,
+    lag=1.0 / 3.5,
 )
 TELLO: Final = Kind(
     "tello",
@@ -57,6 +60,7 @@ TELLO: Final = Kind(
     turn_rate=math.radians(100.0),
     response=1.0,
     turn_response=1.0,
+    lag=1.0 / 3.0,
 )
 KHEPERA4: Final = Kind(
     "khepera4",

@@ -128,6 +128,8 @@ def _origin(entry: EntryPoint) -> str:
     return f"plug-in {entry.name!r} ({entry.value}) of {distribution}"
 
 
+# What a mistake in a plug-in raises.
+FAILURES: Final = (AttributeError, TypeError, ValueError, NameError, LookupError, ArithmeticError)
 # What a stranger's module may raise while it is imported.
 _IMPORT_FAILURES: Final = (
     ImportError, AttributeError, SyntaxError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError

@@ -6,16 +6,14 @@ One plain loop on the monotonic clock, no asyncio, no callbacks: what arrives wa
 from __future__ import annotations
 
 import gc
-import os
-import resource
 import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from math import floor, inf, isfinite, nan
+from dataclasses import dataclass, replace
+from math import floor, nan
 from types import FrameType
-from typing import Any, Final
+from typing import Final, Literal
 
 import numpy as np
 import zenoh
@@ -28,9 +26,12 @@ from agents.keys import Keys
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
 from agents.orders import carry_out
-from agents.rows import Array, Index
+from agents.ranging import HeardRanges, instead
+from agents.rows import Index
+from agents.telemetry import Counts, Telemetry
 
-STATUS_S: Final = 1.0
+Ranging = Literal["body", "world", "far"]
+
 FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its launcher was lost has its motors cut
 GHOST_S: Final = 2.5  # so long may the token of a robot that hangs stand after its end
 REACH_M: Final = 1.0  # a neighbour said to be farther outside the arena than this is not believed
@@ -47,6 +48,8 @@ class Setup:
         state_hz: Rate of telemetry.
         lifeline: Whether standard input is a lifeline.
         located: Which rows get their position from outside.
+        ranging: Where each row's range readings come from: its body; the world, which says them on the row's key
+            `ranges` ("world"); or that key too, but the body hears them by itself ("far"). Left out: the bodies.
     """
 
     keys: Keys
@@ -55,6 +58,7 @@ class Setup:
     state_hz: float
     lifeline: bool
     located: Sequence[bool]
+    ranging: Sequence[Ranging] = ()
 
 
 @dataclass
@@ -85,16 +89,8 @@ class Runtime:
         self._mime = wire.MIME[setup.encoding]
         self._dt = 1.0 / assignment.body_hz
         self._state_every = round(assignment.body_hz / setup.state_hz)
-        rows = len(self._names)
-        self._sent = [0] * rows
-        self._state_slot = self._states = 0
-        self._news: list[list[wire.Heard]] = [[] for _ in range(rows)]
-        self._interventions, self._avoided = np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
-        self._malformed = self._refused = 0
-        self._ticks = self._missed = 0
-        self._late = 0.0
-        self._reported: list[tuple[object, ...]] = [()] * rows
-        self._status_due = 0.0
+        self._counts = Counts.nothing(len(self._names))
+        self._state_slot = 0
         self._stopping: str | None = None
         self._utc = self._now = self._next = 0.0
         limits = assignment.limits
@@ -171,8 +167,6 @@ class Runtime:
         self._session = session
         self._poses = [network.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
-        self._telemetry = [network.publisher(session, keys.state(name), self._mime) for name in names]
-        self._statuses = [network.pose_publisher(session, keys.status(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]
         self._estop = network.subscriber(session, keys.estop)
         self._located = [
@@ -180,9 +174,10 @@ class Runtime:
             for row, name in enumerate(names)
             if self._setup.located[row]
         ]
-        self._ranges = [network.publisher(session, keys.ranges(name), self._mime) for name in names]
-        self._scanned = [-inf] * len(names)
-        self._tokens = [network.alive_token(session, keys.alive(name)) for name in names]
+        ranging = tuple(self._setup.ranging) or ("body",) * len(names)
+        seen_by_world = [row for row, source in enumerate(ranging) if source == "world"]
+        self._from_world = np.array(seen_by_world, dtype=np.intp)
+        self._ranges = HeardRanges(session, keys, names, seen_by_world) if seen_by_world else None
         by_speaker = links_by_speaker(self._assignment.links, self._assignment.speakers)
         self._subscribers = [network.pose_subscriber(session, keys.pose(name)) for name in by_speaker]
         self._watches = [network.alive_watch(session, keys.alive(name)) for name in by_speaker]
@@ -190,6 +185,16 @@ class Runtime:
             _Neighbour(name, links, poses.handler, watch.handler)
             for (name, links), poses, watch in zip(by_speaker.items(), self._subscribers, self._watches, strict=True)
         ]
+        self._telemetry = Telemetry(
+            session,
+            keys,
+            self._setup.encoding,
+            agent=self.agent,
+            speakers=self._neighbours,
+            counts=self._counts,
+            ranged=[source == "body" for source in ranging],
+        )
+        self._tokens = [network.alive_token(session, keys.alive(name)) for name in names]
 
     def _listen(self, t: float) -> None:
         """Takes in what has arrived since the last tick."""
@@ -220,7 +225,7 @@ class Runtime:
             measured = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
             wire.check_position(measured, robot=self._names[row], now=self._utc + t, reach=self._reach)
         except wire.Malformed:
-            self._malformed += 1
+            self._counts.malformed += 1
             return
         yaw = nan if measured.yaw is None else measured.yaw
         self._body.locate(row, measured.stamp - self._utc, np.array(measured.position), yaw)
@@ -230,7 +235,7 @@ class Runtime:
         try:
             stop = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
         except wire.Malformed:
-            self._malformed += 1
+            self._counts.malformed += 1
             return
         for row in range(len(self._names)):
             self.agent.life.stop(row, f"emergency stop by {stop.who}: {stop.reason}")
@@ -242,7 +247,7 @@ class Runtime:
             pose = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Pose)
             wire.check_pose(pose, robot=neighbour.name, now=now, reach=self._reach)
         except wire.Malformed:
-            self._malformed += 1
+            self._counts.malformed += 1
             return
         if pose.stamp <= neighbour.stamp:
             return  # known already: told again after a reconnection
@@ -261,7 +266,7 @@ class Runtime:
         )
         news = wire.Heard(neighbour.name, pose.seq, pose.stamp, now, pose.position)
         for row in self._assignment.links.listener[links]:
-            self._news[row].append(news)
+            self._telemetry.news[row].append(news)
 
     def _obey(self, row: int, query: zenoh.Query, t: float) -> None:
         """One order to one row; it always gets a reply."""
@@ -271,11 +276,11 @@ class Runtime:
             try:
                 order = wire.decode(payload, str(query.encoding or wire.JSON), wire.Order)
             except wire.Malformed as error:
-                self._malformed += 1
+                self._counts.malformed += 1
                 query.reply_err(str(error).encode(), encoding="text/plain")
                 return
             refusal, value = carry_out(self.agent, row, order, t, self._utc)
-            self._refused += bool(refusal)
+            self._counts.refused += bool(refusal)
             if order.order == "start" and order.at is not None and not refusal:
                 self._align(order.at - self._utc)
             phase = Phase(self.agent.life.phase[row]).word
@@ -292,7 +297,8 @@ class Runtime:
         gc.collect()
         gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
         zero = time.monotonic()
-        self._utc = time.time()  # one reading: a step of the wall clock in mid-run does not move the experiment
+        # one reading: a step of the wall clock in mid-run does not move the experiment
+        self._utc = self._telemetry.utc = time.time()
         farewell = np.inf
         while True:
             wait = zero + self._next - time.monotonic()
@@ -300,11 +306,11 @@ class Runtime:
                 time.sleep(wait)
             else:
                 behind = int(-wait / self._dt)
-                self._missed += behind
+                self._counts.missed += behind
                 self._next += behind * self._dt
                 self.agent.tick += behind
             t = self._now = self._next
-            self._late = max(self._late, time.monotonic() - zero - t)
+            self._counts.late_s = max(self._counts.late_s, time.monotonic() - zero - t)
             self._next = t + self._dt
             self._tick(t)
             if farewell == np.inf and (reason := stopping()) is not None:
@@ -313,29 +319,33 @@ class Runtime:
                 for row in range(len(self._names)):
                     self.agent.life.land(row, reason)
             if self._stopping is not None and (t > farewell or (self.agent.life.phase == Phase.DONE).all()):
-                self._report(t, everything=True)
+                self._telemetry.report(t, everything=True)
                 return
 
     def _tick(self, t: float) -> None:
         begun = self.agent.decisions > 0
         self._listen(t)
         state = self._body.read(t)
+        if self._ranges is not None:
+            refused = self._ranges.malformed
+            state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))
+            self._counts.malformed += self._ranges.malformed - refused
         actions = self.agent.step(t, state)
         self._act(actions)
+        counts, telemetry = self._counts, self._telemetry
         if not begun and self.agent.decisions:
-            self._ticks = self._missed = 0  # counted from the common start
-            self._interventions[:] = self._avoided[:] = 0
-        self._ticks += 1
-        self._interventions += actions.changed
-        self._avoided += actions.avoided
+            counts.begin()
+        counts.ticks += 1
+        counts.interventions += actions.changed
+        counts.avoided += actions.avoided
         for row in actions.speak:
             self._say(int(row), state, t)
         slot = (self.agent.tick - 1) // self._state_every
         if slot != self._state_slot:
             self._state_slot = slot
-            self._tell(state, actions, t)
-            self._scan(state)
-        self._report(t, everything=t >= self._status_due, state=state)
+            telemetry.tell(state, actions, t)
+            telemetry.scan(state)
+        telemetry.report(t, everything=t >= telemetry.due, state=state)
 
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""
@@ -351,10 +361,10 @@ class Runtime:
 
     def _say(self, row: int, state: BodyState, t: float) -> None:
         """Sends a row's pose to its neighbours."""
-        self._sent[row] += 1
+        self._counts.sent[row] += 1
         pose = wire.pose(
             self._names[row],
-            self._sent[row],
+            self._counts.sent[row],
             self._utc + t,
             state.position[row].tolist(),
             state.velocity[row].tolist(),
@@ -363,113 +373,3 @@ class Runtime:
         payload = wire.encode(pose, self._setup.encoding)
         self._last[row].hold(payload)
         self._poses[row].put(payload)
-
-    def _tell(self, state: BodyState, actions: Actions, t: float) -> None:
-        """Sends the telemetry of every row that knows where it is."""
-        self._states += 1
-        position, velocity, truth = state.position.tolist(), state.velocity.tolist(), state.true_position.tolist()
-        goal, setpoint = self.agent.goal.tolist(), actions.setpoint.tolist()
-        for row, name in enumerate(self._names):
-            if not isfinite(position[row][0]):
-                continue
-            known = isfinite(truth[row][0])
-            message = wire.State(
-                name,
-                self._states,
-                self._utc + t,
-                Phase(self.agent.life.phase[row]).word,
-                tuple(position[row]),
-                tuple(velocity[row]),
-                float(state.yaw[row]),
-                tuple(goal[row]) if isfinite(goal[row][0]) else None,
-                tuple(setpoint[row]) if isfinite(setpoint[row][0]) else None,
-                float(self.agent.error[row]),
-                tuple(truth[row]) if known else None,
-                float(state.true_yaw[row]) if known else None,
-                self._news[row],
-                _known_row(state.attitude, row),
-                _known_row(state.shadow_position, row),
-                _known_row(state.shadow_yaw, row),
-            )
-            self._telemetry[row].put(wire.encode(message, self._setup.encoding))
-            self._news[row] = []
-
-    def _scan(self, state: BodyState) -> None:
-        """Sends the range readings that are new."""
-        if state.rays is None:
-            return
-        for row in np.unique(state.rays.row).tolist():
-            scan = state.rays.of(row)
-            if scan is not None and scan.time > self._scanned[row]:
-                self._scanned[row] = scan.time
-                distance = [value if isfinite(value) else None for value in scan.distance.tolist()]
-                ranges = wire.Ranges(
-                    self._names[row],
-                    self._utc + scan.time,
-                    scan.bearing.tolist(),
-                    scan.elevation.tolist(),
-                    distance,
-                )
-                self._ranges[row].put(wire.encode(ranges, self._setup.encoding))
-
-    def _report(self, t: float, *, everything: bool, state: BodyState | None = None) -> None:
-        """Sends statuses: of all rows when due, else of those whose phase or reason changed."""
-        if not (everything or self.agent.life.moved):
-            return
-        if everything:
-            self._status_due = t + STATUS_S
-        life = self.agent.life
-        missing = [self.agent.missing(row) for row in range(len(self._names))]
-        for row, name in enumerate(self._names):
-            news = (life.phase[row], life.reason[row], tuple(missing[row]))
-            if not everything and news == self._reported[row]:
-                continue
-            if news[:2] != self._reported[row][:2]:
-                print(f"{name}: {Phase(life.phase[row]).word}" + (f" ({news[1]})" if news[1] else ""), flush=True)
-            self._reported[row] = news
-            mine = [n for n in self._neighbours if (self._assignment.links.listener[n.links] == row).any()]
-            battery = float(state.battery[row]) if state is not None else float("nan")
-            start = float(life.start_at[row])  # a plain float: msgspec does not encode those of numpy
-            status = wire.Status(
-                robot=name,
-                stamp=self._utc + t,
-                phase=Phase(life.phase[row]).word,
-                reason=life.reason[row],
-                body=state.notes[row] if state is not None and state.notes else "",
-                battery=battery if isfinite(battery) else None,
-                sent=self._sent[row],
-                heard=sum(n.heard for n in mine),
-                lost={n.name: n.lost for n in mine},
-                malformed=self._malformed,
-                refused=self._refused,
-                ticks=self._ticks,
-                missed=self._missed,
-                decisions=self.agent.decisions,
-                interventions=int(self._interventions[row]),
-                avoided=int(self._avoided[row]),
-                late_s=self._late,
-                started=self._utc + start if isfinite(start) else 0.0,
-                missing=missing[row],
-                pid=os.getpid(),
-                cpu_s=time.process_time(),
-                rss_mb=_resident_mb(),
-            )
-            self._statuses[row].put(wire.encode(status, self._setup.encoding))
-        if everything:
-            self._late = 0.0
-
-
-def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it
-    """A row of what a body may know or not, for the wire; None if it does not."""
-    if column is None or not np.isfinite(column[row]).all():
-        return None
-    value = column[row].tolist()
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _resident_mb() -> float:
-    try:
-        with open("/proc/self/statm", "rb") as pages:  # noqa: PTH123 - a Path costs more than the read
-            return int(pages.read().split()[1]) * resource.getpagesize() / 1e6
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

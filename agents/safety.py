@@ -9,6 +9,7 @@ import numpy as np
 
 from agents.avoidance import Avoidance, Nearby, Self
 from agents.kinds import Kind
+from agents.plugins import FAILURES, PluginError
 from agents.rows import Array, Mask, Rows, clamp, every, norm, some, span
 
 ESCAPED = 0.25  # [m] this far outside the arena a robot is no longer under control
@@ -118,19 +119,13 @@ class Safety:
             safe[blind | wild] = 0.0
             stay = wild & self._takes_position
             safe[stay, :3] = here[stay]
-        if self._any_position:
-            rows = self._position
-            safe[rows, :3] = self._near(safe[rows, :3], here[rows], rows)
-        if self._any_velocity:
-            rows = self._velocity
-            safe[rows] = self._slow(safe[rows], here[rows], rows)
-        if self._any_twist:
-            rows = self._twist
-            safe[rows, :2] = self._drive(safe[rows, :2], here[rows, :2], yaw[rows], rows)
+        self._limit(safe, here, yaw)
         avoided = nobody
         if avoidance is not None and own is not None and nearby is not None:
-            limited, safe = safe, avoidance.restrain(safe, own, nearby)
-            avoided = np.asarray((np.abs(safe - limited) > ROUNDING).any(axis=1))
+            limited = safe
+            safe = self._restrained(avoidance, limited, own, nearby, here, yaw, blind | wild)
+            if safe is not limited:
+                avoided = np.asarray((np.abs(safe - limited) > ROUNDING).any(axis=1))
         other = np.abs(safe - setpoint) > ROUNDING
         changed = np.asarray(other.any(axis=1)) if some(other) else nobody
         if troubled:
@@ -138,6 +133,43 @@ class Safety:
             # a body that controls its position on board keeps its last setpoint while the position is not known here
             safe[blind & self._takes_position] = np.nan
         return Verdict(safe, changed, blind, escaped, avoided)
+
+    def _limit(self, setpoint: Array, here: Array, yaw: Array) -> None:
+        """Brings setpoints (N, 4) within all limits, in place."""
+        if self._any_position:
+            rows = self._position
+            setpoint[rows, :3] = self._near(setpoint[rows, :3], here[rows], rows)
+        if self._any_velocity:
+            rows = self._velocity
+            setpoint[rows] = self._slow(setpoint[rows], here[rows], rows)
+        if self._any_twist:
+            rows = self._twist
+            setpoint[rows, :2] = self._drive(setpoint[rows, :2], here[rows, :2], yaw[rows], rows)
+
+    def _restrained(  # noqa: PLR0917
+        self, avoidance: Avoidance, setpoint: Array, own: Self, nearby: Nearby, here: Array, yaw: Array, unknown: Mask
+    ) -> Array:
+        """What avoidance makes of setpoints (N, 4) that are within the limits, within the limits again.
+
+        An avoidance may be somebody's first: one that fails is named, a row that is not made of numbers is not taken,
+        and `unknown` rows (N,), which do not know where they are or what they want, stay as they are.
+        """
+        name = type(avoidance).__name__
+        try:
+            wished = np.asarray(avoidance.restrain(setpoint.copy(), own, nearby), dtype=float)
+        except FAILURES as error:
+            raise PluginError(f"the avoidance {name} failed: {type(error).__name__}: {error}") from error
+        if wished.shape != setpoint.shape:
+            raise PluginError(
+                f"`restrain` of the avoidance {name} must give a setpoint per row, {setpoint.shape}, not {wished.shape}"
+            )
+        other = np.asarray((wished != setpoint).any(axis=1) & np.isfinite(wished).all(axis=1))
+        other &= ~unknown
+        if not some(other):
+            return setpoint
+        again = np.where(other[:, None], wished, setpoint)
+        self._limit(again, here, yaw)
+        return np.where(other[:, None], again, setpoint)  # limits twice over may differ in the last bit
 
     def _near(self, target: Array, here: Array, rows: Rows) -> Array:
         """Goals inside the arena and not too far ahead of the robot."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from math import isfinite
 from typing import Final, Literal
 
@@ -18,13 +19,17 @@ from agents import session as network
 from agents import wire
 from agents.body import BodyError, BodyRequest, BodyState
 from agents.positioning import External
-from agents.rows import Array, Index
+from agents.ranging import HeardRanges
+from agents.rows import Array, Index, some
 
 Action = Literal["drive", "takeoff", "land", "stop"]
 
 OPEN_S: Final = 5.0  # for the router to answer and a first position of every row to come
 LOOK_S: Final = 0.02  # between looks for it
 STALE_S: Final = 0.5  # what the robots bear
+GAP_S: Final = 0.25  # after a longer silence it may be another process that answers, which knows of no earlier order
+AGAIN_S: Final = 1.0  # so long it is told what was under way
+WORLD: Final = "world"  # the address of robots that the twin service carries
 REPEAT_S: Final = 0.1  # an order is said again this often: the publisher drops what does not fit
 TAKEOFF_S: Final = 3.0  # for so long
 LANDING_S: Final = 10.0  # a robot that was told to land this long ago, and cannot be seen, is taken for down
@@ -38,10 +43,14 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Standing(msgspec.Struct):
-    """An order that is repeated, under the number that it had, until `until` [s] or until its effect is seen."""
+    """An order that is repeated, under the number that it had, until `until` [s] or until its effect is seen.
+
+    One that is said `again` to a far end that may have lost it is said for its whole time: the robot is in the air.
+    """
 
     order: wire.Command
     until: float
+    again: bool = False
 
 
 class ExternalBody:
@@ -63,7 +72,7 @@ class ExternalBody:
                 raise BodyError(f"{name}: device: {error}; a body that is external has no settings") from None
         rows = len(request.names)
         self._names, self._kinds, self._keys = request.names, request.kinds, request.keys
-        self._endpoints = request.endpoints
+        self._endpoints, self._addresses = request.endpoints, request.addresses
         self._flies = np.array([kind.flies for kind in request.kinds])
         self._zero = time.monotonic()
         self._utc = time.time()  # one reading, as in the runtime: a step of the wall clock moves nothing
@@ -77,6 +86,8 @@ class ExternalBody:
         # so that numbers grow over restarts: a simulator that outlives this process knows new orders from old
         self._sent = [round(1e3 * self._utc)] * rows
         self._standing: dict[int, _Standing] = {}
+        self._under_way: dict[int, wire.Command] = {}  # climbs and landings that have not ended yet
+        self._silent = np.zeros(rows, dtype=bool)
         self._repeat = 0.0
         self._trouble = [""] * rows
         self._malformed = [0] * rows
@@ -94,6 +105,7 @@ class ExternalBody:
             raise BodyError(f"{', '.join(self._names)}: {error}") from None
         session, keys, mime = self._session, self._keys, wire.MIME["json"]
         self._positions = [network.subscriber(session, keys.position(name), 32) for name in self._names]
+        self._ranges = HeardRanges(session, keys, self._names, range(len(self._names)))
         self._setpoints = [network.publisher(session, keys.setpoint(name), mime) for name in self._names]
         pause = threading.Event()
         while (missing := self._missing()) and time.monotonic() < deadline:
@@ -109,6 +121,7 @@ class ExternalBody:
         self._settle()
         rows = len(self._names)
         nothing = np.full((rows, 3), np.nan)
+        rays = self._ranges.read(self._utc, self._now())
         return BodyState(
             time=self._seen.time - self._shift,
             position=self._seen.position.copy(),
@@ -119,6 +132,7 @@ class ExternalBody:
             battery=nothing[:, 0],
             flying=self._flying.copy(),
             notes=self._notes(),
+            rays=None if rays is None else replace(rays, time=rays.time - self._shift),
         )
 
     def command(self, setpoint: Array) -> None:
@@ -128,6 +142,8 @@ class ExternalBody:
         for row in np.flatnonzero(given).tolist():
             x, y, z, w = values[row]
             self._say(row, "drive", setpoint=(x, y, z, w))
+            if self._under_way:
+                self._under_way.pop(row, None)
         now = self._now()
         if self._standing and now >= self._repeat:
             self._repeat = now + REPEAT_S
@@ -144,18 +160,21 @@ class ExternalBody:
                 z = self._seen.position[row, 2]
                 self._ground[row] = z if isfinite(z) else 0.0
                 self._flying[row], self._landing[row], self._stopped[row] = True, np.inf, False
-                self._stand(row, self._say(row, "takeoff", height=up), TAKEOFF_S)
+                self._under_way[row] = self._say(row, "takeoff", height=up)
+                self._stand(row, self._under_way[row], TAKEOFF_S)
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
         for row in rows.tolist():
             self._landing[row] = self._now()
-            self._stand(row, self._say(row, "land"), LANDING_S if self._flying[row] else TAKEOFF_S)
+            self._under_way[row] = self._say(row, "land")
+            self._stand(row, self._under_way[row], LANDING_S if self._flying[row] else TAKEOFF_S)
 
     def stop(self, rows: Index) -> None:
         """See `Body.stop`; said again for as long as this process lives."""
         self._flying[rows], self._stopped[rows] = False, True
         for row in rows.tolist():
+            self._under_way.pop(row, None)
             self._stand(row, self._say(row, "stop"), np.inf)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
@@ -203,7 +222,7 @@ class ExternalBody:
                 found.append(
                     f"{name}: what is published on {key} is no position: {self._trouble[row]}"
                     if self._malformed[row]
-                    else f"{name}: nothing is published on {key}: is the simulator running and connected to "
+                    else f"{name}: nothing is published on {key}: is {self._far_end(row)} running and connected to "
                     f"{', '.join(self._endpoints)}?"
                 )
             elif age > STALE_S:
@@ -215,31 +234,46 @@ class ExternalBody:
                 found.append(f"{name}: the position on {key} has no yaw, without which a robot on wheels cannot steer")
         return found
 
+    def _far_end(self, row: int) -> str:
+        return "`zenpark world` with this experiment" if self._addresses[row] == WORLD else "the simulator"
+
     def _settle(self) -> None:
-        """Ends what has come to its end: climbs, landings."""
-        if not self._standing:
+        """Ends what has come to its end: climbs, landings; says what had not to a far end that begins anew."""
+        now = self._now()
+        age = now - self._seen.time
+        silent = age > GAP_S
+        back = self._silent & ~silent
+        self._silent = silent
+        if self._under_way and some(back):
+            for row in np.flatnonzero(back).tolist():
+                if (order := self._under_way.get(row)) is not None:
+                    self._standing[row] = _Standing(order, now + AGAIN_S, again=True)
+        if not (self._standing or self._under_way):
             return
         high = self._seen.position[:, 2] - self._ground > AWAY_M
         slow = np.abs(self._seen.velocity[:, 2]) < SETTLED
-        now = self._now()
-        aged = now - self._seen.time > STALE_S
+        aged = age > STALE_S
         down = self._flying & np.isfinite(self._landing)
         down &= np.where(aged, now - self._landing > LANDING_S, ~high & slow)
         self._flying &= ~down
         for row, standing in list(self._standing.items()):
-            climbs = standing.order.action == "takeoff" and high[row] and not aged[row]
+            climbs = standing.order.action == "takeoff" and high[row] and not (aged[row] or standing.again)
             if climbs or (standing.order.action == "land" and down[row]):
                 del self._standing[row]
+        for row in np.flatnonzero(down).tolist():
+            self._under_way.pop(row, None)
 
     def _notes(self) -> tuple[str, ...]:
         age = self._now() - self._seen.time
-        if not (age > STALE_S).any() and not any(self._malformed):
+        if not (age > STALE_S).any() and not any(self._malformed) and not self._ranges.malformed:
             return ()
         notes = []
         for row, seconds in enumerate(age.tolist()):
             parts = [f"no position for {seconds:.0f} s"] if seconds > STALE_S else []
             if self._malformed[row]:
                 parts.append(f"{self._malformed[row]} positions refused, the last because {self._trouble[row]}")
+            if self._ranges.malformed:
+                parts.append(f"{self._ranges.malformed} sweeps refused, the last because {self._ranges.trouble}")
             notes.append("; ".join(parts))
         return tuple(notes)
 

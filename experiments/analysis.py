@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -28,6 +28,7 @@ from experiments.feasibility import (
 from experiments.links import pairs
 from experiments.locate import Path
 from experiments.prediction import Prediction, closed, predict
+from twins.scene import Scene
 
 GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
 
@@ -38,7 +39,7 @@ class Analysis:
 
     Attributes:
         experiment: The case.
-        assignment: Of all its robots.
+        assignment: Of all its robots; without avoidance, and without the links that only avoidance needs.
         leaders: Names.
         silent: Rows that hear nobody.
         start: (N, 3) on the floor [m].
@@ -51,6 +52,7 @@ class Analysis:
         modes: Of the sampled loop at the shape.
         prediction: The motion.
         error: (T, E) of each link along it [m].
+        scene: What stands in the arena.
     """
 
     experiment: Experiment
@@ -67,6 +69,7 @@ class Analysis:
     modes: Modes | None
     prediction: Prediction
     error: Array
+    scene: Scene
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -143,7 +146,9 @@ class Analysis:
 def analyse(experiment: Experiment) -> Analysis:
     """All the numbers of one case."""
     names = tuple(experiment.robots)
-    assignment = assign.assign(experiment, names)
+    assignment = replace(
+        assign.assign(experiment, names), links=assign.all_links(experiment), watched=None, avoidance=None
+    )
     links, rows, hz = assignment.links, len(names), experiment.rates.coordination_hz
     start, yaw = assign.start(experiment, names)
     aloft = start.copy()
@@ -172,6 +177,7 @@ def analyse(experiment: Experiment) -> Analysis:
         modes=loop,
         prediction=prediction,
         error=link_errors(links, prediction.position),
+        scene=assign.scene(experiment),
     )
 
 

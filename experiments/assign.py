@@ -18,6 +18,7 @@ from agents.kinds import KINDS, Kind
 from agents.planning import Leg
 from agents.rows import Array, Index
 from agents.safety import Limits
+from experiments import outlines
 from experiments.experiment import Experiment
 from experiments.links import parse_links
 from twins.scene import Scene
@@ -58,7 +59,8 @@ def watch_links(experiment: Experiment) -> Links:
         return nobody
     there = {(listener, speaker) for listener, speaker, _, _ in parse_links(experiment)}
     robots = list(enumerate(experiment.robots))
-    pairs = [(i, j) for i, a in robots for j, b in robots if i != j and (a, b) not in there]
+    listening = [(i, a) for i, a in robots if experiment.robots[a].avoids]
+    pairs = [(i, j) for i, a in listening for j, b in robots if i != j and (a, b) not in there]
     return links(pairs, [1.0] * len(pairs), [1.0] * len(pairs)) if pairs else nobody
 
 
@@ -86,7 +88,7 @@ def start(experiment: Experiment, names: Sequence[str]) -> tuple[Array, Array]:
 
 
 def scattered(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[Array, Array]:
-    """As `start`, scattered by the seed as the file asks; robots that are scattered do not overlap others.
+    """As `start`, scattered by the seed as the file asks; who is scattered overlaps no other robot and no obstacle.
 
     A place is drawn for each robot of the experiment, in the order of the file, whoever asks: all processes agree.
     """
@@ -94,7 +96,8 @@ def scattered(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[
     begin = experiment.start
     if begin.scatter > 0.0 or begin.scatter_yaw > 0.0:
         rng = np.random.default_rng([seed, 0x73746172])
-        radius = np.array([KINDS[robot.kind].radius for robot in experiment.robots.values()])
+        kinds_of, stands = kinds(experiment, tuple(experiment.robots)), scene(experiment)
+        radius = np.array([kind.radius for kind in kinds_of])
         half = 0.5 * np.array(experiment.arena.size[:2]) - experiment.safety.margin
         given = position[:, :2].copy()
         for row in range(len(position)):
@@ -105,11 +108,20 @@ def scattered(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[
                 )
                 gap = np.hypot(*(position[:, :2] - place).T) - radius - radius[row]
                 gap[row] = np.inf
-                if (gap > CLEAR).all():
+                if (gap > CLEAR).all() and _free(stands, place, kinds_of[row]):
                     position[row, :2] = place
                     break
     rows = [list(experiment.robots).index(name) for name in names]
     return position[rows], yaw[rows]
+
+
+def _free(stands: Scene, place: Array, kind: Kind) -> bool:
+    """Whether a robot that stands at `place` (2,) [m] keeps clear of all obstacles."""
+    return all(
+        outlines.distance(stands, k, stands.pose[k], place) > kind.radius + CLEAR
+        for k in range(len(stands.names))
+        if outlines.at_height(stands, k, 0.0, kind.height)
+    )
 
 
 def world(experiment: Experiment, names: Sequence[str], copies: int = 1, *, sensing: bool | None = None) -> World:
@@ -139,6 +151,15 @@ def scene(experiment: Experiment) -> Scene:
         if obstacle.plan is not None
     }
     return Scene.furnished(arena.size, arena.obstacles, plans, walled=arena.walls)
+
+
+def shadows(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Array:
+    """How often the twin beside each robot is put onto it (n,) [s]: infinite for once, NaN for robots without one."""
+    period = []
+    for name in names:
+        shadow = experiment.robots[name].shadow
+        period.append(np.nan if shadow is None else np.inf if shadow.restart_s is None else shadow.restart_s)
+    return np.tile(np.array(period), copies)
 
 
 def hover(experiment: Experiment, names: Sequence[str]) -> Array:
@@ -217,6 +238,7 @@ def assign(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Ass
         avoidance=_avoidance(experiment),
         speaker_kinds=kinds(experiment, everyone) * copies,
         watched=np.tile(only_watched, copies) if len(watched) else None,
+        avoids=np.array([experiment.robots[name].avoids for name in names] * copies),
         body_hz=rates.body_hz,
         pose_every=round(rates.body_hz / rates.pose_hz),
         decide_every=round(rates.body_hz / rates.coordination_hz),

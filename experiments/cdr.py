@@ -18,7 +18,7 @@ from typing import Final, Generic, TypeVar
 import msgspec
 from msgspec import inspect as mi
 
-from agents.wire import Vector
+from agents.wire import Setpoint, Vector
 
 PACKAGE: Final = "zenpark_msgs"
 LITTLE_ENDIAN: Final = b"\0\1\0\0"  # the encapsulation header of plain CDR; alignment counts from behind it
@@ -369,22 +369,21 @@ POSE_STAMPED_SCHEMA: Final = SEPARATOR.join(
 )
 
 
-def pose_stamped(frame_id: str) -> Callable[[float, Vector, float], bytes]:
+def pose_stamped(frame_id: str) -> Callable[[float, Vector, float, Setpoint | None], bytes]:
     """The encoder of `geometry_msgs/msg/PoseStamped` for one frame.
 
     Returns:
-        A function of the UTC stamp [s], the position [m] and the yaw [rad]; it raises `Unencodable`.
+        A function of the UTC stamp [s], the position [m], the yaw [rad] and the attitude (quaternion w, x, y, z), which
+        if known stands for the yaw; it raises `Unencodable`.
     """
     text = _text(frame_id)
     layout = struct.Struct(f"<4siI{len(text)}s{-len(text) % 8}x7d")  # the frame is constant, so the layout is too
 
-    def encode(stamp: float, position: Vector, yaw: float) -> bytes:
+    def encode(stamp: float, position: Vector, yaw: float, attitude: Setpoint | None) -> bytes:
         try:
             seconds, nanoseconds = divmod(round(stamp * 1e9), 1_000_000_000)
-            half = 0.5 * yaw
-            return layout.pack(
-                LITTLE_ENDIAN, seconds, nanoseconds, text, *position, 0.0, 0.0, math.sin(half), math.cos(half)
-            )
+            w, *turned = attitude or (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
+            return layout.pack(LITTLE_ENDIAN, seconds, nanoseconds, text, *position, *turned, w)
         except (struct.error, TypeError, ValueError, OverflowError) as error:
             raise Unencodable(f"{POSE_STAMPED}: {error}") from None
 

@@ -17,9 +17,9 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from experiments import assign, document, motion, theory
+from experiments import assign, document, motion, surroundings, theory
 from experiments.analysis import Analysis, analyse
-from experiments.claim import FORGIVEN, Claim, Severity, few
+from experiments.claim import FORGIVEN, Claim, Severity, few, listed
 from experiments.document import Document
 from experiments.experiment import Channel, Experiment, Network
 from experiments.locate import Path, line_column, nearest, places
@@ -30,6 +30,7 @@ from experiments.syntax import parsed
 
 SUBJECTS: Final = (
     *(theory.network, theory.realisation, theory.rigidity, theory.stability),
+    *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
     *(motion.starts, motion.formation, motion.walls, motion.encounters, motion.speeds, motion.rates, motion.ends),
 )
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
@@ -63,6 +64,8 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         robots: How many.
+        arena: Its size, x, y, z [m].
+        obstacles: What each is, by name.
         links: Directed ones.
         edges: Pairs that are linked, directions ignored.
         parts: Of the network.
@@ -88,6 +91,8 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     robots: int
+    arena: tuple[float, float, float]
+    obstacles: dict[str, str]
     links: int
     edges: int
     parts: int
@@ -220,6 +225,12 @@ class _Index:
             if len(own) > 2:
                 stands, place = own, there
                 break
+        file = self._document.arenas.get(cases[0], self._document.arenas.get("")) if cases else None
+        if file is not None and path[:1] == ("arena",):
+            inside, within = nearest(file.places, path)
+            if len(inside) > len(stands) - 2 * (stands[:1] == ("cases",)):
+                line, column = line_column(file.text, within.value)
+                return f"{file.label}:{line}:{column}"
         if not stands:
             return str(self._document.path)
         line, column = line_column(self._document.text, place.value)
@@ -278,6 +289,8 @@ def _worded(of: Figures) -> dict[str, str]:
 
     return {
         "robots": f"{of.robots}, leader: {', '.join(of.leaders) or 'none'}",
+        "arena": f"{' × '.join(f'{length:g}' for length in of.arena)} m",
+        "obstacles": listed([f"{name} ({what})" for name, what in of.obstacles.items()]) or "none",
         "links": f"{of.links} one-way, {of.edges} pairs",
         "algebraic connectivity": number(of.algebraic_connectivity, ".3f"),
         "rigidity rank, heights held": f"{number(of.rank, 'd')} of {number(of.rank_needed, 'd')}",
@@ -313,6 +326,8 @@ def _figures(analysis: Analysis) -> Figures:
     last = float(prediction.time[-1])
     return Figures(
         robots=len(analysis.names),
+        arena=experiment.arena.size,
+        obstacles={name: surroundings.described(obstacle) for name, obstacle in experiment.arena.obstacles.items()},
         links=len(assignment.links),
         edges=analysis.edges,
         parts=analysis.parts,

@@ -6,21 +6,29 @@ import math
 from collections.abc import Iterator
 from typing import Final
 
+import numpy as np
+
 from agents import plugins
 from agents.kinds import KINDS
 from agents.plugins import did_you_mean
-from experiments.experiment import Experiment, Robot
+from experiments import outlines
+from experiments.experiment import Arena, Experiment, Robot
 from experiments.links import FORM, pairs
 from experiments.problem import Fault
+from twins.scene import Scene
+from twins.sensors import SENSORS
 
 _RESERVED: Final = ("all", "estop", "run", "world", *KINDS)  # they mean something in keys and in [disturbance]
+_WALL: Final = "wall"  # the border of the arena, where contacts are told
 
 
 def faults(experiment: Experiment) -> Iterator[Fault]:
     """Everything that contradicts something else, with its path in the file."""
     yield from _rates(experiment)
+    yield from of_arena(experiment.arena)
     for name, robot in experiment.robots.items():
         yield from _robot(experiment, name, robot)
+    yield from _furnished(experiment)
     yield from _formation(experiment)
     yield from _timeline(experiment)
     for name in experiment.disturbance:
@@ -28,6 +36,62 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
         if name not in known:
             message = f"'{name}' is neither a robot nor a kind of robots"
             yield Fault(("disturbance", name), message, did_you_mean(name, known), on_key=True)
+
+
+def of_arena(arena: Arena) -> Iterator[Fault]:
+    """What is wrong with an arena by itself; paths begin at the top of a document."""
+    scene = Scene.furnished(arena.size, arena.obstacles, {}, walled=arena.walls)
+    x, y, z = arena.size
+    for number, (name, obstacle) in enumerate(arena.obstacles.items()):
+        path = ("arena", "obstacles", name)
+        if name == _WALL:
+            message = f"an obstacle cannot be called '{_WALL}', which means the border of the arena"
+            yield Fault(path, message, "rename it", on_key=True)
+        if outlines.outside(scene, number):
+            message = f"'{name}' stands outside of the arena, of which the middle is 0, 0"
+            hint = f"x lies between {-x / 2:g} and {x / 2:g}, y between {-y / 2:g} and {y / 2:g}; or enlarge size"
+            yield Fault((*path, "at"), message, hint)
+        if obstacle.bottom >= z:
+            message = f"'{name}' begins at {obstacle.bottom:g} m: the arena is {z:g} m high"
+            yield Fault((*path, "bottom"), message, f"give it a bottom below {z:g}, or enlarge size")
+    for name, box in arena.starts.items():
+        for axis in (0, 1):
+            beyond = abs(box.at[axis]) + box.size[axis] / 2 - arena.size[axis] / 2
+            if beyond > 1e-9:
+                message = f"the start box '{name}' reaches {beyond:.2g} m beyond the arena along {'xy'[axis]}"
+                yield Fault(("arena", "starts", name, "at"), message, "move it, make it smaller, or enlarge size")
+
+
+def _furnished(experiment: Experiment) -> Iterator[Fault]:
+    """Do robots and what stands in the arena go together at the start."""
+    arena, robots = experiment.arena, experiment.robots
+    scene = Scene.furnished(arena.size, arena.obstacles, {}, walled=arena.walls)
+    for number, name in enumerate(arena.obstacles):
+        path = ("arena", "obstacles", name)
+        if name in robots:
+            yield Fault(path, f"'{name}' is the name of a robot already", "rename one of them", on_key=True)
+        for robot, each in robots.items():
+            if each.kind not in KINDS:
+                continue
+            kind, place = KINDS[each.kind], np.array(each.start[:2])
+            if not outlines.at_height(scene, number, 0.0, kind.height):  # who flies stands on the floor before
+                continue
+            missing = kind.radius - float(outlines.distance(scene, number, scene.pose[number], place))
+            if missing > 1e-9:
+                message = f"'{robot}' starts in the obstacle '{name}'"
+                hint = f"move one of them by {missing + 0.01:.2f} m or more: all start on the floor, flying ones too"
+                yield Fault(("robots", robot, "start"), message, hint)
+    boxes = arena.starts
+    for robot, each in robots.items():
+        x, y = each.start[:2]
+        inside = [
+            max(abs(x - box.at[0]) - box.size[0] / 2, abs(y - box.at[1]) - box.size[1] / 2) <= 1e-9
+            for box in boxes.values()
+        ]
+        if boxes and not any(inside):
+            where = ", ".join(f"'{name}' around ({box.at[0]:g}, {box.at[1]:g})" for name, box in boxes.items())
+            message = f"'{robot}' starts outside of the boxes where robots may start"
+            yield Fault(("robots", robot, "start"), message, f"start it in {where}; or change [arena.starts]")
 
 
 def _rates(experiment: Experiment) -> Iterator[Fault]:
@@ -63,6 +127,10 @@ def _robot(experiment: Experiment, name: str, robot: Robot) -> Iterator[Fault]:
         yield from _hover(experiment, name, robot)
     else:
         yield Fault((*path, "kind"), f"no {robot.kind!r} among the kinds of robots", did_you_mean(robot.kind, KINDS))
+    for number, sensor in enumerate(robot.sensors or []):
+        if sensor not in SENSORS:
+            message = f"no {sensor!r} among the range sensors"
+            yield Fault((*path, "sensors", number), message, did_you_mean(sensor, SENSORS))
     for axis, size in enumerate(experiment.arena.size[:2]):
         if abs(robot.start[axis]) > size / 2:
             yield Fault(

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from agents import plugins
-from experiments import document, metrics, verdict
+from experiments import document, results, verdict
 from experiments.problem import DocumentError, Problem
 from experiments.progress import shown
 from experiments.records import RecordingError
 from experiments.run import SOURCE, Interrupts, Run, chosen, fly, load, new_folder, reopen, simulate_seeds
+from experiments.seeds import across_seeds
+from experiments.standins import BODIES
 
 
 def run(
@@ -37,8 +39,8 @@ def run(
     read = load(file, *changes)
     if seeds > 1 and not virtual:
         raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
-    if bodies not in (None, "protocol"):
-        raise DocumentError([Problem(f"--bodies {bodies}", 0, 0, "is not known", "the only choice is: protocol")])
+    if bodies not in (None, *BODIES):
+        raise DocumentError([Problem(f"--bodies {bodies}", 0, 0, "is not known", f"there are: {', '.join(BODIES)}")])
     if bodies is not None and virtual:
         raise DocumentError([Problem("--bodies", 0, 0, "is for real time", "leave out --virtual")])
     chosen(read, cases)
@@ -46,7 +48,7 @@ def run(
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     folder = new_folder(read, out)
-    (folder / SOURCE).write_text(read.text, encoding="utf-8")
+    read.keep(folder / SOURCE)
     interrupted = Interrupts()
     if virtual:
         first = read.experiment.seed
@@ -54,9 +56,8 @@ def run(
     else:
         with interrupted:
             show = shown(quiet=as_json)
-            protocol = bodies == "protocol"
             try:
-                runs = [fly(read, folder, cases=cases, show=show, interrupted=interrupted, protocol=protocol)]
+                runs = [fly(read, folder, cases=cases, show=show, interrupted=interrupted, bodies=bodies)]
             except KeyboardInterrupt:
                 print(f"\nended at once; `zenpark report {folder}` shows what was recorded", file=sys.stderr)
                 return 130
@@ -70,7 +71,7 @@ def run(
     )
     summary: dict[str, Any] = runs[0].summary()
     if seeds > 1:
-        summary["across"] = metrics.across_seeds([each.summary() for each in runs])
+        summary["across"] = across_seeds([each.summary() for each in runs])
     if as_json:
         print(json.dumps(summary))
     else:
@@ -133,6 +134,8 @@ def list_all() -> int:
         ("Triggers", plugins.TRIGGERS),
         ("Laws", plugins.LAWS),
         ("Planners", plugins.PLANNERS),
+        ("Avoidances", plugins.AVOIDANCES),
+        ("Engines", plugins.ENGINES),
     ):
         print(f"{what}: {', '.join(plugins.names(group))}")
     return 0
@@ -151,8 +154,8 @@ def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
     from experiments import report as pages  # noqa: PLC0415
 
     every = [case for each in runs for case in each.metrics.values()]
-    metrics.write_csv(folder / "metrics.csv", every)
-    metrics.write_json(folder / "metrics.json", every)
+    results.write_csv(folder / "metrics.csv", every)
+    results.write_json(folder / "metrics.json", every)
     traces = [trace for each in runs for trace in each.traces.values()]
     for name, figure in runs[0].figures().items():
         figures.save(figure, folder / "figures", name)
@@ -189,6 +192,9 @@ def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> No
         if name != next(iter(summary["cases"])):
             line += f"   (ratios: f {_figure(ratio['f_hz'])}, IAE {_figure(ratio['iae'])})"
         print(line)
+    for finding in verdict.contacts([case for each in runs for case in each.metrics.values()]):
+        if finding.mark == "bad":
+            print(finding.text)
     for note in runs[0].notes:
         print(f"note: {note}")
     print(f"run: {runs[0].folder}")

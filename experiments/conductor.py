@@ -30,7 +30,8 @@ ROUTER_S: Final = 10.0
 FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
-ROUTERS: Final = 5  # a router that dies more often is not helped by starting it again
+ROUTERS: Final = 5  # a router that dies more often is not helped by starting it again,
+WORLDS: Final = 5  # nor is a world
 
 M = TypeVar("M", wire.Status, wire.State)
 
@@ -135,7 +136,7 @@ class Conductor:
         for name, robot in experiment.robots.items():
             self._groups.setdefault(robot.process or name, []).append(name)
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
-        self._routers = 1
+        self._routers = self._worlds = 1
 
     def run(self) -> Result:
         """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
@@ -187,7 +188,7 @@ class Conductor:
         return Result(self._recording, self._interrupted(), start, ready, gone)
 
     def _stand_in(self, connect: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
-        """Starts protocol twins and positioning; the case as a file with addresses, and the processes' names."""
+        """Starts world, protocol twins and positioning; the case as a file with addresses, and the processes' names."""
         experiment, started = standins_of.start(
             self._experiment,
             self._file,
@@ -347,6 +348,17 @@ class Conductor:
                 start_router(self._launcher, self._endpoints)
             what = "started again" if self._routers < ROUTERS else "given up: the robots hold, and land at the end"
             self._say("router", "conductor", f"the router ended ({process.exit}); {what}")
+            return
+        if process.name == standins_of.world_name(self._case):
+            self._worlds += 1
+            last = process.tail().strip().splitlines()[-1:]
+            if self._worlds < WORLDS:
+                standins_of.start_world(
+                    self._experiment, self._file, prefix=self._case, launcher=self._launcher, connect=self._connect
+                )
+            what = "started again: robots hold until then" if self._worlds < WORLDS else "given up"
+            why = "".join(f": {line}" for line in last)
+            self._say("world", "conductor", f"the world ended ({process.exit}); {what}{why}")
             return
         if process.name == f"{self._case}-recorder":
             self._say("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")

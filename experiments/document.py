@@ -9,7 +9,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,8 @@ from typing import Any, Final
 import msgspec
 
 from agents.plugins import did_you_mean
-from experiments import catalogue, checks, shape
+from experiments import arena, catalogue, checks, shape
+from experiments.arena import ArenaFile
 from experiments.experiment import Experiment
 from experiments.links import parse_links
 from experiments.locate import Path as Keys
@@ -25,16 +26,15 @@ from experiments.locate import Place, nearest, places
 from experiments.overrides import Override, OverrideError, assign, merged, parse, used
 from experiments.problem import DocumentError, Fault, Problem, at_offset
 from experiments.schema import schema, write_schema
-from experiments.syntax import decoded, parsed
+from experiments.syntax import LARGEST, content, decoded, parsed, reason
 
 __all__ = [
-    "Document", "DocumentError", "Problem", "catalogue_path", "copy", "names", "parse_links", "read", "schema",
-    "write_json", "write_schema",
+    "LARGEST", "Document", "DocumentError", "Problem", "catalogue_path", "copy", "names", "parse_links", "read",
+    "schema", "write_json", "write_schema",
 ]  # fmt: skip
 
 _Table = dict[str, Any]
-
-LARGEST: Final = 4_000_000  # bytes; a hundred robots take ten thousand
+_ABOVE: Final = (("arena",), ("arena", "file"))  # changes after which the arena may begin with another file
 
 
 @dataclass(frozen=True)
@@ -44,17 +44,31 @@ class Document:
     Attributes:
         path: The file that was read.
         text: As it stands there.
-        experiment: What it says, before any case changes it; `--set` is in it.
+        experiment: What it says, before any case changes it; `--set` is in it. Its arena is complete, whatever file it
+            begins with.
+        arenas: The arena file of each case that has one; of the file without cases under the empty name.
     """
 
     path: Path
     text: str
     experiment: Experiment
     resolved: Mapping[str, Experiment]
+    arenas: Mapping[str, ArenaFile] = field(default_factory=dict)
 
     def cases(self) -> dict[str, Experiment]:
         """Each case as an experiment of its own, in the order of the file; one called "default" if it has none."""
         return dict(self.resolved)
+
+    def keep(self, file: Path) -> None:
+        """Writes the text to a file, and the arena files that it names beside it."""
+        file.write_text(self.text, encoding="utf-8")
+        for each in self.arenas.values():
+            (file.parent / each.name).write_text(each.text, encoding="utf-8")
+
+    @property
+    def listing(self) -> str:
+        """The text, and below it those of the arena files that it names: for people."""
+        return listed([self.text, *dict.fromkeys(each.text for each in self.arenas.values())])
 
 
 def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
@@ -70,12 +84,20 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
     """
     file = _file(path)
     label = str(path) if file == Path(path) else str(file)
-    text = decoded(_content(file, label), label)
+    try:
+        text = decoded(content(file, label), label)
+    except FileNotFoundError:
+        raise DocumentError([_no_entry(label)]) from None
     is_json = file.suffix.lower() == ".json"
     try:
         return _Reading(file, label, text, is_json, parsed(text, label, json=is_json), tuple(overrides)).document()
     except RecursionError:
         raise DocumentError([Problem(label, 0, 0, "tables or lists are nested too deeply", "flatten them")]) from None
+
+
+def listed(texts: Sequence[str]) -> str:
+    """The text of an experiment file, and below it those of its arena files: for people."""
+    return "\n\n# ---- the arena file ----\n\n".join(texts)
 
 
 def write_json(experiment: Experiment) -> bytes:
@@ -100,7 +122,7 @@ def catalogue_path(name: str) -> Path:
 
 
 def copy(name: str, target: Path) -> Path:
-    """Copies a catalogue entry, and beside it the schema that its first line shows to editors.
+    """Copies a catalogue entry; beside it its arena file, and the schema that its first line shows to editors.
 
     Args:
         name: Of the entry.
@@ -110,13 +132,18 @@ def copy(name: str, target: Path) -> Path:
         The file that was written.
 
     Raises:
-        DocumentError: If there is no such entry, or the target exists or cannot be written.
+        DocumentError: If there is no such entry, or the target exists or cannot be written, or another arena file of
+            that name is there.
     """
     source = catalogue_path(name)
     target = target / source.name if target.is_dir() else target
     try:
+        text = source.read_text("utf-8")
+        beside = _arena_beside(text, target.parent)
         with target.open("x", encoding="utf-8") as new:
-            new.write(source.read_text("utf-8"))
+            new.write(text)
+        if beside is not None:
+            (target.parent / beside.name).write_text(beside.text, encoding="utf-8")
         if not (target.parent / catalogue.SCHEMA).exists():
             write_schema(target.parent / catalogue.SCHEMA)
     except FileExistsError:
@@ -124,8 +151,24 @@ def copy(name: str, target: Path) -> Path:
         raise DocumentError([Problem(str(target), 0, 0, "exists already", hint)]) from None
     except (OSError, ValueError) as error:
         hint = "choose a place that exists and may be written to"
-        raise DocumentError([Problem(str(target), 0, 0, f"cannot be written: {_reason(error)}", hint)]) from error
+        raise DocumentError([Problem(str(target), 0, 0, f"cannot be written: {reason(error)}", hint)]) from error
     return target
+
+
+def _arena_beside(text: str, folder: Path) -> ArenaFile | None:
+    """The arena file that an entry needs in a folder.
+
+    Raises:
+        DocumentError: If another one of that name is there.
+    """
+    name = arena.named(tomllib.loads(text))
+    if name is None:
+        return None
+    wanted, there = arena.load(name, catalogue.FOLDER), folder / name
+    if there.exists() and there.read_text("utf-8") != wanted.text:
+        hint = "choose another folder, or rename that file; nothing was changed"
+        raise DocumentError([Problem(str(there), 0, 0, "is another arena than that of the entry", hint)])
+    return wanted
 
 
 def _entry(name: str) -> Path:
@@ -147,29 +190,6 @@ def _file(path: str | Path) -> Path:
         return file
 
 
-def _content(file: Path, label: str) -> bytes:
-    try:
-        with file.open("rb") as stream:
-            content = stream.read(LARGEST + 1)
-    except FileNotFoundError:
-        raise DocumentError([_no_entry(label)]) from None
-    except IsADirectoryError:
-        toml = sorted(each.name for each in file.glob("*.toml"))[:5]
-        hint = f"name a file in it: {', '.join(toml)}" if toml else "name an experiment file"
-        raise DocumentError([Problem(label, 0, 0, "is a folder", hint)]) from None
-    except (OSError, ValueError) as error:
-        hint = "check the name and who may read it"
-        raise DocumentError([Problem(label, 0, 0, f"cannot be read: {_reason(error)}", hint)]) from error
-    if len(content) > LARGEST:
-        hint = "name the experiment file, not a recording"
-        raise DocumentError([Problem(label, 0, 0, f"is longer than {LARGEST // 1_000_000} MB", hint)])
-    return content
-
-
-def _reason(error: OSError | ValueError) -> str:
-    return str(error.strerror) if isinstance(error, OSError) and error.strerror else str(error)
-
-
 @dataclass(frozen=True)
 class _Reading:
     """One reading of one file: what is at hand when something must be located."""
@@ -185,7 +205,7 @@ class _Reading:
         """See `read`."""
         overrides = self._overrides()
         self._refuse(shape.storable(self.content), overrides)
-        base, tables, cases = self._changed(overrides)
+        base, tables, cases, files = self._changed(overrides)
         nested = [
             Fault(("cases", name, "cases"), "a case cannot hold cases", "leave them out", on_key=True)
             for name, table in tables.items()
@@ -193,34 +213,67 @@ class _Reading:
         ]
         first = shape.faults(base)
         found = {name: shape.faults(case) for name, case in cases.items()}
-        self._refuse([*nested, *first, *_of_cases(tables, found, first)], overrides)
+        self._refuse([*nested, *first, *_of_cases(tables, found, first)], overrides, files)
 
         experiment = msgspec.convert(base, Experiment)
         resolved = {name: msgspec.convert(case, Experiment) for name, case in cases.items()}
         first = list(checks.faults(experiment))
         found = {name: list(checks.faults(case)) for name, case in resolved.items()}
-        self._refuse([*first, *_of_cases(tables, found, first)], overrides)
-        return Document(self.file, self.text, experiment, resolved or {"default": experiment})
+        self._refuse([*first, *_of_cases(tables, found, first)], overrides, files)
+        return Document(self.file, self.text, experiment, resolved or {"default": experiment}, files)
 
-    def _changed(self, overrides: Sequence[Override]) -> tuple[_Table, dict[str, _Table], dict[str, _Table]]:
-        """The document with `--set`, the tables of its cases, and each case merged into the document."""
-        base = deepcopy(self.content)
+    def _changed(
+        self, overrides: Sequence[Override]
+    ) -> tuple[_Table, dict[str, _Table], dict[str, _Table], dict[str, ArenaFile]]:
+        """The document with `--set`, the tables of its cases, each case merged into the document, and arena files.
+
+        What an arena file holds is put below what the experiment says of its arena, and `--set` finds it there. Only a
+        change of which file that is must come first.
+        """
+        plain = deepcopy(self.content)
         of_all = [override for override in overrides if override.path[0] != "cases" and override.case is None]
+        above = [override for override in overrides if override.path in _ABOVE]
+        late = [each for each in of_all if each.path[0] == "arena" and each not in above]
         unused = set(of_all)
         for override in overrides:
-            table = base if override.case is None else _tables(base).get(override.case, {})
-            if self._assigned(table, override, part=override.case is not None):
+            table = plain if override.case is None else _tables(plain).get(override.case, {})
+            if override not in late and self._assigned(table, override, part=override.case is not None):
                 unused.discard(override)
-        tables, cases = _tables(base), {}
+        files: dict[str, ArenaFile] = {}
+        base = self._furnished(plain, "", overrides, files)
+        tables, cases = _tables(plain), {}
         for name, table in tables.items():
-            cases[name] = deepcopy(merged(_without_cases(base), _without_cases(table)))
-            for override in [*of_all, *(each for each in overrides if each.case == name)]:
-                if self._assigned(cases[name], override):
+            own = deepcopy(merged(_without_cases(plain), _without_cases(table)))
+            mine = [*of_all, *(each for each in overrides if each.case == name)]
+            for override in mine:
+                if override in above:
+                    self._assigned(own, override)
+            cases[name] = self._furnished(own, name, overrides, files)
+            for override in mine:
+                if override not in above and self._assigned(cases[name], override):
                     unused.discard(override)
+        for override in late:
+            if self._assigned(base, override):
+                unused.discard(override)
         if unused:
             known = [base, *cases.values()]
             raise DocumentError([_nowhere(override, known) for override in of_all if override in unused])
-        return base, tables, cases
+        return base, tables, cases, files
+
+    def _furnished(
+        self, document: _Table, case: str, overrides: Sequence[Override], files: dict[str, ArenaFile]
+    ) -> _Table:
+        """The document with what its arena file holds; that file is added to `files`."""
+        name = arena.named(document)
+        if name is None:
+            return document
+        try:
+            known = (each for each in files.values() if each.name == name)
+            files[case] = next(known, None) or arena.load(name, self.file.parent)
+        except arena.Misnamed as error:
+            path = ("cases", case, *error.fault.path) if case else error.fault.path
+            self._refuse([replace(error.fault, path=path)], overrides)
+        return deepcopy(arena.furnished(document, files[case]))
 
     def _overrides(self) -> list[Override]:
         overrides, problems = [], []
@@ -244,13 +297,19 @@ class _Reading:
         except OverrideError as error:
             raise DocumentError([_of_flag(override.flag, str(error), error.hint)]) from None
 
-    def _refuse(self, faults: Iterator[Fault] | Sequence[Fault], overrides: Sequence[Override]) -> None:
+    def _refuse(
+        self,
+        faults: Iterator[Fault] | Sequence[Fault],
+        overrides: Sequence[Override],
+        files: Mapping[str, ArenaFile] | None = None,
+    ) -> None:
         """Raises if there is any fault, all in the order of the file."""
-        problems = dict.fromkeys(self._located(fault, overrides) for fault in faults)
+        problems = dict.fromkeys(self._located(fault, overrides, files or {}) for fault in faults)
         if problems:
-            raise DocumentError(sorted(problems, key=lambda problem: (problem.line, problem.column)))
+            ours = (self.label, *(problem.file for problem in problems if not problem.line))
+            raise DocumentError(sorted(problems, key=lambda each: (each.file not in ours, each.line, each.column)))
 
-    def _located(self, fault: Fault, overrides: Sequence[Override]) -> Problem:
+    def _located(self, fault: Fault, overrides: Sequence[Override], files: Mapping[str, ArenaFile]) -> Problem:
         path = fault.path
         inside = path[2:] if path[:1] == ("cases",) else path
         for override in reversed(overrides):
@@ -260,6 +319,9 @@ class _Reading:
             if whole[: len(path)] == path and path not in self._places:
                 return _of_flag(override.flag, fault.message, fault.hint)
         stands, place = nearest(self._places, path)
+        file = files.get("")
+        if file is not None and len(nearest(file.places, path)[0]) > len(stands):
+            return file.located(fault)
         offset = place.key if fault.on_key and stands == path else place.value
         return at_offset(self.label, self.text, offset, fault.message, fault.hint)
 

@@ -15,6 +15,7 @@ from typing import Any, Final, ParamSpec
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -135,14 +136,17 @@ def robot_lines(trace: Trace) -> list[Line]:
     return [{"color": KINDS.get(kind, "#7a7a7a"), "linewidth": 0.6, "alpha": 0.7} for kind in kinds]
 
 
-def robot_legend(figure: Figure, traces: Sequence[Trace]) -> None:
-    """Which robot, or which kind of robots, has which line."""
+def robot_legend(
+    figure: Figure, traces: Sequence[Trace], more: tuple[Sequence[Artist], Sequence[str]] = ((), ())
+) -> None:
+    """Which robot, or which kind of robots, has which line; and what `more` there is, handles and labels."""
     trace = max(traces, key=lambda each: len(each.robots))
     label = trace.robots
     if len(label) > MANY:
         label = tuple(trace.experiment.robots[name].kind for name in trace.robots)
     shown = {name: Line2D([], [], **line) for name, line in zip(label, robot_lines(trace), strict=True)}
-    legend_above(figure, (list(shown.values()), list(shown)), columns=4 if len(shown) in {4, 7, 8} else 5)
+    entries = [*shown.values(), *more[0]], [*shown, *more[1]]
+    legend_above(figure, entries, columns={4: 4, 6: 3, 7: 4, 8: 4}.get(len(entries[1]), 5))
 
 
 def legend_above(figure: Figure, entries: tuple[Sequence[Any], Sequence[str]], columns: int) -> None:

@@ -86,6 +86,9 @@ class Robot(Part, frozen=True):
         Literal["body", "world"], Meta(description="its own range sensors, or what the world says it would see")
     ] = "body"
     shadow: Annotated[Shadow | None, Meta(description="a twin beside it")] = None
+    avoids: Annotated[
+        bool, Meta(description="whether it keeps clear of others where the experiment has an avoidance")
+    ] = True
 
 
 class Link(Part, frozen=True):

@@ -7,18 +7,15 @@ twice; those that draw motions take traces, of one seed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import PathPatch, Rectangle
-from matplotlib.patheffects import withStroke
+from matplotlib.patches import PathPatch
 from matplotlib.ticker import MaxNLocator, NullFormatter
-from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
-from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from agents.rows import Array
@@ -27,15 +24,10 @@ from experiments.drawing import (
     CASES,
     HATCHES,
     INK,
-    MAGENTA,
-    MANY,
-    PAPER,
     SHORTEST_S,
     WIDTH,
     Line,
     boxes,
-    edges,
-    last_known,
     legend_above,
     mark_phases,
     merged,
@@ -50,8 +42,10 @@ from experiments.drawing import (
     thinned,
     time_axis,
 )
-from experiments.metrics import CaseMetrics, RobotMetrics, Spread, by_case, ratios, spread
-from experiments.signals import formation_errors, gaps, leaders, links_of, phase_starts
+from experiments.measured import CaseMetrics, RobotMetrics
+from experiments.seeds import Spread, by_case, ratios, spread
+from experiments.signals import formation_errors, gaps, leaders, phase_starts
+from experiments.space import after, before, formation_after, formation_before, plan_view, seen
 from experiments.trace import Trace
 
 __all__ = [
@@ -70,16 +64,16 @@ def every(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> dict[str, Fi
     figures: dict[str, Figure] = {}
     if cases:
         figures["global_bars"] = global_bars(cases)
-    if any(_seen(trace, _before(trace)) for trace in first):
+    if any(seen(trace, before(trace)) for trace in first):
         figures["formation_before"] = formation_before(first)
-    if any(len(phase_starts(trace)) > 1 and _seen(trace, _after(trace)) for trace in first):
+    if any(len(phase_starts(trace)) > 1 and seen(trace, after(trace)) for trace in first):
         figures["formation_after"] = formation_after(first)
     if cases:
         figures["robot_bars"] = robot_bars(cases)
     if first:
         figures["errors"], figures["events"] = errors(first), events(first)
         figures["intervals"] = intervals(first)
-    if any(_seen(trace) for trace in first):
+    if any(seen(trace) for trace in first):
         figures["plan_view"] = plan_view(first)
     return figures
 
@@ -147,18 +141,6 @@ def robot_bars(cases: Sequence[CaseMetrics]) -> Figure:
     figure.align_ylabels(list(panels))
     legend_above(figure, panels[0].get_legend_handles_labels(), columns=3)
     return figure
-
-
-@styled
-def formation_before(traces: Sequence[Trace]) -> Figure:
-    """The way from the start into the formation, before the first leg of the timeline (paper, figure 13)."""
-    return _spatial(traces, _before)
-
-
-@styled
-def formation_after(traces: Sequence[Trace]) -> Figure:
-    """The way from the first leg of the timeline to the end (paper, figure 14); the whole run if there is no leg."""
-    return _spatial(traces, _after)
 
 
 @styled
@@ -235,43 +217,6 @@ def intervals(traces: Sequence[Trace]) -> Figure:
     return figure
 
 
-@styled
-def plan_view(traces: Sequence[Trace]) -> Figure:
-    """The trajectories from above, in the arena; start hollow, end full, links of the end grey."""
-    columns = min(2, len(traces))
-    rows = math.ceil(len(traces) / columns)
-    x, y, _ = traces[0].experiment.arena.size
-    side = (WIDTH - 0.5) / columns
-    panel = min(side * y / x, 3.2) + 0.25
-    figure = Figure(figsize=(WIDTH, panel * rows + 0.7), layout="constrained")
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for axes, trace in zip(grid.flat, traces, strict=False):
-        x, y, _ = trace.experiment.arena.size
-        axes.add_patch(Rectangle((-x / 2, -y / 2), x, y, fill=False, edgecolor=INK, linewidth=0.6))
-        few, net = thinned(trace, len(traces)), links_of(trace)
-        place, last = trace.true_position, last_known(trace)
-        for i, j in edges(net.listener, net.speaker):
-            axes.plot(*last[[i, j], :2].T, color="#8a8a8a", linewidth=0.5, zorder=1)
-        small = 3.0 if len(trace.robots) <= MANY else 2.0
-        for i, line in enumerate(robot_lines(trace)):
-            axes.plot(place[few, i, 0], place[few, i, 1], **{**line, "linewidth": 0.8})
-            axes.plot(*place[0, i, :2], "o", ms=small, mec=line["color"], mfc="none", mew=0.7)
-            axes.plot(*last[i, :2], "o", ms=small + 0.5, mec="none", color=line["color"])
-        axes.set_aspect("equal")
-        axes.set_xlim(-0.53 * x, 0.53 * x)
-        axes.set_ylim(-0.53 * y, 0.53 * y)
-        axes.set_title(plain(trace.case), pad=3.0)
-        axes.spines[["left", "bottom"]].set_visible(False)
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-        axes.yaxis.set_major_locator(MaxNLocator(5))
-    for axes in list(grid.flat)[len(traces) :]:
-        axes.set_visible(False)
-    figure.supxlabel("$x$ [m]", fontsize=8)
-    figure.supylabel("$y$ [m]", fontsize=8)
-    robot_legend(figure, traces)
-    return figure
-
-
 def _same(runs: Iterable[CaseMetrics], name: str) -> list[RobotMetrics]:
     return [robot for run in runs for robot in run.robots if robot.robot == name]
 
@@ -304,106 +249,9 @@ def _first_seed(traces: Sequence[Trace]) -> list[Trace]:
     return list({trace.case: trace for trace in reversed(traces)}.values())[::-1]
 
 
-def _before(trace: Trace) -> slice:
-    """Rows until the first leg of the timeline; all if there is none."""
-    starts = phase_starts(trace)
-    return slice(0, _row(trace, starts[1]) if len(starts) > 1 else len(trace.time))
-
-
-def _after(trace: Trace) -> slice:
-    """Rows from the first leg of the timeline on; all if there is none."""
-    starts = phase_starts(trace)
-    return slice(_row(trace, starts[1]) if len(starts) > 1 else 0, len(trace.time))
-
-
-def _row(trace: Trace, at: float) -> int:
-    return int(np.searchsorted(trace.time, at - 1e-9))
-
-
-def _seen(trace: Trace, rows: slice = slice(None)) -> bool:
-    """Whether the position of any robot is known there."""
-    return bool(np.isfinite(trace.true_position[rows]).all(axis=2).any())
-
-
 def _steps(waits: Array) -> tuple[Array, Array]:
     """The empirical distribution, thinned to what can be seen."""
     x = np.sort(np.maximum(waits, 1e-4))
     share = np.arange(1, len(x) + 1) / len(x)
     few = np.unique(np.linspace(0, len(x) - 1, 300).round().astype(int))
     return np.concatenate([x[:1], x[few]]), np.concatenate([[0.0], share[few]])
-
-
-def _spatial(traces: Sequence[Trace], rows_of: Callable[[Trace], slice]) -> Figure:
-    """Trajectories in space over a span of time, one panel per case, with the links at its start and its end."""
-    columns = 1 if len(traces) <= 2 else 2
-    rows = math.ceil(len(traces) / columns)
-    height = panel_height(rows, 2.6 / columns)
-    whole = height * rows + 0.3
-    figure = Figure(figsize=(WIDTH, whole))
-    for k, trace in enumerate(traces):
-        row, column = divmod(k, columns)
-        box = ((column - 0.02) / columns, 1.0 - (0.3 + height * (row + 1)) / whole, 1.0 / columns, height / whole)
-        axes = figure.add_axes(box, projection="3d", computed_zorder=False)
-        assert isinstance(axes, Axes3D)
-        if _seen(trace, rows_of(trace)):
-            _draw_spatial(axes, trace, trace.true_position[rows_of(trace)], columns)
-        else:
-            axes.set_axis_off()
-            axes.text2D(0.5, 0.5, "nothing is known", transform=axes.transAxes, fontsize=7, ha="center")
-        if len(traces) > 1:
-            axes.text2D(0.06, 0.93, plain(trace.case), transform=axes.transAxes, fontsize=8)
-    black, magenta = to_rgb(INK), to_rgb(MAGENTA)
-    handles = [
-        Line2D([], [], color=black, linewidth=0.7),
-        Line2D([], [], color=magenta, linewidth=0.9),
-        Line2D(
-            [], [], color=black, marker="*", linestyle="", markersize=5, markerfacecolor="none", markeredgewidth=0.6
-        ),
-        Line2D([], [], color=black, marker="*", linestyle="", markersize=5.5),
-    ]
-    figure.legend(
-        handles, ["links, start", "links, end", "start", "end"], loc="upper center", ncols=4, bbox_to_anchor=(0.5, 1.0)
-    )
-    return figure
-
-
-def _draw_spatial(axes: Axes3D, trace: Trace, place: Array, columns: int) -> None:
-    known = np.asarray(np.isfinite(place).all(axis=2))
-    ends = place[len(place) - 1 - known[::-1].argmax(axis=0), np.arange(place.shape[1])]
-    starts = place[known.argmax(axis=0), np.arange(place.shape[1])]
-    net = links_of(trace)
-    pairs = edges(net.listener, net.speaker)
-    thin = (1.0 if len(trace.robots) <= MANY else 0.5) / math.sqrt(columns)
-    for where, colour, width, order in ((starts, INK, 0.6, 1), (ends, MAGENTA, 0.9, 4)):
-        lines = [where[[i, j]] for i, j in pairs]
-        axes.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=width * thin, alpha=0.8, zorder=order))
-    few = slice(None, None, max(1, len(place) // 400))
-    for i, line in enumerate(robot_lines(trace)):
-        axes.plot(*place[few, i].T, **{**line, "zorder": 3})
-        axes.plot(*starts[i, :, None], "*", ms=5 * thin, mfc="none", mec=line["color"], mew=0.6, zorder=5)
-        axes.plot(*ends[i, :, None], "*", ms=6 * thin, color=line["color"], mec="none", zorder=6)
-        if len(trace.robots) <= MANY and columns == 1:
-            halo = [withStroke(linewidth=1.5, foreground=PAPER)]
-            axes.text(*(ends[i] + [0.0, 0.0, 0.05]), trace.robots[i], fontsize=6, zorder=7, path_effects=halo)
-    low, high = place[known].min(axis=0), place[known].max(axis=0)
-    low[2] = min(0.0, low[2])
-    size = np.maximum(high - low, 0.4)
-    middle = 0.5 * (low + high)
-    low, high = middle - 0.54 * size, middle + 0.54 * size
-    low[2] = 0.0 if low[2] > -0.1 else low[2]
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    x, y, z = (high - low) / math.dist(high, low)
-    wide, tall = 0.87 * x + 0.5 * y, 0.44 * (0.5 * x + 0.87 * y) + 0.9 * z  # as seen from 26° above and 60° aside
-    axes.set_box_aspect((x, y, z), zoom=min(0.94 / wide, 0.82 / tall))
-    axes.view_init(26, -60)
-    size_pt, pad = (8, -8) if columns == 1 else (6.5, -11)
-    axes.set_xlabel("$x$ [m]", labelpad=pad, fontsize=size_pt)
-    axes.set_ylabel("$y$ [m]", labelpad=pad, fontsize=size_pt)
-    axes.set_zlabel("$z$ [m]", labelpad=pad - 1, fontsize=size_pt)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.set_major_locator(MaxNLocator(5 if columns == 1 else 3))
-        axis.pane.fill = False
-        axis.pane.set_edgecolor("#9a9a9a")
-        axis.pane.set_linewidth(0.4)
-        axis._axinfo["grid"].update(linewidth=0.3, color="#c0c0c0")
-    axes.tick_params(pad=-3.5 if columns == 1 else -4.5, labelsize=6.5 if columns == 1 else 5.5)

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from itertools import repeat
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from agents import wire
+from agents import plugins, wire
 from agents.graph import Links
 from agents.lifecycle import Phase
 from agents.rows import Array, Index, Mask
 from experiments import assign
+from experiments.contacts import ROUNDING_S, WALL, finds_contacts, looked_for, within
 from experiments.experiment import Experiment
 from experiments.recording import Recording
 from experiments.trace import HeardPoses, Sent, Trace
 from experiments.virtual import Log
 
 EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
-ROUNDING_S: Final = 1e-6
 
 
 class Logbook:
@@ -31,6 +33,7 @@ class Logbook:
         self._log, self._experiment, self._case = log, experiment, case
         self._mine = slice(copy * rows, (copy + 1) * rows)
         self._seed = log.seeds[copy]
+        self._scene = assign.scene(experiment)
         self._links: Links = assign.heard_links(experiment)
         time, row, seq, position, velocity, yaw = log.sent
         own = (row >= copy * rows) & (row < (copy + 1) * rows)
@@ -54,6 +57,7 @@ class Logbook:
         heard_time, link, heard_seq, stamp, heard_position = self._heard
         link = link[got]
         rows = len(log.names)
+        contacts, world = within(self._contacts(), EPOCH, duration), within(self._world(), EPOCH, duration)
         return Trace(
             case=self._case,
             experiment=self._experiment,
@@ -82,6 +86,13 @@ class Logbook:
             events=tuple(
                 wire.Event(t, kind, source, text) for t, kind, source, text in self._events() if t <= duration
             ),
+            interventions=log.interventions[mine],
+            avoided=log.avoided[mine],
+            contacts=contacts if looked_for(contacts, world) else None,
+            world=world,
+            attitude=_part(log.attitude, run, mine),
+            shadow_position=_part(log.shadow_position, run, mine),
+            shadow_yaw=_part(log.shadow_yaw, run, mine),
         )
 
     def record(self, path: Path, document: str) -> None:
@@ -117,6 +128,10 @@ class Logbook:
                     recording.state(state)
             for status in self._statuses():
                 recording.status(status)
+            for report in self._world():
+                recording.world(report)
+            for contact in self._contacts():
+                recording.contact(contact)
 
     @property
     def _encoding(self) -> wire.Encoding:
@@ -137,13 +152,15 @@ class Logbook:
         log, mine = self._log, self._mine
         words = [phase.word for phase in Phase]
         columns = (log.phase, log.position, log.velocity, log.yaw, log.goal, log.setpoint, log.error)
+        rest = (log.attitude, log.shadow_position, log.shadow_yaw)
         samples = zip(
             log.time.tolist(),
             *(column[:, mine].tolist() for column in (*columns, log.true_position, log.true_yaw)),
+            *(repeat(None, len(log.time)) if column is None else column[:, mine].tolist() for column in rest),
             strict=True,
         )
         heard = self._heard_by_sample()
-        for k, (t, phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw) in enumerate(samples):
+        for k, (t, phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw, *more) in enumerate(samples):
             yield (
                 t,
                 [
@@ -161,6 +178,7 @@ class Logbook:
                         tuple(truth[row]),
                         true_yaw[row],
                         heard.get((k, row), []),
+                        *(None if column is None else _known(column[row]) for column in more),
                     )
                     for row, name in enumerate(log.names)
                 ],
@@ -214,6 +232,45 @@ class Logbook:
                     rss_mb=0.0,
                 )
 
+    def _contacts(self) -> Iterator[wire.Contact]:
+        """What touched in this repetition, take-off and landing included."""
+        rows, names = len(self._log.names), self._log.names
+        first = self._mine.start
+        for touch in self._log.touches:
+            if first <= touch.first < first + rows:
+                other = names[touch.second - first] if touch.second >= 0 else self._obstacle(-1 - touch.second)
+                yield wire.Contact(
+                    EPOCH + touch.time, names[touch.first - first], other, float(touch.impulse), float(touch.overlap)
+                )
+
+    def _obstacle(self, k: int) -> str:
+        return self._scene.names[k] if k < len(self._scene.names) else WALL
+
+    def _world(self) -> Iterator[wire.WorldState]:
+        """What a world would say of itself at 1 Hz; nothing where robots are alone in an empty place."""
+        log, chosen, scene = self._log, self._experiment.world.engine, self._scene
+        if not (scene.names or log.touches or finds_contacts(chosen)):
+            return
+        touched = np.sort([contact.stamp - EPOCH for contact in self._contacts()])
+        moved = log.obstacles[:, self._mine.start // len(log.names)]
+        whole = np.flatnonzero(np.abs(log.time - np.round(log.time)) < 0.5 / self._experiment.rates.state_hz - 1e-9)
+        for k in whole.tolist():
+            t = float(log.time[k])
+            yield wire.WorldState(
+                stamp=EPOCH + t,
+                engine=plugins.split(chosen)[0],
+                time=t - float(log.time[0]),
+                factor=1.0,
+                load=0.0,
+                paused=False,
+                robots=list(log.names),
+                mirrored=[],
+                obstacles={name: tuple(pose) for name, pose in zip(scene.names, moved[k].tolist(), strict=True)},
+                contacts=int(np.searchsorted(touched, t, side="right")),
+                refused=0,
+                malformed=0,
+            )
+
     def _counts(self, row: Index, time: Array) -> tuple[Index, Index]:
         """How often each row occurs until the end of the run, and until the end of everything."""
         rows = len(self._log.names)
@@ -227,3 +284,14 @@ class Logbook:
         for leg in sorted(self._experiment.timeline, key=lambda leg: leg.at_s):
             yield leg.at_s, "phase", "conductor", f"{leg.robot} under way"
         yield self._experiment.duration_s, "phase", "conductor", "landing"
+
+
+def _part(column: Array | None, run: Mask, mine: slice) -> Array | None:
+    return None if column is None else column[run, mine]
+
+
+def _known(value: Any) -> Any:  # noqa: ANN401 - a number or a list of them
+    """For the wire: as a tuple; None if it is NaN."""
+    if isinstance(value, list):
+        return None if math.isnan(value[0]) else tuple(value)
+    return None if math.isnan(value) else value

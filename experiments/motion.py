@@ -116,7 +116,12 @@ def encounters(analysis: Analysis) -> Iterator[Claim]:
         message = (
             f"{first} and {second} come within {each.distance:.2f} m at {each.time:.1f} s; they touch at {touch:.2f} m"
         )
-        yield Claim("warning", "too-close", message, "move the start of one of them", ("robots", second, "start"))
+        path = ("robots", second, "start")
+        robots = analysis.experiment.robots
+        if analysis.experiment.avoidance is None or not (robots[first].avoids or robots[second].avoids):
+            yield Claim("warning", "too-close", message, "move the start of one of them", path)
+        else:
+            yield Claim("note", "avoidance-acts", f"{message}: avoidance will have to act", "", path)
     if analysis.prediction.time[-1] < analysis.experiment.duration_s - 1.0 / analysis.experiment.rates.coordination_hz:
         return
     final = analysis.prediction.position[-1]

@@ -12,14 +12,16 @@ from typing import Any, Final
 import msgspec
 
 from agents.plugins import did_you_mean
-from experiments.experiment import Experiment, Formation
+from experiments.experiment import Experiment, Formation, World
 from experiments.links import pairs
 from experiments.locate import Path
 from experiments.shape import group_of, parameters
 
 _PART: Final = re.compile(r"\s*(?:\"([^\"]*)\"|'([^']*)'|([^.\"']+))\s*(?:\.|$)")
+_SHAPES: Final = frozenset({"box", "radius", "wall"})
 _DEFAULT: Final[dict[Path, Any]] = {
     ("trigger",): msgspec.structs.fields(Experiment)[Experiment.__struct_fields__.index("trigger")].default,
+    ("world", "engine"): msgspec.structs.fields(World)[World.__struct_fields__.index("engine")].default,
     ("formation", "law"): msgspec.structs.fields(Formation)[Formation.__struct_fields__.index("law")].default,
 }
 
@@ -126,13 +128,16 @@ def merged(document: Mapping[str, Any], changes: Mapping[str, Any], path: Path =
     """A document with the changes of a case: tables merge, everything else replaces.
 
     A trigger, law or plan of another kind replaces the whole table, because the parameters of the old kind mean
-    nothing to the new one. A link is the same link however it is written.
+    nothing to the new one; an obstacle has one shape, and a new one replaces it. A link is the same link however it is
+    written.
     """
     result = dict(document)
     for name, value in changes.items():
         key = _same_link(name, result) if path == ("formation", "links") else name
         here = (*path, key)
         old = _as_table(result.get(key), here) if isinstance(value, dict) else None
+        if isinstance(old, dict) and here[:-1] == ("arena", "obstacles") and _SHAPES & value.keys():
+            old = {part: each for part, each in old.items() if part not in _SHAPES}
         other = group_of(here) and isinstance(old, dict) and value.get("kind", old.get("kind")) != old.get("kind")
         result[key] = merged(old, value, here) if isinstance(old, dict) and not other else value
     return result

@@ -7,28 +7,28 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import msgspec
 import numpy as np
 
 from agents.lifecycle import Phase
-from agents.rows import Array, Index, Mask
-from agents.wire import Event, State, Status
+from agents.rows import Array, Index
+from agents.wire import Contact, Event, State, Status, WorldState
 from experiments.cdr import Undecodable, codec
+from experiments.contacts import ROUNDING_S, looked_for, within
 from experiments.experiment import Experiment
-from experiments.recording import JSON, METADATA, SentPose
+from experiments.recording import JSON, METADATA, SentPose, World
 from experiments.records import RecordingError, Records
+from experiments.resample import HOLE_S, attitude, line, step, turn
 from experiments.trace import HeardPoses, Sent, Trace
 
-ROUNDING_S: Final = 1e-6  # UTC seconds in a float are exact to a quarter of a microsecond
 HOLD_PERIODS: Final = 2.0  # for so many state periods a robot is where it last said; then nobody knows
-HOLE_S: Final = 1.0  # telemetry that is silent for longer is not interpolated over
 STATUS_S: Final = 1.0  # what happened in the run is counted by a status at most this much after its end
 EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the whole run are not that much early
 LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
 NOWHERE: Final = (math.nan, math.nan, math.nan)
-NO_SETPOINT: Final = (*NOWHERE, math.nan)
+UNKNOWN: Final = (*NOWHERE, math.nan)
 
 S = TypeVar("S", bound=msgspec.Struct)
 M = TypeVar("M", State, SentPose, Status)
@@ -60,7 +60,7 @@ def read(path: Path) -> Playback:
 
     Positions and yaw are interpolated onto the grid, goals and setpoints are the last at or before. A robot that never
     reported is NaN; one that fell silent is NaN from two state periods after its last sample, and inside holes of more
-    than a second.
+    than a second. Attitude is interpolated as well, and where the twins beside the robots were.
 
     `lost` of a robot adds up what its sequence numbers prove: (1) gaps among its poses recorded in the run, where a
     number that goes back is a publisher that began anew at 1; (2) what its last status of the run counts as sent beyond
@@ -106,15 +106,20 @@ class _Content:
     poses: list[SentPose] = field(default_factory=list)
     statuses: list[Status] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
+    contacts: list[Contact] = field(default_factory=list)
+    world: list[WorldState] = field(default_factory=list)
 
     def fill(self) -> int:
         """Reads all messages and counts them; those of other types are passed over."""
+        worlds: list[World] = []
         known = dict(
             [
                 _reader(State, self.states),
                 _reader(SentPose, self.poses),
                 _reader(Status, self.statuses),
                 _reader(Event, self.events),
+                _reader(Contact, self.contacts),
+                _reader(World, worlds),
             ]
         )
         readers: dict[int, Callable[[bytes], None] | None] = {}
@@ -129,6 +134,7 @@ class _Content:
                     take(message.data)
                 except Undecodable as error:
                     raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
+        self.world += [each.said() for each in worlds]
         return count
 
     def start(self, announced: float | None) -> float | None:
@@ -193,8 +199,14 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
     poses = [list({(pose.stamp, pose.seq): pose for pose in own}.values()) for own in _by_robot(content.poses, robots)]
     statuses = _by_robot(content.statuses, robots)
     last = [_by_the_end(own, start + duration) for own in statuses]
-    sampled = [_sampled(own, start, time, HOLD_PERIODS / rate) for own in states]
-    position, yaw, true_position, goal, setpoint = (np.stack(columns, axis=1) for columns in zip(*sampled, strict=True))
+    sampled = [_Sampled.of(own, start, time, HOLD_PERIODS / rate) for own in states]
+
+    def column(what: str) -> Array:
+        return np.stack([getattr(own, what) for own in sampled], axis=1)
+
+    told = any(state.attitude is not None for state in content.states)
+    shadowed = any(state.shadow_position is not None for state in content.states)
+    contacts, world = within(content.contacts, start, duration), within(content.world, start, duration)
     return Trace(
         case=about[0],
         experiment=experiment,
@@ -202,22 +214,34 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         robots=robots,
         clock=about[2],
         time=time,
-        position=position,
-        yaw=yaw[:, :, 0],
-        true_position=true_position,
-        goal=goal,
-        setpoint=setpoint,
+        position=column("position"),
+        yaw=column("yaw")[:, :, 0],
+        true_position=column("true_position"),
+        goal=column("goal"),
+        setpoint=column("setpoint"),
         sent=_sent(poses, start, duration),
         heard=_heard(states, robots, start, duration),
         lost=_lost(robots, poses, statuses, (start, start + duration)),
-        missed_deadlines=np.array([status.missed if status else 0 for status in last], dtype=np.intp),
-        ticks=np.array([status.ticks if status else 0 for status in last], dtype=np.intp),
-        decisions=np.array([status.decisions if status else 0 for status in last], dtype=np.intp),
+        missed_deadlines=_counted(last, "missed"),
+        ticks=_counted(last, "ticks"),
+        decisions=_counted(last, "decisions"),
         events=tuple(
             msgspec.structs.replace(event, stamp=event.stamp - start)
             for event in sorted(content.events, key=lambda event: event.stamp)
         ),
+        interventions=_counted(last, "interventions"),
+        avoided=_counted(last, "avoided"),
+        contacts=contacts if looked_for(contacts, world) else None,
+        world=world,
+        attitude=column("attitude") if told else None,
+        shadow_position=column("shadow_position") if shadowed else None,
+        shadow_yaw=column("shadow_yaw")[:, :, 0] if shadowed else None,
     )
+
+
+def _counted(last: Sequence[Status | None], what: str) -> Index:
+    """A counter of each robot, 0 of those that said nothing."""
+    return np.array([getattr(status, what) if status else 0 for status in last], dtype=np.intp)
 
 
 def _by_the_end(said: list[Status], end: float) -> Status | None:
@@ -234,58 +258,43 @@ def _by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:
     return [sorted(own, key=lambda message: message.stamp) for own in found.values()]
 
 
-def _sampled(states: list[State], start: float, time: Array, hold: float) -> tuple[Array, Array, Array, Array, Array]:
-    """Position, yaw, true position, goal and setpoint of one robot on the grid, each (T, k)."""
-    t = np.array([state.stamp for state in states]) - start
-    measured = np.array([state.position for state in states]).reshape(-1, 3)
-    truth = np.array([state.true_position or NOWHERE for state in states]).reshape(-1, 3)
-    goal = np.array([state.goal or NOWHERE for state in states]).reshape(-1, 3)
-    setpoint = np.array([state.setpoint or NO_SETPOINT for state in states]).reshape(-1, 4)
-    yaw = np.array([state.yaw for state in states]).reshape(-1, 1)
-    return (
-        _line(t, measured, time, hold),
-        _turn(t, yaw, time, hold),
-        _line(t, np.where(np.isfinite(truth), truth, measured), time, hold),
-        _step(t, goal, time, hold),
-        _step(t, setpoint, time, hold),
-    )
+@dataclass(frozen=True)
+class _Sampled:
+    """One robot's telemetry on the grid, each (T, k)."""
+
+    position: Array
+    yaw: Array
+    true_position: Array
+    goal: Array
+    setpoint: Array
+    attitude: Array
+    shadow_position: Array
+    shadow_yaw: Array
+
+    @classmethod
+    def of(cls, states: list[State], start: float, time: Array, hold: float) -> _Sampled:
+        t = np.array([state.stamp for state in states]) - start
+        grid = (time, hold)
+
+        def column(values: list[Any], width: int) -> Array:
+            return np.array(values, dtype=float).reshape(-1, width)
+
+        measured = column([state.position for state in states], 3)
+        truth = column([state.true_position or NOWHERE for state in states], 3)
+        return cls(
+            position=line(t, measured, *grid),
+            yaw=turn(t, column([state.yaw for state in states], 1), *grid),
+            true_position=line(t, np.where(np.isfinite(truth), truth, measured), *grid),
+            goal=step(t, column([state.goal or NOWHERE for state in states], 3), *grid),
+            setpoint=step(t, column([state.setpoint or UNKNOWN for state in states], 4), *grid),
+            attitude=attitude(t, column([state.attitude or UNKNOWN for state in states], 4), *grid),
+            shadow_position=line(t, column([state.shadow_position or NOWHERE for state in states], 3), *grid),
+            shadow_yaw=turn(t, column([_number(state.shadow_yaw) for state in states], 1), *grid),
+        )
 
 
-def _line(t: Array, values: Array, time: Array, hold: float) -> Array:
-    """Samples (K, k) at times (K,), interpolated linearly onto the grid (T, k); one that is not finite is none."""
-    whole = np.isfinite(values).all(axis=1)
-    t, values = t[whole], values[whole]
-    if not len(t):
-        return np.full((len(time), values.shape[1]), np.nan)
-    line = np.column_stack([np.interp(time, t, column) for column in values.T])
-    line[~_known(t, time, hold)] = np.nan
-    return line
-
-
-def _turn(t: Array, yaw: Array, time: Array, hold: float) -> Array:
-    """Like `_line` for angles [rad]: the short way round, and on the branch of the sample before."""
-    whole = np.isfinite(yaw[:, 0])
-    t, yaw = t[whole], yaw[whole]
-    turned = _line(t, np.unwrap(yaw, axis=0), time, hold)
-    return turned + 2.0 * np.pi * np.round((_step(t, yaw, time, hold) - turned) / (2.0 * np.pi))
-
-
-def _step(t: Array, values: Array, time: Array, hold: float) -> Array:
-    """Samples (K, k) at times (K,), the last at or before each time of the grid (T, k)."""
-    if not len(t):
-        return np.full((len(time), values.shape[1]), np.nan)
-    before = np.searchsorted(t, time + ROUNDING_S, side="right") - 1
-    step = values[np.maximum(before, 0)]
-    step[~_known(t, time, hold)] = np.nan
-    return step
-
-
-def _known(t: Array, time: Array, hold: float) -> Mask:
-    """Where on the grid the samples say something: close to one, or between two that are not far apart."""
-    after = np.searchsorted(t, time)
-    padded = np.concatenate([[-np.inf], t, [np.inf]])
-    since, until = time - padded[after], padded[after + 1] - time
-    return np.asarray((np.minimum(since, until) <= hold + ROUNDING_S) | (since + until <= HOLE_S + ROUNDING_S))
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def _sent(poses: list[list[SentPose]], start: float, duration: float) -> Sent:

@@ -1,4 +1,4 @@
-"""How an experiment would go if nothing disturbed it: perfect communication, robots without inertia, no walls.
+"""How an experiment would go if nothing disturbed it: perfect communication, robots without inertia, an empty room.
 
 The laws and plans are those of `agents.Agent`; this file only closes the loop, in a tenth of the time that a run in
 virtual time takes.
@@ -59,6 +59,7 @@ def predict(assignment: Assignment, start: Array, yaw: Array, leads: Index, hz: 
             pose_every=4 * DECISIONS,
             trigger=Periodic(),
             limits=limits,
+            avoidance=None,  # it acts on what range sensors see, and here they see nothing
             duration=2.0 * assignment.duration + 1.0,  # it must not end before the last decision
         )
     )

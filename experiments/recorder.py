@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from math import isfinite
 from pathlib import Path
 from types import FrameType
 from typing import Final
@@ -47,6 +48,8 @@ class Recorder:
         self._statuses = network.pose_subscriber(session, keys.status("*"), DEPTH)
         self._states = network.subscriber(session, keys.state("*"), DEPTH)
         self._events = network.subscriber(session, keys.event, DEPTH)
+        self._contacts = network.subscriber(session, keys.contact, DEPTH)
+        self._world = network.subscriber(session, keys.world, DEPTH)
         self._truths = network.subscriber(session, keys.truth("*"), DEPTH)
         self._truth: dict[str, wire.Position] = {}
         self._watch = network.alive_watch(session, keys.alive("*"))
@@ -72,6 +75,8 @@ class Recorder:
             (self._poses.handler, self._pose),
             (self._statuses.handler, self._status),
             (self._events.handler, self._event),
+            (self._contacts.handler, self._contact),
+            (self._world.handler, self._said_by_world),
         ):
             for sample in network.received(handler):
                 try:
@@ -106,6 +111,23 @@ class Recorder:
 
     def _event(self, sample: zenoh.Sample) -> None:
         self._recording.event(wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Event))
+
+    def _contact(self, sample: zenoh.Sample) -> None:
+        contact = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Contact)
+        self._finite(sample, contact.stamp, contact.impulse, contact.overlap)
+        self._recording.contact(contact)
+
+    def _said_by_world(self, sample: zenoh.Sample) -> None:
+        said = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.WorldState)
+        self._finite(sample, said.stamp, said.time, said.factor, said.load)
+        for pose in said.obstacles.values():
+            self._finite(sample, *pose)
+        self._recording.world(said)
+
+    @staticmethod
+    def _finite(sample: zenoh.Sample, *numbers: float) -> None:
+        if not all(map(isfinite, numbers)):
+            raise wire.Malformed(f"a number on {sample.key_expr} is not finite")
 
     def _own(self, sample: zenoh.Sample, robot: str) -> None:
         if self._keys.robot(str(sample.key_expr)) != robot:

@@ -4,6 +4,8 @@
     /<robot>/state      zenpark_msgs/State            telemetry, with the poses heard since the one before
     /<robot>/true_pose  geometry_msgs/PoseStamped     the same place in a type that every viewer draws
     /<robot>/status     zenpark_msgs/Status
+    /world/contact      zenpark_msgs/Contact          what touched in the world, when it began
+    /world/state        zenpark_msgs/World            what the world says of itself
     /events             zenpark_msgs/Event
 
 Attached are the experiment as it was written (`experiment.toml`) and this case with its overrides (`experiment.json`);
@@ -22,7 +24,7 @@ from typing import IO, Any, Final, Literal, Self, cast
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from agents.wire import Event, Pose, State, Status, Vector
+from agents.wire import Contact, Event, Pose, State, Status, Vector, WorldState
 from experiments.cdr import POSE_STAMPED, POSE_STAMPED_SCHEMA, Unencodable, codec, pose_stamped
 from experiments.experiment import Experiment
 from experiments.records import RecordingError
@@ -31,6 +33,7 @@ FRAME: Final = "park"
 TOML: Final = "experiment.toml"
 JSON: Final = "experiment.json"
 METADATA: Final = "zenpark"
+WORLD: Final = "world"  # stands where a robot's name would; no robot may be called so
 CHUNK_BYTES: Final = 32 * 1024  # what a kill can cost: a third of a second of seven robots
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 
@@ -46,6 +49,42 @@ class SentPose(msgspec.Struct, frozen=True):
     yaw: float
     received: float
     size: int
+
+
+class Standing(msgspec.Struct, frozen=True):
+    """An obstacle by name, with x, y [m] and yaw [rad]."""
+
+    name: str
+    pose: Vector
+
+
+class World(msgspec.Struct, frozen=True):
+    """What a world said of itself, see `agents.wire.WorldState`."""
+
+    stamp: float
+    engine: str
+    time: float
+    factor: float
+    load: float
+    paused: bool
+    robots: list[str]
+    mirrored: list[str]
+    obstacles: list[Standing]
+    contacts: int
+    refused: int
+    malformed: int
+    trouble: str
+
+    @classmethod
+    def of(cls, said: WorldState) -> World:
+        """As it is recorded."""
+        fields = {name: getattr(said, name) for name in cls.__struct_fields__}
+        return cls(**fields | {"obstacles": [Standing(name, pose) for name, pose in said.obstacles.items()]})
+
+    def said(self) -> WorldState:
+        """As it was said."""
+        fields = {name: getattr(self, name) for name in self.__struct_fields__}
+        return WorldState(**fields | {"obstacles": {each.name: each.pose for each in self.obstacles}})
 
 
 class Recording:
@@ -90,6 +129,7 @@ class Recording:
         self._state = _topic("state", State)
         self._status = _topic("status", Status)
         self._event = _topic("events", Event)
+        self._contact, self._world = _topic("contact", Contact), _topic("state", World)
         self._drawn = _Topic("true_pose", POSE_STAMPED, POSE_STAMPED_SCHEMA, _drawing())
         self._over = ""  # why nothing more can be written
         try:
@@ -138,6 +178,22 @@ class Recording:
             RecordingError: If it cannot be written; what was written before stays.
         """
         self._record(self._status, status.robot, status, status.stamp, status.stamp)
+
+    def contact(self, contact: Contact) -> None:
+        """Records the beginning of a contact in the world.
+
+        Raises:
+            RecordingError: If it cannot be written; what was written before stays.
+        """
+        self._record(self._contact, WORLD, contact, contact.stamp, contact.stamp)
+
+    def world(self, said: WorldState) -> None:
+        """Records what the world says of itself.
+
+        Raises:
+            RecordingError: If it cannot be written; what was written before stays.
+        """
+        self._record(self._world, WORLD, World.of(said), said.stamp, said.stamp)
 
     def event(self, event: Event) -> None:
         """Records something that happened, and brings all so far to the disk: events are few, and explain the rest.
@@ -247,7 +303,8 @@ def _drawing() -> Callable[[State], bytes]:
 
     def drawn(state: State) -> bytes:
         place = state.position if state.true_position is None else state.true_position
-        return encode(state.stamp, place, state.yaw if state.true_yaw is None else state.true_yaw)
+        yaw = state.yaw if state.true_yaw is None else state.true_yaw
+        return encode(state.stamp, place, yaw, state.attitude)
 
     return drawn
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from mcap.records import Channel
 from mcap.writer import Writer
 
-from experiments.recording import CHUNK_BYTES
+from experiments.recording import CHUNK_BYTES, WORLD
 from experiments.records import Message, RecordingError, Records
 
 
@@ -107,4 +107,4 @@ def _start(records: Records, writer: Writer) -> None:
 
 def _robot(channel: Channel) -> str:
     robot, _, what = channel.topic.removeprefix("/").partition("/")
-    return robot if what else ""
+    return robot if what and robot != WORLD else ""

@@ -15,8 +15,9 @@ import msgspec
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from experiments import figures
-from experiments.metrics import CaseMetrics, by_case, measure
+from experiments import figures, scenery, shadow_figures
+from experiments.measured import CaseMetrics
+from experiments.metrics import measure
 from experiments.report_tables import (
     DEFINITIONS,
     Table,
@@ -28,6 +29,8 @@ from experiments.report_tables import (
     summary_table,
     whole_table,
 )
+from experiments.report_worlds import clearance_tables, collision_table, shadow_tables
+from experiments.seeds import by_case
 from experiments.trace import Trace
 from experiments.verdict import Finding, findings, interruptions, left_out
 
@@ -35,6 +38,14 @@ TEMPLATE: Final = "report.html.jinja"
 PROOF: Final = (
     "Every pose carries a running number, so a gap proves a loss. Heard is counted over all listeners together; a pose "
     "sent in the last instant of the run may still be under way."
+)
+SEEN: Final = "Contacts are those that the world saw begin; distances are between surfaces, on true positions."
+WORKED_OUT: Final = (
+    "Where no world watched for contacts, they are worked out from true positions; distances are between surfaces."
+)
+SHADOWS: Final = (
+    "Robots and the twins beside them: left from above, twins dashed; right the difference, twin less robot, in the "
+    "robot's heading and in height."
 )
 MOST_LINKS: Final = 60  # longer tables are folded
 ORIGIN: Final = "run.json"  # how and when a run was made, for when its report is made again
@@ -124,10 +135,11 @@ def write(
         ("Robots", str(len(traces[0].robots))),
         ("Cases", ", ".join(by_case(cases))),
     ]
+    drawn = _pictures(cases, first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
         Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
-        Section("Figures", pictures=_pictures(cases, first)),
+        Section("Figures", pictures=drawn),
         Section("Each robot", tables=robot_tables(cases)),
         Section(
             "Was anything lost?",
@@ -141,6 +153,7 @@ def write(
             (links_table(cases),),
             folded="Show all links" if len(cases[0].belief) > MOST_LINKS else "",
         ),
+        *_of_worlds(cases, first, len(drawn)),
         Section("What happened", tables=(events_table(first),)),
         Section("The experiment", listing=listing, folded="Show the file"),
         Section("Definitions", terms=DEFINITIONS),
@@ -259,7 +272,8 @@ def _render(
 def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Picture, ...]:
     legs = any(len(case.starts_s) > 1 for case in cases)
     seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
-    links = "links at the start thin, at the end magenta." + seed
+    shown = [trace.experiment for trace in traces]
+    links = f"links at the start thin, at the end magenta.{scenery.caption(shown, space=True)}{seed}"
     captions = {
         "global_bars": _global_caption(cases),
         "formation_before": f"From the start to {'the first leg of the timeline' if legs else 'the end'}: {links}",
@@ -268,10 +282,25 @@ def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Pi
         "errors": f"Formation error of each robot{'; legs of the timeline dashed' if legs else ''}.{seed}",
         "events": f"When each robot transmitted.{seed}",
         "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
-        "plan_view": f"From above: start hollow, end full, links of the end grey.{seed}",
+        "plan_view": f"From above: start hollow, end full, links of the end grey.{scenery.caption(shown)}{seed}",
     }
     drawn = figures.every(cases, traces)
     return _numbered((figure, captions[name]) for name, figure in drawn.items())
+
+
+def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_before: int) -> list[Section]:
+    """What touched or came near, and the twins beside robots, where there is anything to say."""
+    sections = []
+    if any(case.near or case.near_arena or case.collisions for case in cases):
+        touched = (collision_table(cases),) if any(case.collisions for case in cases) else ()
+        said = SEEN if all(case.watched for case in cases) else WORKED_OUT
+        sections.append(Section("Did anything touch?", (said,), (*touched, *clearance_tables(cases))))
+    if tables := shadow_tables(cases):
+        seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
+        drawn = ((figure, f"{SHADOWS}{seed}") for figure in shadow_figures.every(traces).values())
+        pictures = _numbered(drawn, figures_before + 1)
+        sections.append(Section("Twins beside robots", tables=tables, pictures=pictures))
+    return sections
 
 
 def _global_caption(cases: Sequence[CaseMetrics]) -> str:
@@ -282,10 +311,10 @@ def _robot_caption(cases: Sequence[CaseMetrics]) -> str:
     return f"Each robot; those in brackets are left out of the means.{_interval_note(cases)}"
 
 
-def _numbered(drawn: Iterable[tuple[Figure, str]]) -> tuple[Picture, ...]:
+def _numbered(drawn: Iterable[tuple[Figure, str]], first: int = 1) -> tuple[Picture, ...]:
     return tuple(
         Picture(inline(figures.svg(figure), f"f{number}-", caption), number, caption)
-        for number, (figure, caption) in enumerate(drawn, start=1)
+        for number, (figure, caption) in enumerate(drawn, start=first)
     )
 
 

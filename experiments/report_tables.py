@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from experiments.metrics import CaseMetrics, RobotMetrics, Spread, by_case, ratios, spread
+from experiments.measured import Approach, CaseMetrics, RobotMetrics
+from experiments.seeds import Spread, by_case, ratios, spread
 from experiments.trace import Trace
 
 NONE: Final = "–"
@@ -43,6 +44,17 @@ DEFINITIONS: Final = (
     ("Belief", "What a listener holds of a neighbour: the newest pose heard, kept until the next."),
     ("J2", "0.02 · transmissions + 0.1 · decisions + 0.3 · settling time + 0.1 · IAE + 0.01 · ITAE, summed over all"
      " robots; the settling time is when e(t) enters 2 % of its largest value for good (the duration if never)."),
+    ("Collision", "Robots are upright cylinders of their kind's radius and height. A collision is a contact that the"
+     " world's engine saw begin, with its impulse; of robots that no such engine carries it is a maximal time in which"
+     " true cylinders overlap each other, an obstacle or the arena's walls."),
+    ("Closest approach", "Between surfaces, negative where they overlap; that of two robots is between their centres."),
+    ("Changed by safety", "Ticks on which what had been decided was changed before it went to the body; by avoidance:"
+     " those of them, and of changed goals, that kept clear of something."),
+    ("Twin beside a robot", "It gets the same commands, and is put onto the robot, as measured, when that is first"
+     " driven and again as often as \"ahead\" says. Differences are twin less robot: errors of predicting the robot up"
+     " to so far ahead. Along and across are in the robot's heading, to the left positive."),
+    ("Correlation", "Pearson's, between robot and twin, of positions and of speeds over 0.2 s; a dash where one of them"
+     " hardly moved."),
     ("Missed deadline", "A tick that began more than one period late."),
     ("Known", "Share of a robot's link errors that is known. Robots whose position is known for less than 95 % of the"
      " run are left out of the means; their neighbours' errors leave out the links to them."),
@@ -141,6 +153,12 @@ def whole_table(cases: Sequence[CaseMetrics]) -> Table:
         row("Belief error, RMS [mm]", lambda case: case.belief_rms, 1000.0),
         row("Belief error, largest [mm]", lambda case: case.belief_max, 1000.0),
         row("Closest approach of two robots [m]", lambda case: case.closest),
+        row("Closest approach of two surfaces [cm]", lambda case: _gap(case.near), 100.0),
+        row("Closest approach to the arena [cm]", lambda case: _gap(case.near_arena), 100.0),
+        row("Collisions", lambda case: float(len(case.collisions))),
+        row("Hardest impulse [mN s]", lambda case: _of(max, (each.impulse for each in case.collisions)), 1000.0),
+        row("Changed by safety [% of ticks]", lambda case: case.intervened_share, 100.0),
+        row("Changed by avoidance [% of ticks]", lambda case: case.avoided_share, 100.0),
         row("Farthest outside the arena [mm]", lambda case: case.excursion, 1000.0),
         row("Missed deadlines [% of ticks]", lambda case: case.missed_share, 100.0),
         row("Cost J2", lambda case: case.j2),
@@ -261,6 +279,10 @@ def events_table(traces: Sequence[Trace]) -> Table:
 def _of(what: Callable[[Iterable[float]], float], values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return what(known) if known else None
+
+
+def _gap(near: Approach | None) -> float | None:
+    return None if near is None else near.gap
 
 
 def _at(values: Sequence[float | None], k: int) -> float | None:

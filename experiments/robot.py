@@ -8,16 +8,20 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from typing import Final
 
 from agents import plugins
 from agents.body import BodyError
 from agents.fleet import assemble
 from agents.keys import Keys
-from agents.runtime import NameTaken, Runtime, Setup
+from agents.runtime import NameTaken, Ranging, Runtime, Setup
 from agents.session import DEFAULT_ENDPOINT, EndpointError, Unreachable
+from agents.shadow import shadowed
 from experiments import assign, document
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
+
+FAR: Final = ("external", "world")  # bodies that live in another process, their range sensors too
 
 
 def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[str], lifeline: bool) -> int:
@@ -34,7 +38,8 @@ def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[
         hint = plugins.did_you_mean(unknown[0], experiment.robots)
         raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
     endpoints = list(connect) or experiment.network.connect or [DEFAULT_ENDPOINT]
-    body = assemble(assign.request(experiment, names, [experiment.seed], endpoints))
+    request = assign.request(experiment, names, [experiment.seed], endpoints)
+    body = shadowed(assemble(request), request, assign.shadows(experiment, names))
     setup = Setup(
         keys=Keys(experiment.network.realm),
         endpoints=endpoints,
@@ -42,8 +47,16 @@ def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[
         state_hz=experiment.rates.state_hz,
         lifeline=lifeline,
         located=[experiment.robots[name].position == "external" for name in names],
+        ranging=[_ranging(experiment.robots[name]) for name in names],
     )
     return Runtime(assign.assign(experiment, names), body, setup).run()
+
+
+def _ranging(robot: Robot) -> Ranging:
+    """Where a robot's range readings come from: bodies in other processes hear them by themselves."""
+    if plugins.body_name(robot.body) in FAR:
+        return "far"
+    return robot.ranges
 
 
 def chosen_case(read: document.Document, name: str | None) -> Experiment:

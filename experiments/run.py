@@ -21,16 +21,16 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
 from agents.session import free_endpoint
-from experiments import document, metrics, playback, virtual
+from experiments import document, metrics, playback, results, virtual
 from experiments.conductor import Conductor, Result, start_router
 from experiments.document import Document
 from experiments.experiment import Experiment
 from experiments.launcher import Launcher
 from experiments.logbook import Logbook
-from experiments.metrics import CaseMetrics
+from experiments.measured import CaseMetrics
 from experiments.problem import DocumentError, Problem
 from experiments.progress import Shown
-from experiments.standins import behind_protocols
+from experiments.standins import choose_bodies
 from experiments.trace import Trace
 
 if TYPE_CHECKING:
@@ -66,13 +66,14 @@ class Run:
 
     def figures(self) -> dict[str, Figure]:
         """The figures of the report, by name."""
-        from experiments import figures  # noqa: PLC0415 - matplotlib takes 0.6 s
+        from experiments import figures, shadow_figures  # noqa: PLC0415 - matplotlib takes 0.6 s
 
-        return figures.every(list(self.metrics.values()), list(self.traces.values()))
+        traces = list(self.traces.values())
+        return figures.every(list(self.metrics.values()), traces) | shadow_figures.every(traces)
 
     def summary(self) -> dict[str, Any]:
         """The figures for scripts, as `zenpark run --json` prints them."""
-        return metrics.document(str(self.folder or ""), self.seed, list(self.metrics.values()))
+        return results.document(str(self.folder or ""), self.seed, list(self.metrics.values()))
 
 
 def load(file: str | Path, *changes: str) -> Document:
@@ -126,7 +127,7 @@ def simulate_seeds(
             traces[copy][name] = logbook.trace()
             if folder is not None and copy == 0:
                 logbook.record(folder / f"{name}.mcap", read.text)
-    return [_measured(read.experiment.title, mine, folder, read.text) for mine in traces]
+    return [_measured(read.experiment.title, mine, folder, read.listing) for mine in traces]
 
 
 def fly(
@@ -136,7 +137,7 @@ def fly(
     cases: Sequence[str] = (),
     show: Shown,
     interrupted: Callable[[], bool] = lambda: False,
-    protocol: bool = False,
+    bodies: str | None = None,
 ) -> Run:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
@@ -146,14 +147,15 @@ def fly(
         cases: Which of its cases; all if none is named.
         show: Shows the progress.
         interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
-        protocol: Whether every robot is put behind its real bridge and a protocol twin.
+        bodies: What every robot is put into instead of the body that the file gives it: "twin", "world", or
+            "protocol" for its real bridge and a protocol twin.
 
     Raises:
         RunFailed: If robots are not ready in time, unless the file says to go on without them.
         Unreachable: If the routers of the file do not answer.
     """
     results: dict[str, Result] = {}
-    (folder / SOURCE).write_text(read.text, encoding="utf-8")
+    read.keep(folder / SOURCE)
     with Launcher(folder / "logs") as launcher:
         endpoints = read.experiment.network.connect
         if endpoints is None:
@@ -163,8 +165,7 @@ def fly(
             for name, experiment in chosen(read, cases).items():
                 if interrupted():
                     break
-                if protocol:
-                    experiment = behind_protocols(experiment)  # noqa: PLW2901
+                experiment = choose_bodies(experiment, bodies)  # noqa: PLW2901
                 file = folder / f"{name}.json"
                 file.write_bytes(document.write_json(experiment))
                 results[name] = Conductor(
@@ -214,7 +215,8 @@ def _read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str
         if not played.complete:
             remarks.append(f"{case}: the recording was cut off; `zenpark recover {file}` mends it")
     source = folder / SOURCE
-    text = source.read_text("utf-8") if source.exists() else ""
+    arenas = sorted(set(folder.glob("*.toml")) - {source}) if source.exists() else []
+    text = document.listed([file.read_text("utf-8") for file in [source, *arenas]]) if source.exists() else ""
     title = next((trace.experiment.title for trace in traces.values()), "")
     return replace(_measured(title, traces, folder, text, remarks), made=min(made, default=0.0))
 

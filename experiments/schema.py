@@ -19,6 +19,9 @@ _CHOICES: Final = (
     ("Experiment", "trigger", plugins.TRIGGERS),
     ("Formation", "law", plugins.LAWS),
     ("Leg", "plan", plugins.PLANNERS),
+    ("Obstacle", "plan", plugins.PLANNERS),
+    ("Experiment", "avoidance", plugins.AVOIDANCES),
+    ("World", "engine", plugins.ENGINES),
 )
 _CASE: Final = "InCase"
 

@@ -50,9 +50,9 @@ def storable(value: object, path: Path = ()) -> Iterator[Fault]:
         yield Fault(path, f"'{_name(path)}' has more digits than a 64-bit integer holds", "give a smaller number")
 
 
-def faults(document: Mapping[str, Any]) -> list[Fault]:
-    """Everything by which a document is not an `Experiment`; empty if `msgspec.convert` takes it."""
-    found = _table(document, Experiment, ())
+def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment) -> list[Fault]:
+    """Everything by which a document is not what it should be; empty if `msgspec.convert` takes it."""
+    found = _table(document, struct, ())
     strayed = {str(fault.path[-1]) for fault in found if "belongs at the top" in fault.hint}
     return [
         fault for fault in found if fault.path or not any(f"'{key}' is missing" == fault.message for key in strayed)
@@ -66,8 +66,12 @@ def group_of(path: Path) -> str | None:
             return plugins.TRIGGERS
         case ("formation", "law"):
             return plugins.LAWS
-        case ("timeline", int(), "plan"):
+        case ("timeline", int(), "plan") | ("arena", "obstacles", str(), "plan"):
             return plugins.PLANNERS
+        case ("avoidance",):
+            return plugins.AVOIDANCES
+        case ("world", "engine"):
+            return plugins.ENGINES
     return None
 
 
@@ -150,6 +154,10 @@ def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
     """A plug-in and its parameters."""
     known, what = plugins.names(group), group.rpartition(".")[2]
     if isinstance(value, dict) and not isinstance(value.get("kind"), str):
+        for key in value:
+            if key != "kind" and (hint := did_you_mean(key, ["kind"])).startswith("did you mean"):
+                message = f"unknown key '{key}' in '{_name(path)}', which lacks its kind"
+                return [Fault((*path, key), message, hint, on_key=True)]
         likely = _kind_with(group, [key for key in value if key != "kind"])
         hint = f'add kind = "{likely}"' if likely else f'add kind = "..."; known: {", ".join(known)}'
         return [Fault((*path, "kind"), f"'{_name(path)}' must say its kind, as text", hint)]
@@ -192,7 +200,8 @@ def _judged(
                 ),
                 None,
             )
-            return [Fault(path if named is None else (*path, named), text, note)]
+            text, _, hint = text.partition("; ")
+            return [Fault(path if named is None else (*path, named), text, hint or note)]
         return [_in_words(text, value, annotation, path, note)]
     return []
 

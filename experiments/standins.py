@@ -1,4 +1,4 @@
-"""What stands in for hardware in a run: protocol twins for robots that ask for one, and who measures positions."""
+"""What stands in for hardware in a run: the world, protocol twins for robots that ask for one, and who measures."""
 
 from __future__ import annotations
 
@@ -29,9 +29,29 @@ PROTOCOL: Final[dict[str, tuple[str, str | None, str]]] = {
     "turtlebot3": ("turtlebot3-twin", None, "external"),
 }
 
+BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
+
 
 class StandInError(RuntimeError):
     """A protocol twin or a positioning system that did not start, with what it said."""
+
+
+def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
+    """The experiment with every robot in the body that `--bodies` names; as it is without.
+
+    Args:
+        experiment: A case.
+        bodies: One of `BODIES`, or None.
+    """
+    if bodies is None:
+        return experiment
+    if bodies == "protocol":
+        return behind_protocols(experiment)
+    robots = {
+        name: msgspec.structs.replace(robot, body=bodies, position="body", ranges="body", device={})
+        for name, robot in experiment.robots.items()
+    }
+    return msgspec.structs.replace(experiment, robots=robots)
 
 
 def behind_protocols(experiment: Experiment) -> Experiment:
@@ -68,6 +88,7 @@ def start(
     Raises:
         StandInError: If one does not start in time.
     """
+    world = start_world(experiment, file, prefix=prefix, launcher=launcher, connect=connect)
     words = plugins.names(plugins.DEVICES)
     groups: dict[str, list[str]] = {}
     for name, robot in experiment.robots.items():
@@ -82,6 +103,9 @@ def start(
         wanted = _said(processes[word], r"^address (\w+) (\S+)$", len(names), interrupted)
         addresses.update(wanted)
     started = [process.name for process in processes.values()]
+    if world is not None:
+        _said(world, r"^(world) (ready)\b", 1, interrupted)
+        started.append(world.name)
     robots = {
         name: msgspec.structs.replace(robot, body=addresses.get(name, robot.body))
         for name, robot in experiment.robots.items()
@@ -90,6 +114,21 @@ def start(
         experiment, robots, prefix=prefix, launcher=launcher, connect=connect, interrupted=interrupted
     )
     return msgspec.structs.replace(experiment, robots=robots), tuple(started)
+
+
+def start_world(
+    experiment: Experiment, file: Path, *, prefix: str, launcher: Launcher, connect: Sequence[str]
+) -> Process | None:
+    """Starts the world of an experiment, for the first time or again; None if no robot asks for one."""
+    robots = experiment.robots.values()
+    if not any(assign.WORLD in (robot.body, robot.ranges) for robot in robots):
+        return None
+    return launcher.start(world_name(prefix), "experiments.world", str(file), *connect, "--lifeline")
+
+
+def world_name(prefix: str) -> str:
+    """What the process of the world is called."""
+    return f"{prefix}-world"
 
 
 def _positioning(
@@ -102,7 +141,8 @@ def _positioning(
     interrupted: Callable[[], bool],
 ) -> list[str]:
     """Who measures external positions; the names of the processes that were started for it."""
-    measured = [name for name, robot in robots.items() if robot.position == "external"]
+    # where robots of the world are, the world itself says: two who did would contradict each other
+    measured = [name for name, robot in robots.items() if robot.position == "external" and robot.body != assign.WORLD]
     if experiment.positioning is None or not measured:
         return []
     started = []

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 import tomllib
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
 from experiments.problem import DocumentError, Problem, at_offset
 
+LARGEST: Final = 4_000_000  # bytes; a hundred robots take ten thousand
 _AT: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _REMEDIES: Final = (
     ("Invalid value", 'text stands in quotes, as in kind = "crazyflie"; numbers have a point, not a comma'),
@@ -23,6 +25,36 @@ _REMEDIES: Final = (
     ("Invalid initial character", "a key is letters, digits, _ and -, or stands in quotes"),
     ("Unescaped '\\'", "write a backslash twice, or use single quotes"),
 )
+
+
+def content(file: Path, label: str) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        FileNotFoundError: If there is none.
+        DocumentError: If it is a folder, cannot be read, or is too long to be what it should be.
+    """
+    try:
+        with file.open("rb") as stream:
+            found = stream.read(LARGEST + 1)
+    except FileNotFoundError:
+        raise
+    except IsADirectoryError:
+        toml = sorted(each.name for each in file.glob("*.toml"))[:5]
+        hint = f"name a file in it: {', '.join(toml)}" if toml else "name an experiment file"
+        raise DocumentError([Problem(label, 0, 0, "is a folder", hint)]) from None
+    except (OSError, ValueError) as error:
+        hint = "check the name and who may read it"
+        raise DocumentError([Problem(label, 0, 0, f"cannot be read: {reason(error)}", hint)]) from error
+    if len(found) > LARGEST:
+        hint = "name the experiment file, not a recording"
+        raise DocumentError([Problem(label, 0, 0, f"is longer than {LARGEST // 1_000_000} MB", hint)])
+    return found
+
+
+def reason(error: OSError | ValueError) -> str:
+    """What the system says is the matter."""
+    return str(error.strerror) if isinstance(error, OSError) and error.strerror else str(error)
 
 
 def decoded(content: bytes, label: str) -> str:

@@ -37,7 +37,11 @@ def network(analysis: Analysis) -> Iterator[Claim]:
             message = f"{who} cannot hear of the leader ({listed(leaders)}), neither directly nor through others"
             remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
             problems.append(Claim("error", "leader-unknown", message, remedy, path))
-    if analysis.parts > 1:
+    apart = analysis.experiment.avoidance is not None and len(leaders) >= analysis.parts
+    if analysis.parts > 1 and apart:
+        message = f"{analysis.parts} formations that know of each other only to keep clear"
+        yield Claim("note", "parts", message, "", path)
+    elif analysis.parts > 1:
         message = f"the network falls into {analysis.parts} parts that know nothing of each other"
         problems.append(Claim("error", "parts", message, "join them by links, or make them separate experiments", path))
     deaf = [names[row] for row in analysis.silent if names[row] not in leaders]
@@ -51,7 +55,8 @@ def network(analysis: Analysis) -> Iterator[Claim]:
     yield from problems
     if not problems:
         said = f"everybody hears of {listed(leaders)}" if leaders else "no leader: the formation finds its own place"
-        yield Claim("note", "connected", f"the network is whole; {said}")
+        whole = "the network is whole; " if analysis.parts == 1 else ""
+        yield Claim("note", "connected", f"{whole}{said}")
 
 
 def realisation(analysis: Analysis) -> Iterator[Claim]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from agents.rows import Array, Index
-from agents.wire import Event
+from agents.wire import Contact, Event, WorldState
 from experiments.experiment import Experiment
 
 
@@ -77,6 +77,14 @@ class Trace:
         ticks: (N,) ticks in all, from the common start on.
         decisions: (N,) coordination decisions, from the common start on.
         events: What happened, stamps in seconds since the common start.
+        interventions: (N,) ticks on which safety changed what had been decided, from the common start on.
+        avoided: (N,) ticks on which avoidance did.
+        contacts: What touched in the world from the common start to the end, stamps in seconds since then; None if
+            nobody looked: there was no world, or its engine finds no contacts.
+        world: What the world said of itself in that time, stamps in seconds since the common start.
+        attitude: (T, N, 4) unit quaternions w, x, y, z from robot to room, NaN where unknown; None if none was told.
+        shadow_position: (T, N, 3) of the twin beside each robot [m], NaN for robots without one; None if there is none.
+        shadow_yaw: (T, N) of those twins [rad].
     """
 
     case: str
@@ -97,3 +105,10 @@ class Trace:
     ticks: Index
     decisions: Index
     events: tuple[Event, ...]
+    interventions: Index
+    avoided: Index
+    contacts: tuple[Contact, ...] | None = None
+    world: tuple[WorldState, ...] = ()
+    attitude: Array | None = None
+    shadow_position: Array | None = None
+    shadow_yaw: Array | None = None

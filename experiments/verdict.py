@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from experiments.metrics import CaseMetrics, by_case, ratios, same_length, spread
+from experiments.measured import CaseMetrics, Collision
 from experiments.report_tables import interval, number
+from experiments.report_worlds import shadowed
+from experiments.seeds import by_case, ratios, same_length, spread
 
 Mark = Literal["good", "fair", "bad", "plain"]
-CLOSE_M = 0.15  # centres closer than this: two Crazyflies or Kheperas touch at 0.13 to 0.14 m
+KEPT_UP = 0.99  # a world that is slower than this share of real time falls behind
+NAMED = 3  # so many collisions, or twins, are named; the tables have them all
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,11 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *_acquired(cases),
         _worst_link(cases),
         *_against_the_first(cases),
+        *contacts(cases),
+        *_avoided(cases),
         *_room(cases),
+        *_pace(cases),
+        *_shadows(cases),
     ]
 
 
@@ -177,14 +184,71 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
     return found
 
 
+def contacts(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """What touched; if nothing did, how near it came to that."""
+    found = []
+    for name, runs in by_case(cases).items():
+        touched = [each for run in runs for each in run.collisions]
+        if not touched:
+            continue
+        shown = [_collision(each) for each in touched[:NAMED]]
+        shown += [f"{len(touched) - NAMED} more"] if len(touched) > NAMED else []
+        which = f"{sum(1 for run in runs if run.collisions)} of {len(runs)} seeds of {name}"
+        count = "One collision" if len(touched) == 1 else f"{len(touched)} collisions"
+        found.append(Finding("bad", f"{count} in {name if len(runs) == 1 else which}: {_list(shown)}."))
+    near = [(case.near, case.case) for case in cases if case.near is not None]
+    arena = [(case.near_arena, case.case) for case in cases if case.near_arena is not None]
+    if found or not (near or arena):
+        return found
+    gaps = []
+    for what, known in (("robots", near), ("robot and arena", arena)):
+        if known:
+            closest, case = min(known, key=lambda each: each[0].gap)
+            who = "–".join(closest.between)
+            where = f", {case}" if len(by_case(cases)) > 1 else ""
+            gaps.append(f"{number(closest.gap, 100.0)} cm between {what} ({who} at {closest.at_s:.1f} s{where})")
+    return [Finding("good", f"No robot touched another or the arena; the closest approach was {_list(gaps)}.")]
+
+
+def _collision(each: Collision) -> str:
+    parts = [] if each.impulse is None else [f"{number(each.impulse, 1000.0)} mN s"]
+    parts += [f"{number(each.overlap, 1000.0)} mm deep"] if each.overlap > 0.0 else []
+    return f"{each.first}–{each.second} at {each.time_s:.2f} s" + (f" ({', '.join(parts)})" if parts else "")
+
+
+def _avoided(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    found = []
+    for case in cases:
+        if case.avoided_share:
+            most = max(case.robots, key=lambda robot: robot.avoided)
+            text = f"Avoidance was at work on {number(case.avoided_share, 100.0)} % of all ticks in {case.case}"
+            found.append(Finding("plain", f"{text}, most on those of {most.robot} ({number(most.avoided)})."))
+    return found[:NAMED]
+
+
+def _pace(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    slow = [(case.world_factor, case.case) for case in cases if case.world_factor is not None]
+    if not slow or min(slow)[0] >= KEPT_UP:
+        return []
+    factor, case = min(slow)
+    text = f"The world fell behind: at its slowest it ran at {factor:.2f} of real time, in {case}."
+    return [Finding("fair" if factor >= 0.9 else "bad", text)]
+
+
+def _shadows(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    found = sorted(shadowed(cases), key=lambda each: -each[2].rmse)
+    if not found:
+        return []
+    shown = []
+    for case, robot, shadow in found[:NAMED]:
+        ahead = "over the whole run" if shadow.horizon_s is None else f"up to {shadow.horizon_s:g} s ahead"
+        shown.append(f"{robot.robot} to {number(shadow.rmse, 100.0)} cm RMSE {ahead} ({case.case})")
+    rest = "; the others more closely" if len(found) > NAMED else ""
+    return [Finding("plain", f"Twins beside robots foresaw {_list(shown)}{rest}.")]
+
+
 def _room(cases: Sequence[CaseMetrics]) -> list[Finding]:
     found = []
-    measured = [case for case in cases if case.closest is not None]
-    if measured:
-        tight = min(measured, key=lambda case: case.closest or 0.0)
-        text = f"No two robots came closer than {number(tight.closest)} m, centre to centre"
-        text += f" ({_list(tight.closest_between)}, {number(tight.closest_at_s)} s, {tight.case})."
-        found.append(Finding("plain" if (tight.closest or 0.0) > CLOSE_M else "bad", text))
     far = max(cases, key=lambda case: case.excursion)
     if far.excursion > 0.0:
         text = f"{far.excursion_robot} was {number(far.excursion, 100.0)} cm outside the arena in {far.case}."

@@ -17,6 +17,7 @@ from agents.agent import Agent
 from agents.body import BodyState
 from agents.lifecycle import LANDING, Phase
 from agents.rows import Array, Index, some
+from agents.shadow import shadowed
 from experiments import assign
 from experiments.channel import Channel
 from experiments.experiment import Experiment
@@ -48,12 +49,16 @@ class Log:
         heard: Columns time, link, seq, stamp, position.
         lost: (E,) samples lost on each link of all repetitions, from the common start to the landing.
         decisions: Coordination decisions of each row.
-        interventions: (R,) ticks on which safety changed what was decided.
-        avoided: (R,) ticks on which avoidance did.
+        interventions: (R,) ticks on which safety changed what was decided, from the common start on.
+        avoided: (R,) ticks on which avoidance did, from the common start on.
         touches: Contacts that began, at times since the common start.
         ticks: Ticks from the common start to the end.
         airborne: When all robots were up (negative), and `ended` when all were done.
         ended: See `airborne`.
+        attitude: (K, R, 4) unit quaternions w, x, y, z from robot to room; None if the engine has none.
+        obstacles: (K, repetitions, M, 3) x, y [m], yaw [rad] of each.
+        shadow_position: (K, R, 3) of the twins beside the robots, NaN for rows without one; None if there is none.
+        shadow_yaw: (K, R) of those twins.
     """
 
     names: tuple[str, ...]
@@ -78,6 +83,10 @@ class Log:
     ticks: int
     airborne: float
     ended: float
+    attitude: Array | None
+    obstacles: Array
+    shadow_position: Array | None
+    shadow_yaw: Array | None
 
 
 class _Samples:
@@ -111,7 +120,8 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:  # noqa: PLR0
     agent = Agent(assignment)
     request = assign.request(experiment, names, seeds)
     request = replace(request, external=(False,) * len(request.names))  # nobody measures in virtual time
-    body = TwinBody(request, assign.world(experiment, names, len(seeds)))
+    twin = TwinBody(request, assign.world(experiment, names, len(seeds)))
+    body = shadowed(twin, request, assign.shadows(experiment, names, len(seeds)))
     channel = Channel(assignment.links, experiment.channel, seeds)
     rows = len(assignment.names)
     dt = 1.0 / assignment.body_hz
@@ -119,7 +129,7 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:  # noqa: PLR0
     seq = np.zeros(rows, dtype=np.intp)
     interventions, avoided = np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
     touches: list[Touch] = []
-    states, sent, heard = _Samples(), _Samples(), _Samples()
+    states, seen, sent, heard = _Samples(), _Samples(), _Samples(), _Samples()
     lost_before = lost_after = channel.lost
     conductor = _Conductor(agent, names)
     tick = 0
@@ -141,23 +151,27 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:  # noqa: PLR0
             body.land(actions.duties.land)
             body.stop(actions.duties.stop)
         body.command(actions.setpoint)
-        if some(actions.changed):
-            interventions += actions.changed
-        if some(actions.avoided):
-            avoided += actions.avoided
-        touches += body.touches()
+        if agent.decisions:
+            if some(actions.changed):
+                interventions += actions.changed
+            if some(actions.avoided):
+                avoided += actions.avoided
+        touches += twin.touches()
         if (agent.tick - 1) % log_every == 0:  # the agent's count begins anew at the common start
             states.add(t, agent.life.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
+            seen.add(np.array(twin.engine.obstacles), *(value for value in _extra(state) if value is not None))
         if len(speak := actions.speak):
             seq[speak] += 1
             said = (state.position[speak], state.velocity[speak], state.yaw[speak])
             sent.add(np.full(len(speak), t), speak, seq[speak], *said)
             channel.send(t, speak, seq, state.position, state.velocity, surely=agent.decisions == 0)
         conductor.look(t, dt)
-        body.begun_at = conductor.start_at
+        twin.begun_at = conductor.start_at
         tick += 1
     begin = conductor.start_at
     time, phase, position, velocity, yaw, true_position, true_yaw, goal, setpoint, error = states.stacked()
+    obstacles, *more = seen.stacked()
+    attitude, shadow_position, shadow_yaw = (None if value is None else more.pop(0) for value in _extra(state))
     at, row, number, *pose = sent.joined((0,), (0,), (0,), (0, 3), (0, 3), (0,))
     arrival, link, told, stamp, place = heard.joined((0,), (0,), (0,), (0,), (0, 3))
     return Log(
@@ -183,11 +197,20 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:  # noqa: PLR0
         ticks=round(experiment.duration_s / dt),
         airborne=conductor.airborne_at - begin,
         ended=tick * dt - begin,
+        attitude=attitude,
+        obstacles=obstacles,
+        shadow_position=shadow_position,
+        shadow_yaw=shadow_yaw,
     )
 
 
 def _measured(state: BodyState) -> tuple[Array, ...]:
     return state.position, state.velocity, state.yaw, state.true_position, state.true_yaw
+
+
+def _extra(state: BodyState) -> tuple[Array | None, ...]:
+    """What there is of in all samples or in none."""
+    return state.attitude, state.shadow_position, state.shadow_yaw
 
 
 class _Conductor:

@@ -29,6 +29,8 @@ EXPLAINED: Final = (
     ("experiments.conductor", "RunFailed"),
     ("experiments.virtual", "Stuck"),
     ("experiments.standins", "StandInError"),
+    ("experiments.world", "WorldTaken"),
+    ("tools.world", "WorldOrderError"),
     ("tools.network", "KeyExpressionError"),
 )
 
@@ -74,7 +76,10 @@ def run(
     seeds: Annotated[int, typer.Option(min=1, help="Runs so many seeds: mean and spread (virtual only).")] = 1,
     bodies: Annotated[
         str | None,
-        typer.Option(metavar="protocol", help="Every robot behind its real bridge and a protocol twin (real time)."),
+        typer.Option(
+            metavar="twin|world|protocol",
+            help="Every robot in a twin of its own, in one world, or behind a protocol twin (real time).",
+        ),
     ] = None,
     anyway: Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")] = False,
     report: Annotated[bool, typer.Option(help="Writes the report.")] = True,
@@ -132,6 +137,23 @@ def router(
     from agents.session import DEFAULT_ENDPOINT  # noqa: PLC0415
 
     raise typer.Exit(serve(listen or [DEFAULT_ENDPOINT], lifeline=lifeline))
+
+
+@app.command()
+def world(
+    file: File,
+    *,
+    case: Annotated[str | None, typer.Option(metavar="NAME", help="A case of the file. [the first]")] = None,
+    connect: Connect = None,
+    engine: Annotated[str | None, typer.Option(metavar="NAME", help="What moves the twins. [the file's]")] = None,
+    lifeline: Annotated[
+        bool, typer.Option("--lifeline", help="End, after its robots, when standard input ends or falls silent.")
+    ] = False,
+) -> None:
+    """Be the world of an experiment: carry its twins, with obstacles, contacts and range sensors."""
+    from experiments.world import serve  # noqa: PLC0415
+
+    raise typer.Exit(serve(file, case=case, connect=connect or [], lifeline=lifeline, engine=engine))
 
 
 @app.command()
@@ -247,6 +269,41 @@ def order(
     from tools.order import command  # noqa: PLC0415
 
     raise typer.Exit(command(what, robots or [], connect=connect or [], realm=realm))
+
+
+@app.command(name="world-order")
+def world_order(
+    what: Annotated[str, typer.Argument(metavar="ORDER", help="pause, resume, step, reset, spawn or remove.")],
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Of the robot or obstacle; reset without one resets all.")
+    ] = None,
+    *,
+    steps: Annotated[int, typer.Option(min=1, help="Ticks of a step.")] = 1,
+    kind: Annotated[str | None, typer.Option(help="Of a new robot.")] = None,
+    at: Annotated[tuple[float, float] | None, typer.Option(metavar="X Y", help="Where it is put [m].")] = None,
+    yaw: Annotated[float, typer.Option(help="Of a robot that is put in [rad].")] = 0.0,
+    obstacle: Annotated[
+        str | None, typer.Option(metavar="JSON", help='Puts in an obstacle, such as \'{"radius": 0.1, "at": [0, 1]}\'.')
+    ] = None,
+    connect: Connect = None,
+    realm: Annotated[str, typer.Option(metavar="NAME", help="First chunk of the keys.")] = "park",
+) -> None:
+    """Tell a running world what to do."""
+    from tools.world import command  # noqa: PLC0415
+
+    raise typer.Exit(
+        command(
+            what,
+            name,
+            steps=steps,
+            kind=kind,
+            at=at,
+            yaw=yaw,
+            obstacle=obstacle,
+            connect=connect or [],
+            realm=realm,
+        )
+    )
 
 
 @app.command()

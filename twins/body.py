@@ -13,7 +13,7 @@ from agents.rows import Array, Index, Mask
 from twins.disturbance import Drift, HoverJitter, Latency, Measurement
 from twins.engine import Engine, EngineFactory, Stage, Touch
 from twins.noise import Noise
-from twins.pointmass import PointMass
+from twins.pointmass import PointMass, PointMassEngine
 from twins.sensors import RangeSensors
 from twins.world import World
 
@@ -107,9 +107,14 @@ class TwinBody:
         """See `Body.locate`."""
         self._external.update(row, t, position, yaw)
 
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """Puts rows somewhere, at rest: (len(rows), 3) [m], (len(rows),) [rad]; flying rows hold that place."""
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask, velocity: Array | None = None) -> None:
+        """Puts rows somewhere: (len(rows), 3) [m], (len(rows),) [rad]; flying rows hold that place.
+
+        They are at rest, or move with a `velocity` (len(rows), 3) [m/s] if the engine is of point masses.
+        """
         self.engine.place(rows, position, yaw, flying)
+        if velocity is not None and isinstance(self.engine, PointMassEngine):
+            self.engine.push(rows, velocity)
         self._state = self._measure()
 
     def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:

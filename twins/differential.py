@@ -70,6 +70,11 @@ class Differential:
         self.position[rows], self.yaw[rows], self.velocity[rows] = position, yaw, 0.0
         self._wanted[:, rows] = self._wheels[:, rows] = 0.0
 
+    def roll(self, rows: Index, velocity: Array) -> None:
+        """Lets rows go straight ahead, with what of a velocity (len(rows), 3) [m/s] is along their heading."""
+        speed = velocity[:, 0] * np.cos(self.yaw[rows]) + velocity[:, 1] * np.sin(self.yaw[rows])
+        self._wanted[:, rows] = self._wheels[:, rows] = speed
+
     def advance(self) -> None:
         """One step of dt, along an arc: no side-slip (paper, eq. (1))."""
         self._patience -= self._dt

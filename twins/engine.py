@@ -119,7 +119,11 @@ class Engine(Protocol):
 
 
 class EngineFactory(Protocol):
-    """The parameters of an engine."""
+    """The parameters of an engine.
+
+    One whose engines find contacts says so by the class variable `contacts = True`: that a run has none recorded then
+    means that nothing touched. Of others, what touched is worked out from the recorded positions.
+    """
 
     def build(self, stage: Stage) -> Engine:
         """An engine with these parameters.

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Annotated, ClassVar, Protocol
+
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from agents.body import BodyError
+from agents.kinds import Kind
 from agents.rows import Array, Index, Mask, span
 from twins.differential import DRIVES, Differential
 from twins.engine import Stage, Touch
@@ -13,11 +19,36 @@ from twins.quadrotor import RESPONSES, Quadrotor
 
 
 class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Its parameters: none."""
+    """Its parameters."""
+
+    leaning: Annotated[
+        bool, Meta(description="quadrotors must lean before they accelerate: truer, and formation gains must be lower")
+    ] = False
+
+    contacts: ClassVar[bool] = False
 
     def build(self, stage: Stage) -> PointMassEngine:
         """See `EngineFactory.build`."""
-        return PointMassEngine(stage)
+        return PointMassEngine(stage, partial(Quadrotor, leaning=True) if self.leaning else Quadrotor)
+
+
+class Flight(Protocol):
+    """What moves rows that fly; methods as of `twins.quadrotor.Quadrotor`."""
+
+    position: Array
+    velocity: Array
+    yaw: Array
+    flying: Mask
+
+    def command(self, setpoint: Array) -> None: ...
+    def takeoff(self, rows: Index, height: Array) -> None: ...
+    def land(self, rows: Index) -> None: ...
+    def stop(self, rows: Index) -> None: ...
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None: ...
+    def advance(self) -> None: ...
+
+
+Flights = Callable[[Sequence[Kind], Array, Array, float], Flight]  # kinds, start, yaw, dt
 
 
 class Models:
@@ -30,7 +61,7 @@ class Models:
         differential: Of the rows `floor`.
     """
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: Stage, flights: Flights = Quadrotor) -> None:
         kinds = stage.kinds
         unknown = sorted({kind.name for kind in kinds} - DRIVES.keys() - RESPONSES.keys())
         if unknown:
@@ -39,7 +70,7 @@ class Models:
         air, floor = np.flatnonzero(flies), np.flatnonzero(~flies)
         self.in_air, self.on_floor = air, floor
         self.air, self.floor = span(air), span(floor)
-        self.quadrotor = Quadrotor([kinds[i] for i in air], stage.start[air], stage.yaw[air], stage.dt)
+        self.quadrotor: Flight = flights([kinds[i] for i in air], stage.start[air], stage.yaw[air], stage.dt)
         self.differential = Differential([kinds[i] for i in floor], stage.start[floor], stage.yaw[floor], stage.dt)
 
     def command(self, setpoint: Array) -> None:
@@ -71,6 +102,12 @@ class Models:
             at = np.searchsorted(part, rows[which])
             model.place(at, position[which], yaw[which], flying[which])
 
+    def push(self, rows: Index, velocity: Array) -> None:
+        """Gives rows a velocity (len(rows), 3) [m/s]; drives the part of it that is along their heading."""
+        flies = np.isin(rows, self.in_air)
+        self.quadrotor.velocity[np.searchsorted(self.in_air, rows[flies])] = velocity[flies]
+        self.differential.roll(np.searchsorted(self.on_floor, rows[~flies]), velocity[~flies])
+
     @staticmethod
     def _among(part: Index, rows: Index) -> Index:
         """Where in `part` those of `rows` stand that belong to it."""
@@ -80,11 +117,11 @@ class Models:
 class PointMassEngine(Models):
     """Implements `twins.engine.Engine`."""
 
-    attitude = None
+    attitude: Array | None = None
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: Stage, flights: Flights = Quadrotor) -> None:
         """Raises BodyError for a kind without a twin."""
-        super().__init__(stage)
+        super().__init__(stage, flights)
         rows = len(stage.kinds)
         self._scene, self._copies = stage.scene, int(stage.copy.max(initial=0)) + 1
         self._moves = len(stage.scene.moving) > 0
@@ -107,17 +144,24 @@ class PointMassEngine(Models):
             floor = self.floor
             self.position[floor], self.velocity[floor], self.yaw[floor] = drive.position, drive.velocity, drive.yaw
         if len(self.in_air):
-            flight = self.quadrotor
-            flight.advance()
-            air = self.air
-            self.position[air], self.velocity[air], self.yaw[air] = flight.position, flight.velocity, flight.yaw
-            self.position[air, :2] += wobble[air]
-            self.flying[air] = flight.flying
+            self._fly(wobble)
         if len(self._mirrored):
             rows = self._mirrored
             self.position[rows], self.velocity[rows], self.yaw[rows] = self._seen
         if self._moves:
             self.obstacles = np.tile(self._scene.at(t), (self._copies, 1, 1))
+
+    def _fly(self, wobble: Array) -> None:
+        """A step of the rows that fly; the wobble is no motion of theirs, it is added to where they are."""
+        self.quadrotor.advance()
+        self._adopt()
+        self.position[self.air, :2] += wobble[self.air]
+
+    def _adopt(self) -> None:
+        """Takes over where the rows that fly are."""
+        flight, air = self.quadrotor, self.air
+        self.position[air], self.velocity[air], self.yaw[air] = flight.position, flight.velocity, flight.yaw
+        self.flying[air] = flight.flying
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
         """See `Engine.place`."""

@@ -37,11 +37,11 @@ class Obstacle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def __post_init__(self) -> None:
         if sum(part is not None for part in (self.box, self.radius, self.wall)) != 1:
-            raise ValueError("an obstacle has exactly one of box, radius and wall")
+            raise ValueError("an obstacle has exactly one of box, radius and wall; for example box = [0.5, 0.2]")
         if self.mass is not None and (self.plan is not None or self.wall is not None):
-            raise ValueError("only a box or a cylinder without a plan can have a mass")
+            raise ValueError("only a box or a cylinder without a plan can have a mass; leave mass out")
         if self.plan is not None and self.wall is not None:
-            raise ValueError("a wall cannot move: use a box")
+            raise ValueError("a wall cannot have a plan, because it does not move; use a box")
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,14 @@ from typing import Final
 
 FOLDER: Final = Path(__file__).parent
 SCHEMA: Final = "zenpark.schema.json"
+_ARENA: Final = ".arena.toml"  # how the names of arena files end here, which are no experiments
 
 
 def names() -> list[str]:
     """Names of all entries, sorted."""
-    return sorted(file.stem for file in FOLDER.glob("*.toml"))
+    return sorted(file.stem for file in FOLDER.glob("*.toml") if not file.name.endswith(_ARENA))
+
+
+def arenas() -> list[str]:
+    """Names of all arena files, sorted."""
+    return sorted(file.name for file in FOLDER.glob(f"*{_ARENA}"))

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -230,7 +231,76 @@ def test_poses_are_as_they_were_said_and_grow_old(body: ExternalBody, far: FarEn
     drive.until(lambda: drive.state.position[0, 0] == 0.0 and "no position" not in drive.state.notes[0], "it is back")
 
 
+@pytest.mark.system
+def test_what_robots_see_comes_from_the_far_end(body: ExternalBody, far: FarEnd) -> None:
+    drive = Drive(body)
+    drive.until(lambda: True, "a first look")
+    assert drive.state.rays is None
+
+    def say(name: str, *distance: float | None, robot: str | None = None) -> None:
+        angles = [0.1 * k for k in range(len(distance))]
+        sweep = wire.Ranges(robot or name, time.time(), angles, [0.0] * len(distance), list(distance))
+        far.session.put(KEYS.ranges(name), wire.encode(sweep), encoding=wire.JSON)
+
+    say("KH01", 0.25, None, 1.5)
+    say("CF01", 2.0)
+    drive.until(lambda: drive.state.rays is not None and len(drive.state.rays.row) == 4, "they are heard")
+    rays = drive.state.rays
+    assert rays is not None
+    assert rays.row.tolist() == [0, 2, 2, 2]
+    np.testing.assert_array_equal(rays.distance, [2.0, 0.25, np.nan, 1.5])
+    assert rays.bearing.tolist() == pytest.approx([0.0, 0.0, 0.1, 0.2])
+    assert rays.time == pytest.approx(time.monotonic() - drive.zero, abs=0.5)
+    say("KH01", 0.1, robot="TE01")
+    drive.until(lambda: any("1 sweeps refused" in note for note in drive.state.notes), "nonsense is counted")
+    drive.until(lambda: drive.state.rays is None, "what is old is forgotten")
+
+
 # ---------------------------------------------------------------------- what it says
+
+
+@pytest.mark.system
+def test_a_far_end_that_begins_anew_is_told_what_was_under_way(body: ExternalBody, far: FarEnd) -> None:
+    """The twin service was killed while one robot climbed and the other landed; its successor knows of neither."""
+    drive = Drive(body)
+    drive.until(lambda: True, "a first look")
+    everyone = np.array([0, 1])
+    body.takeoff(everyone, np.array([0.6, 0.8]))
+    far.place["CF01"] = far.place["TE01"] = [0.0, 0.0, 0.3]
+    drive.until(lambda: drive.state.position[:2, 2].min() > 0.2, "they are up")
+    body.land(np.array([1]))
+    drive.until(lambda: far.actions("TE01", "land"), "one lands")
+    climb, landing = far.actions("CF01", "takeoff")[-1].seq, far.actions("TE01", "land")[-1].seq
+    far.hush()
+    drive.until(lambda: any("no position" in note for note in drive.state.notes), "silence is noticed")
+    assert drive.state.flying.tolist() == [True, True, False]
+    told = len(far.actions("CF01", "takeoff"))
+    assert far.actions("TE01", "drive") == []
+    far.talk(*ROWS)
+    drive.until(lambda: len(far.actions("CF01", "takeoff")) >= told + 5, "it is told again to climb")
+    assert {command.seq for command in far.actions("CF01", "takeoff")} == {climb}
+    assert {command.seq for command in far.actions("TE01", "land")} == {landing}
+    setpoint = np.full((3, 4), np.nan)
+    setpoint[0] = [0.0, 0.0, 0.6, 0.0]
+    drive.until(lambda: far.actions("CF01", "drive"), "it is steered", setpoint)
+    far.hush()
+    drive.until(lambda: any("no position" in note for note in drive.state.notes), "silence is noticed again")
+    told = len(far.actions("CF01", "takeoff"))
+    far.talk(*ROWS)
+    drive.until(lambda: not any(drive.state.notes), "it is back", setpoint)
+    assert len(far.actions("CF01", "takeoff")) == told, "what is steered need not climb"
+
+
+@pytest.mark.system
+def test_without_a_world_it_says_what_to_start(router: RouterProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(external, "OPEN_S", 0.3)
+    asked = replace(request(router.endpoint, {"CF01": "crazyflie"}), addresses=("world",))
+    with pytest.raises(BodyError) as caught:
+        open_external(asked).open()
+    assert str(caught.value) == (
+        "CF01: nothing is published on park/CF01/position: is `zenpark world` with this experiment running and "
+        f"connected to {router.endpoint}?"
+    )
 
 
 @pytest.mark.system

@@ -13,6 +13,7 @@ from agents.planning import Line
 from agents.triggers import Periodic, SendOnDelta
 from experiments import assign, document
 from experiments.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Safety, Start
+from twins.scene import Obstacle
 
 NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
 
@@ -163,3 +164,15 @@ def test_rates_patience_and_triggers():
     assert made.trigger == SendOnDelta(threshold=0.02, maximum_silence_s=1.0)
     with pytest.raises(msgspec.ValidationError, match="threshold"):
         assign.assign(experiment(trigger={**trigger, "threshold": -1.0}), ("A",))
+
+
+def test_robots_are_not_scattered_into_obstacles():
+    robots = {name: Robot(kind="khepera4", start=[-0.5, y]) for name, y in (("A", -0.5), ("B", 0.5))}
+    post = Obstacle(radius=0.3, at=(0.0, 0.0))
+    given = Experiment(
+        title="t", duration_s=1.0, robots=robots, arena=Arena(obstacles={"post": post}), start=Start(scatter=0.6)
+    )
+    place = np.array([assign.scattered(given, ("A", "B"), seed)[0][:, :2] for seed in range(100)])
+    gap = np.hypot(place[..., 0], place[..., 1]) - 0.3 - 0.07
+    assert gap.min() > assign.CLEAR
+    assert gap.min() < 0.1  # it is near enough to be in the way

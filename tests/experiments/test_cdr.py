@@ -329,7 +329,7 @@ def test_an_empty_struct_is_no_message():
 @pytest.mark.slow
 @given(st.floats(0, 2**31 - 1), vector, st.floats(-10, 10), st.text("abcdefgh/", max_size=9))
 def test_pose_stamped_is_what_rosbags_writes(stamp, position, yaw, frame):
-    data = pose_stamped(frame)(stamp, position, yaw)
+    data = pose_stamped(frame)(stamp, position, yaw, None)
     store = get_typestore(Stores.ROS2_HUMBLE)
     theirs = store.deserialize_cdr(data, POSE_STAMPED)
     assert theirs.header.stamp.sec * 10**9 + theirs.header.stamp.nanosec == round(stamp * 1e9)
@@ -339,6 +339,12 @@ def test_pose_stamped_is_what_rosbags_writes(stamp, position, yaw, frame):
     assert (turn.x, turn.y) == (0.0, 0.0)
     assert math.remainder(2.0 * math.atan2(turn.z, turn.w) - yaw, 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
     assert bytes(store.serialize_cdr(theirs, POSE_STAMPED)) == data
+
+
+def test_an_attitude_stands_for_the_yaw():
+    data = pose_stamped("park")(1.0, (0.0, 0.0, 0.0), 3.0, (0.1, 0.2, 0.4, 0.8))
+    turn = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, POSE_STAMPED).pose.orientation
+    assert (turn.w, turn.x, turn.y, turn.z) == (0.1, 0.2, 0.4, 0.8)
 
 
 def test_the_schema_of_pose_stamped_is_the_standard_one():
@@ -353,4 +359,4 @@ def test_the_schema_of_pose_stamped_is_the_standard_one():
 @pytest.mark.parametrize("stamp", [math.nan, math.inf, 2.0**31, -(2.0**32)])
 def test_a_stamp_that_ros_cannot_hold_is_refused(stamp):
     with pytest.raises(Unencodable, match="PoseStamped"):
-        pose_stamped("park")(stamp, (0.0, 0.0, 0.0), 0.0)
+        pose_stamped("park")(stamp, (0.0, 0.0, 0.0), 0.0, None)

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import metrics
+from experiments import metrics, results, seeds
+from experiments.measured import INDICES, CaseMetrics, RobotMetrics
 from experiments.signals import formation_errors, net_rotation
 from experiments.trace import Trace
 from tests.experiments.traces import STEP, cut, experiment, pair, park, trace
@@ -18,7 +19,7 @@ from tests.experiments.traces import STEP, cut, experiment, pair, park, trace
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
 
 
-def follower(measured: metrics.CaseMetrics) -> metrics.RobotMetrics:
+def follower(measured: CaseMetrics) -> RobotMetrics:
     return next(robot for robot in measured.robots if robot.robot == "F")
 
 
@@ -213,13 +214,14 @@ def test_a_trace_without_time_is_refused():
 
 def test_document_has_the_shape_for_scripts():
     first, second = (metrics.measure(park("a", seed=4)), metrics.measure(park("b", 0.01, seed=4)))
-    found = metrics.document("runs/7", 4, [first, second])
+    found = results.document("runs/7", 4, [first, second])
     assert (found["run"], found["seed"], list(found["cases"])) == ("runs/7", 4, ["a", "b"])
     b = found["cases"]["b"]
-    assert set(b) == {"robots", "mean", "ratio"}
-    short = metrics.document("runs/7", 4, [metrics.measure(cut(park("a", seed=4), 8.0))])["cases"]["a"]
+    assert set(b) == {"robots", "mean", "ratio", "collisions", "near_m"}
+    assert b["collisions"] == 0
+    short = results.document("runs/7", 4, [metrics.measure(cut(park("a", seed=4), 8.0))])["cases"]["a"]
     assert (short["duration_s"], short["interrupted"]) == (8.0, True)
-    assert set(b["robots"]["TB01"]) == set(b["mean"]) == set(b["ratio"]) == set(metrics.INDICES)
+    assert set(b["robots"]["TB01"]) == set(b["mean"]) == set(b["ratio"]) == set(INDICES)
     followers = [b["robots"][name]["iae"] for name in b["robots"] if name != "TB01"]
     assert b["mean"]["iae"] == pytest.approx(np.mean(followers))
     assert b["ratio"]["f_hz"] == pytest.approx(b["mean"]["f_hz"] / 50.0)
@@ -254,9 +256,9 @@ def test_who_died_before_the_interruption_died():
 
 def test_what_grows_with_time_is_not_compared_with_an_interrupted_run():
     whole, half = metrics.measure(park("a")), metrics.measure(cut(park("b"), 20.0))
-    assert metrics.ratios([half], [whole], "iae") == metrics.ratios([half], [whole], "messages") == [None]
-    assert metrics.ratios([half], [whole], "f_hz") == [pytest.approx(1.0)]
-    assert metrics.document("x", 1, [whole, half])["cases"]["b"]["ratio"]["itae"] is None
+    assert seeds.ratios([half], [whole], "iae") == seeds.ratios([half], [whole], "messages") == [None]
+    assert seeds.ratios([half], [whole], "f_hz") == [pytest.approx(1.0)]
+    assert results.document("x", 1, [whole, half])["cases"]["b"]["ratio"]["itae"] is None
 
 
 def test_a_whole_run_may_end_one_sample_before_its_time():
@@ -266,10 +268,10 @@ def test_a_whole_run_may_end_one_sample_before_its_time():
 
 def test_spread_over_seeds():
     documents = [
-        {"seed": k, "cases": {"a": {group: dict.fromkeys(metrics.INDICES, value) for group in ("mean", "ratio")}}}
+        {"seed": k, "cases": {"a": {group: dict.fromkeys(INDICES, value) for group in ("mean", "ratio")}}}
         for k, value in enumerate([1.0, 2.0, None, 3.0])
     ]
-    found = metrics.across_seeds(documents)
+    found = seeds.across_seeds(documents)
     assert found["seeds"] == [0, 1, 2, 3]
     assert found["cases"]["a"]["mean"]["iae"] == {
         "mean": 2.0,
@@ -277,8 +279,8 @@ def test_spread_over_seeds():
         "ci95": pytest.approx(4.302653 / math.sqrt(3.0)),
         "n": 3,
     }
-    assert metrics.spread([None]) == metrics.Spread(None, None, None, 0)
-    assert metrics.spread([5.0]) == metrics.Spread(5.0, None, None, 1)
+    assert seeds.spread([None]) == seeds.Spread(None, None, None, 0)
+    assert seeds.spread([5.0]) == seeds.Spread(5.0, None, None, 1)
 
 
 @pytest.mark.parametrize(
@@ -286,19 +288,19 @@ def test_spread_over_seeds():
     [(1, 12.7062), (2, 4.30265), (3, 3.18245), (4, 2.77645), (5, 2.57058), (9, 2.26216), (19, 2.09302), (99, 1.98422)],
 )
 def test_student_quantiles_against_the_printed_table(freedom: int, quantile: float):
-    assert metrics.student_95(freedom) == pytest.approx(quantile, rel=1.5e-3)
+    assert seeds.student_95(freedom) == pytest.approx(quantile, rel=1.5e-3)
 
 
 def test_ratios_pair_seeds_or_divide_by_the_mean():
     runs = [metrics.measure(park("a", seed=seed, duration=2.0)) for seed in (1, 2)]
-    assert metrics.ratios(runs, runs[::-1], "iae") == [1.0, 1.0]
+    assert seeds.ratios(runs, runs[::-1], "iae") == [1.0, 1.0]
     iae = [run.mean["iae"] for run in runs]
-    assert metrics.ratios(runs, runs[:1], "iae") == [1.0, pytest.approx(iae[1] / iae[0])]
+    assert seeds.ratios(runs, runs[:1], "iae") == [1.0, pytest.approx(iae[1] / iae[0])]
 
 
 def test_csv_has_a_row_per_robot_and_a_mean(tmp_path):
     measured = metrics.measure(park())
-    metrics.write_csv(tmp_path / "metrics.csv", [measured])
+    results.write_csv(tmp_path / "metrics.csv", [measured])
     with (tmp_path / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["robot"] for row in rows] == [*(robot.robot for robot in measured.robots), "mean"]
@@ -310,8 +312,8 @@ def test_csv_has_a_row_per_robot_and_a_mean(tmp_path):
 
 def test_json_holds_everything(tmp_path):
     measured = metrics.measure(park(duration=5.0))
-    metrics.write_json(tmp_path / "metrics.json", [measured])
-    assert msgspec.json.decode((tmp_path / "metrics.json").read_bytes(), type=list[metrics.CaseMetrics]) == [measured]
+    results.write_json(tmp_path / "metrics.json", [measured])
+    assert msgspec.json.decode((tmp_path / "metrics.json").read_bytes(), type=list[CaseMetrics]) == [measured]
 
 
 @settings(deadline=None, max_examples=20)

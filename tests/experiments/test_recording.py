@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from agents.wire import Event, Heard, Pose, State, Status
+from agents.wire import Contact, Event, Heard, Pose, State, Status, WorldState
 from experiments.experiment import Experiment, Rates, Robot
 from experiments.playback import NotStarted, read
 from experiments.recording import Recording
@@ -107,6 +107,33 @@ def put(recording, messages):
                 recording.status(message)
             case Event():
                 recording.event(message)
+            case Contact():
+                recording.contact(message)
+            case WorldState():
+                recording.world(message)
+
+
+def touched(at, first="TB01", second="CF01"):
+    return Contact(START + at, first, second, 0.25, 0.001)
+
+
+def world(at, engine="pymunk", **more):
+    known = {
+        "stamp": START + at,
+        "engine": engine,
+        "time": at + 3.0,
+        "factor": 0.98,
+        "load": 0.4,
+        "paused": False,
+        "robots": ["TB01"],
+        "mirrored": ["CF01"],
+        "obstacles": {"box": (1.0, 0.5 * at, 0.1), "post": (0.0, 0.0, 0.0)},
+        "contacts": 2,
+        "refused": 0,
+        "malformed": 1,
+        "trouble": "none",
+    }
+    return WorldState(**known | more)
 
 
 def whole_run():
@@ -154,6 +181,9 @@ def test_a_run_is_read_back(path):
     np.testing.assert_allclose(trace.position[:, 1, 0], -along, atol=1e-6)
     np.testing.assert_allclose(trace.true_position[:, 0, 2], 0.01)
     np.testing.assert_allclose(trace.true_position[:, 1], trace.position[:, 1])
+    assert (trace.contacts, trace.world, trace.attitude, trace.shadow_position, trace.shadow_yaw) == (
+        None, (), None, None, None
+    )  # fmt: skip
     np.testing.assert_allclose(trace.goal[:, 0], np.column_stack([along + 1, along * 0 + 2, along * 0 + 3]))
     np.testing.assert_allclose(
         trace.setpoint[:, 1], np.column_stack([-along, along * 0, along * 0 + 0.5, along * 0 + 0.25])
@@ -175,6 +205,73 @@ def test_a_run_is_read_back(path):
     assert trace.missed_deadlines.tolist() == [3, 0]
     assert trace.decisions.tolist() == [10, 9]
     assert trace.events == (Event(0.0, "start", "conductor", "go"),)
+
+
+def test_what_the_world_said_is_read_back(path):
+    said = [world(-0.5), world(0.5), world(1.5), touched(0.7), touched(-0.1), touched(0.2, second="wall"), touched(1.2)]
+    write(path, *whole_run(), *said)
+    trace = read(path).trace
+    assert [(each.first, each.second, round(each.stamp, 6)) for each in trace.contacts] == [
+        ("TB01", "wall", 0.2),
+        ("TB01", "CF01", 0.7),
+    ]
+    assert (trace.contacts[0].impulse, trace.contacts[0].overlap) == (0.25, 0.001)
+    assert [msgspec.structs.replace(each, stamp=START + 0.5) for each in trace.world] == [world(0.5)]
+    assert trace.world[0].stamp == pytest.approx(0.5)
+    path.write_bytes(path.read_bytes()[:-1])
+    target = path.with_name("whole.mcap")
+    assert recover(path, target).robots == ("TB01", "CF01")
+    assert read(target).trace.contacts == trace.contacts
+    with AnyReader([target]) as reader:
+        seen = {c.topic: reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()}
+    assert seen["/world/contact"].second == "CF01"
+    box, post = seen["/world/state"].obstacles
+    assert (box.name, box.pose.tolist(), post.name) == ("box", [1.0, 0.75, 0.1], "post")
+
+
+@pytest.mark.parametrize(
+    ("said", "contacts"),
+    [([], None), ([world(0.5, "point-mass")], None), ([world(0.5, "nobody-has-it")], None), ([world(0.5)], ())],
+)
+def test_no_contacts_and_nobody_who_looked_are_not_the_same(path, said, contacts):
+    write(path, *whole_run(), *said)
+    assert read(path).trace.contacts == contacts
+
+
+def test_what_kept_robots_off_is_counted_until_the_end(path):
+    counted = [
+        msgspec.structs.replace(status(at=at), interventions=5 * k, avoided=2 * k)
+        for k, at in enumerate((-0.5, 0.5, 1.5, 2.5))
+    ]
+    write(path, *whole_run()[:-2], *counted)
+    trace = read(path).trace
+    assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([10, 0], [4, 0])
+
+
+def test_attitude_is_interpolated_the_short_way_on_the_side_it_was_recorded_on(path):
+    angle = [0.2 * k for k in range(12)]
+    sign = [-1.0 if k in {3, 4, 5} else 1.0 for k in range(12)]
+    turned = [
+        state(at=k / 10 - 0.05, attitude=(s * math.cos(0.5 * a), 0.0, s * math.sin(0.5 * a), 0.0))
+        for k, (a, s) in enumerate(zip(angle, sign, strict=True))
+    ]
+    write(path, begun(), *turned)
+    trace = read(path).trace
+    wanted = np.array([[math.cos(0.1 * (k + 0.5)), 0.0, math.sin(0.1 * (k + 0.5)), 0.0] for k in range(11)])
+    np.testing.assert_allclose(trace.attitude[:, 0], wanted * np.array(sign)[:11, None], atol=1e-6)
+    assert np.isnan(trace.attitude[:, 1]).all()
+
+
+def test_where_the_twin_beside_a_robot_was(path):
+    beside = [
+        state(at=k / 10, x=k / 10, shadow_position=(k / 10, 0.1, 0.0), shadow_yaw=3.0 + k / 10) for k in range(11)
+    ]
+    write(path, begun(), *beside, *[state("CF01", at=k / 10) for k in range(11)])
+    trace = read(path).trace
+    np.testing.assert_allclose(trace.shadow_position[:, 0] - trace.position[:, 0], np.tile([0.0, 0.1, 0.0], (11, 1)))
+    np.testing.assert_allclose(trace.shadow_yaw[:, 0], 3.0 + np.arange(11) / 10, atol=1e-6)
+    assert np.isnan(trace.shadow_position[:, 1]).all()
+    assert trace.attitude is None
 
 
 def test_what_is_attached(path):

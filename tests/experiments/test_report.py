@@ -1,17 +1,21 @@
 from __future__ import annotations
 
+import csv
 import dataclasses
 import re
 from html.parser import HTMLParser
 
+import msgspec
 import numpy as np
 import pytest
 
-from agents.wire import Event
+from agents.wire import Contact, Event, WorldState
 from experiments import report
-from experiments.experiment import Experiment
-from experiments.metrics import measure, spread
+from experiments.experiment import Arena, Experiment, Shadow
+from experiments.metrics import measure
 from experiments.report_tables import interval, number, proof_tables, robot_tables, summary_table
+from experiments.results import write_csv
+from experiments.seeds import spread
 from experiments.verdict import findings, left_out
 from tests.experiments.traces import crowd, cut, experiment, park, trace
 
@@ -263,6 +267,96 @@ def test_verdict_of_a_formation_that_never_came_to_be():
     said = {finding.text: finding.mark for finding in findings([measure(trace(what, place))])}
     assert said["The formation never stayed within 5 cm in only."] == "bad"
     assert said["F was 10.0 cm outside the arena in only."] == "bad"
+
+
+def side_by_side(*, apart=0.5, seed=1):
+    """Two Kheperas that stand for two seconds, in an arena without walls."""
+    what = experiment({"A": "khepera4", "B": "khepera4"}, {"A - B": apart}, arena=Arena(walls=False))
+    place = np.zeros((101, 2, 3))
+    place[:, 1, 0] = apart
+    return trace(what, place, seed=seed)
+
+
+def said_of(*traces):
+    return {finding.text: finding.mark for finding in findings([measure(each) for each in traces])}
+
+
+def test_verdict_says_how_near_it_came_if_nothing_touched():
+    text = "No robot touched another or the arena; the closest approach was 36.0 cm between robots (A–B at 0.0 s)."
+    assert said_of(side_by_side())[text] == "good"
+    walled = park("a"), park("b")
+    (text,) = [
+        text for text, mark in said_of(*walled).items() if text.startswith("No robot touched") and mark == "good"
+    ]
+    assert re.search(r" cm between robots \(\w+–\w+ at [\d.]+ s, [ab]\) and ", text)
+    assert re.search(r" cm between robot and arena \(\w+–wall at [\d.]+ s, [ab]\)\.$", text)
+
+
+def test_verdict_names_collisions():
+    text = "One collision in only: A–B at 0.00 s (40.0 mm deep)."
+    assert said_of(side_by_side(apart=0.1))[text] == "bad"
+    contacts = tuple(Contact(0.5 * k, "A", "wall" if k else "B", 0.012 * k, 0.0003) for k in range(5))
+    seen = dataclasses.replace(side_by_side(), contacts=contacts)
+    text = (
+        "5 collisions in only: A–B at 0.00 s (0 mN s, 0.300 mm deep), A–wall at 0.50 s (12.0 mN s, 0.300 mm deep), "
+        "A–wall at 1.00 s (24.0 mN s, 0.300 mm deep) and 2 more."
+    )
+    assert said_of(seen)[text] == "bad"
+    seeds = [side_by_side(), side_by_side(apart=0.1, seed=2)]
+    assert said_of(*seeds)["One collision in 1 of 2 seeds of only: A–B at 0.00 s (40.0 mm deep)."] == "bad"
+
+
+def test_verdict_on_a_world_that_fell_behind():
+    def paced(*factors, clock="real"):
+        world = tuple(
+            WorldState(float(k), "pymunk", 0.0, factor, 0.1, factor == 0.0, [], [], {}, 0, 0, 0)
+            for k, factor in enumerate(factors)
+        )
+        return dataclasses.replace(side_by_side(), world=world, clock=clock)
+
+    text = "The world fell behind: at its slowest it ran at 0.93 of real time, in only."
+    assert said_of(paced(1.0, 0.93, 0.0))[text] == "fair"  # it was paused in the end
+    assert said_of(paced(1.0, 0.5))[text.replace("0.93", "0.50")] == "bad"
+    assert not any("world" in said for said in said_of(paced(1.0, 0.995)))
+    assert not any("world" in said for said in said_of(paced(0.5, clock="virtual")))
+
+
+def test_avoidance_and_twins_beside_robots_are_in_the_report(tmp_path):
+    plain = side_by_side()
+    robots = {name: msgspec.structs.replace(robot, shadow=Shadow()) for name, robot in plain.experiment.robots.items()}
+    known = dataclasses.replace(
+        plain,
+        experiment=msgspec.structs.replace(plain.experiment, robots=robots),
+        contacts=(Contact(1.234, "A", "B", 0.017, 0.0004),),
+        interventions=np.array([10, 40]),
+        avoided=np.array([0, 25]),
+        ticks=np.array([100, 100]),
+        shadow_position=plain.position + np.array([0.0, 0.012, 0.0]),
+        shadow_yaw=plain.yaw,
+    )
+    said = said_of(known)
+    assert said["Avoidance was at work on 12.5 % of all ticks in only, most on those of B (25)."] == "plain"
+    assert (
+        "Twins beside robots foresaw A to 1.20 cm RMSE up to 5 s ahead (only) and B to 1.20 cm RMSE up to 5 s ahead "
+        "(only)."
+    ) in said
+    page = checked(report.write(tmp_path, [known]).read_text(encoding="utf-8"))
+    for words in (
+        "Contacts are those that the world saw begin",
+        "only 1.23 A B 17.0 0.400",
+        "B 36.0 A 0.00 – – 1 40.0 25.0",
+        "A 5 0.0, 12.0, 0.0 0.0, 12.0 0.0 12.0 0 12.0 –, –, – –",
+        "Robots and the twins beside them",
+    ):
+        assert words in page.words
+    figures = [int(found) for found in re.findall(r"Figure (\d+)\.", page.words)]
+    assert figures == list(range(1, len(figures) + 1))
+    flat = measure(known)
+    write_csv(tmp_path / "m.csv", [flat])
+    with (tmp_path / "m.csv").open() as file:
+        row = next(csv.DictReader(file))
+    assert (row["collisions"], row["impulse"], row["near_to"], row["near_arena_gap"]) == ("1", "0.017", "B", "")
+    assert (float(row["shadow_bias_y"]), float(row["intervened_share"])) == (pytest.approx(0.012), 0.1)
 
 
 def test_left_out_of_the_means(run):

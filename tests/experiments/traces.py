@@ -95,6 +95,8 @@ def trace(
         ticks=np.full(rows, count),
         decisions=np.full(rows, count // 5),
         events=tuple(events),
+        interventions=np.zeros(rows, dtype=np.intp),
+        avoided=np.zeros(rows, dtype=np.intp),
     )
 
 

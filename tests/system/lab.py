@@ -111,6 +111,39 @@ class RobotProcess:
         return code
 
 
+class WorldProcess:
+    """`zenpark world`, started by hand as a user would, with its standard input held open."""
+
+    def __init__(self, endpoint: str, file: str | Path, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "experiments.world", str(file), "--connect", endpoint, *arguments],
+            cwd=ROOT,
+            env=ENVIRONMENT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.ready = self.process.stdout.readline().strip()
+
+    def end(self) -> int:
+        """SIGTERM: it ends as soon as its robots are down."""
+        self.process.terminate()
+        return self.wait()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.wait()
+
+    def wait(self, limit_s: float = 25.0) -> int:
+        code = self.process.wait(limit_s)
+        for stream in (self.process.stdin, self.process.stdout):
+            assert stream is not None
+            stream.close()
+        return code
+
+
 class Flight:
     """`zenpark run` in a process of its own."""
 
@@ -129,7 +162,7 @@ class Flight:
         )
 
     def children(self) -> dict[str, psutil.Process]:
-        """The processes that it started, by robot name, "router" and "recorder"."""
+        """The processes that it started, by robot name, "router", "recorder" and "world"."""
         found = {}
         for child in psutil.Process(self.process.pid).children(recursive=True):
             try:
@@ -143,6 +176,8 @@ class Flight:
                 found["router"] = child
             elif "experiments.recorder" in line:
                 found["recorder"] = child
+            elif "experiments.world" in line:
+                found["world"] = child
         return found
 
     def endpoint(self) -> str:

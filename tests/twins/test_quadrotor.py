@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from agents.kinds import CRAZYFLIE, TELLO
-from twins.quadrotor import CLIMB, RESPONSES, TOUCHDOWN, Quadrotor
+from twins.pilot import CLIMB, TOUCHDOWN
+from twins.quadrotor import RESPONSES, Quadrotor
 
 
 def flying(kinds=(CRAZYFLIE,), height=0.8, dt=0.01, yaw=0.0):
@@ -63,7 +64,7 @@ def test_a_step_of_any_size_is_the_solution_of_its_law(target):
     response = RESPONSES["crazyflie"]
     path = fly(flying(), [[target, 0.0, 0.8, 0.0]], 5.0)[:, 0, 0]
     times = 0.001 * np.arange(5001)
-    truth = exact(target, response.position[0], response.velocity[0], response.speed, times)
+    truth = exact(target, response.position[0], response.velocity[0], response.speed[0], times)
     np.testing.assert_allclose(path, truth[10::10], atol=0.012)  # steps of 10 ms at 1 m/s
     assert path[-1] == pytest.approx(target, abs=0.01)
 

@@ -1,0 +1,227 @@
+"""What a robot process says of itself for people and recorders: telemetry, range readings, statuses.
+
+Nothing here is needed by another robot; poses for the neighbours are the runtime's.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite
+from typing import Any, Final, Protocol
+
+import numpy as np
+import zenoh
+
+from agents import ranging, wire
+from agents import session as network
+from agents.agent import Actions, Agent
+from agents.body import BodyState
+from agents.keys import Keys
+from agents.lifecycle import Phase
+from agents.rows import Array, Index
+
+STATUS_S: Final = 1.0
+
+
+class Speaker(Protocol):
+    """What is counted of somebody who is listened to: on which links, and how many samples came and are missing."""
+
+    name: str
+    links: Index
+    heard: int
+    lost: int
+
+
+@dataclass
+class Counts:
+    """What is counted in a process of n rows; ticks and interventions from the common start.
+
+    Attributes:
+        sent: (n) poses said.
+        interventions: (n,) ticks on which safety changed what had been decided.
+        avoided: (n,) ticks on which avoidance did.
+        malformed: Payloads that were refused.
+        refused: Orders that were.
+        ticks: Since the start, and `missed` ones.
+        missed: See `ticks`.
+        late_s: Largest lateness of a tick since the last status.
+    """
+
+    sent: list[int]
+    interventions: Index
+    avoided: Index
+    malformed: int = 0
+    refused: int = 0
+    ticks: int = 0
+    missed: int = 0
+    late_s: float = 0.0
+
+    @classmethod
+    def nothing(cls, rows: int) -> Counts:
+        """Before anything was counted."""
+        return cls([0] * rows, np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp))
+
+    def begin(self) -> None:
+        """At the common start."""
+        self.ticks = self.missed = 0
+        self.interventions[:] = self.avoided[:] = 0
+
+
+class Telemetry:
+    """Says how the rows of a process are.
+
+    Attributes:
+        utc: UTC time at which the process's clock was 0 [s].
+        news: Poses heard since the last telemetry, per row; sent along with it.
+        due: When all rows' statuses are sent next, on the process's clock [s].
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        encoding: wire.Encoding,
+        *,
+        agent: Agent,
+        speakers: Sequence[Speaker],
+        counts: Counts,
+        ranged: Sequence[bool],
+    ) -> None:
+        """Declares the publishers.
+
+        Args:
+            session: Of the process.
+            keys: Of the realm.
+            encoding: Of payloads.
+            agent: Whose rows they are.
+            speakers: Whom the rows listen to.
+            counts: Kept by the runtime.
+            ranged: (n) rows whose range readings are their own: the others' come from the network, where they need
+                not be said again.
+        """
+        self._agent, self._speakers, self._counts = agent, speakers, counts
+        self._encoding = encoding
+        names = self._names = agent.assignment.names
+        mime = wire.MIME[encoding]
+        self._states = [network.publisher(session, keys.state(name), mime) for name in names]
+        self._statuses = [network.pose_publisher(session, keys.status(name), mime) for name in names]
+        self._ranges = [
+            network.publisher(session, keys.ranges(name), mime) if own else None
+            for name, own in zip(names, ranged, strict=True)
+        ]
+        self.utc = self.due = 0.0
+        self.news: list[list[wire.Heard]] = [[] for _ in names]
+        self._told = 0
+        self._scanned = [-inf] * len(names)
+        self._reported: list[tuple[object, ...]] = [()] * len(names)
+
+    def tell(self, state: BodyState, actions: Actions, t: float) -> None:
+        """Sends the telemetry of every row that knows where it is."""
+        self._told += 1
+        agent = self._agent
+        position, velocity, truth = state.position.tolist(), state.velocity.tolist(), state.true_position.tolist()
+        goal, setpoint = agent.goal.tolist(), actions.setpoint.tolist()
+        for row, name in enumerate(self._names):
+            if not isfinite(position[row][0]):
+                continue
+            known = isfinite(truth[row][0])
+            message = wire.State(
+                name,
+                self._told,
+                self.utc + t,
+                Phase(agent.life.phase[row]).word,
+                tuple(position[row]),
+                tuple(velocity[row]),
+                float(state.yaw[row]),
+                tuple(goal[row]) if isfinite(goal[row][0]) else None,
+                tuple(setpoint[row]) if isfinite(setpoint[row][0]) else None,
+                float(agent.error[row]),
+                tuple(truth[row]) if known else None,
+                float(state.true_yaw[row]) if known else None,
+                self.news[row],
+                _known_row(state.attitude, row),
+                _known_row(state.shadow_position, row),
+                _known_row(state.shadow_yaw, row),
+            )
+            self._states[row].put(wire.encode(message, self._encoding))
+            self.news[row] = []
+
+    def scan(self, state: BodyState) -> None:
+        """Sends the range readings that are new and the rows' own."""
+        if state.rays is None:
+            return
+        for row in np.unique(state.rays.row).tolist():
+            publisher = self._ranges[row]
+            scan = state.rays.of(row) if publisher is not None else None
+            if publisher is not None and scan is not None and scan.time > self._scanned[row]:
+                self._scanned[row] = scan.time
+                ranges = ranging.message(self._names[row], self.utc, scan)
+                publisher.put(wire.encode(ranges, self._encoding))
+
+    def report(self, t: float, *, everything: bool, state: BodyState | None = None) -> None:
+        """Sends statuses: of all rows when asked for everything, else of those whose phase or reason changed."""
+        agent, counts = self._agent, self._counts
+        if not (everything or agent.life.moved):
+            return
+        if everything:
+            self.due = t + STATUS_S
+        life = agent.life
+        listener = agent.assignment.links.listener
+        for row, name in enumerate(self._names):
+            missing = agent.missing(row)
+            news = (life.phase[row], life.reason[row], tuple(missing))
+            if not everything and news == self._reported[row]:
+                continue
+            if news[:2] != self._reported[row][:2]:
+                print(f"{name}: {Phase(life.phase[row]).word}" + (f" ({news[1]})" if news[1] else ""), flush=True)
+            self._reported[row] = news
+            mine = [speaker for speaker in self._speakers if (listener[speaker.links] == row).any()]
+            battery = float(state.battery[row]) if state is not None else float("nan")
+            start = float(life.start_at[row])  # a plain float: msgspec does not encode those of numpy
+            status = wire.Status(
+                robot=name,
+                stamp=self.utc + t,
+                phase=Phase(life.phase[row]).word,
+                reason=life.reason[row],
+                body=state.notes[row] if state is not None and state.notes else "",
+                battery=battery if isfinite(battery) else None,
+                sent=counts.sent[row],
+                heard=sum(speaker.heard for speaker in mine),
+                lost={speaker.name: speaker.lost for speaker in mine},
+                malformed=counts.malformed,
+                refused=counts.refused,
+                ticks=counts.ticks,
+                missed=counts.missed,
+                decisions=agent.decisions,
+                interventions=int(counts.interventions[row]),
+                avoided=int(counts.avoided[row]),
+                late_s=counts.late_s,
+                started=self.utc + start if isfinite(start) else 0.0,
+                missing=missing,
+                pid=os.getpid(),
+                cpu_s=time.process_time(),
+                rss_mb=_resident_mb(),
+            )
+            self._statuses[row].put(wire.encode(status, self._encoding))
+        if everything:
+            counts.late_s = 0.0
+
+
+def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it
+    """A row of what a body may know or not, for the wire; None if it does not."""
+    if column is None or not np.isfinite(column[row]).all():
+        return None
+    value = column[row].tolist()
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _resident_mb() -> float:
+    try:
+        with open("/proc/self/statm", "rb") as pages:  # noqa: PTH123 - a Path costs more than the read
+            return int(pages.read().split()[1]) * resource.getpagesize() / 1e6
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

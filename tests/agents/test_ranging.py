@@ -1,0 +1,97 @@
+"""Range readings on the network: what is sent is what is heard, nonsense is refused, what is old is forgotten."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents import ranging, wire
+from agents import session as network
+from agents.body import RangeScan, Rays
+from agents.keys import Keys
+from agents.ranging import HeardRanges, instead
+from tests.conftest import RouterProcess
+
+KEYS = Keys()
+GOOD = wire.Ranges("KH01", 1000.0, [0.0, 1.5], [0.0, 0.0], [0.25, None])
+
+
+def scan(t: float, *distance: float) -> RangeScan:
+    count = len(distance)
+    return RangeScan(t, np.linspace(0.0, 1.0, count), np.zeros(count), np.array(distance))
+
+
+def test_a_sweep_as_a_message() -> None:
+    said = ranging.message("KH01", 1000.0, scan(2.5, 0.12345678, np.nan, 1.0))
+    assert said == wire.Ranges("KH01", 1002.5, [0.0, 0.5, 1.0], [0.0, 0.0, 0.0], [0.123457, None, 1.0])
+    wire.check_ranges(said, robot="KH01", now=1002.5)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "why"),
+    [
+        ("robot", "KH02", "ranges of 'KH02' on the key of 'KH01'"),
+        ("stamp", math.nan, "stamp nan is impossible"),
+        ("stamp", 1006.0, "stamp 1006.0 is impossible"),
+        ("distance", [0.25], "differ in number"),
+        ("distance", [0.25, math.inf], "a distance is not between 0 and 100 m"),
+        ("distance", [-0.1, None], "a distance is not between 0 and 100 m"),
+        ("distance", [], "0 rays; a sweep has 1 to 720"),
+        ("distance", [1.0] * 721, "721 rays; a sweep has 1 to 720"),
+        ("bearing", [0.0, math.nan], "no angle in radians"),
+        ("bearing", [0.0, 90.0], "no angle in radians"),
+        ("elevation", [0.0, 0.0, 0.0], "differ in number"),
+    ],
+)
+def test_what_no_sensor_sees_is_refused(field: str, value: object, why: str) -> None:
+    wire.check_ranges(GOOD, robot="KH01", now=1000.0)
+    with pytest.raises(wire.Malformed, match=why):
+        wire.check_ranges(msgspec.structs.replace(GOOD, **{field: value}), robot="KH01", now=1000.0)
+
+
+def test_what_is_heard_takes_the_place_of_what_is_seen() -> None:
+    own = Rays.gather([scan(1.0, 0.1, 0.2), scan(1.0, 0.3), scan(1.0, 0.4)])
+    heard = Rays.gather([None, scan(2.0, 0.5, 0.6)])
+    rays = instead(own, heard, np.array([1, 2]))
+    assert rays is not None
+    assert rays.row.tolist() == [0, 0, 1, 1]
+    assert rays.distance.tolist() == [0.1, 0.2, 0.5, 0.6]
+    assert rays.time.tolist() == [1.0, 1.0, 2.0, 2.0]
+    assert instead(None, heard, np.array([1])) is heard
+    assert instead(own, None, np.arange(3)) is None
+
+
+@pytest.mark.system
+def test_the_newest_sweep_of_each_row_is_known_until_it_is_old(
+    router: RouterProcess, eventually: Callable[[Callable[[], object]], None]
+) -> None:
+    with network.open_session([router.endpoint], name="test") as session:
+        listener = HeardRanges(session, KEYS, ("CF01", "KH01"), [1])
+        utc = time.time() - 10.0
+        assert listener.read(utc, 10.0) is None
+
+        def say(*distance: float | None, at: float, robot: str = "KH01") -> None:
+            angles = [0.0] * len(distance)
+            message = wire.Ranges(robot, utc + at, angles, angles, list(distance))
+            session.put(KEYS.ranges("KH01"), wire.encode(message), encoding=wire.JSON)
+
+        say(0.5, None, at=10.0)
+        eventually(lambda: listener.read(utc, 10.0) is not None)
+        rays = listener.read(utc, 10.0)
+        assert rays is not None
+        assert rays.row.tolist() == [1, 1]
+        np.testing.assert_array_equal(rays.distance, [0.5, np.nan])
+        assert rays.time.tolist() == pytest.approx([10.0, 10.0], abs=1e-6)
+        assert listener.read(utc, 10.5) is rays, "nothing new costs nothing"
+        say(0.7, 0.8, at=9.5)  # overtaken
+        say(0.7, 0.8, at=10.2, robot="CF01")
+        say(0.9, at=10.2)
+        eventually(lambda: len((listener.read(utc, 10.2) or rays).row) == 1)
+        assert listener.malformed == 1
+        assert listener.trouble == "ranges of 'CF01' on the key of 'KH01'"
+        assert listener.read(utc, 11.3) is None, "a second later it says nothing of where things are"

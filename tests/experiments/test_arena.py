@@ -1,0 +1,201 @@
+"""Arena files: what they say, what the experiment changes, and where they are wrong."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from experiments import catalogue, document
+from experiments.check import check
+from experiments.document import DocumentError, read
+from twins.scene import Obstacle
+
+LAB = """# A lab
+[arena]
+size = [4.0, 3.0, 2.0]
+walls = false
+
+[arena.obstacles.post]
+radius = 0.1
+at = [1.0, 0.0]
+
+[arena.obstacles.cart]
+box = [0.3, 0.2]
+at = [0.0, 1.0]
+plan = { kind = "line", move_by = [1.0, 0.0], speed = 0.1 }
+
+[arena.starts.west]
+at = [-1.5, 0.0]
+size = [0.9, 1.0]
+"""
+ONE = """title = "One"
+duration_s = 20.0
+[arena]
+file = "lab.toml"
+[robots.KH01]
+kind = "khepera4"
+start = [-1.5, 0.0]
+"""
+
+
+@pytest.fixture
+def lab(tmp_path):
+    """A folder with an arena file; call it with the text of an experiment, and of the arena if it is another."""
+
+    def written(experiment=ONE, arena=LAB):
+        (tmp_path / "lab.toml").write_text(arena)
+        file = tmp_path / "one.toml"
+        file.write_text(experiment)
+        return file
+
+    return written
+
+
+def refused(file, *changes):
+    with pytest.raises(DocumentError) as caught:
+        read(file, changes)
+    return [(problem.file, problem.line, problem.column, problem.message) for problem in caught.value.problems]
+
+
+def test_the_arena_is_that_of_the_file(lab):
+    arena = read(lab()).experiment.arena
+    assert arena.size == (4.0, 3.0, 2.0)
+    assert not arena.walls
+    assert arena.obstacles["post"] == Obstacle(radius=0.1, at=(1.0, 0.0))
+    assert arena.starts["west"].size == (0.9, 1.0)
+    assert arena.file is None
+
+
+def test_own_keys_win_and_obstacles_merge_by_name(lab):
+    own = "walls = true\n[arena.obstacles.post]\nheight = 0.5\n[arena.obstacles.cart]\nradius = 0.2\n"
+    own += "[arena.obstacles.new]\nradius = 0.3\nat = [1.0, -1.0]\n"
+    own += "[arena.starts.east]\nat = [1.5, 0.0]\nsize = [0.5, 0.5]\n"
+    arena = read(lab(ONE.replace('"lab.toml"\n', f'"lab.toml"\n{own}'))).experiment.arena
+    assert arena.walls
+    assert arena.size == (4.0, 3.0, 2.0)
+    assert list(arena.obstacles) == ["post", "cart", "new"]
+    assert arena.obstacles["post"] == Obstacle(radius=0.1, at=(1.0, 0.0), height=0.5)
+    cart = arena.obstacles["cart"]  # another shape in place of the old one; the rest stays
+    assert (cart.box, cart.radius, cart.at) == (None, 0.2, (0.0, 1.0))
+    assert list(arena.starts) == ["west", "east"]
+
+
+def test_a_case_changes_the_arena_or_takes_another_file(lab, tmp_path):
+    (tmp_path / "hall.toml").write_text("[arena]\nsize = [9.0, 9.0, 3.0]\n[arena.obstacles.pillar]\nradius = 0.4\n")
+    cases = '[cases.lab.arena.obstacles.post]\nradius = 0.2\n[cases.hall.arena]\nfile = "hall.toml"\n'
+    given = read(lab(ONE + cases))
+    found = given.cases()
+    assert found["lab"].arena.obstacles["post"].radius == 0.2
+    assert list(found["hall"].arena.obstacles) == ["pillar"]
+    assert found["hall"].arena.size == (9.0, 9.0, 3.0)
+    assert given.experiment.arena.obstacles["post"].radius == 0.1
+    assert {name: file.name for name, file in given.arenas.items()} == {
+        "": "lab.toml", "lab": "lab.toml", "hall": "hall.toml"
+    }  # fmt: skip
+
+
+def test_changes_of_the_command_line_find_what_the_file_holds(lab, tmp_path):
+    file = lab()
+    found = read(file, ["arena.obstacles.cart.plan.speed=0.2", "arena.obstacles.post.at=[0.5, 0.5]"]).experiment.arena
+    assert found.obstacles["cart"].plan == {"kind": "line", "move_by": [1.0, 0.0], "speed": 0.2}
+    assert found.obstacles["post"].at == (0.5, 0.5)
+    (tmp_path / "hall.toml").write_text("[arena]\nsize = [9.0, 9.0, 3.0]\n")
+    assert read(file, ["arena.file=hall.toml", "arena.walls=false"]).experiment.arena.obstacles == {}
+    assert refused(file, "arena.file=hal.toml")[0][0] == "--set arena.file=hal.toml"
+    ((where, *_, message),) = refused(file, "arena.obstacles.cart.plan.radius=0.2")
+    assert where == "--set arena.obstacles.cart.plan.radius=0.2"
+    assert "no plan of this experiment has a parameter 'radius'" in message
+
+
+def test_what_processes_read_needs_no_arena_file(lab, tmp_path):
+    found = read(lab()).experiment
+    file = tmp_path / "elsewhere" / "case.json"
+    file.parent.mkdir()
+    file.write_bytes(document.write_json(found))
+    assert read(file).experiment == found
+    assert "file" not in msgspec.json.decode(file.read_bytes())["arena"]
+
+
+def test_a_run_keeps_what_it_needs_to_be_done_again(lab, tmp_path):
+    given = read(lab())
+    kept = tmp_path / "run"
+    kept.mkdir()
+    given.keep(kept / "experiment.toml")
+    assert read(kept / "experiment.toml").experiment == given.experiment
+    assert LAB in given.listing
+    assert given.listing.startswith(ONE)
+
+
+@pytest.mark.parametrize(
+    ("arena", "line", "column", "message"),
+    [
+        ("[arena]\nsize = [4.0, 3.0]\n", 2, 8, "'size' must be a list of length 3"),
+        ("[arena]\nsize = [4.0, inf, 2.0]\n", 2, 14, "'size[1]' is inf"),
+        ("[arena]\nsiez = [4.0, 3.0, 2.0]\n", 2, 1, "unknown key 'siez' in 'arena'"),
+        ("size = [4.0, 3.0, 2.0]\n", 1, 1, "unknown key 'size'"),
+        ("[arena]\n[robots.KH01]\nstart = [0.0, 0.0]\n", 2, 2, "unknown key 'robots'"),
+        ("[arena]\nseed = 3\n", 2, 1, "unknown key 'seed' in 'arena'"),
+        ('[arena]\nfile = "hall.toml"\n', 2, 1, "an arena file cannot name another"),
+        ("[arena]\n[arena.obstacles.a]\nradius = 0.1\nat = [9.0, 0.0]\n", 4, 6, "'a' stands outside of the arena"),
+        ("[arena]\n[arena.obstacles.a]\nbox = [0.1, 0.1]\nwall = 3\n", 4, 8, "'wall' must be a list"),
+        ('[arena]\n[arena.obstacles.a]\nradius = 0.1\nplan = "run"\n', 4, 8, "no 'run' among the planners"),
+        ("[arena\n", 1, 7, "Expected ']'"),
+        ("", 0, 0, "is empty"),
+        ("# nothing\n", 0, 0, "holds nothing but comments"),
+        ("arena = " + "[" * 5000 + "]" * 5000, 0, 0, "nested too deeply"),
+    ],
+)
+def test_a_wrong_arena_file_is_refused_where_it_is_wrong(lab, arena, line, column, message):
+    file = lab(arena=arena)
+    (where, *place, said) = refused(file)[0]
+    assert where == str(file.parent / "lab.toml")
+    assert place == [line, column]
+    assert message in said
+
+
+def test_an_arena_file_is_told_what_belongs_elsewhere(lab):
+    with pytest.raises(DocumentError) as caught:
+        read(lab(arena="[arena]\nseed = 3\n[robots.KH01]\n"))
+    hints = [problem.hint for problem in caught.value.problems]
+    assert hints[0].startswith("'seed' belongs in the experiment file")
+    assert hints[1].startswith("it belongs in the experiment file")
+
+
+def test_what_the_experiment_makes_wrong_of_it_points_into_both_files(lab):
+    file = lab()
+    found = refused(lab(ONE.replace('"lab.toml"\n', '"lab.toml"\nsize = [2.0, 3.0, 2.0]\n')))
+    assert [(where, line) for where, line, _, _ in found] == [
+        (str(file), 8),  # the robot
+        (str(file.parent / "lab.toml"), 16),  # the start box
+    ]
+    ((where, line, *_, message),) = refused(lab(ONE + "[cases.small.arena]\nsize = [3.9, 1.0, 2.0]\n"))[:1]
+    assert (where, line) == (str(file), 8)
+    assert message.startswith("in case 'small', arena.obstacles.cart.at: 'cart' stands outside")
+
+
+def test_findings_of_the_check_point_into_the_arena_file(lab):
+    plan = '[[timeline]]\nat_s = 2.0\nrobot = "KH01"\nplan = { kind = "line", move_by = [2.6, 0.0], speed = 0.2 }\n'
+    file = lab(ONE + plan)
+    (found,) = [each for each in check(read(file)) if each.code == "hits-obstacle"]
+    assert found.where == f"{file.parent / 'lab.toml'}:6:1"
+    assert "KH01 would run into 'post' at 13.8 s" in found.message
+
+
+def test_the_catalogue_has_arena_files_that_are_no_experiments(tmp_path):
+    assert catalogue.arenas() == ["gate.arena.toml"]
+    assert "obstacle-course" in catalogue.names()
+    assert not any("arena" in name for name in catalogue.names())
+    made = document.copy("obstacle-course", tmp_path)
+    assert read(made).experiment == read("obstacle-course").experiment
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(
+        [made.name, "gate.arena.toml", catalogue.SCHEMA]
+    )  # fmt: skip
+    (tmp_path / "gate.arena.toml").write_text("[arena]\n")
+    with pytest.raises(DocumentError, match="is another arena"):
+        document.copy("obstacle-course", tmp_path / "again.toml")
+    assert not (tmp_path / "again.toml").exists()
+
+
+def test_an_arena_of_the_catalogue_needs_not_stand_beside(lab):
+    arena = read(lab(ONE.replace("lab.toml", "gate.arena.toml"))).experiment.arena
+    assert list(arena.obstacles) == ["left", "right"]

@@ -1,0 +1,114 @@
+"""A virtual run as it is logged, and read back from its recording, is the same trace."""
+
+from dataclasses import fields, replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.body import Disturbance
+from experiments import playback
+from experiments.experiment import Arena, Experiment, Formation, Leg, Rates, Robot, Shadow, World
+from experiments.logbook import Logbook
+from experiments.virtual import simulate
+from twins.engine import Touch
+from twins.scene import Obstacle
+
+CART = Obstacle(box=(0.2, 0.2), at=(-0.8, 0.8), plan={"kind": "line", "move_by": [0.5, 0.0], "speed": 0.1})
+NATURE = Disturbance(position_sigma=0.001, yaw_sigma=0.002)
+
+
+def experiment(engine="point-mass", **parts):
+    robots = {
+        "KH": Robot(kind="khepera4", start=[-0.4, 0.0], shadow=Shadow(restart_s=1.0)),
+        "CF": Robot(kind="crazyflie", start=[0.4, 0.1], hover=0.5),
+    }
+    given = {
+        "title": "Logged",
+        "duration_s": 3.0,
+        "robots": robots,
+        "arena": Arena(obstacles={"post": Obstacle(radius=0.1, at=(1.0, 1.0)), "cart": CART}),
+        "formation": Formation(links={"KH - CF": 0.7}),
+        "disturbance": {"all": NATURE},
+        "rates": Rates(state_hz=50.0),
+        "timeline": [Leg(at_s=1.0, robot="CF", plan={"kind": "line", "move_by": [0.2, 0.0], "speed": 0.2})],
+        "world": World(engine=engine),
+    }
+    return Experiment(**given | parts)
+
+
+@pytest.fixture(scope="module")
+def log():
+    """Of two repetitions; what the engine does not know is made up."""
+    plain = simulate(experiment(), [3, 4])
+    half = np.linspace(0.0, 2.0, len(plain.time))[:, None] * [1.0, 0.5, 0.2, 0.1]
+    attitude = np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=-1)
+    touches = (
+        Touch(-0.4, 1, -1, 0.1, 0.001),  # before the start
+        Touch(0.503, 0, 1, 0.2, 0.002),
+        Touch(1.25, 2, -2, 0.3, 0.003),
+        Touch(2.5, 3, -3, 0.4, 0.004),
+        Touch(3.2, 3, 2, 0.5, 0.005),  # after the end
+    )
+    counts = np.array([4, 3, 2, 1])
+    return replace(plain, attitude=attitude, touches=touches, interventions=counts, avoided=counts // 2)
+
+
+def equal(one, other, name):
+    if isinstance(one, np.ndarray):
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=2e-6, err_msg=name)
+    elif isinstance(one, tuple) and one and isinstance(one[0], msgspec.Struct):
+        assert len(one) == len(other), name
+        for a, b in zip(one, other, strict=True):
+            assert a.stamp == pytest.approx(b.stamp, abs=1e-6), name
+            assert msgspec.structs.replace(a, stamp=0.0) == msgspec.structs.replace(b, stamp=0.0)
+    elif hasattr(one, "__dataclass_fields__"):
+        for field in fields(one):
+            equal(getattr(one, field.name), getattr(other, field.name), f"{name}.{field.name}")
+    else:
+        assert one == other, name
+
+
+@pytest.mark.parametrize("copy", [0, 1])
+def test_what_is_logged_and_what_is_played_back_are_the_same(log, tmp_path, copy):
+    book = Logbook(log, experiment(), "only", copy)
+    book.record(tmp_path / "run.mcap", "")
+    played = playback.read(tmp_path / "run.mcap")
+    assert played.complete
+    trace = book.trace()
+    until = msgspec.structs.replace(trace.events[-1], stamp=0.0)
+    assert msgspec.structs.replace(played.trace.events[-1], stamp=0.0) == until
+    equal(trace, played.trace, "trace")
+    assert trace.shadow_position is not None
+    assert np.isfinite(trace.shadow_position).all(axis=(0, 2)).tolist() == [True, False]
+
+
+def test_each_repetition_has_its_own_contacts(log):
+    found = [Logbook(log, experiment(), "only", copy).trace() for copy in (0, 1)]
+    assert [[(c.stamp, c.first, c.second, c.impulse, c.overlap) for c in trace.contacts] for trace in found] == [
+        [(pytest.approx(0.503), "KH", "CF", 0.2, 0.002)],
+        [(pytest.approx(1.25), "KH", "cart", 0.3, 0.003), (pytest.approx(2.5), "CF", "wall", 0.4, 0.004)],
+    ]
+    assert [trace.interventions.tolist() for trace in found] == [[4, 3], [2, 1]]
+    assert [trace.avoided.tolist() for trace in found] == [[2, 1], [1, 0]]
+
+
+def test_the_world_is_said_once_a_second_with_what_moves_in_it(log):
+    world = Logbook(log, experiment(), "only").trace().world
+    assert [round(said.stamp, 6) for said in world] == [0.0, 1.0, 2.0, 3.0]
+    assert [said.obstacles["cart"][0] for said in world] == pytest.approx([-0.8, -0.7, -0.6, -0.5])
+    assert {said.obstacles["post"] for said in world} == {(1.0, 1.0, 0.0)}
+    assert [said.contacts for said in world] == [1, 2, 2, 2]
+    assert {(said.engine, said.factor, said.paused) for said in world} == {("point-mass", 1.0, False)}
+
+
+@pytest.mark.parametrize(("engine", "contacts"), [("point-mass", None), ("pymunk", ())])
+def test_no_contacts_of_an_engine_that_looks_for_them_are_none(log, engine, contacts):
+    quiet = replace(log, touches=())
+    assert Logbook(quiet, experiment(engine), "only").trace().contacts == contacts
+
+
+def test_nothing_is_said_of_an_empty_place(log):
+    quiet = replace(log, touches=(), obstacles=log.obstacles[:, :, :0])
+    trace = Logbook(quiet, experiment(arena=Arena()), "only").trace()
+    assert (trace.world, trace.contacts) == ((), None)

@@ -1,0 +1,169 @@
+"""What `zenpark check` says of obstacles, range sensors, worlds, mirrors and shadows."""
+
+from __future__ import annotations
+
+import pytest
+
+from experiments.check import check, command, figures
+from experiments.document import read
+
+HEAD = """title = "One"
+duration_s = 20.0
+"""
+ROBOTS = """[robots.KH01]
+kind = "khepera4"
+start = [-1.5, 0.0]
+[robots.CF01]
+kind = "crazyflie"
+start = [-1.5, 0.6]
+hover = 0.8
+[formation.links]
+"KH01 > CF01" = 1.0
+[[timeline]]
+at_s = 2.0
+robot = "KH01"
+plan = { kind = "line", move_by = [2.5, 0.0], speed = 0.15 }
+"""
+POST = "[arena.obstacles.post]\nradius = 0.1\nat = [0.5, 0.0]\n"
+LOW = POST + "height = 0.3\n"
+AVOIDS = '[avoidance]\nkind = "barrier"\n'
+
+
+@pytest.fixture
+def said(tmp_path):
+    """Everything the check says of an experiment, by code."""
+
+    def found(*parts, robots=ROBOTS):
+        file = tmp_path / "one.toml"
+        file.write_text(HEAD + "".join(parts) + robots)
+        codes = {}
+        for each in check(read(file)):
+            codes.setdefault(each.code, each)
+        return codes
+
+    return found
+
+
+def test_a_path_into_an_obstacle_is_found_in_time(said):
+    found = said(LOW)["hits-obstacle"]
+    assert found.severity == "warning"
+    assert found.message == "KH01 would run into 'post' at 14.4 s, around (0.34, 0.00)"
+    assert "[avoidance]" in found.remedy
+    assert found.where.endswith("one.toml:3:1")
+
+
+def test_the_drone_above_a_low_obstacle_does_not_meet_it_and_one_beside_a_tall_one_does(said):
+    assert "CF01" not in said(LOW)["hits-obstacle"].message
+    both = said(POST.replace("[0.5, 0.0]", "[0.3, 0.0]"))["hits-obstacle"]
+    assert both.message.startswith("KH01, CF01 would run into") or both.message.startswith("KH01 would")
+
+
+def test_nobody_meets_what_stands_aside_or_hangs_high(said):
+    aside = said(LOW.replace("[0.5, 0.0]", "[0.5, 0.5]"))
+    high = said(POST + "bottom = 1.5\n")
+    for found in (aside, high):
+        assert "hits-obstacle" not in found
+        assert found["obstacles"].severity == "note"
+
+
+def test_an_obstacle_on_a_path_is_met_where_it_is_then(said):
+    cart = '[arena.obstacles.cart]\nbox = [0.2, 0.2]\nat = [0.5, 1.0]\nheight = 0.3\nplan = { kind = "line", '
+    assert "hits-obstacle" not in said(f"{cart}move_by = [0.0, -2.9], speed = 0.5 }}\n")  # long gone
+    found = said(f"{cart}move_by = [0.0, -1.0], speed = 0.1 }}\n")["hits-obstacle"]
+    assert "KH01 would run into 'cart'" in found.message
+    away = said(f"{cart}move_by = [0.0, 3.0], speed = 0.5 }}\n")["obstacle-leaves"]
+    assert away.message == "the middle of 'cart' leaves the arena at 2.1 s"
+
+
+def test_with_avoidance_the_same_is_news_and_no_warning(said):
+    found = said(AVOIDS, LOW)
+    assert "hits-obstacle" not in found
+    assert found["avoidance-acts"].severity == "note"
+    assert found["avoidance-acts"].message.endswith("avoidance will have to act")
+
+
+def test_who_does_not_avoid_still_runs_into_it(said):
+    found = said(AVOIDS, LOW, robots=ROBOTS.replace('kind = "khepera4"\n', 'kind = "khepera4"\navoids = false\n'))
+    assert found["hits-obstacle"].message.startswith("KH01 would run into 'post'")
+    assert "avoidance-acts" not in found
+
+
+def test_what_can_be_pushed_is_pushed_if_the_engine_can(said):
+    crate = LOW + "mass = 1.0\n"
+    found = said(crate)
+    assert "in the engine 'point-mass' nothing is pushed" in found["not-pushed"].message
+    assert found["pushes"].severity == "note"
+    assert "not-pushed" not in said('[world]\nengine = "pymunk"\n', crate)
+
+
+def test_a_robot_in_a_wall_is_an_error_where_walls_are_touched(said):
+    near = ROBOTS.replace("[-1.5, 0.0]", "[-1.95, 0.0]")
+    found = said('[world]\nengine = "pymunk"\n', robots=near)["start-overlap"]
+    assert found.severity == "error"
+    assert found.message.startswith("KH01 starts in a wall of the arena: 0.05 m off, but needs 0.07 m")
+    assert "start-overlap" not in said(robots=near)
+    assert "start-overlap" not in said('[world]\nengine = "pymunk"\n', "[arena]\nwalls = false\n", robots=near)
+
+
+def test_who_has_no_range_sensors_is_told_what_it_cannot_avoid(said):
+    found = said(AVOIDS, POST)["sees-nothing"]
+    assert found.message == "CF01 has no range sensors: it cannot avoid 'post'"
+    assert 'sensors = ["multiranger"] in [robots.CF01]' in found.remedy
+    assert "sees-nothing" not in said(AVOIDS, LOW)  # it flies over it, and hears its neighbour
+    assert "sees-nothing" not in said(AVOIDS, POST, robots=ROBOTS.replace("hover", 'sensors = ["multiranger"]\nhover'))
+
+
+def test_who_hears_nobody_either_avoids_nothing(said):
+    blind = ROBOTS.replace('kind = "khepera4"', 'kind = "khepera4"\nsensors = []')
+    found = said(AVOIDS, robots=blind)["sees-nothing"]
+    assert found.message == "KH01 hears nobody and has no range sensors: it avoids nothing"
+    assert 'hears = "all"' in found.remedy
+    assert "sees-nothing" not in said(AVOIDS, 'hears = "all"\n', robots=blind)
+
+
+def test_links_of_avoidance_are_none_of_the_formation(said):
+    found = said(AVOIDS, 'hears = "all"\n')
+    assert found["connected"].message == "the network is whole; everybody hears of KH01"
+
+
+def test_formations_without_links_between_them_may_share_an_arena_if_they_keep_clear(said):
+    more = ROBOTS + '[robots.A]\nkind = "khepera4"\nstart = [-1.0, -1.0]\n[robots.B]\nkind = "khepera4"\n'
+    more = more.replace('CF01" = 1.0\n', 'CF01" = 1.0\n"A > B" = 0.5\n') + "start = [-1.0, -1.5]\n"
+    assert said(robots=more)["parts"].severity == "error"
+    assert said(AVOIDS, robots=more)["parts"].severity == "note"
+
+
+@pytest.mark.parametrize(
+    ("robot", "code", "part"),
+    [
+        ('body = "world"\nranges = "world"\n', "ranges-twice", "adds nothing"),
+        ('body = "khepera4-twin"\nsensors = []\nranges = "world"\n', "ranges-of-nothing", "no range sensors"),
+        ('body = "khepera4-twin"\nranges = "world"\n', "ranges-of-nothing", "nobody lives"),
+        ('body = "world"\nshadow = {}\n', "shadow-of-twin", "one twin with another"),
+        ("shadow = { restart_s = 2.0 }\n", "shadow-of-twin", "one twin with another"),
+    ],
+)
+def test_worlds_and_shadows_that_make_no_sense(said, robot, code, part):
+    changed = ROBOTS.replace('kind = "khepera4"\n', f'kind = "khepera4"\n{robot}')
+    found = said("[arena]\nwalls = false\n", robots=changed)[code]
+    assert found.severity == "warning"
+    assert part in found.message
+
+
+def test_worlds_and_shadows_that_make_sense(said):
+    real = ROBOTS.replace('kind = "khepera4"\n', 'kind = "khepera4"\nbody = "khepera4-twin"\nshadow = {}\n')
+    found = said(LOW, robots=real.replace("shadow", 'ranges = "world"\nshadow'))
+    assert not {"ranges-twice", "ranges-of-nothing", "shadow-of-twin"} & found.keys()
+
+
+def test_the_summary_names_the_obstacles(tmp_path, capsys):
+    file = tmp_path / "one.toml"
+    cart = '[arena.obstacles.cart]\nbox = [0.2, 0.3]\nat = [0.5, 1.0]\nplan = "hold"\n'
+    crate = "[arena.obstacles.crate]\nradius = 0.1\nat = [1.0, 1.0]\nmass = 2.0\n"
+    fence = "[arena.obstacles.fence]\nwall = [[1.0, 0.0], [1.0, 1.0]]\nbottom = 1.0\n"
+    file.write_text(HEAD + cart + crate + fence + ROBOTS)
+    assert command(str(file), settings=(), as_json=False) == 0
+    printed = capsys.readouterr().out
+    assert "cart (box 0.2 × 0.3 m, moves), crate (cylinder of radius 0.1 m, 2 kg), fence (wall, 1 m above" in printed
+    assert "4 × 4 × 2.5 m" in printed
+    assert list(figures(read(file).experiment).obstacles) == ["cart", "crate", "fence"]

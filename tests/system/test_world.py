@@ -1,0 +1,380 @@
+"""The twin service in real processes: a run in one world, its orders, its death, robots of other processes in it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from experiments import orders, playback
+from tests.conftest import RouterProcess
+from tests.system.lab import Flight, RobotProcess, Watcher, WorldProcess, gone, until
+
+pytestmark = pytest.mark.system
+
+KEYS = Keys()
+THREE = """
+title = "three"
+duration_s = 30.0
+[arena]
+size = [4.0, 4.0, 2.0]
+[arena.obstacles.post]
+radius = 0.1
+at = [1.5, 1.5]
+[robots.KH01]
+kind = "khepera4"
+body = "world"
+start = [0.0, 0.0]
+[robots.CF01]
+kind = "crazyflie"
+body = "world"
+start = [0.0, 1.0]
+hover = 0.6
+[robots.TE01]
+kind = "tello"
+body = "world"
+start = [-1.0, 1.0]
+hover = 0.6
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    made = tmp_path / "three.toml"
+    made.write_text(THREE)
+    return made
+
+
+class Desk:
+    """The world as an operator, and a robot's process, see it."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.session = network.open_session([endpoint], name="desk")
+        self._positions = network.subscriber(self.session, KEYS.position("*"), 4096)
+        self._worlds = network.pose_subscriber(self.session, KEYS.world)
+        self._events = network.subscriber(self.session, KEYS.event)
+        self._ranges = network.subscriber(self.session, KEYS.ranges("*"))
+        self.at: dict[str, wire.Position] = {}
+        self.ranges: dict[str, wire.Ranges] = {}
+        self.events: list[wire.Event] = []
+        self.world: wire.WorldState | None = None
+        self._seq = round(time.time() * 1e3)
+
+    def look(self) -> None:
+        for sample in network.received(self._positions.handler):
+            position = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
+            self.at[position.robot] = position
+        for sample in network.received(self._worlds.handler):
+            self.world = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.WorldState)
+        for sample in network.received(self._events.handler):
+            self.events.append(wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Event))
+        for sample in network.received(self._ranges.handler):
+            ranges = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Ranges)
+            self.ranges[ranges.robot] = ranges
+
+    def until(self, true: object, what: str, limit_s: float = 10.0) -> None:
+        def seen() -> object:
+            self.look()
+            return true()  # type: ignore[operator]
+
+        until(seen, what, limit_s)
+
+    def x(self, name: str) -> list[float]:
+        return list(self.at[name].position)
+
+    def give(self, order: str, **fields: object) -> wire.WorldReply:
+        return orders.give_world(self.session, KEYS, wire.WorldOrder(order, **fields))  # type: ignore[arg-type]
+
+    def tell(self, name: str, action: str, **fields: object) -> None:
+        self._seq += 1
+        command = wire.Command(name, self._seq, time.time(), action, **fields)  # type: ignore[arg-type]
+        self.session.put(KEYS.setpoint(name), wire.encode(command), encoding=wire.JSON)
+
+    def drive_until(self, name: str, setpoint: tuple[float, ...], true: object, what: str) -> None:
+        due = [0.0]
+
+        def seen() -> object:
+            if time.monotonic() > due[0]:
+                due[0] = time.monotonic() + 0.02
+                self.tell(name, "drive", setpoint=setpoint)
+            self.look()
+            return true()  # type: ignore[operator]
+
+        until(seen, what, 10.0)
+
+    def close(self) -> None:
+        self.session.close()  # type: ignore[no-untyped-call]
+
+
+@pytest.fixture
+def desk(router: RouterProcess) -> Iterator[Desk]:
+    made = Desk(router.endpoint)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def world(router: RouterProcess, desk: Desk, file: Path) -> Iterator[WorldProcess]:
+    made = WorldProcess(router.endpoint, file)
+    assert made.ready == (
+        f"world ready: point-mass at 100 Hz carries KH01, CF01, TE01; mirrors nobody; realm park at {router.endpoint}"
+    )
+    desk.until(lambda: len(desk.at) == 3 and desk.world, "everybody is there")
+    yield made
+    assert made.process.returncode is not None or made.end() == 0
+
+
+# ---------------------------------------------------------------------- a run
+
+
+@pytest.mark.timeout(180)
+def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    flight = Flight(
+        folder, "robotic-park", "--bodies", "world", "--case", "event", "--json", "--no-report",
+        "--set", "duration_s=18", "--set", "timeline=[]",
+    )  # fmt: skip
+    flight.until_said(r"phase conductor: formation", 60.0)
+    everyone = list(flight.children().values())
+    assert "world" in flight.children()
+    code, out = flight.finish(90.0)
+    assert code == 0
+    until(lambda: gone(everyone), "nothing is left")
+    robots = json.loads(out)["cases"]["event"]["robots"]
+    followers = {name: robot for name, robot in robots.items() if name != "TB01"}
+    assert all(robot["acquired_s"] is not None and robot["lost"] == 0 for robot in followers.values()), followers
+    trace = playback.read(folder / "event.mcap").trace
+    assert np.isfinite(trace.true_position).all(axis=(1, 2)).mean() > 0.98, "the truth is known"
+    last = trace.time > trace.time[-1] - 1.0
+    rows = {name: row for row, name in enumerate(trace.robots)}
+    for text, link in trace.experiment.formation.links.items():
+        one, _, other = text.split()
+        apart = np.linalg.norm(trace.true_position[last, rows[one]] - trace.true_position[last, rows[other]], axis=1)
+        assert np.abs(apart - (link if isinstance(link, float) else link.distance)).mean() < 0.03, text
+
+
+def test_a_world_that_is_killed_is_started_again_and_robots_go_on_where_they_were(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    flight = Flight(
+        folder, "triangle", "--bodies", "world", "--case", "event", "--json", "--no-report", "--set", "duration_s=8"
+    )
+    flight.until_said(r"phase conductor: formation", 60.0)
+    watcher = Watcher(flight.endpoint())
+    try:
+        begun = time.time()
+        watcher.until(lambda: time.time() > begun + 1.0, "they are on their way")
+        before = dict(watcher.state)
+        flight.children()["world"].kill()
+        flight.until_said(r"world conductor: the world ended \(killed by SIGKILL\); started again", 5.0)
+        assert {state.phase for state in before.values()} == {"running"}
+        code, out = flight.finish(60.0)
+        assert code == 0
+        assert json.loads(out)["cases"]["event"]["robots"]["CF01"]["acquired_s"] is not None
+    finally:
+        watcher.close()
+    trace = playback.read(folder / "event.mcap").trace
+    truth, when = trace.true_position, trace.time
+    known = np.isfinite(truth).all(axis=(1, 2))
+    step = np.linalg.norm(np.diff(truth[known], axis=0), axis=2)
+    assert step.max() < 0.05, "nobody jumps"
+    middle = (when > 0.5) & (when < 7.5) & known
+    assert truth[middle][:, list(trace.robots).index("CF01"), 2].min() > 0.5, "it holds in the air"
+    assert not [event for event in trace.events if event.kind == "robot" and "lost" in event.text]
+
+
+def test_climbs_and_landings_go_on_in_the_next_world(router: RouterProcess, file: Path) -> None:
+    world = WorldProcess(router.endpoint, file)
+    watcher = Watcher(router.endpoint)
+    robots = RobotProcess(router.endpoint, file, "CF01", "TE01")
+    both = ("CF01", "TE01")
+
+    def height(name: str) -> float:
+        return watcher.state[name].position[2] if name in watcher.state else 0.0
+
+    def again() -> WorldProcess:
+        world.kill()
+        made = WorldProcess(router.endpoint, file)
+        assert "CF01" in made.ready.rpartition(";")[2], "it asks them where they were"
+        return made
+
+    try:
+        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in both), "they are ready")
+        for name in both:
+            assert watcher.order(name, wire.Order("takeoff")).ok
+        watcher.until(lambda: min(map(height, both)) > 0.25, "they climb")
+        world = again()
+        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in both), "they arrive", 8.0)
+        assert min(map(height, both)) > 0.54
+        for name in both:
+            assert watcher.order(name, wire.Order("land")).ok
+        watcher.until(lambda: max(map(height, both)) < 0.4, "they sink")
+        world = again()
+        watcher.until(lambda: all(watcher.phase(name) == "done" for name in both), "they are down", 8.0)
+        assert max(map(height, both)) < 0.06
+    finally:
+        robots.end()
+        world.end()
+        watcher.close()
+
+
+# ---------------------------------------------------------------------- orders
+
+
+def test_pause_step_and_resume(world: WorldProcess, desk: Desk) -> None:
+    assert desk.give("pause") == wire.WorldReply(True, True, pytest.approx(0.0, abs=60.0))  # type: ignore[arg-type]
+    paused = desk.give("pause").time
+    stamp = desk.at["KH01"].stamp
+    desk.until(lambda: desk.world and desk.world.paused, "it says so")
+    desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.at["KH01"].stamp > stamp + 0.5, "stamps stay fresh")
+    assert desk.x("KH01") == [0.0, 0.0, 0.0]
+    assert desk.give("step", steps=20).ok
+    desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH01")[0] > 0.0, "it moves")
+    desk.until(lambda: desk.world and desk.world.time == pytest.approx(paused + 0.2), "twenty ticks of 10 ms, no more")
+    assert 0.02 < desk.x("KH01")[0] < 0.041
+    assert desk.give("resume") == wire.WorldReply(True, False, pytest.approx(paused + 0.2, abs=0.05))  # type: ignore[arg-type]
+    desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH01")[0] > 0.1, "it goes on")
+    refused = desk.give("step", steps=0)
+    assert (refused.ok, refused.reason) == (False, "0 steps; step takes 1 to 1000000 ticks of 10 ms")
+
+
+def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
+    desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH01")[0] > 0.1, "it moves")
+    assert desk.give("reset", name="KH01").ok
+    desk.until(lambda: desk.x("KH01") == [0.0, 0.0, 0.0], "it is back")
+
+    def refusal(order: str, **fields: object) -> str:
+        reply = desk.give(order, **fields)
+        assert not reply.ok
+        return reply.reason
+
+    assert refusal("spawn", name="KH02", kind="khepera4", at=(0.1, 0.0)) == (
+        "KH02 would overlap KH01 by 40 mm; choose another place"
+    )
+    assert refusal("spawn", name="KH02", kind="khepera4", at=(1.35, 1.5)) == (
+        "KH02 would overlap post by 20 mm; choose another place"
+    )
+    assert "outside the arena, which is 4 by 4 m" in refusal("spawn", name="KH02", kind="khepera4", at=(1.95, 0.0))
+    assert refusal("spawn", name="KH02", kind="kephera4", at=(1.0, 0.0)) == (
+        "there is no kind of robot 'kephera4'; did you mean 'khepera4'?"
+    )
+    assert refusal("spawn", name="KH02") == (
+        "KH02 is not in the experiment: a new robot needs its kind and a place (kind, at)"
+    )
+    assert refusal("remove", name="KH1") == "there is no 'KH1' in this world; did you mean 'KH01'?"
+    assert "already" in refusal("spawn", name="CF01")
+    assert "would overlap KH01" in refusal("spawn", name="box", obstacle={"box": [0.2, 0.2]})
+    assert "out of the arena" in refusal("spawn", name="box", obstacle={"box": [0.2, 0.2], "at": [1.95, 0.0]})
+    assert "exactly one of box, radius and wall" in refusal("spawn", name="box", obstacle={"at": [1.0, 0.0]})
+
+    assert desk.give("spawn", name="KH02", kind="khepera4", at=(1.0, 0.0), yaw=0.5).ok
+    desk.until(lambda: "KH02" in desk.at, "it is there")
+    assert desk.at["KH02"].yaw == 0.5
+    desk.drive_until("KH02", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH02")[0] > 1.05, "and can be driven")
+    assert desk.give("spawn", name="box", obstacle={"box": [0.2, 0.2], "at": [-1.0, -1.0]}).ok
+    desk.until(lambda: desk.world and "box" in desk.world.obstacles, "it stands")
+    assert desk.world is not None
+    assert desk.world.robots == ["KH01", "CF01", "TE01", "KH02"]
+    assert desk.world.obstacles == {"post": (1.5, 1.5, 0.0), "box": (-1.0, -1.0, 0.0)}
+
+    assert desk.give("remove", name="CF01").ok
+    assert desk.give("remove", name="box").ok
+    desk.until(lambda: desk.world and len(desk.world.robots) == 3, "it is gone")
+    desk.tell("CF01", "takeoff", height=0.5)
+    desk.tell("CF01", "takeoff", height=0.5)
+    desk.until(lambda: any("CF01 is told" in event.text for event in desk.events), "whoever calls it is told")
+    told = [event.text for event in desk.events if "CF01 is told" in event.text]
+    assert told == [
+        "CF01 is told what to do, but is not in this world: start the world with the experiment that has it, or put it "
+        "in with `zenpark world-order spawn CF01`"
+    ]
+    assert desk.give("spawn", name="CF01").ok
+    desk.until(lambda: desk.world and "CF01" in desk.world.robots, "it is back")
+    assert desk.world is not None
+    assert desk.world.refused == 12
+    desk.session.put(KEYS.setpoint("KH01"), b"{", encoding=wire.JSON)
+    desk.session.put(KEYS.setpoint("KH01"), wire.encode(wire.Command("KH02", 1, 1.0, "stop")), encoding=wire.JSON)
+    desk.until(lambda: desk.world and desk.world.malformed == 2, "nonsense is counted")
+
+
+# ---------------------------------------------------------------------- robots
+
+
+def test_robots_that_are_told_nothing_hold_and_then_land(world: WorldProcess, desk: Desk) -> None:
+    for name in ("CF01", "TE01"):
+        desk.tell(name, "takeoff", height=0.6)
+    desk.until(lambda: min(desk.x("CF01")[2], desk.x("TE01")[2]) > 0.59, "they are up")
+    desk.tell("TE01", "drive", setpoint=(0.4, 0.0, 0.0, 0.0))
+    desk.tell("CF01", "drive", setpoint=(1.0, 1.0, 0.6, 0.0))
+    desk.until(lambda: desk.x("TE01")[0] > -0.95, "it moves")
+    desk.until(lambda: desk.x("TE01")[2] == 0.0 and desk.x("CF01")[2] == 0.0, "they land", 15.0)
+    assert -0.95 < desk.x("TE01")[0] < -0.55, "half a second at 0.4 m/s, and what it takes to stop"
+    assert 0.2 < desk.x("CF01")[0] < 0.6, "where it was when it had not been told anything for half a second"
+    assert {event.source for event in desk.events if event.kind == "silent"} == {"CF01", "TE01"}
+
+
+def test_a_second_world_is_refused_and_so_is_an_experiment_without_one(
+    world: WorldProcess, router: RouterProcess, file: Path
+) -> None:
+    second = WorldProcess(router.endpoint, file)
+    assert second.wait() == 2
+    assert second.ready.startswith("zenpark: a world runs in the realm 'park' already: end it first, choose another")
+    none = WorldProcess(router.endpoint, "triangle")
+    assert none.wait() == 2
+    assert "no robot of this experiment lives in a world" in none.ready
+    unknown = WorldProcess(router.endpoint, file, "--engine", "pymonk")
+    assert unknown.wait() == 2
+    assert "did you mean 'pymunk'?" in unknown.ready
+
+
+def test_a_world_that_is_told_to_end_waits_for_its_robots(
+    world: WorldProcess, router: RouterProcess, file: Path
+) -> None:
+    watcher = Watcher(router.endpoint)
+    robot = RobotProcess(router.endpoint, file, "CF01", lifeline=False)
+    try:
+        watcher.until(lambda: watcher.phase("CF01") == "ready", "it is ready")
+        assert watcher.order("CF01", wire.Order("takeoff")).ok
+        watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
+        world.process.terminate()
+        assert robot.end() == 0
+        watcher.until(lambda: watcher.phase("CF01") == "done", "it landed in the world that was told to end")
+        assert world.wait(5.0) == 0
+    finally:
+        watcher.close()
+
+
+def test_a_robot_of_another_process_is_seen(router: RouterProcess, desk: Desk, tmp_path: Path) -> None:
+    file = tmp_path / "mixed.toml"
+    file.write_text(
+        'title = "mixed"\nduration_s = 30.0\n'
+        "[world]\nsensor_noise = 0.0\n"
+        '[robots.TB01]\nkind = "turtlebot3"\nbody = "world"\nstart = [0.0, 0.0]\n'
+        '[robots.TB02]\nkind = "turtlebot3"\nstart = [1.0, 0.0, 3.141592653589793]\nranges = "world"\n'
+    )
+    world = WorldProcess(router.endpoint, file)
+    assert "carries TB01; mirrors TB02" in world.ready
+    desk.until(lambda: desk.world, "it is there")
+    robot = None
+    try:
+        desk.until(lambda: "TB01" in desk.ranges, "it looks ahead")
+        assert desk.ranges["TB01"].distance[0] == pytest.approx(2.0, abs=1e-3), "the wall"
+        robot = RobotProcess(router.endpoint, file, "TB02")
+        desk.until(lambda: desk.world and desk.world.mirrored == ["TB02"], "the other is there")
+        desk.until(lambda: desk.ranges["TB01"].distance[0] == pytest.approx(1.0 - 0.105, abs=1e-3), "it is seen")
+        desk.until(lambda: desk.ranges["TB02"].distance[0] == pytest.approx(1.0 - 0.105, abs=1e-3), "and sees")
+        robot.kill()
+        robot = None
+        desk.until(lambda: desk.ranges["TB01"].distance[0] == pytest.approx(2.0, abs=1e-3), "gone, it is no obstacle")
+        assert desk.world is not None
+        desk.until(lambda: desk.world and desk.world.mirrored == [], "and is said to be")
+    finally:
+        if robot is not None:
+            robot.end()
+        world.end()

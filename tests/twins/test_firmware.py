@@ -1,0 +1,127 @@
+"""The cascade by itself: what each loop answers to what, with the firmware's figures worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from twins.firmware import BASE, FULL, LEAST, MIX, OUTER, RATE_HZ, SPEED, TILT, Firmware, Gains, Pid
+
+DT = 1.0 / RATE_HZ
+NONE = np.zeros((1, 3))
+
+
+def guided(offset=NONE, velocity=NONE, wanted=None, yaw=0.0):
+    """A cascade after one step of its outer loops."""
+    made = Firmware(1, DT)
+    by_velocity = np.array([wanted is not None])
+    flown = NONE if wanted is None else np.array([wanted])
+    made.guide(np.array(offset, dtype=float), np.array(velocity, dtype=float), flown, by_velocity, np.array([yaw]))
+    return made
+
+
+def test_a_pid_is_its_formula():
+    gains = Gains((2.0, 3.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.1, 0.0), (0.3, 1.0, 1.0))
+    pid = Pid(gains, 1, 0.1)
+    first = pid.advance(np.array([[1.0, 1.0, 1.0]]), np.array([[0.0, 5.0, 0.0]]))
+    np.testing.assert_allclose(first, [[2.0 + 0.5 * 0.1, 3.0, 0.0]])  # no derivative of the first value
+    second = pid.advance(np.array([[1.0, 1.0, 1.0]]), np.array([[0.0, 5.2, 0.0]]))
+    np.testing.assert_allclose(second, [[2.0 + 0.5 * 0.2, 3.0 - 0.1 * 0.2 / 0.1, 0.0]])
+    for _ in range(10):
+        last = pid.advance(np.array([[1.0, 1.0, 1.0]]), np.array([[0.0, 5.2, 0.0]]))
+    np.testing.assert_allclose(last, [[2.0 + 0.5 * 0.3, 3.0, 0.0]])  # the integral has its limit
+    pid.reset(np.array([0]))
+    np.testing.assert_allclose(pid.advance(np.array([[1.0, 1.0, 1.0]]), np.array([[0.0, 9.0, 0.0]])), first)
+
+
+def test_ahead_is_nose_down_and_left_is_left_side_down():
+    roll, pitch = np.degrees(guided([[0.1, 0.0, 0.0]]).tilt[0])
+    assert pitch == pytest.approx(25.0 * 0.2 + 1.0 * 0.2 * OUTER * DT)
+    assert roll == 0.0
+    roll, pitch = np.degrees(guided([[0.0, 0.1, 0.0]]).tilt[0])
+    assert roll == pytest.approx(-(25.0 * 0.2 + 0.2 * OUTER * DT))
+    assert pitch == 0.0
+    turned = np.degrees(guided([[0.0, 0.1, 0.0]], yaw=math.pi / 2).tilt[0])  # what is left of the room is ahead of it
+    np.testing.assert_allclose(turned, [0.0, 25.0 * 0.2 + 0.2 * OUTER * DT], atol=1e-12)
+
+
+def test_limits_of_speed_tilt_and_thrust():
+    far = guided([[9.0, 0.0, 0.0]], [[SPEED - 0.1, 0.0, 0.0]])
+    assert np.degrees(far.tilt[0, 1]) == pytest.approx(25.0 * 0.1 + 0.1 * OUTER * DT)  # only 0.1 m/s are missing
+    assert np.degrees(guided([[9.0, -9.0, 0.0]]).tilt[0]).tolist() == pytest.approx([TILT, TILT])
+    level = (NONE, NONE, np.zeros(1))
+    up = guided([[0.0, 0.0, 9.0]]).motors(*level)
+    lift = 25.0 * SPEED + 15.0 * SPEED * OUTER * DT
+    np.testing.assert_allclose(up, np.full((1, 4), (BASE + 1000.0 * lift) / FULL))
+    down = guided([[0.0, 0.0, -9.0]]).motors(*level)
+    np.testing.assert_allclose(down, np.full((1, 4), LEAST / FULL))
+    rest = guided().motors(*level)
+    np.testing.assert_allclose(4 * 0.12 * rest[0, 0], 0.995 * 0.027 * 9.81, rtol=1e-3)
+
+
+def test_velocities_are_flown_instead_of_positions():
+    made = guided([[9.0, 9.0, 9.0]], wanted=[0.2, 0.0, 0.0])
+    np.testing.assert_allclose(np.degrees(made.tilt[0]), [0.0, 25.0 * 0.2 + 0.2 * OUTER * DT])
+
+
+def test_torques_turn_the_right_way():
+    assert np.allclose(MIX.sum(axis=0), 0.0)  # a torque does not lift
+    made = guided()
+    step = math.radians(1.0)
+    rate = 6.0 + 3.0 * DT  # deg/s asked for by one degree
+    units = (250.0 + 500.0 * DT) * rate
+    leaning = made.motors(np.array([[-step, 0.0, 0.0]]), NONE, np.zeros(1))
+    np.testing.assert_allclose(FULL * leaning[0] - BASE, 0.5 * units * np.array([-1.0, -1.0, 1.0, 1.0]))
+    nose_up = guided().motors(np.array([[0.0, -step, 0.0]]), NONE, np.zeros(1))
+    np.testing.assert_allclose(FULL * nose_up[0] - BASE, 0.5 * units * np.array([-1.0, 1.0, 1.0, -1.0]))
+    turn = guided().motors(NONE, NONE, np.array([step]))
+    yawing = (120.0 + 16.7 * DT) * (6.0 + 1.0 * DT)
+    np.testing.assert_allclose(FULL * turn[0] - BASE, yawing * np.array([-1.0, 1.0, -1.0, 1.0]))
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
+def test_yaw_turns_the_short_way(yaw, heading):
+    motors = guided().motors(np.array([[0.0, 0.0, yaw]]), NONE, np.array([heading]))[0]
+    way = math.remainder(heading - yaw, 2.0 * math.pi)
+    if 1e-3 < abs(way) < math.pi - 1e-3:
+        assert (motors[1] > motors[0]) == (way > 0.0)
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=12, max_size=12))
+def test_motors_stay_in_their_range_and_keep_their_torque(numbers):
+    values = np.array(numbers).reshape(4, 1, 3)
+    made = Firmware(1, DT)
+    made.guide(values[0], values[1], NONE, np.array([False]), values[2, :, 2])
+    motors = made.motors(values[2], 5.0 * values[3], np.zeros(1))
+    assert motors.min() >= 0.0
+    assert motors.max() <= 1.0
+
+
+def test_the_outer_loops_run_at_a_fifth_of_the_rate():
+    made = guided([[0.1, 0.0, 0.0]])
+    before = made.tilt.copy()
+    for _ in range(OUTER - 1):
+        made.guide(np.array([[0.0, 0.1, 0.0]]), NONE, NONE, np.array([False]), np.zeros(1))
+        np.testing.assert_array_equal(made.tilt, before)
+    made.guide(np.array([[0.0, 0.1, 0.0]]), NONE, NONE, np.array([False]), np.zeros(1))
+    assert np.degrees(made.tilt[0, 0]) < -4.9
+
+
+def test_rows_do_not_know_of_each_other():
+    rng = np.random.default_rng(3)
+    together, alone = Firmware(3, DT), [Firmware(1, DT) for _ in range(3)]
+    for tick in range(40):
+        given_ = [rng.standard_normal((3, 3)) for _ in range(5)]
+        yaw = rng.standard_normal(3)
+        by_velocity = np.array([False, True, False])
+        if tick == 20:
+            together.reset(np.array([2]))
+            alone[2].reset(np.array([0]))
+        together.guide(given_[0], given_[1], given_[2], by_velocity, yaw)
+        motors = together.motors(given_[3], given_[4], yaw)
+        for row, single in enumerate(alone):
+            one = slice(row, row + 1)
+            single.guide(given_[0][one], given_[1][one], given_[2][one], by_velocity[one], yaw[one])
+            np.testing.assert_array_equal(single.motors(given_[3][one], given_[4][one], yaw[one])[0], motors[row])

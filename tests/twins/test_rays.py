@@ -1,0 +1,272 @@
+"""Rays against pymunk's own queries, and what they must and must not see."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pymunk
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
+from twins import rays
+from twins.rays import Beams, Caster, Fan
+from twins.scene import Obstacle, Scene
+
+LOW = 0.01  # [m] everything that stands on the floor spans this height
+
+
+def fan(bearing, reach=3.0, height=LOW, elevation=None):
+    bearing = np.asarray(bearing, dtype=float)
+    return Fan(bearing, np.zeros(len(bearing)) if elevation is None else np.asarray(elevation), height, reach)
+
+
+def furnished(obstacles=None, *, walled=False, size=(6.0, 6.0, 2.5)):
+    return Scene.furnished(size, obstacles or {}, {}, walled=walled)
+
+
+def look(position, fans, *, kinds=None, yaw=None, copy=None, scene=None, obstacles=None, row=None, which=None):
+    """Distances (F, m) that rows see, one fan each unless said otherwise."""
+    position = np.asarray(position, dtype=float)
+    n = len(position)
+    copy = np.zeros(n, dtype=int) if copy is None else np.asarray(copy)
+    scene = furnished() if scene is None else scene
+    obstacles = np.tile(scene.pose, (copy.max() + 1, 1, 1)) if obstacles is None else obstacles
+    row = np.arange(n) if row is None else np.asarray(row)
+    beams = Beams(fans, row, np.zeros(len(row), dtype=int) if which is None else np.asarray(which))
+    caster = Caster(scene, kinds or [KHEPERA4] * n, copy)
+    seen = caster.cast(beams, position, np.zeros(n) if yaw is None else np.asarray(yaw), obstacles)
+    return seen.reshape(len(row), -1) if which is None else seen
+
+
+CROWD = (KHEPERA4, TURTLEBOT3, CRAZYFLIE, KHEPERA4, TELLO)
+THINGS = {
+    "box": Obstacle(box=(0.5, 0.3)),
+    "pillar": Obstacle(radius=0.2),
+    "wall": Obstacle(wall=[(-0.6, 0.0), (0.1, 0.4), (0.6, 0.0)]),
+    "plate": Obstacle(box=(0.05, 1.1)),
+    "mast": Obstacle(radius=0.05),
+}
+
+
+def by_pymunk(position, angles, reach, scene, pose):
+    """What pymunk sees of one copy, (n, m), along rays at (n, m) [rad]."""
+    space = pymunk.Space()
+    fixed = space.static_body
+    shapes = []
+    for place, kind in zip(position, CROWD, strict=True):
+        shapes.append(pymunk.Circle(fixed, kind.radius, tuple(place[:2])))
+        space.add(shapes[-1])
+    for k, (x, y, angle) in enumerate(pose):
+        body = pymunk.Body(body_type=pymunk.Body.STATIC)
+        body.position, body.angle = (x, y), angle
+        outline = scene.outline[k]
+        if outline is None:
+            parts = [pymunk.Circle(body, scene.radius[k])]
+        elif scene.closed[k]:
+            parts = [pymunk.Poly(body, outline.tolist())]
+        else:
+            parts = [pymunk.Segment(body, tuple(a), tuple(b), 0.0) for a, b in pairwise(outline)]
+        space.add(body, *parts)
+    (x0, y0), (x1, y1) = scene.low[:2], scene.high[:2]
+    corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+    space.add(*(pymunk.Segment(fixed, corners[k - 1], corners[k], 0.0) for k in range(4)))
+    seen = np.full(angles.shape, np.nan)
+    for row, (x, y, _) in enumerate(position):
+        shapes[row].filter = pymunk.ShapeFilter(categories=2)
+        others = pymunk.ShapeFilter(mask=pymunk.ShapeFilter.ALL_MASKS() ^ 2)
+        for k, angle in enumerate(angles[row]):
+            end = x + reach * math.cos(angle), y + reach * math.sin(angle)
+            hit = space.segment_query_first((x, y), end, 0.0, others)
+            if hit is not None:
+                seen[row, k] = reach * hit.alpha
+        shapes[row].filter = pymunk.ShapeFilter()
+    return seen
+
+
+@pytest.mark.parametrize("budget", [rays.BUDGET, 300])
+def test_random_scenes_are_seen_as_pymunk_sees_them(budget, monkeypatch):
+    monkeypatch.setattr(rays, "BUDGET", budget)  # however memory is portioned
+    rng = np.random.default_rng(4)
+    scene = furnished(THINGS, walled=True, size=(4.0, 3.0, 2.5))
+    copies, n, reach = 12, len(CROWD), 2.2
+    bearing = np.sort(rng.uniform(-7.0, 7.0, 70))  # irregular, and more than a turn
+    rng.shuffle(bearing)
+    position = np.zeros((copies * n, 3))
+    position[:, :2] = rng.uniform([-1.9, -1.4], [1.9, 1.4], (copies * n, 2))
+    yaw = rng.uniform(-20.0, 20.0, copies * n)
+    pose = rng.uniform([-2.0, -1.5, -9.0], [2.0, 1.5, 9.0], (copies, len(THINGS), 3))
+    mixed = rng.permutation(copies * n)  # rows of a copy need not stand together
+    copy = np.repeat(np.arange(copies), n)
+    kinds = CROWD * copies
+    seen = np.zeros((copies * n, len(bearing)))
+    seen[mixed] = look(
+        position[mixed],
+        [fan(bearing, reach)],
+        kinds=[kinds[k] for k in mixed],
+        yaw=yaw[mixed],
+        copy=copy[mixed],
+        scene=scene,
+        obstacles=pose,
+    )
+    for c in range(copies):
+        mine = copy == c
+        expected = by_pymunk(position[mine], yaw[mine, None] + bearing, reach, scene, pose[c])
+        assert np.isfinite(expected).mean() > 0.6
+        outside = (expected != 0.0).all(axis=1)  # inside a thing pymunk says 0, and we see through it
+        assert outside.sum() >= 3
+        np.testing.assert_allclose(seen[mine][outside], expected[outside], rtol=0.0, atol=1e-9)
+
+
+def test_a_robot_and_a_wall_at_known_distances():
+    seen = look(
+        [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]],
+        [fan([0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi])],
+        yaw=[0.0, math.pi],
+        scene=furnished(walled=True, size=(4.0, 5.0, 2.5)),
+    )
+    np.testing.assert_allclose(seen, [[0.93, 2.5, 2.0, 2.5], [0.93, 2.5, 1.0, 2.5]], atol=1e-12)
+
+
+def test_reach_counts_from_the_centre_to_the_surface():
+    other = KHEPERA4.radius + 2.0
+    for beyond, expected in ((-1e-6, 2.0 - 1e-6), (1e-6, np.nan)):
+        seen = look([[0.0, 0.0, 0.0], [other + beyond, 0.0, 0.0]], [fan([0.0], 2.0)])
+        np.testing.assert_allclose(seen[0], [expected], atol=1e-12)
+
+
+def test_nothing_is_seen_in_an_empty_room_or_alone():
+    assert np.isnan(look([[0.0, 0.0, 0.0]], [fan(np.arange(12.0))])).all()
+    assert look(np.zeros((1, 3)), [fan([])]).shape == (1, 0)
+
+
+def test_copies_do_not_see_each_other():
+    position = [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0], [0.7, 0.0, 0.0]]
+    scene = furnished({"pillar": Obstacle(radius=0.1, at=(-1.0, 0.0))})
+    obstacles = np.array([[[-1.0, 0.0, 0.0]], [[-1.5, 0.0, 0.0]]])
+    seen = look(position, [fan([0.0, math.pi])], copy=[0, 0, 1, 1], scene=scene, obstacles=obstacles)
+    np.testing.assert_allclose(seen[0], [0.43, 0.9], atol=1e-12)
+    np.testing.assert_allclose(seen[2], [0.63, 1.4], atol=1e-12)
+    alone = look(position[:2], [fan([0.0, math.pi])], scene=scene, obstacles=obstacles[:1])
+    np.testing.assert_array_equal(alone, seen[:2])
+
+
+def test_who_is_not_there_neither_sees_nor_is_seen():
+    seen = look(
+        [[0.0, 0.0, 0.0], [np.nan] * 3, [1.0, 0.0, 0.0]],
+        [fan([0.0, 0.0], elevation=[0.0, 0.5 * math.pi])],
+        scene=furnished(walled=True),
+    )
+    np.testing.assert_allclose(seen, [[0.93, 2.49], [np.nan, np.nan], [2.0, 2.49]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("height", "expected"),
+    [(0.02, 0.5 - 0.070), (0.1, 1.0 - 0.105), (0.3, 1.6 - 0.2), (0.6, 2.4 - 0.1), (1.03, 2.0 - 0.065), (1.5, 3.0)],
+)
+def test_a_level_ray_sees_what_spans_its_height(height, expected):
+    """Khepera, TurtleBot, a box up to 0.5 m, a Crazyflie at 1 m, a box from 0.55 m to 0.95 m, and the border."""
+    scene = furnished(
+        {
+            "low": Obstacle(box=(0.4, 0.4), at=(1.6, 0.0), height=0.5),
+            "hung": Obstacle(radius=0.1, at=(2.4, 0.0), bottom=0.55, height=0.4),
+        },
+        walled=True,
+    )
+    position = [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 1.01]]
+    seen = look(
+        position, [fan([0.0], 4.0, height)], kinds=[KHEPERA4, KHEPERA4, TURTLEBOT3, CRAZYFLIE], scene=scene, row=[0]
+    )
+    np.testing.assert_allclose(seen, [[expected]], atol=1e-12)
+
+
+def test_a_flying_robot_looks_from_its_own_height():
+    scene = furnished({"low": Obstacle(box=(0.4, 0.4), at=(1.0, 0.0), height=0.5)})
+    for height, expected in ((0.3, 0.8), (0.8, np.nan)):
+        np.testing.assert_allclose(look([[0.0, 0.0, height]], [fan([0.0])], scene=scene), [[expected]], atol=1e-12)
+
+
+UP, DOWN = 0.5 * math.pi, -0.5 * math.pi
+
+
+def test_vertical_rays_see_the_nearest_thing_over_and_under_them():
+    scene = furnished(
+        {
+            "shelf": Obstacle(box=(1.0, 0.2), at=(0.0, 0.0), yaw=0.5 * math.pi, bottom=1.5, height=0.1),
+            "table": Obstacle(radius=0.3, at=(0.0, 0.0), height=0.4),
+            "roof": Obstacle(box=(3.0, 3.0), bottom=2.0, height=0.1),
+            "wall": Obstacle(wall=[(-1.0, 0.0), (1.0, 0.0)], bottom=1.2, height=0.1),
+        },
+        walled=True,
+    )
+    position = [[0.0, 0.0, 1.0], [0.0, 0.4, 1.0], [0.4, 0.0, 1.0], [2.0, 2.0, 1.0], [2.05, 2.0, 1.3], [2.0, 2.0, 0.0]]
+    seen = look(position, [fan([0.0, 0.0], 4.0, elevation=[UP, DOWN])], kinds=[CRAZYFLIE] * 6, scene=scene)
+    expected = [
+        [0.49, 0.61],  # the shelf over it, the table under it
+        [0.49, 1.01],  # the shelf is turned; the floor
+        [0.99, 1.01],  # the roof only: a thin wall covers nothing
+        [0.29, 1.01 - 0.029],  # other robots
+        [1.19, 1.31 - 1.029],  # the ceiling
+        [0.99, 0.01],
+    ]
+    np.testing.assert_allclose(seen, expected, atol=1e-12)
+
+
+def test_there_is_no_ceiling_without_walls_but_a_floor():
+    seen = look([[0.0, 0.0, 1.0]], [fan([0.0, 0.0], elevation=[UP, DOWN])])
+    np.testing.assert_allclose(seen, [[np.nan, 1.01]], atol=1e-12)
+
+
+def test_a_ray_that_begins_inside_a_thing_does_not_see_it():
+    scene = furnished({"box": Obstacle(box=(1.0, 1.0)), "pillar": Obstacle(radius=0.4)}, walled=True)
+    seen = look([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]], [fan([0.0, 1.5, -2.0], 5.0)], scene=scene)
+    np.testing.assert_allclose(seen[0], [3.0, 3.0 / math.sin(1.5), 3.0 / math.sin(2.0)], atol=1e-12)
+
+
+@given(
+    x=st.floats(-1.9, 1.9),
+    y=st.floats(-1.9, 1.9),
+    yaw=st.floats(-10.0, 10.0),
+    corner=st.sampled_from([(2.0, 2.0), (2.0, -2.0), (-2.0, 2.0), (-2.0, -2.0)]),
+)
+@settings(max_examples=200, deadline=None)
+def test_corners_are_tight(x, y, yaw, corner):
+    """A ray aimed exactly at the corner of two walls meets one of them."""
+    aim = math.atan2(corner[1] - y, corner[0] - x) - yaw
+    seen = look([[x, y, 0.0]], [fan([aim], 9.0)], yaw=[yaw], scene=furnished(walled=True, size=(4.0, 4.0, 1.0)))
+    assert seen[0, 0] == pytest.approx(math.hypot(corner[0] - x, corner[1] - y), abs=1e-7)
+
+
+@given(st.integers(0, 2**32), st.floats(-6.0, 6.0))
+@settings(max_examples=50, deadline=None)
+def test_turning_and_shifting_everything_changes_nothing(seed, turn):
+    rng = np.random.default_rng(seed)
+    position, pose = np.zeros((5, 3)), rng.uniform(-1.5, 1.5, (1, len(THINGS), 3))
+    position[:, :2] = rng.uniform(-1.5, 1.5, (5, 2))
+    yaw, bearing, scene = rng.uniform(-3.0, 3.0, 5), rng.uniform(0.0, 6.0, 30), furnished(THINGS)
+    shift, c, s = rng.uniform(-5.0, 5.0, 2), math.cos(turn), math.sin(turn)
+    back = np.array([[c, s], [-s, c]])
+    moved, moved_pose = position.copy(), pose.copy()
+    moved[:, :2] = position[:, :2] @ back + shift
+    moved_pose[..., :2], moved_pose[..., 2] = pose[..., :2] @ back + shift, pose[..., 2] + turn
+    here = look(position, [fan(bearing)], kinds=CROWD, yaw=yaw, scene=scene, obstacles=pose)
+    there = look(moved, [fan(bearing)], kinds=CROWD, yaw=yaw + turn, scene=scene, obstacles=moved_pose)
+    close = np.abs(here - there) < 1e-9
+    # a ray that grazes a rim (the root magnifies rounding) or an end may go either way
+    assert (close | (np.isnan(here) & np.isnan(there))).mean() > 0.98
+
+
+def test_rows_may_send_several_fans_and_fans_of_others_change_nothing():
+    position = [[0.0, 0.0, 0.0], [0.5, 0.3, 0.0], [-0.4, 0.6, 0.0]]
+    near, wide = fan(np.linspace(0.0, 6.0, 25), 0.45), fan(np.linspace(-1.0, 5.0, 40), 3.0)
+    both = look(position, [near, wide], row=[2, 0, 0], which=[1, 0, 1])
+    assert len(both) == 40 + 25 + 40
+    np.testing.assert_array_equal(both[:40], look(position, [wide])[2])
+    np.testing.assert_array_equal(both[40:65], look(position, [near])[0])
+    np.testing.assert_array_equal(both[65:], look(position, [wide])[0])
+
+
+def test_slanted_rays_are_refused():
+    with pytest.raises(ValueError, match=r"level .* or vertical"):
+        fan([0.0], elevation=[0.3])

@@ -1,0 +1,61 @@
+"""`zenpark world-order`: tells a running world what to do, by hand."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import msgspec
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from agents.plugins import did_you_mean
+from experiments import orders
+
+KINDS = ("pause", "resume", "step", "reset", "spawn", "remove")
+
+
+class WorldOrderError(ValueError):
+    """An order that makes no sense as it was written, with how to write it."""
+
+
+def command(
+    what: str,
+    name: str | None,
+    *,
+    steps: int,
+    kind: str | None,
+    at: tuple[float, float] | None,
+    yaw: float,
+    obstacle: str | None,
+    connect: Sequence[str],
+    realm: str,
+) -> int:
+    """Gives an order to the world and prints its reply.
+
+    Returns:
+        The exit code: 0, or 1 if it refused.
+
+    Raises:
+        WorldOrderError: If there is no such order, or the obstacle is no JSON object.
+        EndpointError, Unreachable: If no router can be reached.
+    """
+    if what not in KINDS:
+        raise WorldOrderError(f"no order '{what}' to a world; {did_you_mean(what, KINDS)}")
+    given = None
+    if obstacle is not None:
+        try:
+            given = msgspec.json.decode(obstacle, type=dict[str, object])
+        except msgspec.MsgspecError as error:
+            raise WorldOrderError(f"--obstacle {obstacle}: {error}; write a JSON object, as in the file") from None
+        if at is not None:
+            given["at"] = at
+    order = wire.WorldOrder(what, steps=steps, name=name, kind=kind, at=at, yaw=yaw, obstacle=given)  # type: ignore[arg-type]
+    with network.open_session(list(connect) or [network.DEFAULT_ENDPOINT], name="world-order", wait_s=2.0) as session:
+        reply = orders.give_world(session, Keys(realm), order)
+    if not reply.ok:
+        print(f"no: {reply.reason}", file=sys.stderr)
+        return 1
+    print(f"yes, {'paused' if reply.paused else 'running'} at {reply.time:.2f} s")
+    return 0
