@@ -1,6 +1,8 @@
 """The potential of the paper, and what every avoidance is held to by safety and by the decision."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -210,3 +212,14 @@ def test_without_avoidance_nobody_looks():
     agent, state = running_pair(None, 0.01)
     assert agent._sight is None
     assert not agent.step(0.0, state).avoided.any()
+
+
+def test_the_avoidance_of_the_docs_stops_short():
+    text = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text(encoding="utf-8")
+    (source,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "StopShort" in block]
+    names: dict[str, type[Avoidance]] = {}
+    exec(source, names)
+    here = own((KHEPERA4, KHEPERA4), [[0.0, 0.0], [1.0, 0.0]])
+    thing = near([0], [KHEPERA4.radius + 0.19, 0.0])
+    goal = names["StopShort"]().deviate(np.full((2, 3), 0.5), here, thing, 0.01)
+    np.testing.assert_array_equal(goal, [[0.0, 0.0, 0.5], [0.5, 0.5, 0.5]])

@@ -1,0 +1,104 @@
+"""Robots that change sides: with the barrier none touches another, and all arrive."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.lifecycle import RUNNING
+from experiments.encounters import ANGLES, Outcome, encounter, meet, random_pairs
+from experiments.experiment import Channel
+from experiments.virtual import simulate
+
+BARRIER = {"kind": "barrier", "hears": "all"}
+FOUR = ("khepera4", "turtlebot3", "crazyflie", "tello")
+
+
+def met(kinds, avoidance, each, **settings):
+    parts = (meet(encounter(kinds, avoidance, between=b, **settings), range(1, each + 1)) for b in ANGLES)
+    return Outcome.joined(parts)
+
+
+def test_without_avoidance_they_run_into_each_other():
+    outcome = met(("turtlebot3", "turtlebot3"), None, 6, duration_s=12.0)
+    assert outcome.collided.sum() >= 6
+    assert outcome.gap.min() < -0.1
+    assert outcome.arrived.all()
+    assert not outcome.avoided.any()
+
+
+def test_with_the_barrier_they_keep_clear_and_arrive():
+    outcome = met(("khepera4", "tello"), BARRIER, 5, duration_s=20.0)
+    assert outcome.gap.min() > 0.01
+    assert outcome.arrived.all()
+    assert (outcome.avoided > 0.0).any()
+
+
+def test_the_gap_is_that_between_true_surfaces_and_only_beside_each_other():
+    experiment = encounter(("khepera4", "tello"), None, duration_s=10.0)
+    log = simulate(experiment, [3])
+    place = log.true_position[(log.phase == RUNNING).all(axis=1)]
+    expected = np.hypot(*(place[:, 0] - place[:, 1])[:, :2].T).min() - 0.07 - 0.1
+    assert meet(experiment, [3]).gap[0] == pytest.approx(expected, abs=1e-12)
+    robots = {**experiment.robots, "R1": msgspec.structs.replace(experiment.robots["R1"], hover=0.5)}
+    assert np.isinf(meet(msgspec.structs.replace(experiment, robots=robots), [3]).gap[0])
+
+
+def test_an_encounter_is_the_same_alone_and_beside_others():
+    experiment = encounter(("crazyflie", "turtlebot3"), BARRIER, duration_s=12.0)
+    together = meet(experiment, range(1, 6))
+    for number in (0, 3):
+        single = meet(experiment, [1 + number])
+        assert single.gap[0] == together.gap[number]
+        assert single.missed[0] == together.missed[number]
+        assert single.avoided[0] == together.avoided[number]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_thousand_random_encounters_with_the_barrier_and_no_collision():
+    outcomes = random_pairs(BARRIER, 50)
+    whole = Outcome.joined(outcomes.values())
+    assert len(whole.gap) == 1000
+    assert whole.collided.sum() == 0
+    assert whole.gap.min() > 0.02
+    assert whole.arrived.all()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_potential_keeps_pairs_apart_as_well():
+    whole = Outcome.joined(random_pairs({"kind": "potential", "hears": "all"}, 8).values())
+    assert whole.collided.sum() == 0
+    assert whole.arrived.all()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_one_that_does_not_avoid_is_avoided():
+    whole = Outcome.joined(random_pairs(BARRIER, 8, stubborn=1).values())
+    assert whole.collided.sum() == 0
+    assert whole.arrived.all()
+
+
+@pytest.mark.slow
+def test_four_of_all_kinds_change_sides():
+    outcome = meet(encounter(FOUR, BARRIER), range(1, 41))
+    assert outcome.collided.sum() == 0
+    assert outcome.arrived.mean() >= 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "sensors"), [("turtlebot3", ["lds01"]), ("khepera4", ["infrared", "ultrasonic"])])
+def test_two_that_only_see_each_other_keep_clear(kind, sensors):
+    outcome = met((kind, kind), {"kind": "barrier"}, 10, sensors=sensors)
+    assert outcome.collided.sum() == 0
+    assert outcome.arrived.all()
+
+
+@pytest.mark.slow
+def test_a_network_that_loses_and_delays_does_not_bring_them_together():
+    bad = Channel(delay_s=0.02, jitter_s=0.02, loss=0.2)
+    for kinds in (("tello", "tello"), ("crazyflie", "turtlebot3")):
+        outcome = meet(msgspec.structs.replace(encounter(kinds, BARRIER), channel=bad), range(1, 41))
+        assert outcome.collided.sum() == 0
+        assert outcome.arrived.all()

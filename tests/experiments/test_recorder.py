@@ -1,0 +1,65 @@
+"""What goes over the network is taken down, and what is nonsense is not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import msgspec
+import pytest
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from experiments.recorder import Recorder
+from tests.conftest import RouterProcess
+from tests.experiments.test_recording import touched, world
+
+KEYS = Keys()
+
+
+class Taken:
+    """In the place of a recording: what would be in it."""
+
+    def __init__(self) -> None:
+        self.contacts: list[wire.Contact] = []
+        self.worlds: list[wire.WorldState] = []
+
+    def contact(self, contact: wire.Contact) -> None:
+        self.contacts.append(contact)
+
+    def world(self, said: wire.WorldState) -> None:
+        self.worlds.append(said)
+
+
+@pytest.mark.system
+def test_what_the_world_says_is_taken_down_if_it_can_be_true(
+    router: RouterProcess, eventually: Callable[[Callable[[], object]], None]
+) -> None:
+    said: list[tuple[str, wire.Message]] = [
+        (KEYS.contact, msgspec.structs.replace(touched(0.1), impulse=math.nan)),
+        (KEYS.contact, msgspec.structs.replace(touched(0.1), stamp=math.inf)),
+        (KEYS.contact, world(0.1)),
+        (KEYS.world, msgspec.structs.replace(world(0.1), obstacles={"box": (0.0, math.nan, 0.0)})),
+        (KEYS.world, touched(0.1)),
+        (KEYS.world, world(0.2)),
+        (KEYS.contact, touched(0.3)),
+    ]
+    taken = Taken()
+    with (
+        network.open_session([router.endpoint], name="recorder") as session,
+        network.open_session([router.endpoint], name="world") as other,
+    ):
+        recorder = Recorder(session, KEYS, taken)  # type: ignore[arg-type]
+
+        def heard() -> bool:
+            for key, message in said:
+                # MessagePack keeps what is not finite; JSON would say null
+                other.put(key, wire.encode(message, "msgpack"), encoding=wire.MSGPACK)
+            recorder.take()
+            return bool(taken.contacts and taken.worlds)
+
+        eventually(heard)
+    assert set(map(str, taken.contacts)) == {str(touched(0.3))}
+    assert set(map(str, taken.worlds)) == {str(world(0.2))}
+    assert recorder.malformed >= 5
