@@ -12,87 +12,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents import coordination
+from agents.assignment import Assignment
 from agents.avoidance import Avoidance, Nearby, Self
 from agents.body import BodyState
 from agents.graph import Links
+from agents.hearing import Heard, Hearing
 from agents.individual import Individual
-from agents.kinds import Kind
 from agents.lifecycle import AIRBORNE, RUNNING, Duties, Lifecycle, Phase
-from agents.planning import Itinerary, Leg
+from agents.planning import Itinerary
 from agents.plugins import FAILURES, PluginError
-from agents.rows import Array, Index, Mask, every, some
-from agents.safety import Limits, Safety, Verdict
+from agents.reshaping import Reshaping
+from agents.rows import Array, Index, Mask, some
+from agents.safety import Safety, Verdict
 from agents.sight import Sight
-from agents.triggers import Told, Trigger, View
-
-
-@dataclass(frozen=True)
-class Assignment:
-    """What the experiment tells some of its robots.
-
-    Attributes:
-        names: Of the rows (N).
-        kinds: Of the rows (N).
-        hover: (N,) height that a flying row holds [m]; NaN for ground robots.
-        speakers: Names of all robots of the experiment; `links.speaker` points here.
-        links: On which the rows listen.
-        law: Formation law.
-        trigger: Who speaks when.
-        clamp: Largest step of a goal per axis and decision [m].
-        tracking_gain: k of (7) [1/(m² decision)].
-        legs: Plans: rows, and the legs that they follow.
-        limits: For `agents.safety`.
-        avoidance: How the rows keep clear of what they see and hear; None: they do not.
-        speaker_kinds: Kinds of all robots of the experiment.
-        watched: (E,) links that are only for avoidance: the law knows nothing of them; None: there are none.
-        avoids: (N,) rows that keep clear at all; None: all.
-        body_hz: Rate of ticks.
-        pose_every: The trigger is asked on every so many ticks.
-        decide_every: A goal is decided on every so many ticks.
-        duration: Of the experiment [s].
-        patience_s: A row that misses a neighbour for this long is ready without it; None: never.
-    """
-
-    names: tuple[str, ...]
-    kinds: tuple[Kind, ...]
-    hover: Array
-    speakers: tuple[str, ...]
-    links: Links
-    law: coordination.Law
-    trigger: Trigger
-    clamp: float
-    tracking_gain: float
-    legs: tuple[tuple[Index, tuple[Leg, ...]], ...]
-    limits: Limits
-    body_hz: float
-    pose_every: int
-    decide_every: int
-    duration: float
-    patience_s: float | None = None
-    avoidance: Avoidance | None = None
-    speaker_kinds: tuple[Kind, ...] = ()
-    watched: Mask | None = None
-    avoids: Mask | None = None
-
-
-@dataclass
-class Heard:
-    """What was last heard on each link (E): positions and velocities (E, 3), sample and arrival times (E,) [s].
-
-    `gone` is the time since which the speaker is known to be dead, infinity while it lives.
-    """
-
-    position: Array
-    velocity: Array
-    stamp: Array
-    arrived: Array
-    gone: Array
-
-    @classmethod
-    def nothing(cls, count: int) -> Heard:
-        """Before anything was heard."""
-        never = np.full(count, -np.inf)
-        return cls(np.full((count, 3), np.nan), np.zeros((count, 3)), never, never.copy(), np.full(count, np.inf))
+from agents.speaking import Said, Voice
+from agents.triggers import Told, Trigger
+from agents.updating import Input, Updating
 
 
 @dataclass(frozen=True)
@@ -105,6 +40,8 @@ class Actions:
         duties: Take-offs, landings, stops; None on nearly every tick.
         changed: (N,) safety had to change what was decided.
         avoided: (N,) avoidance did.
+        position: (N, 3) that rows which speak say [m].
+        velocity: (N, 3) that they say [m/s].
     """
 
     speak: Index
@@ -112,6 +49,8 @@ class Actions:
     duties: Duties | None
     changed: Mask
     avoided: Mask
+    position: Array
+    velocity: Array
 
 
 NOBODY: Index = np.zeros(0, dtype=np.intp)
@@ -125,8 +64,10 @@ class Agent:
         goal: (N, 3) decided last [m].
         toward: (N,) yaw wanted at the goal [rad], NaN for any.
         error: (N,) Σ of the link errors as the rows see them [m].
+        offset: (N, 3) decided last, before it was clamped [m].
         decisions: Coordination decisions since the common start.
-        heard: What was heard on each link.
+        updates: (N,) of these, those at which each row computed its goal anew.
+        hearing: What was heard on each link, and who takes part in the law.
         life: Phases.
     """
 
@@ -136,23 +77,31 @@ class Agent:
         self.tick = 0
         self.goal = np.full((rows, 3), np.nan)
         self.toward = np.full(rows, np.nan)
-        self.error = np.zeros(rows)
+        self.error, self.offset = np.zeros(rows), np.zeros((rows, 3))
         self.decisions = 0
-        self.told = Told.nothing(rows)
-        self.heard = Heard.nothing(len(assignment.links))
+        self.updates: Index = np.zeros(rows, dtype=np.intp)
+        self.hearing = Hearing(assignment.links, assignment.watched, assignment.limits.link_silence_s)
         flies = np.array([kind.flies for kind in assignment.kinds])
         self.life = Lifecycle(flies, assignment.hover, assignment.duration)
-        self.trigger = assignment.trigger
+        self._voice = Voice(assignment.trigger, rows, assignment.predictor)
+        self._updating = None if assignment.update is None else Updating(assignment.update, rows, assignment.links)
         self.clamp, self.tracking_gain = assignment.clamp, assignment.tracking_gain
         self.offline_since = np.inf
         self._begun = False
         self._decided = self._asked = -1
-        self._memory = self.trigger.memory(rows)
         self._flies = flies
         self._ground = np.where(flies, assignment.hover, 0.0)
         self._listens = np.zeros(rows, dtype=bool)
         watched = assignment.watched
         self._listens[assignment.links.listener if watched is None else assignment.links.listener[~watched]] = True
+        self._anchored = np.zeros(rows, dtype=bool)
+        if assignment.anchors is not None:
+            self._anchored[assignment.anchors.row] = True
+        self._listens |= self._anchored
+        changing = bool(assignment.changes) or assignment.presence is not None
+        self._reshaping = Reshaping(assignment.links, assignment.changes, assignment.presence) if changing else None
+        if self._reshaping is not None:
+            self.hearing.reshape(self._reshaping.links, self._reshaping.there)
         self._ordered = np.zeros(rows, dtype=bool)
         self._held = np.zeros(rows, dtype=bool)
         self._hold_at = np.full((rows, 3), np.nan)
@@ -173,33 +122,40 @@ class Agent:
         if len(rest):  # nobody tells it anything: it stays where it is
             itineraries.append(Itinerary(rest, (), holds_before=True))
         self._itineraries = tuple(itineraries)
-        self._choose_links(0.0)
+        self._gated = self._listens & ~planned  # a plan moves its target while nobody looks
 
     # ------------------------------------------------------------------ what the outside tells
 
+    @property
+    def trigger(self) -> Trigger:
+        """Who speaks when; may be replaced by one of the same kind."""
+        return self._voice.trigger
+
+    @trigger.setter
+    def trigger(self, trigger: Trigger) -> None:
+        self._voice.trigger = trigger
+
+    @property
+    def told(self) -> Told:
+        """What the neighbours were told."""
+        return self._voice.told
+
+    @property
+    def heard(self) -> Heard:
+        """What was heard on each link."""
+        return self.hearing.heard
+
     def hear(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
-        """Poses that arrived on links `at` (H,), in order of arrival; older samples than known are left out."""
-        if some(stamp[1:] < stamp[:-1]):  # of several on one link the newest stays, whichever came last
-            order = np.argsort(stamp, kind="stable")
-            at, position, velocity = at[order], position[order], velocity[order]
-            stamp, arrived = stamp[order], arrived[order]
-        newer = stamp > self.heard.stamp[at]
-        if not every(newer):
-            at, position, velocity = at[newer], position[newer], velocity[newer]
-            stamp, arrived = stamp[newer], arrived[newer]
-        self.heard.position[at], self.heard.velocity[at] = position, velocity
-        self.heard.stamp[at], self.heard.arrived[at] = stamp, arrived
-        if self._unsettled:
-            self.heard.gone[at] = np.inf
+        """See `Hearing.hear`."""
+        self.hearing.hear(at, position, velocity, stamp, arrived)
 
     def lose(self, at: Index, t: float) -> None:
-        """The speakers of links `at` are gone since `t` [s]; heard again, they are back."""
-        self.heard.gone[at] = np.minimum(self.heard.gone[at], t)
-        self._unsettled = True
+        """See `Hearing.lose`."""
+        self.hearing.lose(at, t)
 
     def find(self, at: Index) -> None:
-        """The speakers of links `at` are back, whether or not they have something new to say."""
-        self.heard.gone[at] = np.inf
+        """See `Hearing.find`."""
+        self.hearing.find(at)
 
     def hold(self, row: int) -> str:
         """Order to stay where it is; an empty answer means yes, else why not."""
@@ -217,16 +173,14 @@ class Agent:
 
     def missing(self, row: int) -> list[str]:
         """Neighbours that a row has never heard, or that are gone."""
-        links = self.assignment.links
-        lacks = ~np.isfinite(self.heard.stamp) | np.isfinite(self.heard.gone)
-        return [self.assignment.speakers[s] for s in links.speaker[(links.listener == row) & lacks]]
+        return [self.assignment.speakers[s] for s in self.hearing.missing(row)]
 
     # ------------------------------------------------------------------ the decision
 
     def step(self, t: float, state: BodyState) -> Actions:
         """One tick at time `t` [s] of the process's clock."""
-        if self._unsettled:
-            self._choose_links(t)
+        if self.hearing.unsettled:
+            self._links_changed(self.hearing.choose(t))
         duties = self.life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
         assignment = self.assignment
         if self.life.moved and not self._begun and (self.life.phase == RUNNING).any():
@@ -240,17 +194,10 @@ class Agent:
             self._decide(t, state)
         elif self.life.moved:  # a row that has just arrived at its height needs a place to stay until the next decision
             self._stay(self._held | (self.life.phase == AIRBORNE), state.position)
-        speak = NOBODY
+        said = Said(NOBODY, state.position, state.velocity)
         if question != self._asked:
             self._asked = question
-            self._see_errors(state.position)
-            view = View(t, state.position, state.velocity, self.told, self.error)
-            speak = self._ask(view)
-            if len(speak):
-                seen = np.isfinite(state.position)
-                if not every(seen):
-                    speak = speak[seen[speak].all(axis=1)]
-                self.told.tell(speak, t, state.position, state.velocity)
+            said = self._speak(t, state)
         goal, avoided = self.goal, self._nobody
         age = t - state.time
         avoidance = self.assignment.avoidance
@@ -273,7 +220,7 @@ class Agent:
             setpoint = np.where(passive[:, None], np.where(self._flies, np.nan, 0.0)[:, None], setpoint)
             changed, avoided = changed & ~passive, avoided & ~passive
         self.tick += 1
-        return Actions(speak, setpoint, duties, changed, avoided)
+        return Actions(said.rows, setpoint, duties, changed, avoided, said.position, said.velocity)
 
     def _ready(self, t: float, state: BodyState) -> Mask:
         if not self.life.waiting:
@@ -296,6 +243,8 @@ class Agent:
             self.decisions += 1
             self._formation_goal(t, state, running)
         self._stay(self._holds(t, running) | (phase == AIRBORNE), state.position)
+        if self._updating is not None and some(away := self._held | ~running):
+            self._updating.forget(np.flatnonzero(away))  # whoever comes back has an old goal
 
     def _stay(self, held: Mask, position: Array) -> None:
         """Rows that are held keep the place where that began."""
@@ -316,18 +265,27 @@ class Agent:
         held = running & self._ordered
         if t - self.offline_since > limits.link_silence_s:
             held = held | running
-        if len(self._live) < len(self.assignment.links):
+        if len(self.hearing.live) < len(self.assignment.links):
             hears = np.zeros(len(held), dtype=bool)
-            hears[self._live_links.listener] = True
+            hears[self.hearing.links.listener] = True
+            if self.assignment.anchors is not None:
+                hears[self.assignment.anchors.row] = True
             held = held | (running & self._listens & ~hears)
         return held
 
     def _formation_goal(self, t: float, state: BodyState, running: Mask) -> None:
-        law, position = self.assignment.law, state.position
-        try:
-            offset = law.offset(position, self.heard.position[self._live], self._live_links)
-        except FAILURES as error:
-            raise PluginError(f"the law {type(law).__name__} failed: {_what(error)}") from error
+        position, follows, due, view = state.position, self._listens, running, None
+        if self._reshaping is not None:
+            everywhere = self.hearing.everywhere(self.assignment.predictor, t)
+            self._reshaping.move(t - self.life.start_at, position, everywhere)
+            self._links_changed(self.hearing.reshape(self._reshaping.links, self._reshaping.there))
+        if self._updating is not None:
+            view = self._input(self._updating, t, state)
+            due = running & (~self._gated | self._updating.due(view))
+        if view is None:
+            offset = self._law_offset(t, position)
+        else:
+            offset = view.offset if some(due & follows) else np.zeros_like(position)
         goal = position.copy()
         toward = np.full(len(position), np.nan)
         place = position.copy()
@@ -336,27 +294,64 @@ class Agent:
             rows = itinerary.rows
             target, yaw = itinerary.target(t - self.life.start_at[rows], place[rows], state.yaw[rows])
             toward[rows] = yaw
-            leads = ~self._listens[rows]
+            leads = ~follows[rows]
             if leads.all():
                 goal[rows] = target
             else:
                 offset[rows] += coordination.tracking(position[rows], target, self.tracking_gain)
-        follows = self._listens
         goal = np.where(follows[:, None], coordination.goal(position, offset, self.clamp), goal)
         goal[:, 2] = np.where(follows | ~self._flies, self._ground, goal[:, 2])
-        self.goal = np.where(running[:, None], goal, self.goal)
-        self.toward = np.where(running, toward, self.toward)
+        self.goal = np.where(due[:, None], goal, self.goal)
+        self.offset = np.where(due[:, None], offset, self.offset)
+        self.toward = np.where(due, toward, self.toward)
+        self.updates += due
 
-    def _ask(self, view: View) -> Index:
-        """Who speaks now; a trigger that fails is named, for it may be somebody's first."""
+    def _law_offset(self, t: float, position: Array) -> Array:
+        """The offset of all rows (N, 3) [m]; a law that fails is named, for it may be somebody's first."""
+        law, hearing, anchors = self.assignment.law, self.hearing, self.assignment.anchors
+        believed = hearing.heard.believed(self.assignment.predictor, t, hearing.live)
         try:
-            return self.trigger.speaks(view, self._memory)
+            offset = law.offset(position, believed, hearing.links)
         except FAILURES as error:
-            raise PluginError(f"the trigger {type(self.trigger).__name__} failed: {_what(error)}") from error
+            raise PluginError(f"the law {type(law).__name__} failed: {_what(error)}") from error
+        return offset if anchors is None else offset + anchors.offset(position)
 
-    def _see_errors(self, position: Array) -> None:
-        error = self.assignment.law.error(position, self.heard.position[self._live], self._live_links)
-        self.error = self._live_links.onto_listeners(error[:, None], len(position))[:, 0]
+    def _see_errors(self, t: float, position: Array) -> tuple[Array, Array]:
+        """Σ|e| [m] and Σ ½e² [m²] of each row's links, as it sees them."""
+        hearing = self.hearing
+        believed = hearing.heard.believed(self.assignment.predictor, t, hearing.live)
+        error = self.assignment.law.error(position, believed, hearing.links)
+        both = hearing.links.onto_listeners(_error_and_energy(error), len(position))
+        anchors = self.assignment.anchors
+        if anchors is not None:
+            np.add.at(both, anchors.row, _error_and_energy(anchors.error(position)))
+        return both[:, 0], both[:, 1]
+
+    def _speak(self, t: float, state: BodyState) -> Said:
+        """Who speaks now, and what."""
+        self.error, energy = self._see_errors(t, state.position)
+        return self._voice.speak(
+            t, state.position, state.velocity,
+            error=self.error, energy=energy, start=self.life.start_at, offset=self.offset,
+        )  # fmt: skip
+
+    def _input(self, updating: Updating, t: float, state: BodyState) -> Input:
+        """What the trigger of the control place sees."""
+        hearing, predictor, position = self.hearing, self.assignment.predictor, state.position
+        listener = hearing.links.listener
+        believed = hearing.heard.believed(predictor, t, hearing.live)
+        moves = hearing.heard.believed_velocity(predictor, t, hearing.live)
+        return updating.input(
+            t, position, state.velocity,
+            start=self.life.start_at,
+            live=hearing.live,
+            links=hearing.links,
+            anchored=self._anchored,
+            apart=position[listener] - believed,
+            rate=state.velocity[listener] - moves,
+            law=lambda: self._law_offset(t, position),
+            errors=lambda: self._see_errors(t, position),
+        )  # fmt: skip
 
     def _deviate(self, avoidance: Avoidance, own: Self, near: Nearby) -> Array:
         """The goals that are pursued; an avoidance that fails is named, for it may be somebody's first."""
@@ -392,20 +387,16 @@ class Agent:
         for row in np.flatnonzero(active & escaped).tolist():
             self.life.land(row, "it left the arena")
 
-    def _choose_links(self, t: float) -> None:
-        """Which links take part in the law: heard once, and the speaker is not gone for long."""
-        links, heard = self.assignment.links, self.heard
-        known, here = np.isfinite(heard.stamp), np.isinf(heard.gone)
-        self._unsettled = not (known & here).all()
-        live = known & (t - heard.gone <= self.assignment.limits.link_silence_s)
-        if self.assignment.watched is not None:
-            live &= ~self.assignment.watched
-        self._live = np.flatnonzero(live)
-        self._live_links = (
-            links
-            if live.all()
-            else Links(links.listener[live], links.speaker[live], links.distance[live], links.gain[live])
-        )
+    def _links_changed(self, rows: Index) -> None:
+        """Rows that got or lost a link, or whose links ask for something else, compute the law at once."""
+        if self._updating is not None and len(rows):
+            self._updating.forget(rows)
+
+
+def _error_and_energy(error: Array) -> Array:
+    both = np.empty((len(error), 2))  # `stack` takes three times as long
+    both[:, 0], both[:, 1] = error, 0.5 * error * error
+    return both
 
 
 def _what(error: Exception) -> str:

@@ -3,26 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from agents.rows import Array, Index, Mask
 
+BY_DISTANCE, BY_RELATIVE, BY_BEARING = range(3)  # what a link wants
+
 
 @dataclass(frozen=True)
 class Links:
     """Directed links sorted by listener: `listener`, `speaker` (E,) rows, target `distance` [m] and `gain` (E,).
 
+    What a link wants is a distance, a relative position or a direction; it is told in each way that follows from it.
     In a robot's own process the listeners are its rows, renumbered from 0; the speakers keep the numbers that they
     have in the experiment.
+
+    Attributes:
+        listener: (E,) rows i.
+        speaker: (E,) rows j.
+        distance: (E,) d_ij [m]; NaN where only a direction is wanted.
+        gain: (E,) of the law.
+        relative: (E, 3) wanted p_i − p_j [m], NaN where only a distance or a direction is; None: nowhere any.
+        bearing: (E, 3) unit vector along the wanted p_i − p_j, NaN where none is; its z alone is NaN where the
+            direction is one seen from above. None: nowhere any.
+        wants: (E,) BY_DISTANCE, BY_RELATIVE or BY_BEARING, as the file has it; None, as both before: all by distance.
     """
 
     listener: Index
     speaker: Index
     distance: Array
     gain: Array
+    relative: Array | None = None
+    bearing: Array | None = None
+    wants: Index | None = None
 
     def __len__(self) -> int:
         return len(self.listener)
@@ -43,33 +59,58 @@ class Links:
             total[self._heads] = np.add.reduceat(per_link, self._starts, axis=0)
         return total
 
+    def take(self, which: Index | Mask) -> Links:
+        """Some of them, or the same in another order."""
+        return Links(*(None if column is None else column[which] for column in self._columns()))  # type: ignore[arg-type]
+
+    def most_of_listeners(self, per_link: Array, rows: int) -> Array:
+        """Largest of a quantity (E,) over each listener's links -> (rows,), 0 without links."""
+        most = np.zeros(rows)
+        if len(self):
+            most[self._heads] = np.maximum.reduceat(per_link, self._starts)
+        return most
+
     def of(self, rows: Index) -> Links:
         """The links on which these rows listen; listeners renumbered 0..len(rows)-1, speakers keep their numbers."""
-        mine = np.isin(self.listener, rows)
+        at, listener = self.heard_by(rows)
+        return replace(self.take(at), listener=listener)
+
+    def heard_by(self, rows: Index) -> tuple[Index, Index]:
+        """Which links these rows listen on, in the order of `of`, and the new number of each one's listener."""
+        mine = np.flatnonzero(np.isin(self.listener, rows))
         order = np.argsort(rows)
         listener = order[np.searchsorted(rows, self.listener[mine], sorter=order)]
         by_listener = np.argsort(listener, kind="stable")
-        speaker, distance, gain = self.speaker[mine], self.distance[mine], self.gain[mine]
-        return Links(listener[by_listener], speaker[by_listener], distance[by_listener], gain[by_listener])
+        return mine[by_listener], listener[by_listener]
 
     def repeated(self, times: int, rows: int) -> Links:
         """The same links in `times` copies of an experiment of `rows` robots, one copy behind the other."""
         shift = np.repeat(np.arange(times) * rows, len(self))
-        return Links(
-            np.tile(self.listener, times) + shift,
-            np.tile(self.speaker, times) + shift,
-            np.tile(self.distance, times),
-            np.tile(self.gain, times),
-        )
+        many = self.take(np.tile(np.arange(len(self)), times))
+        return replace(many, listener=many.listener + shift, speaker=many.speaker + shift)
 
     def and_then(self, others: Links) -> Links:
         """These and others behind them: no longer sorted, so only a sorted part of it may be summed."""
-        mine = ("listener", "speaker", "distance", "gain")
-        return Links(*(np.concatenate([getattr(self, name), getattr(others, name)]) for name in mine))
+        if others.wants is None and self.wants is None:
+            ours, theirs = self, others
+        else:
+            ours, theirs = self._told_in_full(), others._told_in_full()
+        both = zip(ours._columns(), theirs._columns(), strict=True)
+        return Links(*(None if a is None or b is None else np.concatenate([a, b]) for a, b in both))  # type: ignore[arg-type]
+
+    def _told_in_full(self) -> Links:
+        """With every column."""
+        if self.wants is not None:
+            return self
+        blank = np.full((len(self), 3), np.nan)
+        return replace(self, relative=blank, bearing=blank, wants=np.full(len(self), BY_DISTANCE))
+
+    def _columns(self) -> tuple[Array | Index | None, ...]:
+        return self.listener, self.speaker, self.distance, self.gain, self.relative, self.bearing, self.wants
 
 
 def links(pairs: Sequence[tuple[int, int]], distance: Sequence[float], gain: Sequence[float]) -> Links:
-    """Links from (listener, speaker) pairs in any order."""
+    """Links by distance from (listener, speaker) pairs in any order."""
     both = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     order = np.lexsort((both[:, 1], both[:, 0]))
     return Links(
@@ -165,12 +206,12 @@ def rigidity(position: Array, pairs: Index, moves: Mask | None = None) -> Rigidi
     singular = np.linalg.svd(rigidity_matrix(position, pairs, free), compute_uv=False)
     tolerance = 1e-9 * max(1.0, float(singular[0]) if len(singular) else 1.0)
     rank = int((singular > tolerance).sum())
-    needed = int(free.sum()) - _rigid_motions(position, free)
+    needed = int(free.sum()) - rigid_motions(position, free)
     smallest = float(singular[needed - 1]) if 0 < needed <= len(singular) else 0.0
     return Rigidity(rank, needed, smallest)
 
 
-def _rigid_motions(position: Array, free: Mask) -> int:
+def rigid_motions(position: Array, free: Mask) -> int:
     """Dimension of the rigid motions (N, 3 velocities) that are zero in every held coordinate."""
     x, y, z = (position - position.mean(axis=0)).T
     zero, one = np.zeros_like(x), np.ones_like(x)
@@ -192,6 +233,8 @@ def _rigid_motions(position: Array, free: Mask) -> int:
 
 def _null_space(matrix: Array) -> Array:
     """Basis (k, m) of the vectors that `matrix` (n, k) maps to zero."""
+    if len(matrix) > matrix.shape[1]:  # its triangle says the same, and is as small as the vectors
+        matrix = np.asarray(np.linalg.qr(matrix, mode="r"))
     _, singular, right = np.linalg.svd(matrix)
     rank = int((singular > 1e-9 * max(1.0, float(singular[0]))).sum())
     return np.asarray(right[rank:].T)

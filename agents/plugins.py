@@ -18,6 +18,7 @@ import msgspec
 BODIES: Final = "zenpark.bodies"
 TRIGGERS: Final = "zenpark.triggers"
 LAWS: Final = "zenpark.laws"
+PREDICTORS: Final = "zenpark.predictors"
 PLANNERS: Final = "zenpark.planners"
 AVOIDANCES: Final = "zenpark.avoidances"
 ENGINES: Final = "zenpark.engines"  # what moves the twins of a world

@@ -20,8 +20,9 @@ import zenoh
 
 from agents import session as network
 from agents import wire
-from agents.agent import Actions, Agent, Assignment, links_by_speaker
-from agents.body import Body, BodyState
+from agents.agent import Actions, Agent, links_by_speaker
+from agents.assignment import Assignment
+from agents.body import Body
 from agents.keys import Keys
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
@@ -264,7 +265,7 @@ class Runtime:
             full,
             np.full(len(links), t),
         )
-        news = wire.Heard(neighbour.name, pose.seq, pose.stamp, now, pose.position)
+        news = wire.Heard(neighbour.name, pose.seq, pose.stamp, now, pose.position, pose.velocity)
         for row in self._assignment.links.listener[links]:
             self._telemetry.news[row].append(news)
 
@@ -339,7 +340,7 @@ class Runtime:
         counts.interventions += actions.changed
         counts.avoided += actions.avoided
         for row in actions.speak:
-            self._say(int(row), state, t)
+            self._say(int(row), actions, float(state.yaw[row]), t)
         slot = (self.agent.tick - 1) // self._state_every
         if slot != self._state_slot:
             self._state_slot = slot
@@ -359,16 +360,16 @@ class Runtime:
                 self._body.takeoff(duties.takeoff, self._assignment.hover[duties.takeoff])
         self._body.command(actions.setpoint)
 
-    def _say(self, row: int, state: BodyState, t: float) -> None:
+    def _say(self, row: int, actions: Actions, yaw: float, t: float) -> None:
         """Sends a row's pose to its neighbours."""
         self._counts.sent[row] += 1
         pose = wire.pose(
             self._names[row],
             self._counts.sent[row],
             self._utc + t,
-            state.position[row].tolist(),
-            state.velocity[row].tolist(),
-            float(state.yaw[row]),
+            actions.position[row].tolist(),
+            actions.velocity[row].tolist(),
+            yaw,
         )
         payload = wire.encode(pose, self._setup.encoding)
         self._last[row].hold(payload)

@@ -16,7 +16,7 @@ from agents.rows import Array, Index, Mask, clamp, every, some
 from agents.safety import Limits
 
 if TYPE_CHECKING:
-    from agents.agent import Heard
+    from agents.hearing import Heard
 
 REACH: Final = 3.0  # [m] between axes; what is farther away is nobody's concern yet
 AHEAD_S: Final = 0.1  # heard positions are carried on for so long: who is silent for longer may as well have stopped

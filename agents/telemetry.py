@@ -196,7 +196,7 @@ class Telemetry:
                 refused=counts.refused,
                 ticks=counts.ticks,
                 missed=counts.missed,
-                decisions=agent.decisions,
+                decisions=int(agent.updates[row]),
                 interventions=int(counts.interventions[row]),
                 avoided=int(counts.avoided[row]),
                 late_s=counts.late_s,

@@ -1,108 +1,219 @@
-"""Triggers: who speaks now.
+"""Triggers: for which rows it is time, to speak (communication) or to compute the law anew (control).
 
 A trigger is a frozen struct of its parameters, found by the entry-point group `zenpark.triggers`. It has no state:
-what it must remember stands in rows outside of it, so that one serves a robot, a swarm, or a sweep of swarms.
+what it must remember stands in rows outside of it, so that one serves a robot, a swarm, or a sweep of swarms. It judges
+a value that somebody holds: for communication the position that the neighbours believe, for control the input that
+the law was last computed from. Here are the seam and the two basic ones; the others are in `agents.trigger_families`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from functools import cached_property
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.rows import Array, Index, Mask, norm
+from agents.prediction import HOLD, Predictor
+from agents.rows import Array, Index, Mask, norm, some
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
+Place = Literal["communication", "control"]
 
 ROUNDING_S = 1e-6  # ticks are multiples of a period that binary fractions miss by less than this
 
 
 @dataclass
 class Told:
-    """What each row's neighbours were last told: position (N, 3), velocity (N, 3), time (N,).
+    """What was so at the last event of each row: when it last spoke, or the law was last computed.
 
-    Rows that never spoke have an infinite position and a time of minus infinity: every trigger lets them speak.
+    Rows without an event have an infinite position and a time of minus infinity.
+
+    Attributes:
+        position: (N, 3) said [m].
+        velocity: (N, 3) said [m/s].
+        time: (N,) of the event [s].
+        offset: (N, 3) of the law [m].
+        energy: (N,) of the formation error [m²].
     """
 
     position: Array
     velocity: Array
     time: Array
+    offset: Array
+    energy: Array
 
     @classmethod
     def nothing(cls, rows: int) -> Told:
-        """Before anybody spoke."""
-        return cls(np.full((rows, 3), np.inf), np.zeros((rows, 3)), np.full(rows, -np.inf))
+        """Before any event."""
+        zeros = np.zeros((rows, 3))
+        return cls(np.full((rows, 3), np.inf), zeros, np.full(rows, -np.inf), zeros.copy(), np.zeros(rows))
 
-    def tell(self, rows: Index, t: float, position: Array, velocity: Array) -> None:
-        """Remembers what `rows` say at time `t` [s]."""
-        self.position[rows], self.velocity[rows], self.time[rows] = position[rows], velocity[rows], t
+    def tell(self, rows: Index, view: View) -> None:
+        """An event of `rows`: remembers what they see."""
+        self.position[rows], self.velocity[rows], self.time[rows] = view.position[rows], view.velocity[rows], view.t
+        self.offset[rows], self.energy[rows] = view.offset[rows], view.energy[rows]
 
 
-@dataclass(frozen=True)
 class View:
-    """What a trigger may look at.
+    """What a trigger may look at, in rows; what costs something is computed when it is looked at.
 
     Attributes:
         t: Now [s].
-        position: (N, 3) own [m].
+        position: (N, 3) own [m]; for communication what would be said, smoothed if that is asked for.
         velocity: (N, 3) own [m/s].
-        told: What the neighbours hold.
-        error: (N,) formation error as the row itself sees it [m].
+        told: The last event of each row.
+        error: (N,) Σ|e| of its links, as the row itself sees them [m].
+        energy: (N,) edge potential Σ ½e² of its links [m²].
+        start: (N,) when each row began, or will [s].
+        predictor: How neighbours carry on what they were told.
     """
 
-    t: float
-    position: Array
-    velocity: Array
-    told: Told
-    error: Array
+    def __init__(
+        self,
+        t: float,
+        position: Array,
+        velocity: Array,
+        told: Told,
+        *,
+        error: Array,
+        energy: Array,
+        start: Array,
+        offset: Array,
+        predictor: Predictor = HOLD,
+    ) -> None:
+        self.t, self.position, self.velocity, self.told = t, position, velocity, told
+        self.error, self.energy, self.start, self.predictor = error, energy, start, predictor
+        self._offset = offset
+
+    @property
+    def quiet(self) -> Array:
+        """(N,) t − t_k: time since the last event [s], infinite before the first."""
+        return self.t - self.told.time
+
+    @property
+    def since(self) -> Array:
+        """(N,) time since the row's start in the experiment [s], 0 before."""
+        return np.maximum(self.t - self.start, 0.0)
+
+    @property
+    def offset(self) -> Array:
+        """(N, 3) u of the law [m]: as it was last decided, for control as it would be now."""
+        return self._offset
+
+    @cached_property
+    def held(self) -> Array:
+        """(N, 3) where the neighbours believe each row to be [m]; infinite before it first spoke."""
+        if self.predictor is HOLD:
+            return self.told.position
+        age = np.where(np.isinf(self.told.time), 0.0, self.quiet)
+        return self.predictor.position(self.told.position, self.told.velocity, age)
+
+    @cached_property
+    def gap(self) -> Array:
+        """(N,) ‖ε‖: how far what is held is from what is [m]."""
+        return norm(self.position - self.held)
+
+    @property
+    def drift(self) -> Array:
+        """(N,) how fast ε began to grow after the last event, as was known then [m/s]."""
+        told = self.told.velocity
+        return norm(told - self.predictor.velocity(told, np.zeros(len(told))))
+
+    @property
+    def reach_s(self) -> float:
+        """For how long after an event `drift` stays what it was [s], if nobody changes speed."""
+        return self.predictor.reach_s
 
 
 class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Parameters that every trigger has, and the question that each answers in its own way."""
+    """Parameters that every trigger has, and the question that each answers in its own way.
 
-    minimum_interval_s: Annotated[NotNegative, Meta(description="never speak sooner after the last time [s]")] = 0.0
-    maximum_silence_s: Annotated[Positive | None, Meta(description="speak at the latest after this [s]")] = None
+    Class attributes of a kind of trigger: `places` where it makes sense, and the `prediction` that it needs; an
+    experiment that names none gets it.
+    """
+
+    places: ClassVar[tuple[Place, ...]] = ("communication", "control")
+    prediction: ClassVar[str] = "hold"
+
+    minimum_interval_s: Annotated[NotNegative, Meta(description="never sooner after the last event [s]")] = 0.0
+    maximum_silence_s: Annotated[Positive | None, Meta(description="at the latest so long after it [s]")] = None
+    evaluate_every_s: Annotated[
+        Positive | None,
+        Meta(description="its condition is looked at this often [s]; left out: as often as it is asked"),
+    ] = None
+    smoothing_s: Annotated[
+        NotNegative, Meta(description="time constant of the low-pass on what is said and judged [s]; 0: none")
+    ] = 0.0
 
     def memory(self, rows: int) -> Array:
         """What it remembers of each row, at the beginning: (N, k)."""
         return np.zeros((rows, 0))
 
     def fires(self, view: View, memory: Array) -> Mask:
-        """Which rows (N,) have something to say; `memory` (N, k) is updated in place."""
+        """For which rows (N,) its condition holds; `memory` (N, k) is updated in place."""
         raise TypeError(f"{type(self).__name__} must say when it fires")
 
-    def speaks(self, view: View, memory: Array) -> Index:
-        """Rows that speak now: what fires, no sooner than the minimum interval, no later than the maximum silence."""
-        fired = self.fires(view, memory)
+    def state(self, rows: int) -> Array:
+        """What must be kept from one question to the next (N, 1 + k): when it was last evaluated, and its memory."""
+        return np.concatenate([np.full((rows, 1), -np.inf), self.memory(rows)], axis=1)
+
+    def due(self, view: View, state: Array) -> Index:
+        """Rows that have an event now; `state` of `Trigger.state` is updated in place.
+
+        Rows without any event yet have one. Others have one where the condition holds, no sooner than the minimum
+        interval, and in any case at the maximum silence. With `evaluate_every_s` this is periodic event-triggered
+        control (Heemels, Donkers and Teel, "Periodic event-triggered control for linear systems", IEEE Transactions
+        on Automatic Control 58(4), 2013).
+
+        Raises:
+            ValueError: If `fires` does not give one bool per row.
+        """
+        fired = self._evaluated(view, state)
         if np.shape(fired) != view.told.time.shape:
             raise ValueError(f"`fires` must give one bool per row, {view.told.time.shape}, not {np.shape(fired)}")
-        if self.minimum_interval_s > 0.0 or self.maximum_silence_s is not None:
-            quiet = view.t - view.told.time
-            if self.maximum_silence_s is not None:
-                fired = fired | (quiet >= self.maximum_silence_s - ROUNDING_S)
+        quiet = view.quiet
+        if self.maximum_silence_s is not None:
+            fired = fired | (quiet >= self.maximum_silence_s - ROUNDING_S)
+        if self.minimum_interval_s > 0.0:
             fired = fired & (quiet >= self.minimum_interval_s - ROUNDING_S)
-        return np.flatnonzero(fired)
+        return np.flatnonzero(fired | (quiet == np.inf))
+
+    def _evaluated(self, view: View, state: Array) -> Mask:
+        if self.evaluate_every_s is None:
+            return self.fires(view, state[:, 1:])
+        ripe = view.t - state[:, 0] >= self.evaluate_every_s - ROUNDING_S
+        if not some(ripe):
+            return ripe
+        before = state.copy()
+        fired = self.fires(view, state[:, 1:])
+        state[:, 0] = view.t
+        state[~ripe] = before[~ripe]  # rows that nobody looked at remember what they did
+        return fired & ripe
 
 
 class Periodic(Trigger, frozen=True):
-    """Speak every `period_s`."""
+    """t − t_k ≥ T."""
 
-    period_s: Annotated[Positive, Meta(description="[s]")] = 0.02
+    period_s: Annotated[Positive, Meta(description="T [s]")] = 0.02
 
     def fires(self, view: View, memory: Array) -> Mask:
-        """t − t_k ≥ T."""
-        return view.t - view.told.time >= self.period_s - ROUNDING_S
+        """See `Trigger.fires`."""
+        return view.quiet >= self.period_s - ROUNDING_S
 
 
 class SendOnDelta(Trigger, frozen=True):
-    """Speak when the neighbours hold a position that is off by more than `threshold` (Miskowicz, Sensors 2006)."""
+    """‖ε‖ > δ: what is held is off by more than a threshold.
+
+    M. Miskowicz, "Send-On-Delta Concept: An Event-Based Data Reporting Strategy", Sensors 6(1), 2006, 49–63; here on
+    the distance of positions. Case 2 of the paper's experiment, with δ = 1 cm.
+    """
 
     threshold: Annotated[Positive, Meta(description="δ [m]")] = 0.01
 
     def fires(self, view: View, memory: Array) -> Mask:
-        """‖p − p_k‖ > δ."""
-        return norm(view.position - view.told.position) > self.threshold
+        """See `Trigger.fires`."""
+        return view.gap > self.threshold

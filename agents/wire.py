@@ -52,6 +52,7 @@ class Heard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stamp: float
     arrived: float
     position: Vector
+    velocity: Vector
 
 
 class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -87,9 +88,9 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     `missing` names neighbours that were never heard or are gone; `lost` counts, per neighbour, samples that the
     sequence numbers prove were sent and never heard. `late_s` is the largest lateness of a tick since the last status.
-    `started` is the UTC time at which the robot began to run the experiment (0 before), `decisions` and `ticks` count
-    from there. `interventions` are ticks on which safety changed what had been decided, `avoided` those of them, and
-    of changed goals, that kept clear of something.
+    `started` is the UTC time at which the robot began to run the experiment (0 before). From there `ticks` count, and
+    `decisions`, at which it computed its goal. `interventions` are ticks on which safety changed what had been decided,
+    `avoided` those of them, and of changed goals, that kept clear of something.
     """
 
     robot: str

@@ -3,33 +3,37 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+import msgspec
 import numpy as np
 
-from agents.agent import Assignment
-from agents.graph import Rigidity, components, edges
+from agents.assignment import Assignment
+from agents.graph import Links, Rigidity, components, edges
 from agents.planning import Planner
+from agents.redundancy import Redundancy
 from agents.rows import Array, Index, Mask
 from experiments import assign
 from experiments.experiment import Experiment
 from experiments.feasibility import (
-    Modes,
     Shape,
     algebraic_connectivity,
-    link_errors,
-    modes,
+    expendable,
     realise,
     stiffness,
     unfolded,
 )
+from experiments.formation import Pattern, errors
 from experiments.links import pairs
 from experiments.locate import Path
+from experiments.modes import Modes, modes
 from experiments.prediction import Prediction, closed, predict
+from experiments.residuals import as_taken
 from twins.scene import Scene
 
+MANY: Final = 500  # robots of which it is not asked any more what can be lost: the time grows with their third power
 GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
 
 
@@ -45,13 +49,19 @@ class Analysis:
         start: (N, 3) on the floor [m].
         parts: Of the network.
         fiedler: Algebraic connectivity.
-        shapes: Places that were tried; `shape` is the best.
-        shape: None without links.
+        pattern: The links, what becomes of them, and when they are there.
+        asked: The links of the beginning, with what the law takes them to ask for.
+        standing: (E,) those that are there at the beginning, however far the robots are from each other.
+        shapes: Places that were tried for the last stage of the formation, the best of which is to be its end.
+        shape: The best for the beginning; None if no link stands then.
+        later: The best after each change.
         planar: Rigidity with heights held.
         spatial: Rigidity in full space.
+        spare: What the formation can lose and stay rigid, of the pairs `edges(...)` of the links that stand at the
+            beginning; None if it is not rigid, if its links ask for more than distances, or if it has too many robots.
         modes: Of the sampled loop at the shape.
         prediction: The motion.
-        error: (T, E) of each link along it [m].
+        error: (T, E) of each link along it [m]; 0 while it is not there.
         scene: What stands in the arena.
     """
 
@@ -62,10 +72,15 @@ class Analysis:
     start: Array
     parts: int
     fiedler: float
+    pattern: Pattern
+    asked: Links
+    standing: Mask
     shapes: tuple[Shape, ...]
     shape: Shape | None
+    later: tuple[Shape, ...]
     planar: Rigidity | None
     spatial: Rigidity | None
+    spare: Redundancy | None
     modes: Modes | None
     prediction: Prediction
     error: Array
@@ -100,12 +115,10 @@ class Analysis:
 
     @property
     def departure(self) -> float:
-        """When the first robot leaves by plan, after the start; infinity if none does [s]."""
+        """When the first robot leaves by plan or the shape changes, after the start; infinity if neither [s]."""
         timeline = self.experiment.timeline
-        return min(
-            (timeline[k].at_s for k, _, plan in self.legs if plan.speed() > 0 and timeline[k].at_s > 0),
-            default=math.inf,
-        )
+        leaves = [timeline[k].at_s for k, _, plan in self.legs if plan.speed() > 0]
+        return min((at for at in (*leaves, *(each.at for each in self.pattern.changes)) if at > 0), default=math.inf)
 
     @property
     def fastest(self) -> tuple[int, str, Planner] | None:
@@ -133,6 +146,11 @@ class Analysis:
         links = self.assignment.links
         return f"{self.names[links.speaker[number]]} - {self.names[links.listener[number]]}"
 
+    def pair(self, number: int) -> str:
+        """One of the pairs `edges(...)` of the links that stand at the beginning, in words."""
+        first, second = edges(self.asked.take(self.standing))[number]
+        return f"{self.names[first]} - {self.names[second]}"
+
     def link_path(self, number: int) -> Path:
         """Where a link stands in the file."""
         wanted = self.assignment.links.listener[number], self.assignment.links.speaker[number]
@@ -146,22 +164,31 @@ class Analysis:
 def analyse(experiment: Experiment) -> Analysis:
     """All the numbers of one case."""
     names = tuple(experiment.robots)
-    assignment = replace(
-        assign.assign(experiment, names), links=assign.all_links(experiment), watched=None, avoidance=None
-    )
+    assignment = assign.assign(msgspec.structs.replace(experiment, avoidance=None), names)
+    pattern = Pattern.of(experiment, names)
     links, rows, hz = assignment.links, len(names), experiment.rates.coordination_hz
     start, yaw = assign.start(experiment, names)
     aloft = start.copy()
     aloft[:, 2] = np.nan_to_num(assignment.hover)
-    silent = np.setdiff1d(np.arange(rows), links.listener)
+    anchored = np.zeros(0, dtype=np.intp) if assignment.anchors is None else assignment.anchors.row
+    silent = np.setdiff1d(np.arange(rows), np.concatenate([links.listener, anchored]))
     prediction = predict(assignment, aloft, yaw, silent, hz)
-    shapes: list[Shape] = []
-    shape, planar, spatial, loop = None, None, None, None
-    if len(links):
-        shapes = _shapes(experiment, assignment, prediction, aloft, silent)
-        shape = min(shapes, key=lambda each: each.worst)
-        planar, spatial = stiffness(shape.position, links, silent)
-        loop = modes(assignment.law, links, shape.position, closed(assignment.kinds, hz), hz)
+    standing = np.ones(len(links), dtype=bool) if pattern.presence is None else pattern.presence.at_first()
+    stages: list[list[Shape]] = []
+    shape, planar, spatial, spare, loop = None, None, None, None, None
+    asked = as_taken(assignment.law, links)
+    if standing.any() or len(anchored):
+        for at, wanted in zip((0.0, *(each.at + each.over for each in pattern.changes)), pattern.stages(), strict=True):
+            there = standing if pattern.presence is None else pattern.presence.planned(at)
+            stage = _shapes(experiment, assignment, as_taken(assignment.law, wanted), there, prediction, aloft, silent)
+            stages.append(stage)
+        shape = _best(stages[0])
+        here = asked.take(standing)
+        planar, spatial = stiffness(shape.position, here, silent, assignment.anchors)
+        if planar.rigid and spatial is not None and rows <= MANY:
+            spare = expendable(shape.position, here, silent)
+        share = closed(assignment.kinds, hz)
+        loop = modes(assignment.law, here, shape.position, share, hz, anchors=assignment.anchors)
     return Analysis(
         experiment=experiment,
         assignment=assignment,
@@ -170,29 +197,44 @@ def analyse(experiment: Experiment) -> Analysis:
         start=start,
         parts=components(links, rows),
         fiedler=algebraic_connectivity(links, rows),
-        shapes=tuple(shapes),
+        pattern=pattern,
+        asked=asked,
+        standing=standing,
+        shapes=tuple(stages[-1]) if stages else (),
         shape=shape,
+        later=tuple(_best(each) for each in stages[1:]),
         planar=planar,
         spatial=spatial,
+        spare=spare,
         modes=loop,
         prediction=prediction,
-        error=link_errors(links, prediction.position),
+        error=np.nan_to_num(errors(assignment.law, pattern, prediction.time, prediction.position)),
         scene=assign.scene(experiment),
     )
 
 
-def _shapes(
-    experiment: Experiment, assignment: Assignment, prediction: Prediction, aloft: Array, silent: Index
+def _best(shapes: Sequence[Shape]) -> Shape:
+    return min(shapes, key=lambda each: each.worst)
+
+
+def _shapes(  # noqa: PLR0917 - one caller
+    experiment: Experiment,
+    assignment: Assignment,
+    wanted: Links,
+    there: Mask,
+    prediction: Prediction,
+    aloft: Array,
+    silent: Index,
 ) -> list[Shape]:
     """Where the robots end, where they start, what the distances suggest, and random places, until one is exact."""
-    end, rows = prediction.position[-1], len(aloft)
+    end, rows, links = prediction.position[-1], len(aloft), wanted.take(there)
     moves = np.ones(rows, dtype=bool)
     moves[silent] = False
     rng = np.random.default_rng(experiment.seed)
 
     def guesses() -> Iterator[Array]:
         yield end
-        plane = unfolded(assignment.links, aloft[:, 2])
+        plane = unfolded(links, aloft[:, 2])
         anchor = silent[:1] if len(silent) else np.arange(rows)
         for mirror in (1.0, -1.0):
             flipped = plane * [1.0, mirror, 1.0]
@@ -203,7 +245,12 @@ def _shapes(
             place = rng.uniform(-0.5, 0.5, (rows, 2)) * experiment.arena.size[:2]
             yield _rest(np.column_stack([place, aloft[:, 2]]), end, moves)
 
-    return realise(assignment.links, guesses(), moves)
+    found = []
+    for each in realise(links, guesses(), moves, assignment.anchors):
+        error = np.zeros(len(there))
+        error[there] = each.error
+        found.append(replace(each, error=error))
+    return found
 
 
 def _rest(guess: Array, end: Array, moves: Mask) -> Array:

@@ -9,17 +9,19 @@ import msgspec
 import numpy as np
 
 from agents import plugins
-from agents.agent import Assignment
+from agents.assignment import Assignment
 from agents.avoidance import Avoidance
 from agents.body import BodyRequest, Disturbance
 from agents.graph import Links, links
 from agents.keys import Keys
 from agents.kinds import KINDS, Kind
 from agents.planning import Leg
+from agents.prediction import HOLD, Predictor
 from agents.rows import Array, Index
 from agents.safety import Limits
 from experiments import outlines
 from experiments.experiment import Experiment
+from experiments.formation import Pattern, anchors_of
 from experiments.links import parse_links
 from twins.scene import Scene
 from twins.sensors import OF_KIND
@@ -36,14 +38,8 @@ def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
 
 
 def all_links(experiment: Experiment) -> Links:
-    """Every link of the experiment; rows in the order of the file."""
-    number = {name: row for row, name in enumerate(experiment.robots)}
-    parsed = parse_links(experiment)
-    return links(
-        [(number[listener], number[speaker]) for listener, speaker, _, _ in parsed],
-        [distance for _, _, distance, _ in parsed],
-        [gain for _, _, _, gain in parsed],
-    )
+    """Every link that the formation may have, with the targets of the beginning; rows in the order of the file."""
+    return Pattern.of(experiment, tuple(experiment.robots)).links
 
 
 def heard_links(experiment: Experiment) -> Links:
@@ -71,12 +67,22 @@ def _avoidance(experiment: Experiment) -> Avoidance | None:
     return built
 
 
+def predictor(experiment: Experiment) -> Predictor:
+    """Where a robot is believed to be between two messages: as the experiment says, else as its trigger needs it."""
+    chosen = experiment.prediction
+    if chosen is None:
+        trigger = plugins.struct(plugins.TRIGGERS, plugins.split(experiment.trigger)[0])
+        chosen = getattr(trigger, "prediction", "hold")
+    built: Predictor = plugins.build(plugins.PREDICTORS, chosen)
+    return HOLD if built == HOLD else built
+
+
 def leaders(experiment: Experiment) -> list[str]:
-    """The leader of the file, or every robot that listens to nobody (none, if that would be all of them)."""
+    """The leader of the file, or every robot that listens to nobody and has no anchor (none, if that would be all)."""
     if experiment.formation.leader is not None:
         return [experiment.formation.leader]
     listening = {listener for listener, _, _, _ in parse_links(experiment)}
-    silent = [name for name in experiment.robots if name not in listening]
+    silent = [name for name in experiment.robots if name not in listening | set(experiment.formation.anchors)]
     return silent if len(silent) < len(experiment.robots) else []
 
 
@@ -212,13 +218,15 @@ def assign(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Ass
     if copies > 1 and tuple(names) != everyone:
         raise ValueError("only the whole experiment can be repeated")
     rows = np.array([everyone.index(name) for name in names], dtype=np.intp)
-    net, watched = all_links(experiment).of(rows), watch_links(experiment).of(rows)
-    only_watched = np.repeat([False, True], [len(net), len(watched)])
+    pattern, watched = Pattern.of(experiment, everyone).heard_by(rows), watch_links(experiment).of(rows)
+    anchors = anchors_of(experiment, names)
+    only_watched = np.repeat([False, True], [len(pattern.links), len(watched)])
     legs = _legs(experiment, names)
     if len(watched):
-        net = net.and_then(watched)
+        pattern = pattern.and_then(watched)
     if copies > 1:
-        net = net.repeated(copies, len(names))
+        pattern = pattern.repeated(copies, len(names))
+        anchors = None if anchors is None else anchors.repeated(copies, len(names))
         legs = tuple(
             (np.concatenate([group + c * len(names) for c in range(copies)]), planned) for group, planned in legs
         )
@@ -228,9 +236,16 @@ def assign(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Ass
         kinds=kinds(experiment, names) * copies,
         hover=np.tile(hover(experiment, names), copies),
         speakers=everyone * copies,
-        links=net,
+        links=pattern.links,
+        changes=pattern.changes,
+        presence=pattern.presence,
+        anchors=anchors,
         law=plugins.build("zenpark.laws", experiment.formation.law),
         trigger=plugins.build("zenpark.triggers", experiment.trigger),
+        predictor=predictor(experiment),
+        update=None
+        if experiment.formation.update is None
+        else plugins.build(plugins.TRIGGERS, experiment.formation.update),
         clamp=experiment.formation.clamp,
         tracking_gain=experiment.formation.tracking_gain,
         legs=legs,

@@ -29,7 +29,7 @@ from experiments.problem import DocumentError, Problem
 from experiments.syntax import parsed
 
 SUBJECTS: Final = (
-    *(theory.network, theory.realisation, theory.rigidity, theory.stability),
+    *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
     *(motion.starts, motion.formation, motion.walls, motion.encounters, motion.speeds, motion.rates, motion.ends),
 )
@@ -77,6 +77,10 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
         rank_space_needed: See `rank_space`.
         smallest_singular: Of the rigidity matrix when heights are held, rigid motions left out [m].
         smallest_eigenvalue: Its square [m²].
+        spare_links: Pairs without any one of which the formation stays rigid; None where that has no meaning.
+        vital_links: The other pairs.
+        spare_robots: Robots without any one of which it stays rigid.
+        vital_robots: The other robots.
         residual_mm: Worst link of the best shape.
         loop_gain: h·μ·λ_max; 2 is where the formation hunts.
         slowest_mode_s: Time constant of the slowest mode that moves.
@@ -104,6 +108,10 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     rank_space_needed: int | None
     smallest_singular: float | None
     smallest_eigenvalue: float | None
+    spare_links: int | None
+    vital_links: tuple[str, ...]
+    spare_robots: int | None
+    vital_robots: tuple[str, ...]
     residual_mm: float | None
     loop_gain: float | None
     slowest_mode_s: float | None
@@ -173,13 +181,13 @@ def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
     found = {}
     for name, case in cases.items():
         bare = msgspec.structs.replace(
-            case, trigger="periodic", channel=Channel(), network=Network(), disturbance={}, cases={}
+            case, trigger="periodic", prediction=None, channel=Channel(), network=Network(), disturbance={}, cases={}
         )
         key = msgspec.json.encode(bare)
         if key not in known:
             known[key] = analyse(bare)
-        trigger = assign.assign(case, tuple(case.robots)).trigger
-        assignment = replace(known[key].assignment, trigger=trigger)
+        told = assign.assign(case, tuple(case.robots))
+        assignment = replace(known[key].assignment, trigger=told.trigger, predictor=told.predictor)
         found[name] = replace(known[key], experiment=case, assignment=assignment)
     return found
 
@@ -296,6 +304,8 @@ def _worded(of: Figures) -> dict[str, str]:
         "rigidity rank, heights held": f"{number(of.rank, 'd')} of {number(of.rank_needed, 'd')}",
         "rigidity rank in space": f"{number(of.rank_space, 'd')} of {number(of.rank_space_needed, 'd')}",
         "smallest rigidity eigenvalue": number(of.smallest_eigenvalue, ".2g", " m²"),
+        "single links it can lose": _spared(of.spare_links, len(of.vital_links)),
+        "single robots it can lose": _spared(of.spare_robots, len(of.vital_robots)),
         "distances met to": number(of.residual_mm, ".1f", " mm"),
         "loop gain h·μ·λ, hunts at 2": number(of.loop_gain, ".3g"),
         "slowest mode": number(of.slowest_mode_s, ".1f", " s"),
@@ -308,10 +318,15 @@ def _worded(of: Figures) -> dict[str, str]:
     }
 
 
+def _spared(spare: int | None, vital: int) -> str:
+    return "-" if spare is None else f"{spare} of {spare + vital}"
+
+
 @QUIET
 def _figures(analysis: Analysis) -> Figures:
     experiment = analysis.experiment
     shape, planar, spatial, loop = analysis.shape, analysis.planar, analysis.spatial, analysis.modes
+    spare = analysis.spare
     assignment, prediction, limits = analysis.assignment, analysis.prediction, analysis.assignment.limits
     end, fastest, follower = prediction.position[-1], analysis.fastest, analysis.follower
     rate = message_rate(
@@ -320,6 +335,7 @@ def _figures(analysis: Analysis) -> Figures:
         assignment.links,
         prediction,
         [assign.disturbance(experiment, name) for name in analysis.names],
+        predictor=assignment.predictor,
         hz=experiment.rates.pose_hz,
         rng=np.random.default_rng(experiment.seed),
     )
@@ -339,6 +355,10 @@ def _figures(analysis: Analysis) -> Figures:
         rank_space_needed=spatial.needed if spatial else None,
         smallest_singular=planar.smallest if planar else None,
         smallest_eigenvalue=planar.smallest**2 if planar else None,
+        spare_links=int(spare.pairs.sum()) if spare else None,
+        vital_links=tuple(analysis.pair(int(k)) for k in np.flatnonzero(~spare.pairs)) if spare else (),
+        spare_robots=int(spare.robots.sum()) if spare else None,
+        vital_robots=tuple(analysis.names[row] for row in np.flatnonzero(~spare.robots)) if spare else (),
         residual_mm=_finite(1e3 * shape.worst) if shape else None,
         loop_gain=_finite(loop.gain) if loop else None,
         slowest_mode_s=_finite(loop.slowest_s) if loop else None,

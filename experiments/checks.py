@@ -11,9 +11,8 @@ import numpy as np
 from agents import plugins
 from agents.kinds import KINDS
 from agents.plugins import did_you_mean
-from experiments import outlines
+from experiments import formation_checks, outlines
 from experiments.experiment import Arena, Experiment, Robot
-from experiments.links import FORM, pairs
 from experiments.problem import Fault
 from twins.scene import Scene
 from twins.sensors import SENSORS
@@ -29,8 +28,9 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
     for name, robot in experiment.robots.items():
         yield from _robot(experiment, name, robot)
     yield from _furnished(experiment)
-    yield from _formation(experiment)
+    yield from formation_checks.faults(experiment)
     yield from _timeline(experiment)
+    yield from _triggers(experiment)
     for name in experiment.disturbance:
         known = ("all", *KINDS, *experiment.robots)
         if name not in known:
@@ -161,32 +161,29 @@ def _hover(experiment: Experiment, name: str, robot: Robot) -> Iterator[Fault]:
         )
 
 
-def _formation(experiment: Experiment) -> Iterator[Fault]:
-    robots = experiment.robots
-    leader = experiment.formation.leader
-    if leader is not None and leader not in robots:
-        yield Fault(("formation", "leader"), f"no robot is called '{leader}'", did_you_mean(leader, robots))
-    said: dict[tuple[str, str], str] = {}
-    for text in experiment.formation.links:
-        path = ("formation", "links", text)
-        try:
-            both = pairs(text)
-        except ValueError as error:
-            hint = str(error)
-            yield Fault(path, f"{text!r} is no link", hint if hint == FORM else f"{hint}; {FORM}", on_key=True)
-            continue
-        for name in dict.fromkeys(reversed(both[0])):
-            if name not in robots:
-                yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, robots), on_key=True)
-        if both[0][0] == both[0][1]:
-            yield Fault(path, f"'{both[0][0]}' cannot listen to itself", "name two robots", on_key=True)
-            continue
-        again = [pair for pair in both if pair in said]
-        if again:
-            listener, speaker = again[0]
-            message = f"that {listener} listens to {speaker} is already said by '{said[again[0]]}'"
-            yield Fault(path, message, "keep one of the two", on_key=True)
-        said.update(dict.fromkeys(both, text))
+def _triggers(experiment: Experiment) -> Iterator[Fault]:
+    """Does each trigger stand where it makes sense, with the prediction that it needs."""
+    kind, _ = plugins.split(experiment.trigger)
+    spoken = plugins.struct(plugins.TRIGGERS, kind)
+    if "communication" not in getattr(spoken, "places", ("communication",)):
+        message = f"'{kind}' tells when the law is computed anew, not when a robot speaks"
+        yield Fault(("trigger",), message, f"put it into [formation] as update = '{kind}', and another trigger here")
+    needed = getattr(spoken, "prediction", "hold")
+    if experiment.prediction is not None and needed != "hold":
+        given, _ = plugins.split(experiment.prediction)
+        if given == "hold":
+            message = f"'{kind}' counts on neighbours that extrapolate, but prediction = 'hold' says that they do not"
+            hint = f"leave prediction out, which means '{needed}', or take the trigger send-on-delta"
+            yield Fault(("prediction",), message, hint)
+    if experiment.formation.update is None:
+        return
+    kind, given_too = plugins.split(experiment.formation.update)
+    if "control" not in getattr(plugins.struct(plugins.TRIGGERS, kind), "places", ("control",)):
+        message = f"'{kind}' tells when a robot speaks, not when the law is computed anew"
+        yield Fault(("formation", "update"), message, "take another one, such as send-on-delta or relative-control")
+    if given_too.get("smoothing_s"):
+        message = "smoothing_s is for what is said; nothing is said where the law is computed"
+        yield Fault(("formation", "update", "smoothing_s"), message, "leave it out", on_key=True)
 
 
 def _timeline(experiment: Experiment) -> Iterator[Fault]:

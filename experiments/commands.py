@@ -44,7 +44,7 @@ def run(
     if bodies is not None and virtual:
         raise DocumentError([Problem("--bodies", 0, 0, "is for real time", "leave out --virtual")])
     chosen(read, cases)
-    if not _sound(read, changes) and not anyway:
+    if not sound(read, changes) and not anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     folder = new_folder(read, out)
@@ -81,7 +81,7 @@ def run(
     return 130 if interrupted.asked else 0
 
 
-def _sound(read: document.Document, changes: Sequence[str]) -> bool:
+def sound(read: document.Document, changes: Sequence[str]) -> bool:
     """Says on standard error what the check warns of; False if it finds errors."""
     from experiments.check import check  # noqa: PLC0415
 
@@ -132,6 +132,7 @@ def list_all() -> int:
         ("Bodies", plugins.BODIES),
         ("Protocol twins", plugins.DEVICES),
         ("Triggers", plugins.TRIGGERS),
+        ("Predictors", plugins.PREDICTORS),
         ("Laws", plugins.LAWS),
         ("Planners", plugins.PLANNERS),
         ("Avoidances", plugins.AVOIDANCES),

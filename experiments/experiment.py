@@ -18,6 +18,7 @@ NotNegative = Annotated[float, Meta(ge=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Planar = tuple[float, float]
+Vector = Annotated[list[float], Meta(min_length=2, max_length=3)]
 Spatial = tuple[Positive, Positive, Positive]
 Choice = str | dict[str, Any]  # a plug-in by name, or a table with its `kind` and its parameters
 
@@ -91,24 +92,114 @@ class Robot(Part, frozen=True):
     ] = True
 
 
-class Link(Part, frozen=True):
-    """A link with a gain of its own."""
+class Target(Part, frozen=True):
+    """What a link asks for, one of the three: how far apart, where from each other, or in which direction."""
 
-    distance: Annotated[Positive, Meta(description="[m]")]
+    distance: Annotated[Positive | None, Meta(description="[m]")] = None
+    offset: Annotated[
+        Vector | None,
+        Meta(description="x, y (, z) of the second robot from the first [m]; z left out: as they hold their heights"),
+    ] = None
+    bearing: Annotated[
+        Vector | None,
+        Meta(description="direction x, y (, z) from the first robot to the second; seen from above if z is left out"),
+    ] = None
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("distance", "offset", "bearing") if getattr(self, name) is not None]
+        if len(given) != 1:
+            said = " and ".join(given) or "none of them"
+            raise ValueError(f"a link asks for distance, offset or bearing, not for {said}; give one of the three")
+        if self.bearing is not None and not any(self.bearing):
+            raise ValueError("a bearing of zeros has no direction; give x, y, such as [1.0, 0.0]")
+
+
+class Link(Target, frozen=True):
+    """A link that asks for something else than a distance, has a gain of its own, or is there for a time."""
+
     gain: Annotated[Positive | None, Meta(description="the formation's if left out")] = None
+    from_s: Annotated[NotNegative, Meta(description="the link is there from then on [s]")] = 0.0
+    until_s: Annotated[Positive | None, Meta(description="and until then [s]; left out: to the end")] = None
+
+    def __post_init__(self) -> None:
+        Target.__post_init__(self)
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError("`until_s` must be later than `from_s`; or leave it out")
+
+
+class Anchor(Part, frozen=True):
+    """A distance that a robot keeps to a point, to a line through it, or to a plane through it."""
+
+    distance: Annotated[NotNegative, Meta(description="[m]; 0: on it")] = 0.0
+    to: Annotated[Vector | None, Meta(description="the point, x, y (, z) [m]; left out: the origin")] = None
+    along: Annotated[Vector | None, Meta(description="direction of a line through that point")] = None
+    across: Annotated[Vector | None, Meta(description="direction across a plane through that point")] = None
+    gain: Annotated[
+        Positive | None, Meta(description="left out: twice the formation's gain, or its stiffness where distance is 0")
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.along is not None and self.across is not None:
+            raise ValueError("`along` means a line and `across` a plane; give one of them")
+        for name in ("along", "across"):
+            direction = getattr(self, name)
+            if direction is not None and not any(direction):
+                raise ValueError(f"`{name}` has no direction; give x, y, such as [1.0, 0.0]")
+
+
+class Change(Part, frozen=True):
+    """From `at_s` on, the formation goes smoothly to another shape."""
+
+    at_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
+    over_s: Annotated[NotNegative, Meta(description="how long it takes [s]; 0: at once")] = 5.0
+    links: Annotated[
+        dict[str, Positive | Target],
+        Meta(description="links that ask for something else then"),
+    ] = {}
+    scale: Annotated[Positive, Meta(description="of the shape seen from above, as it is then; heights stay")] = 1.0
+    rotate: Annotated[float, Meta(description="to the left [rad]; not for distances, which know no direction")] = 0.0
+
+
+class Proximity(Part, frozen=True):
+    """Links that are there while two robots are near each other."""
+
+    range: Annotated[Positive, Meta(description="nearer than this they become neighbours [m]")]
+    release: Annotated[Positive | None, Meta(description="farther than this no more [m]; left out: 1.1 range")] = None
+    distance: Annotated[
+        Positive | None,
+        Meta(description="what any two robots without a link keep then [m]; left out: only the links of the file"),
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.release is not None and self.release < self.range:
+            raise ValueError("`release` must not be nearer than `range`; or leave it out")
 
 
 class Formation(Part, frozen=True):
     """Which shape, by which law."""
 
     law: Annotated[Choice, Meta(description="a registered law")] = "distance"
-    gain: Annotated[Positive, Meta(description="μ [1/(m²·decision)] (paper, eq. (6))")] = 3.0
+    update: Annotated[
+        Choice | None, Meta(description="a trigger: when a robot computes the law anew; left out: at every decision")
+    ] = None
+    gain: Annotated[
+        Positive, Meta(description="μ of links that ask for a distance [1/(m²·decision)] (paper, eq. (6))")
+    ] = 3.0
+    stiffness: Annotated[Positive, Meta(description="k of links that ask for an offset or a bearing [1/decision]")] = (
+        0.5
+    )
     clamp: Annotated[Positive, Meta(description="largest step of the goal per axis and decision [m]")] = 0.1
     tracking_gain: Annotated[NotNegative, Meta(description="k [1/(m²·decision)] (paper, eq. (7))")] = 3.0
     leader: Annotated[Name | None, Meta(description="left out: every robot that listens to nobody")] = None
     links: Annotated[
         dict[str, Positive | Link], Meta(description='"A > B": B listens to A; "A - B": both listen; distance [m]')
     ] = {}
+    anchors: Annotated[
+        dict[Name, Positive | Anchor],
+        Meta(description="by robot: distance to the origin [m], or to another place"),
+    ] = {}
+    changes: Annotated[list[Change], Meta(description="other shapes, in order of time")] = []
+    proximity: Annotated[Proximity | None, Meta(description="links by range; left out: they are always there")] = None
 
 
 class Leg(Part, frozen=True):
@@ -184,7 +275,11 @@ class Experiment(Part, frozen=True):
     rates: Rates = Rates()
     formation: Formation = Formation()
     timeline: list[Leg] = []
-    trigger: Annotated[Choice, Meta(description="a registered trigger")] = "periodic"
+    trigger: Annotated[Choice, Meta(description="a registered trigger: when a robot speaks")] = "periodic"
+    prediction: Annotated[
+        Choice | None,
+        Meta(description="where a robot is believed to be between two messages; left out: as the trigger needs it"),
+    ] = None
     positioning: Annotated[
         str | None, Meta(description='who measures `position = "external"`: vicon://HOST[:PORT], or vicon-twin')
     ] = None

@@ -1,21 +1,25 @@
-"""Can a formation exist, does it hold its shape, and does the sampled loop settle: the numbers, without any motion."""
+"""Can a formation exist, and does it hold its shape: the numbers, without any motion."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from agents.coordination import Law
-from agents.graph import Links, Rigidity, edges, rigidity
+from agents.anchors import Anchors
+from agents.coordination import Mixed
+from agents.graph import BY_RELATIVE, Links, Rigidity, edges, rigidity
+from agents.redundancy import Redundancy, redundancy
 from agents.rows import Array, Index, Mask, norm
+from experiments.residuals import residuals
 
 EXACT = 1e-9  # [m] link errors below this are arithmetic
+ENOUGH = 3e-4  # [m] distances written with four decimals are met as well as can be; a better shape is not sought
+SLOWLY = 1e-2  # of what is left: improvements of an error that is small already are not worth their time
 ROUNDED = 1e-3  # [m] distances written with three decimals contradict one another by less
-STEP = 1e-4  # [m] of the differences that stand for the law's derivative
-STANDING = 1e-6  # modes slower than the fastest by this factor do not move at all
+POINT = 1e-6  # [m] robots that are nearer than this to each other stand in one point, which nothing turns
 
 
 @dataclass(frozen=True)
@@ -24,16 +28,18 @@ class Shape:
 
     Attributes:
         position: (N, 3) [m].
-        error: (E,) |‖p_i − p_j‖ − d_ij| of each link [m].
+        error: (E,) of each link as its law measures it, |‖p_i − p_j‖ − d_ij| for distances [m].
+        anchored: (A,) of each anchor [m].
     """
 
     position: Array
     error: Array
+    anchored: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def worst(self) -> float:
-        """The largest error of a link [m]."""
-        return float(self.error.max(initial=0.0))
+        """The largest error of a link or an anchor [m]."""
+        return max(float(self.error.max(initial=0.0)), float(self.anchored.max(initial=0.0)))
 
 
 def link_errors(links: Links, position: Array) -> Array:
@@ -42,22 +48,24 @@ def link_errors(links: Links, position: Array) -> Array:
     return np.asarray(np.abs(norm(offset) - links.distance))
 
 
-def realise(links: Links, guesses: Iterable[Array], moves: Mask) -> list[Shape]:
-    """Places at the distances wanted, one for each guess, until one is exact.
+def realise(links: Links, guesses: Iterable[Array], moves: Mask, anchors: Anchors | None = None) -> list[Shape]:
+    """Places where links and anchors have what they ask for, one for each guess, until one is good.
 
     Args:
-        links: With the distances.
+        links: With what they ask for, see `residuals.as_taken`.
         guesses: (N, 3) each [m]; heights are held where they are.
         moves: (N,) rows that may be placed elsewhere in the plane.
+        anchors: Distances to what stands still.
 
     Returns:
-        The shapes that were found, in the order of the guesses; the last one is the only one that may be exact.
+        The shapes that were found, in the order of the guesses; only the last one may be good.
     """
     found = []
     for guess in guesses:
-        position = _fitted(links, guess, np.flatnonzero(moves))
-        found.append(Shape(position, link_errors(links, position)))
-        if found[-1].worst < EXACT:
+        position = _fitted(links, anchors, guess, np.flatnonzero(moves))
+        error = Mixed().error(position, position[links.speaker], links)
+        found.append(Shape(position, error, np.zeros(0) if anchors is None else anchors.error(position)))
+        if found[-1].worst < ENOUGH:
             break
     return found
 
@@ -71,7 +79,8 @@ def unfolded(links: Links, height: Array) -> Array:
     rows = len(height)
     way = np.full((rows, rows), np.inf)
     rise = height[links.listener] - height[links.speaker]
-    way[links.listener, links.speaker] = np.sqrt(np.maximum(links.distance**2 - rise**2, 0.0))
+    far = np.sqrt(np.maximum(links.distance**2 - rise**2, 0.0))
+    way[links.listener, links.speaker] = np.where(np.isnan(far), 1.0, far)  # any length suits a direction
     way = np.minimum(way, way.T)
     np.fill_diagonal(way, 0.0)
     for over in range(rows):
@@ -84,42 +93,26 @@ def unfolded(links: Links, height: Array) -> Array:
     return np.column_stack([np.zeros((rows, 2 - plane.shape[1])), plane, height])
 
 
-def _fitted(links: Links, guess: Array, rows: Index) -> Array:
-    """Least squares of the link errors over x and y of `rows`, by Levenberg's and Marquardt's method."""
+def _fitted(links: Links, anchors: Anchors | None, guess: Array, rows: Index) -> Array:
+    """Least squares of the residuals over x and y of `rows`, by Levenberg's and Marquardt's method."""
     position, damping = guess.copy(), 1e-3
-    column = np.full(len(guess), -1)
-    column[rows] = np.arange(len(rows))
-    link = np.arange(len(links))
-    tails, heads = column[links.listener], column[links.speaker]
-    tail, head = tails >= 0, heads >= 0
-    error, offset, length = _lengths(links, position)
+    now = residuals(links, anchors, position)
     for _ in range(200):
-        direction = offset[:, :2] / length[:, None]
-        slopes = np.zeros((len(links), len(rows), 2))
-        slopes[link[tail], tails[tail]] = direction[tail]
-        slopes[link[head], heads[head]] = -direction[head]
-        jacobian = slopes.reshape(len(links), -1)
-        slope, normal = jacobian.T @ error, jacobian.T @ jacobian
+        normal, slope = now.normal(rows, len(guess))
         step = np.linalg.solve(normal + damping * np.eye(len(slope)), -slope).reshape(-1, 2)
         tried = position.copy()
         tried[rows, :2] += step
-        then = _lengths(links, tried)
-        before, after = float(error @ error), float(then[0] @ then[0])
+        then = residuals(links, anchors, tried)
+        before, after = float(now.value @ now.value), float(then.value @ then.value)
         if after < before:
-            position, damping = tried, max(damping / 10.0, 1e-10)
-            error, offset, length = then
+            position, damping, now = tried, max(damping / 10.0, 1e-10), then
         else:
             damping *= 10.0
-        if damping > 1e9 or before < (EXACT / 100) ** 2 or 0.0 <= before - after < 1e-9 * before:
+        small = float(np.abs(now.value).max(initial=0.0)) < ENOUGH
+        least = SLOWLY * before if small else 1e-9 * before
+        if damping > 1e9 or before < (EXACT / 100) ** 2 or 0.0 <= before - after < least:
             break
     return position
-
-
-def _lengths(links: Links, position: Array) -> tuple[Array, Array, Array]:
-    """Signed error (E,), offset (E, 3) and length (E,) of each link [m]; no length is zero."""
-    offset = position[links.listener] - position[links.speaker]
-    length = np.sqrt(np.einsum("ek,ek->e", offset, offset) + 1e-18)
-    return length - links.distance, offset, length
 
 
 @dataclass(frozen=True)
@@ -175,16 +168,116 @@ def _of_triangle(triangle: tuple[int, ...], wanted: Array, height: Array) -> Con
     return Conflict(triangle, math.nan, ())
 
 
-def stiffness(position: Array, links: Links, led: Index) -> tuple[Rigidity, Rigidity]:
-    """Infinitesimal rigidity when heights are held, and in full space.
+@dataclass(frozen=True)
+class Contradiction:
+    """Relative positions that do not add up: around `rows`, each linked to the next and the last to the first.
+
+    Attributes:
+        rows: Two robots of which each asks for something else, or more around a ring.
+        link: The one that closes the ring.
+        gap: How far its ends miss each other [m].
+    """
+
+    rows: tuple[int, ...]
+    link: int
+    gap: float
+
+
+def contradictions(links: Links) -> list[Contradiction]:
+    """Rings of links by relative position whose vectors do not add up to zero, the shortest rings first."""
+    if links.wants is None or links.relative is None:
+        return []
+    here = np.flatnonzero(links.wants == BY_RELATIVE)
+    place: dict[int, Array] = {}
+    above: dict[int, int] = {}
+    neighbours: dict[int, list[tuple[int, Array]]] = {}
+    for k in here.tolist():
+        i, j = int(links.listener[k]), int(links.speaker[k])
+        neighbours.setdefault(j, []).append((i, links.relative[k]))
+        neighbours.setdefault(i, []).append((j, -links.relative[k]))
+    for root in neighbours:
+        if root in place:
+            continue
+        place[root], queue = np.zeros(3), [root]
+        for at in queue:
+            for to, step in neighbours[at]:
+                if to not in place:
+                    place[to], above[to] = place[at] + step, at
+                    queue.append(to)
+    found = []
+    for k in here.tolist():
+        i, j = int(links.listener[k]), int(links.speaker[k])
+        gap = float(norm((place[i] - place[j] - links.relative[k])[None, :2])[0])
+        if gap > ROUNDED:
+            found.append(Contradiction(_ring(i, j, above), k, gap))
+    return sorted(found, key=lambda each: len(each.rows))
+
+
+def _ring(one: int, other: int, above: dict[int, int]) -> tuple[int, ...]:
+    """The way from one row to another through a tree of which `above` tells the parents."""
+
+    def up(row: int) -> list[int]:
+        way = [row]
+        while way[-1] in above:
+            way.append(above[way[-1]])
+        return way
+
+    first, second = up(one), up(other)
+    while len(first) > 1 and len(second) > 1 and first[-2] == second[-2]:
+        first.pop()
+        second.pop()
+    return (*first, *reversed(second[:-1]))
+
+
+def stiffness(
+    position: Array, links: Links, led: Index, anchors: Anchors | None = None
+) -> tuple[Rigidity, Rigidity | None]:
+    """Infinitesimal rigidity when heights are held, and in full space if all links ask for distances.
 
     Leaders (rows `led`) keep their places among themselves by their plans, so a bar stands between any two of them.
+    Where links ask for more than distances, or robots are anchored, the formation is rigid if nothing moves it but
+    translations, a rotation and a growth: as many of those as they leave free.
     """
-    bars = np.array([(i, j) for i in led for j in led if i < j], dtype=np.intp).reshape(-1, 2)
-    pairs = np.unique(np.concatenate([edges(links), bars]), axis=0).astype(np.intp)
+    pairs = np.array([(i, j) for i in led for j in led if i < j], dtype=np.intp).reshape(-1, 2)
+    if links.wants is not None or anchors is not None:
+        return _told_more(position, links, pairs, anchors), None
+    pairs = np.unique(np.concatenate([edges(links), pairs]), axis=0).astype(np.intp)
     moves = np.ones_like(position, dtype=bool)
     moves[:, 2] = False
     return rigidity(position, pairs, moves), rigidity(position, pairs)
+
+
+def expendable(position: Array, links: Links, led: Index) -> Redundancy:
+    """What a formation by distances can lose and stay rigid while heights are held: of its `edges`, and of its robots.
+
+    Bars between leaders, rows `led`, cannot be lost as links are; they go with their robots.
+    """
+    own = edges(links)
+    bars = np.array([(i, j) for i in led for j in led if i < j], dtype=np.intp).reshape(-1, 2)
+    pairs = np.concatenate([own, bars[~(bars[:, None] == own).all(axis=2).any(axis=1)]])
+    moves = np.ones_like(position, dtype=bool)
+    moves[:, 2] = False
+    found = redundancy(position, pairs, moves)
+    return Redundancy(found.pairs[: len(own)], found.robots)
+
+
+def _told_more(position: Array, links: Links, bars: Index, anchors: Anchors | None) -> Rigidity:
+    rows = len(position)
+    matrix = residuals(links, anchors, position).jacobian(np.arange(rows), rows)
+    stiff = np.zeros((len(bars), 2, rows, 2))
+    number = np.arange(len(bars))
+    for axis in (0, 1):
+        stiff[number, axis, bars[:, 0], axis], stiff[number, axis, bars[:, 1], axis] = 1.0, -1.0
+    matrix = np.concatenate([matrix, stiff.reshape(-1, 2 * rows)])
+    x, y = (position - position.mean(axis=0))[:, :2].T
+    zero, one = np.zeros(rows), np.ones(rows)
+    alike = np.stack([np.stack(each, axis=1).ravel() for each in ((one, zero), (zero, one), (-y, x), (x, y))])
+    alike = alike[norm(alike) > POINT]
+    kept = len(alike) - np.linalg.matrix_rank(matrix @ alike.T, tol=1e-6)
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    rank = int((singular > 1e-9 * max(1.0, float(singular.max(initial=0.0)))).sum())
+    needed = 2 * rows - int(kept)
+    return Rigidity(rank, needed, float(singular[needed - 1]) if 0 < needed <= len(singular) else 0.0)
 
 
 def algebraic_connectivity(links: Links, rows: int) -> float:
@@ -194,50 +287,3 @@ def algebraic_connectivity(links: Links, rows: int) -> float:
     between[i, j] = between[j, i] = 1.0
     values = np.linalg.eigvalsh(np.diag(between.sum(axis=1)) - between)
     return max(0.0, float(values[1])) if rows > 1 else 0.0
-
-
-@dataclass(frozen=True)
-class Modes:
-    """The sampled loop near its target.
-
-    Attributes:
-        gain: Largest real part of the eigenvalues of H M, what a decision takes from a mode; 2 is where it hunts.
-        radius: Largest |1 − λ|: above 1 something grows.
-        slowest_s: Time constant of the slowest mode that moves [s]; infinity where none does.
-    """
-
-    gain: float
-    radius: float
-    slowest_s: float
-
-
-def modes(law: Law, links: Links, position: Array, closed: Array, hz: float) -> Modes:
-    """Eigenvalues of p⁺ = p + H u(p) at `position`, over x and y of the robots that listen.
-
-    Args:
-        law: Its offset is differentiated numerically, in all coordinates at once.
-        links: Of the whole experiment.
-        position: (N, 3) where the formation is met [m].
-        closed: (N,) h_i, the share of a position error that robot i closes until its next decision.
-        hz: Decisions per second.
-    """
-    rows, listeners = len(position), np.unique(links.listener)
-    free = (3 * listeners[:, None] + np.arange(2)).ravel()
-    count = len(free)
-    moved = np.tile(position.ravel(), (2 * count, 1))
-    moved[np.arange(count), free] += STEP
-    moved[count + np.arange(count), free] -= STEP
-    many = links.repeated(2 * count, rows)
-    places = moved.reshape(-1, 3)
-    offset = law.offset(places, places[many.speaker], many).reshape(2 * count, 3 * rows)[:, free]
-    slope = -(offset[:count] - offset[count:]).T / (2.0 * STEP)
-    taken = np.repeat(closed[listeners], 2)[:, None] * slope
-    if not np.isfinite(taken).all():
-        return Modes(math.inf, math.inf, math.inf)
-    values = np.linalg.eigvals(taken)
-    moving = values[np.abs(values) > STANDING * np.abs(values).max(initial=0.0)]
-    left = np.abs(1.0 - moving)
-    decaying = left[left < 1.0]
-    with np.errstate(divide="ignore"):
-        slowest = -1.0 / (hz * np.log(decaying.max())) if len(decaying) else math.inf
-    return Modes(float(values.real.max(initial=0.0)), float(left.max(initial=0.0)), float(slowest))

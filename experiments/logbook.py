@@ -39,9 +39,9 @@ class Logbook:
         own = (row >= copy * rows) & (row < (copy + 1) * rows)
         self._sent = (time[own], row[own] - copy * rows, seq[own], position[own], velocity[own], yaw[own])
         per_copy = len(self._links)
-        time, link, seq, stamp, position = log.heard
+        time, link, seq, stamp, position, velocity = log.heard
         own = (link >= copy * per_copy) & (link < (copy + 1) * per_copy)
-        self._heard = (time[own], link[own] - copy * per_copy, seq[own], stamp[own], position[own])
+        self._heard = (time[own], link[own] - copy * per_copy, seq[own], stamp[own], position[own], velocity[own])
         lost = np.zeros(rows, dtype=np.intp)
         np.add.at(lost, self._links.speaker, log.lost[copy * per_copy : (copy + 1) * per_copy])
         self._lost = lost
@@ -54,7 +54,7 @@ class Logbook:
         time, row, seq, position, velocity, yaw = self._sent
         sizes = np.array([len(wire.encode(pose, self._encoding)) for pose in self._poses(sent)], dtype=np.intp)
         got = self._within(self._heard[0])
-        heard_time, link, heard_seq, stamp, heard_position = self._heard
+        heard_time, link, heard_seq, stamp, heard_position, heard_velocity = self._heard
         link = link[got]
         rows = len(log.names)
         contacts, world = within(self._contacts(), EPOCH, duration), within(self._world(), EPOCH, duration)
@@ -78,11 +78,12 @@ class Logbook:
                 heard_seq[got],
                 stamp[got],
                 heard_position[got],
+                heard_velocity[got],
             ),
             lost=self._lost,
             missed_deadlines=np.zeros(rows, dtype=np.intp),
             ticks=np.full(rows, log.ticks, dtype=np.intp),
-            decisions=np.full(rows, log.decisions, dtype=np.intp),
+            decisions=log.updates[mine],
             events=tuple(
                 wire.Event(t, kind, source, text) for t, kind, source, text in self._events() if t <= duration
             ),
@@ -185,14 +186,14 @@ class Logbook:
             )
 
     def _heard_by_sample(self) -> dict[tuple[int, int], list[wire.Heard]]:
-        time, link, seq, stamp, position = self._heard
+        time, link, seq, stamp, position, velocity = self._heard
         names = self._log.names
         sample = np.searchsorted(self._log.time, time - ROUNDING_S)
         listener, speaker = self._links.listener[link], self._links.speaker[link]
         found: dict[tuple[int, int], list[wire.Heard]] = {}
-        columns = (sample, listener, speaker, seq, stamp, time, position)
-        for k, row, whose, number, taken, arrived, where in zip(*(c.tolist() for c in columns), strict=True):
-            news = wire.Heard(names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where))
+        columns = (sample, listener, speaker, seq, stamp, time, position, velocity)
+        for k, row, whose, number, taken, arrived, where, moves in zip(*(c.tolist() for c in columns), strict=True):
+            news = wire.Heard(names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where), tuple(moves))
             found.setdefault((k, row), []).append(news)
         return found
 
@@ -221,7 +222,7 @@ class Logbook:
                     refused=0,
                     ticks=log.ticks,
                     missed=0,
-                    decisions=log.decisions,
+                    decisions=int(log.updates[self._mine][row]),
                     interventions=int(log.interventions[self._mine][row]),
                     avoided=int(log.avoided[self._mine][row]),
                     late_s=0.0,

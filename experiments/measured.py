@@ -96,7 +96,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
         phases: The same for each later phase.
         settle_s: When e enters the 2 % band of its largest value for good [s]; the duration if never.
         missed_share: Missed deadlines over ticks.
-        updates: Coordination decisions.
+        updates: How often it computed its goal.
         gap_min_s: Shortest time between two transmissions [s].
         gap_median_s: Median of those times [s].
         gap_max_s: Longest of them [s].
@@ -160,7 +160,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
 
 
 class Belief(msgspec.Struct, frozen=True):
-    """How far what a listener holds of a speaker (the last pose heard) is from where the speaker is."""
+    """How far what a listener believes of a speaker (the last pose heard, carried on) is from where it is."""
 
     listener: str
     speaker: str

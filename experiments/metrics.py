@@ -23,7 +23,7 @@ from experiments.signals import (
     beliefs,
     closest,
     gaps,
-    integral,
+    integrals,
     leaders,
     mean_known,
     net_rotation,
@@ -61,7 +61,7 @@ def measure(trace: Trace) -> CaseMetrics:
     if len(trace.time) < 2:
         raise ValueError(f"case '{trace.case}' holds fewer than two samples: the run ended before it began")
     names, errors = trace.robots, LinkErrors.of(trace)
-    bounds = _bounds(trace)
+    bounds = bounds_of(trace)
     phases = _phases(trace, errors, bounds)
     clearance = Clearance.of(trace)
     touched = collisions(trace, clearance)
@@ -125,7 +125,7 @@ def measure(trace: Trace) -> CaseMetrics:
     )
 
 
-def _bounds(trace: Trace) -> list[tuple[float, int, int]]:
+def bounds_of(trace: Trace) -> list[tuple[float, int, int]]:
     """Start [s], first row and last row + 1 of each phase; legs that begin within one sample are one phase."""
     starts = phase_starts(trace)
     begins, first = np.unique(np.searchsorted(trace.time, np.array(starts) - 1e-9), return_index=True)
@@ -154,9 +154,7 @@ def _robots(
     rows, time, mine = len(trace.robots), trace.time, errors.own
     duration = float(time[-1] - time[0])
     total = errors.per_robot()
-    rmse = np.sqrt(mean_known(total**2))
-    iae = np.where(np.isfinite(rmse), integral(total, time), np.nan)
-    itae = np.where(np.isfinite(rmse), integral(time[:, None] * total, time), np.nan)
+    iae, itae, rmse = integrals(total, time)
     coverage = (np.isfinite(errors.error).mean(axis=0) @ mine) / np.maximum(mine.sum(axis=0), 1.0)
     settled = after_last(~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0)), time)
     sent, recorded = transmissions(trace)

@@ -66,9 +66,11 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
             return
         then = analysis.error[prediction.time <= departure + 1e-9][-1]
         early = f"{analysis.link(int(then.argmax()))} is still {1e3 * then.max():.0f} mm off {allowed}"
-        message = f"the formation is not acquired when the plans begin at {departure:g} s: {early}"
+        changes = any(each.at == departure for each in analysis.pattern.changes)
+        what, path = ("shape changes", ("formation", "changes")) if changes else ("plans begin", ("timeline",))
+        message = f"the formation is not acquired when the {what} at {departure:g} s: {early}"
         remedy = "begin later, start nearer to the shape, or raise the gain"
-        yield Claim("warning", "acquired-late", message, remedy, ("timeline",))
+        yield Claim("warning", "acquired-late", message, remedy, path)
     elif analysis.shapes[0].worst > OFF:
         message = f"from these starts the robots end in another shape, a local minimum: {left} {allowed}"
         remedy = "start them nearer to the shape, in the order in which they stand in it"

@@ -321,13 +321,16 @@ def _heard(states: list[list[State]], robots: tuple[str, ...], start: float, dur
     row = {robot: index for index, robot in enumerate(robots)}
     table = _in_run(
         [
-            (heard.arrived, listener, row[heard.speaker], heard.seq, heard.stamp - start, *heard.position)
+            (
+                *(heard.arrived, listener, row[heard.speaker], heard.seq, heard.stamp - start),
+                *(*heard.position, *heard.velocity),
+            )
             for listener, own in enumerate(states)
             for state in own
             for heard in state.heard
             if heard.speaker in row
         ],
-        (8, start, duration),
+        (11, start, duration),
     )
     return HeardPoses(
         time=table[:, 0],
@@ -336,6 +339,7 @@ def _heard(states: list[list[State]], robots: tuple[str, ...], start: float, dur
         seq=table[:, 3].astype(np.intp),
         stamp=table[:, 4],
         position=table[:, 5:8],
+        velocity=table[:, 8:11],
     )
 
 

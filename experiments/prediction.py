@@ -12,13 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agents.agent import Agent, Assignment
+from agents.agent import Agent
+from agents.assignment import Assignment
 from agents.body import BodyState, Disturbance
 from agents.coordination import Law
 from agents.graph import Links
 from agents.kinds import Kind
+from agents.prediction import HOLD, Predictor
 from agents.rows import Array, Index, clamp, norm
-from agents.triggers import Periodic, Told, Trigger, View
+from agents.speaking import Voice
+from agents.triggers import Periodic, Trigger
 
 FAR = 1e6  # [m] walls that nobody meets
 DECISIONS = 6000  # as many are predicted: ten minutes at the usual rate
@@ -58,6 +61,8 @@ def predict(assignment: Assignment, start: Array, yaw: Array, leads: Index, hz: 
             decide_every=1,
             pose_every=4 * DECISIONS,
             trigger=Periodic(),
+            predictor=HOLD,
+            update=None,
             limits=limits,
             avoidance=None,  # it acts on what range sensors see, and here they see nothing
             duration=2.0 * assignment.duration + 1.0,  # it must not end before the last decision
@@ -122,6 +127,10 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
     """
     i, j = np.triu_indices(len(kinds), 1)
     radius, height = np.array([kind.radius for kind in kinds]), np.array([kind.height for kind in kinds])
+    low, high = prediction.position[..., :2].min(axis=0), prediction.position[..., :2].max(axis=0)
+    gap = np.maximum(low[i] - high[j], low[j] - high[i]).max(axis=1)
+    meet = gap < radius[i] + radius[j]  # the areas in which they move: of many robots most never come near each other
+    i, j = i[meet], j[meet]
     apart, layer = radius[i] + radius[j], (height[i] + height[j]) / 2.0 + clearance
     nearest, when = np.full(len(i), np.inf), np.zeros(len(i))
     block = max(1, PAIRS // max(1, len(i)))
@@ -143,6 +152,7 @@ def message_rate(
     prediction: Prediction,
     nature: Sequence[Disturbance],
     *,
+    predictor: Predictor,
     hz: float,
     rng: np.random.Generator,
 ) -> float:
@@ -154,6 +164,7 @@ def message_rate(
         links: Of the whole experiment.
         prediction: The motion.
         nature: Of each row; its hover jitter and its position noise count, because they make robots speak.
+        predictor: Where neighbours believe each other to be.
         hz: How often the trigger is asked.
         rng: Of the jitter and the noise.
     """
@@ -162,16 +173,19 @@ def message_rate(
     time = np.arange(count) / hz
     position = _between(prediction, time)
     rows = position.shape[1]
+    velocity = np.gradient(position, time, axis=0) if count > 1 else np.zeros_like(position)  # as robots know theirs
     position[..., :2] += _wobble(nature, (count, rows, 2), 1.0 / hz, rng)
-    velocity = np.gradient(position, time, axis=0) if count > 1 else np.zeros_like(position)
-    told, memory = Told.nothing(rows), trigger.memory(rows)
+    voice, still = Voice(trigger, rows, predictor), np.zeros((rows, 3))
     heard = position[:, links.speaker]
     spoken = 0
     for tick in range(count):
-        error = links.onto_listeners(law.error(position[tick], heard[tick], links)[:, None], rows)[:, 0]
-        speak = trigger.speaks(View(float(time[tick]), position[tick], velocity[tick], told, error), memory)
-        told.tell(speak, float(time[tick]), position[tick], velocity[tick])
-        spoken += len(speak)
+        link_error = law.error(position[tick], heard[tick], links)
+        error, energy = links.onto_listeners(np.stack([link_error, 0.5 * link_error**2], axis=1), rows).T
+        t = float(time[tick])
+        said = voice.speak(
+            t, position[tick], velocity[tick], error=error, energy=energy, start=np.zeros(rows), offset=still
+        )
+        spoken += len(said.rows)
     return spoken * hz / count
 
 

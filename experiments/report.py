@@ -130,7 +130,7 @@ def write(
     facts = [
         ("Date", made.date),
         ("Clock", _words(trace.clock for trace in traces)),
-        ("Seed" if len(seeds) == 1 else "Seeds", _seeds(seeds)),
+        ("Seed" if len(seeds) == 1 else "Seeds", seeds_in_words(seeds)),
         ("Duration", _words(_length(case) for case in cases)),
         ("Robots", str(len(traces[0].robots))),
         ("Cases", ", ".join(by_case(cases))),
@@ -149,7 +149,7 @@ def write(
         Section("Time between transmissions", tables=(gaps_table(cases),)),
         Section(
             "What neighbours hold",
-            ("How far the last pose heard on each link is from where its robot really is.",),
+            ("How far the last pose heard on each link, carried on by the prediction, is from where its robot is.",),
             (links_table(cases),),
             folded="Show all links" if len(cases[0].belief) > MOST_LINKS else "",
         ),
@@ -159,7 +159,7 @@ def write(
         Section("Definitions", terms=DEFINITIONS),
     ]
     cut, verdict = interruptions(cases), findings(cases)
-    return _render(
+    return render(
         folder / name,
         title=experiment.title,
         source=experiment.source,
@@ -209,14 +209,14 @@ def compare(
     experiments = dict.fromkeys(trace.experiment.title for _, traces in runs for trace in traces)
     sections = [
         Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
-        Section("Figures", pictures=_numbered(zip(drawn, captions, strict=True))),
+        Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
         Section("Each robot", tables=robot_tables(cases), folded="Show all tables"),
         Section("Was anything lost?", tables=proof_tables(cases), folded="Show all tables"),
         Section("Definitions", terms=DEFINITIONS),
     ]
     target.parent.mkdir(parents=True, exist_ok=True)
     source = "; ".join(experiments)
-    return _render(
+    return render(
         target,
         title=title,
         source=source,
@@ -245,7 +245,7 @@ def _origin(folder: Path, now: Origin) -> Origin:
         return now
 
 
-def _render(
+def render(
     target: Path,
     *,
     title: str,
@@ -255,6 +255,7 @@ def _render(
     verdict: Sequence[Finding],
     sections: Sequence[Section],
 ) -> Path:
+    """Writes a page that needs nothing else: facts and findings on top, then the sections."""
     pages = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -285,7 +286,7 @@ def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Pi
         "plan_view": f"From above: start hollow, end full, links of the end grey.{scenery.caption(shown)}{seed}",
     }
     drawn = figures.every(cases, traces)
-    return _numbered((figure, captions[name]) for name, figure in drawn.items())
+    return numbered((figure, captions[name]) for name, figure in drawn.items())
 
 
 def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_before: int) -> list[Section]:
@@ -298,7 +299,7 @@ def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_be
     if tables := shadow_tables(cases):
         seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
         drawn = ((figure, f"{SHADOWS}{seed}") for figure in shadow_figures.every(traces).values())
-        pictures = _numbered(drawn, figures_before + 1)
+        pictures = numbered(drawn, figures_before + 1)
         sections.append(Section("Twins beside robots", tables=tables, pictures=pictures))
     return sections
 
@@ -311,7 +312,8 @@ def _robot_caption(cases: Sequence[CaseMetrics]) -> str:
     return f"Each robot; those in brackets are left out of the means.{_interval_note(cases)}"
 
 
-def _numbered(drawn: Iterable[tuple[Figure, str]], first: int = 1) -> tuple[Picture, ...]:
+def numbered(drawn: Iterable[tuple[Figure, str]], first: int = 1) -> tuple[Picture, ...]:
+    """Figures and their captions, to stand in a page."""
     return tuple(
         Picture(inline(figures.svg(figure), f"f{number}-", caption), number, caption)
         for number, (figure, caption) in enumerate(drawn, start=first)
@@ -372,7 +374,8 @@ def _first_seed(traces: Sequence[Trace]) -> list[Trace]:
     return list(found.values())
 
 
-def _seeds(seeds: Sequence[int]) -> str:
+def seeds_in_words(seeds: Sequence[int]) -> str:
+    """`1 to 50` of many that follow one another, else each."""
     if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
         return f"{seeds[0]} to {seeds[-1]}"
     return ", ".join(str(seed) for seed in seeds)

@@ -41,7 +41,8 @@ DEFINITIONS: Final = (
     ("Worst link", "Of each robot the link with the largest error, averaged over the last second of a phase."),
     ("Net rotation", "How fast the formation turns about its centroid, seen from above, after it was acquired: the"
      " slope of the angle that fits the followers' positions best to those at acquisition."),
-    ("Belief", "What a listener holds of a neighbour: the newest pose heard, kept until the next."),
+    ("Belief", "What a listener holds of a neighbour: the newest pose heard, carried on by the prediction until the"
+     " next."),
     ("J2", "0.02 · transmissions + 0.1 · decisions + 0.3 · settling time + 0.1 · IAE + 0.01 · ITAE, summed over all"
      " robots; the settling time is when e(t) enters 2 % of its largest value for good (the duration if never)."),
     ("Collision", "Robots are upright cylinders of their kind's radius and height. A collision is a contact that the"

@@ -17,6 +17,8 @@ from experiments.experiment import Experiment
 
 _CHOICES: Final = (
     ("Experiment", "trigger", plugins.TRIGGERS),
+    ("Experiment", "prediction", plugins.PREDICTORS),
+    ("Formation", "update", plugins.TRIGGERS),
     ("Formation", "law", plugins.LAWS),
     ("Leg", "plan", plugins.PLANNERS),
     ("Obstacle", "plan", plugins.PLANNERS),

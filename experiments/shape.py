@@ -62,17 +62,21 @@ def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experimen
 def group_of(path: Path) -> str | None:
     """The entry-point group that the choice at this path is made from, if a choice stands there."""
     match path:
-        case ("trigger",):
-            return plugins.TRIGGERS
+        case ("trigger",) | ("formation", "update"):
+            group = plugins.TRIGGERS
+        case ("prediction",):
+            group = plugins.PREDICTORS
         case ("formation", "law"):
-            return plugins.LAWS
+            group = plugins.LAWS
         case ("timeline", int(), "plan") | ("arena", "obstacles", str(), "plan"):
-            return plugins.PLANNERS
+            group = plugins.PLANNERS
         case ("avoidance",):
-            return plugins.AVOIDANCES
+            group = plugins.AVOIDANCES
         case ("world", "engine"):
-            return plugins.ENGINES
-    return None
+            group = plugins.ENGINES
+        case _:
+            return None
+    return group
 
 
 def parameters(group: str, kind: str) -> list[str]:

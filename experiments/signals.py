@@ -12,36 +12,32 @@ from itertools import pairwise
 
 import numpy as np
 
-from agents.graph import Links, links
+from agents import plugins
+from agents.graph import Links
 from agents.rows import Array, Index, Mask, norm
 from experiments import assign
 from experiments.experiment import Experiment
-from experiments.links import parse_links
+from experiments.formation import Pattern, errors
 from experiments.trace import Trace
 
 
 def links_of(trace: Trace) -> Links:
     """The links of the experiment in the row numbers of the trace."""
-    row = {name: i for i, name in enumerate(trace.robots)}
-    listed = [link for link in parse_links(trace.experiment) if link[0] in row and link[1] in row]
-    return links([(row[i], row[j]) for i, j, _, _ in listed], [d for *_, d, _ in listed], [g for *_, g in listed])
+    return Pattern.of(trace.experiment, trace.robots).links
 
 
 def phase_starts(trace: Trace) -> tuple[float, ...]:
-    """When phases begin: the common start and each leg of the timeline within the run [s]."""
+    """When phases begin: the common start, each leg of the timeline and each change of shape within the run [s]."""
     first, last = float(trace.time[0]), float(trace.time[-1])
-    return (first, *sorted({leg.at_s for leg in trace.experiment.timeline if first < leg.at_s < last}))
+    experiment = trace.experiment
+    begins = {leg.at_s for leg in experiment.timeline} | {change.at_s for change in experiment.formation.changes}
+    return (first, *sorted(at for at in begins if first < at < last))
 
 
 def leaders(experiment: Experiment) -> tuple[str, ...]:
     """Who is left out of the means; nobody if that would leave out all."""
     leading = tuple(assign.leaders(experiment))
     return () if len(leading) == len(experiment.robots) else leading
-
-
-def link_errors(trace: Trace, net: Links) -> Array:
-    """Distance error ‖p_i − p_j‖ − d_ij of each link (T, E) [m]; NaN where an end is unknown."""
-    return norm(trace.true_position[:, net.listener] - trace.true_position[:, net.speaker]) - net.distance
 
 
 def own_links(net: Links, rows: int) -> Array:
@@ -55,13 +51,14 @@ def own_links(net: Links, rows: int) -> Array:
 
 @dataclass(frozen=True)
 class LinkErrors:
-    """How far the links are from their distances, and whose they are.
+    """How far the links are from what they ask for, and whose they are.
 
     Attributes:
         time: (T,) [s].
         net: The links.
         own: (E, N) 1 where a link counts for a robot, see `own_links`.
-        error: (T, E) |‖p_i − p_j‖ − d_ij| [m]; NaN where an end is unknown.
+        error: (T, E) as the law measures it, |‖p_i − p_j‖ − d_ij| for distances [m]; NaN where an end is unknown or
+            the link is not there.
         alive: (T, N) whether the robot's own position is known.
     """
 
@@ -74,16 +71,18 @@ class LinkErrors:
     @classmethod
     def of(cls, trace: Trace) -> LinkErrors:
         """The errors of a whole trace."""
-        net = links_of(trace)
+        pattern = Pattern.of(trace.experiment, trace.robots)
+        law = plugins.build(plugins.LAWS, trace.experiment.formation.law)
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
-        return cls(trace.time, net, own_links(net, len(trace.robots)), np.abs(link_errors(trace, net)), alive)
+        error = errors(law, pattern, trace.time, trace.true_position)
+        return cls(trace.time, pattern.links, own_links(pattern.links, len(trace.robots)), error, alive)
 
     def part(self, begin: int, end: int) -> LinkErrors:
         """The same from one row in time to another."""
         return LinkErrors(self.time[begin:end], self.net, self.own, self.error[begin:end], self.alive[begin:end])
 
     def per_robot(self) -> Array:
-        """e_i(t) = Σ_j |d_ij − ‖p_i − p_j‖| (T, N) [m]; NaN where none of the robot's links is known."""
+        """e_i(t) = Σ_j e_ij (T, N) [m] over its own links, see `error`; NaN where none of them is known."""
         known = np.isfinite(self.error)
         total = np.where(known, self.error, 0.0) @ self.own
         total[known.astype(float) @ self.own == 0.0] = np.nan
@@ -137,6 +136,14 @@ def integral(values: Array, time: Array) -> Array:
     return np.asarray(np.where(np.isfinite(parts), parts, 0.0).sum(axis=0))
 
 
+def integrals(total: Array, time: Array) -> tuple[Array, Array, Array]:
+    """∫ e dt [m s], ∫ t·e dt [m s²] and √(mean e²) [m] of errors (T, N); NaN where nothing is known."""
+    rmse = np.sqrt(mean_known(total**2))
+    known = np.isfinite(rmse)
+    iae, itae = integral(total, time), integral(time[:, None] * total, time)
+    return np.where(known, iae, np.nan), np.where(known, itae, np.nan), np.asarray(rmse)
+
+
 def after_last(bad: Mask, time: Array) -> list[float | None]:
     """Per column of (n, N): time since the first row from which on nothing is bad; None if the last row is bad."""
     last = np.where(bad.any(axis=0), len(bad) - 1 - bad[::-1].argmax(axis=0), -1)
@@ -166,7 +173,11 @@ def net_rotation(position: Array, time: Array) -> float | None:
 
 
 def beliefs(trace: Trace, net: Links) -> Array:
-    """Error (T, E) [m] of the newest pose heard on each link, held since; NaN before the first and after a death."""
+    """Error (T, E) [m] of what is believed on each link: the newest pose heard, carried on by the predictor since.
+
+    NaN before the first pose, and after a death.
+    """
+    predictor = assign.predictor(trace.experiment)
     rows, heard = len(trace.robots), trace.heard
     number = np.full((rows, rows), -1)
     number[net.listener, net.speaker] = np.arange(len(net))
@@ -180,7 +191,10 @@ def beliefs(trace: Trace, net: Links) -> Array:
         if not len(mine):
             continue
         at = np.searchsorted(heard.time[mine], trace.time, side="right") - 1
-        error[:, k] = norm(heard.position[mine[at]] - trace.true_position[:, net.speaker[k]])
+        newest = mine[at]
+        age = np.maximum(trace.time - heard.stamp[newest], 0.0)
+        believed = predictor.position(heard.position[newest], heard.velocity[newest], age)
+        error[:, k] = norm(believed - trace.true_position[:, net.speaker[k]])
         error[at < 0, k] = np.nan
     return error
 

@@ -43,6 +43,7 @@ class HeardPoses:
         seq: (H,) the speaker's number.
         stamp: (H,) when the pose was taken, since the common start [s].
         position: (H, 3) as heard [m].
+        velocity: (H, 3) as heard [m/s].
     """
 
     time: Array
@@ -51,6 +52,7 @@ class HeardPoses:
     seq: Index
     stamp: Array
     position: Array
+    velocity: Array
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class Trace:
             never got.
         missed_deadlines: (N,) ticks that began more than one period late.
         ticks: (N,) ticks in all, from the common start on.
-        decisions: (N,) coordination decisions, from the common start on.
+        decisions: (N,) how often it computed its goal, from the common start on.
         events: What happened, stamps in seconds since the common start.
         interventions: (N,) ticks on which safety changed what had been decided, from the common start on.
         avoided: (N,) ticks on which avoidance did.

@@ -16,7 +16,7 @@ import numpy as np
 from agents.agent import Agent
 from agents.body import BodyState
 from agents.lifecycle import LANDING, Phase
-from agents.rows import Array, Index, some
+from agents.rows import Array, Index, Mask, some
 from agents.shadow import shadowed
 from experiments import assign
 from experiments.channel import Channel
@@ -46,9 +46,10 @@ class Log:
         true_position: (K, R, 3), `true_yaw` (K, R).
         goal: (K, R, 3), `setpoint` (K, R, 4), `error` (K, R).
         sent: Columns time, row, seq, position, velocity, yaw.
-        heard: Columns time, link, seq, stamp, position.
+        heard: Columns time, link, seq, stamp, position, velocity.
         lost: (E,) samples lost on each link of all repetitions, from the common start to the landing.
         decisions: Coordination decisions of each row.
+        updates: (R,) of these, those at which the row computed its goal anew.
         interventions: (R,) ticks on which safety changed what was decided, from the common start on.
         avoided: (R,) ticks on which avoidance did, from the common start on.
         touches: Contacts that began, at times since the common start.
@@ -59,6 +60,7 @@ class Log:
         obstacles: (K, repetitions, M, 3) x, y [m], yaw [rad] of each.
         shadow_position: (K, R, 3) of the twins beside the robots, NaN for rows without one; None if there is none.
         shadow_yaw: (K, R) of those twins.
+        waited: (repetitions,) that got an order later than they would have got it alone, because another one was late.
     """
 
     names: tuple[str, ...]
@@ -74,9 +76,10 @@ class Log:
     setpoint: Array
     error: Array
     sent: tuple[Array, Index, Index, Array, Array, Array]
-    heard: tuple[Array, Index, Index, Array, Array]
+    heard: tuple[Array, Index, Index, Array, Array, Array]
     lost: Index
     decisions: int
+    updates: Index
     interventions: Index
     avoided: Index
     touches: tuple[Touch, ...]
@@ -87,6 +90,7 @@ class Log:
     obstacles: Array
     shadow_position: Array | None
     shadow_yaw: Array | None
+    waited: Mask
 
 
 class _Samples:
@@ -109,8 +113,16 @@ class _Samples:
         return tuple(np.concatenate(column) for column in zip(*self._columns, strict=True))
 
 
-def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:  # noqa: PLR0915 - one loop, told in order
+def simulate(  # noqa: PLR0915 - one loop, told in order
+    experiment: Experiment, seeds: Sequence[int], *, lean: bool = False
+) -> Log:
     """Flies one case of an experiment once for each seed.
+
+    Args:
+        experiment: The case.
+        seeds: One for each repetition.
+        lean: Keep `true_position` and who sent when, and nothing of the other columns: a seventh of the memory, for
+            sweeps. They are empty, and so is everything that was heard.
 
     Raises:
         Stuck: If robots do not become ready, airborne or done.
@@ -132,6 +144,8 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:  # noqa: PLR0
     states, seen, sent, heard = _Samples(), _Samples(), _Samples(), _Samples()
     lost_before = lost_after = channel.lost
     conductor = _Conductor(agent, names)
+    nothing = np.zeros((rows, 0))
+    blank = (nothing,) * 4
     tick = 0
     while not conductor.over:
         t = tick * dt
@@ -139,7 +153,8 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:  # noqa: PLR0
         arrived = channel.due(t)
         if arrived is not None:
             agent.hear(arrived.link, arrived.position, arrived.velocity, arrived.stamp, arrived.arrival)
-            heard.add(arrived.arrival, arrived.link, arrived.seq, arrived.stamp, arrived.position)
+            if not lean:
+                heard.add(arrived.arrival, arrived.link, arrived.seq, arrived.stamp, arrived.position, arrived.velocity)
         actions = agent.step(t, state)
         if agent.life.moved:
             if lost_before is channel.lost and agent.decisions:
@@ -158,22 +173,26 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:  # noqa: PLR0
                 avoided += actions.avoided
         touches += twin.touches()
         if (agent.tick - 1) % log_every == 0:  # the agent's count begins anew at the common start
-            states.add(t, agent.life.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
-            seen.add(np.array(twin.engine.obstacles), *(value for value in _extra(state) if value is not None))
+            whole = (agent.life.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
+            states.add(t, *((*blank, state.true_position, *blank) if lean else whole))
+            more = () if lean else tuple(value for value in _extra(state) if value is not None)
+            seen.add(nothing if lean else np.array(twin.engine.obstacles), *more)
         if len(speak := actions.speak):
             seq[speak] += 1
-            said = (state.position[speak], state.velocity[speak], state.yaw[speak])
+            said = (
+                (nothing[speak],) * 3 if lean else (actions.position[speak], actions.velocity[speak], state.yaw[speak])
+            )
             sent.add(np.full(len(speak), t), speak, seq[speak], *said)
-            channel.send(t, speak, seq, state.position, state.velocity, surely=agent.decisions == 0)
+            channel.send(t, speak, seq, actions.position, actions.velocity, surely=agent.decisions == 0)
         conductor.look(t, dt)
         twin.begun_at = conductor.start_at
         tick += 1
     begin = conductor.start_at
     time, phase, position, velocity, yaw, true_position, true_yaw, goal, setpoint, error = states.stacked()
-    obstacles, *more = seen.stacked()
-    attitude, shadow_position, shadow_yaw = (None if value is None else more.pop(0) for value in _extra(state))
+    obstacles, *rest = seen.stacked()
+    extra = [None if lean or value is None else rest.pop(0) for value in _extra(state)]
     at, row, number, *pose = sent.joined((0,), (0,), (0,), (0, 3), (0, 3), (0,))
-    arrival, link, told, stamp, place = heard.joined((0,), (0,), (0,), (0,), (0, 3))
+    arrival, link, told, stamp, *heard_pose = heard.joined((0,), (0,), (0,), (0,), (0, 3), (0, 3))
     return Log(
         names=names,
         seeds=tuple(seeds),
@@ -188,19 +207,21 @@ def simulate(experiment: Experiment, seeds: Sequence[int]) -> Log:  # noqa: PLR0
         setpoint=setpoint,
         error=error,
         sent=(at - begin, row.astype(np.intp), number.astype(np.intp), pose[0], pose[1], pose[2]),
-        heard=(arrival - begin, link.astype(np.intp), told.astype(np.intp), stamp - begin, place),
+        heard=(arrival - begin, link.astype(np.intp), told.astype(np.intp), stamp - begin, *heard_pose),
         lost=lost_after - lost_before,
         decisions=agent.decisions,
+        updates=agent.updates,
         interventions=interventions,
         avoided=avoided,
         touches=tuple(replace(touch, time=touch.time - begin) for touch in touches),
         ticks=round(experiment.duration_s / dt),
         airborne=conductor.airborne_at - begin,
         ended=tick * dt - begin,
-        attitude=attitude,
+        attitude=extra[0],
         obstacles=obstacles,
-        shadow_position=shadow_position,
-        shadow_yaw=shadow_yaw,
+        shadow_position=extra[1],
+        shadow_yaw=extra[2],
+        waited=conductor.waited,
     )
 
 
@@ -221,6 +242,7 @@ class _Conductor:
         self._stage = Phase.READY
         self._since = 0.0
         self.airborne_at = self.start_at = np.nan
+        self.waited: Mask = np.zeros(len(agent.life.phase) // len(names), dtype=bool)
         self.over = False
 
     def look(self, t: float, dt: float) -> None:
@@ -232,14 +254,17 @@ class _Conductor:
             if phase.min() >= Phase.LANDING:
                 self._since, self._stage = t, Phase.DONE
             return
+        orders = not round(t / dt) % max(1, round(ORDERS_S / dt))
         if phase.min() < self._stage:
+            if orders and self._stage < Phase.RUNNING:
+                self.waited |= phase.reshape(len(self.waited), -1).min(axis=1) >= self._stage
             if t - self._since > PATIENCE_S:
                 late = np.flatnonzero(phase < self._stage)[: len(self._names)]
                 names = ", ".join(sorted({self._names[row % len(self._names)] for row in late}))
                 reason = self._agent.life.reason[late[0]]
                 raise Stuck(f"not {self._stage.word} after {PATIENCE_S:g} s: {names} ({reason})")
             return
-        if self._stage < Phase.RUNNING and round(t / dt) % max(1, round(ORDERS_S / dt)):
+        if self._stage < Phase.RUNNING and not orders:
             return
         self._since = t
         life = self._agent.life

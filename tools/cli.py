@@ -28,6 +28,7 @@ EXPLAINED: Final = (
     ("experiments.records", "RecordingError"),
     ("experiments.conductor", "RunFailed"),
     ("experiments.virtual", "Stuck"),
+    ("experiments.sweep_workers", "SweepError"),
     ("experiments.standins", "StandInError"),
     ("experiments.world", "WorldTaken"),
     ("tools.world", "WorldOrderError"),
@@ -102,6 +103,61 @@ def run(
             anyway=anyway,
             report=report,
             open_report=open_report,
+        )
+    )
+
+
+@app.command()
+def sweep(
+    file: File,
+    given: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[PATH=VALUES...]",
+            help="What changes: trigger.threshold=0.002:0.05:log12, or lin12, or a list 1,2,3; several make a grid. "
+            "seeds=50 or seeds=101:150 [20 from the file's on]; tuning=1001:1060 for --optimize.",
+        ),
+    ] = None,
+    *,
+    case: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Only this case; may be repeated.")] = None,
+    settings: Settings = None,
+    optimize: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WISH",
+            help="Seeks values in the ranges instead: 'messages, iae<=1.01' (relative to the first case).",
+        ),
+    ] = None,
+    out: Annotated[str | None, typer.Option(metavar="FOLDER", help="Where runs and table are kept. [runs/...]")] = None,
+    processes: Annotated[int | None, typer.Option(min=1, help="How many at once. [one per core]")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="On the workers of this dask scheduler, tcp://HOST:PORT.")
+    ] = None,
+    as_json: AsJson = False,
+    anyway: Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")] = False,
+    report: Annotated[bool, typer.Option(help="Writes the page and the figure.")] = True,
+    open_report: Annotated[bool, typer.Option("--open", help="Opens the page in the browser.")] = False,
+) -> None:
+    """Run cases x values x seeds in virtual time on all cores; what is done is never run again."""
+    from experiments.sweep_command import Request  # noqa: PLC0415
+    from experiments.sweep_command import command as run_sweep  # noqa: PLC0415
+
+    raise typer.Exit(
+        run_sweep(
+            Request(
+                file=file,
+                given=given or [],
+                settings=settings or [],
+                cases=case or [],
+                out=out,
+                scheduler=scheduler,
+                processes=processes,
+                optimize=optimize,
+                as_json=as_json,
+                anyway=anyway,
+                report=report,
+                open_report=open_report,
+            )
         )
     )
 
@@ -218,13 +274,55 @@ def recover(
 
 @app.command()
 def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A ready-made experiment; `zenpark list` shows them.")],
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="NAME", help="A ready-made experiment (`zenpark list`); TARGET behind a formation."),
+    ] = None,
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
+    *,
+    polygon: Annotated[int | None, typer.Option(metavar="N", help="Robots on a regular polygon.")] = None,
+    grid: Annotated[str | None, typer.Option(metavar="RxC", help="Robots on a grid, such as 5x8.")] = None,
+    hemisphere: Annotated[int | None, typer.Option(metavar="N", help="On a hemisphere, with Delaunay links.")] = None,
+    henneberg: Annotated[int | None, typer.Option(metavar="N", help="Minimally rigid: 2N - 3 links.")] = None,
+    circulant: Annotated[int | None, typer.Option(metavar="N", help="On a circle, linked by --jumps.")] = None,
+    jumps: Annotated[str, typer.Option(metavar="J,J", help="Of a circulant: i hears i ± J.")] = "1,2",
+    kind: Annotated[str, typer.Option(metavar="KIND", help="Of the robots of a formation.")] = "crazyflie",
+    spacing: Annotated[float, typer.Option(min=0.01, help="Between neighbours [m].")] = 0.6,
+    scatter: Annotated[
+        float | None, typer.Option(min=0.0, help="Starts are drawn this far around, by seed [m]. [0.3 spacing]")
+    ] = None,
+    law: Annotated[str, typer.Option(metavar="distance|displacement", help="Of a formation.")] = "distance",
+    seed: Annotated[int, typer.Option(min=0, help="Of the file.")] = 1,
+    duration: Annotated[float, typer.Option(min=1.0, help="[s]")] = 60.0,
 ) -> None:
-    """Begin an experiment file from a ready-made one."""
-    from experiments.commands import new as command  # noqa: PLC0415
+    """Begin an experiment file from a ready-made one, or with a formation of any size."""
+    asked = {"polygon": polygon, "grid": grid, "hemisphere": hemisphere, "henneberg": henneberg, "circulant": circulant}
+    formations = [(what, str(size)) for what, size in asked.items() if size is not None]
+    if not formations:
+        if name is None:
+            raise typer.BadParameter("give a NAME (`zenpark list`), or a formation such as --hemisphere 40")
+        from experiments.commands import new as copied  # noqa: PLC0415
 
-    raise typer.Exit(command(name, target))
+        raise typer.Exit(copied(name, target))
+    if len(formations) > 1 or target is not None:
+        what = f"--{formations[1][0]}" if len(formations) > 1 else f"'{target}'"
+        raise typer.BadParameter(f"{what} is too much behind --{formations[0][0]}: one formation, one TARGET")
+    from experiments.generate import Wanted, command  # noqa: PLC0415
+
+    wanted = Wanted(kind=kind, spacing=spacing, scatter=scatter, seed=seed, duration_s=duration, law=law)
+    raise typer.Exit(command(*formations[0], name, wanted, jumps))
+
+
+@app.command(name="import")
+def import_(
+    file: Annotated[str, typer.Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
+    duration: Annotated[float, typer.Option(min=1.0, help="Their files do not say how long [s].")] = 60.0,
+) -> None:
+    """Turn an experiment file of Robotic Park's authors into one of zenpark."""
+    from experiments.importing import command  # noqa: PLC0415
+
+    raise typer.Exit(command(file, target, duration))
 
 
 @app.command(name="list")

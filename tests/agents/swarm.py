@@ -124,8 +124,8 @@ class Swarm:
             group, row = self.where[name]
             if row in group.actions.speak:
                 self.sent.append((self.tick, name))
-                state = group.state
-                self._flying.append((name, state.position[row].copy(), state.velocity[row].copy(), self.t))
+                said = group.actions
+                self._flying.append((name, said.position[row].copy(), said.velocity[row].copy(), self.t))
         self.log.append({what: self._all(what) for what in ("phase", "goal", "error", "setpoint", "position", "truth")})
         self.tick += 1
 

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from agents.agent import Heard
 from agents.body import BodyState, Rays
 from agents.graph import links
+from agents.hearing import Heard
 from agents.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.safety import Limits
 from agents.sight import AHEAD_S, REACH, SCAN_S, Sight

@@ -1,5 +1,7 @@
 """Every registered trigger: rows decide as if alone, first asks are answered, intervals and silences are kept."""
 
+import re
+from pathlib import Path
 from typing import get_type_hints
 
 import msgspec
@@ -9,10 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents import plugins
+from agents.prediction import HOLD
 from agents.triggers import Periodic, SendOnDelta, Told, Trigger, View
+from tests.agents.signals import DT, Play, wander
 
-DT = 0.02
 NAMES = plugins.names(plugins.TRIGGERS)
+FAMILIES = {
+    "periodic", "send-on-delta", "relative", "mixed", "decaying", "dynamic", "integral", "predictive",
+    "self-triggered", "lyapunov", "relative-control",
+}  # fmt: skip
 SEEDS = st.integers(0, 2**32 - 1)
 FEW = settings(max_examples=15, deadline=None)
 
@@ -24,32 +31,30 @@ def made(name, **parameters):
     return plugins.build(plugins.TRIGGERS, {"kind": name, **dict.fromkeys(needed, 0.05), **parameters})
 
 
-def wander(seed, rows, ticks):
-    """Random walks with rests: (K, N, 3) positions and velocities, and an error (K, N)."""
-    rng = np.random.default_rng(seed)
-    speed = rng.choice([0.0, 0.05, 0.5], (ticks, rows, 1)) * rng.normal(size=(ticks, rows, 3))
-    return np.cumsum(speed * DT, axis=0) + rng.normal(size=(rows, 3)), speed, rng.uniform(0, 0.3, (ticks, rows))
+def gaps(fired):
+    """Ticks between events of each row."""
+    return [np.diff(np.flatnonzero(column)) for column in fired.T]
 
 
-def play(trigger, positions, velocities, errors):
-    """Who speaks when (K, N), and what is remembered at the end."""
-    rows = positions.shape[1]
-    told, memory, spoke = Told.nothing(rows), trigger.memory(rows), []
-    for k, (position, velocity, error) in enumerate(zip(positions, velocities, errors, strict=True)):
-        t = k * DT
-        now = trigger.speaks(View(t, position, velocity, told, error), memory)
-        told.tell(now, t, position, velocity)
-        spoke.append(np.isin(np.arange(rows), now))
-    return np.array(spoke), told, memory
+def view(position, told, *, t=0.0, error=0.0):
+    """A moment of rows that stand at `position`."""
+    rows = len(position)
+    zeros = np.zeros(rows)
+    return View(
+        t, np.asarray(position, dtype=float), np.zeros((rows, 3)), told,
+        error=zeros + error, energy=zeros, start=zeros, offset=np.zeros((rows, 3)), predictor=HOLD,
+    )  # fmt: skip
 
 
-def gaps(spoke):
-    """Ticks between messages of each row."""
-    return [np.diff(np.flatnonzero(column)) for column in spoke.T]
+def told(position, t=0.0):
+    """Everybody said this at `t`."""
+    said = Told.nothing(len(position))
+    said.position[:], said.time[:] = position, t
+    return said
 
 
-def test_triggers_are_registered():
-    assert {"periodic", "send-on-delta"} <= set(NAMES)
+def test_all_families_are_registered():
+    assert set(NAMES) >= FAMILIES
     for name in NAMES:
         assert isinstance(made(name), Trigger)
 
@@ -57,33 +62,31 @@ def test_triggers_are_registered():
 @pytest.mark.parametrize("name", NAMES)
 @FEW
 @given(seed=SEEDS)
-def test_rows_speak_as_if_each_were_alone(name, seed):
-    trigger, signal = made(name, minimum_interval_s=0.04, maximum_silence_s=0.3), wander(seed, 4, 40)
-    together, told, memory = play(trigger, *signal)
+def test_rows_have_events_as_if_each_were_alone(name, seed):
+    trigger = made(name, minimum_interval_s=0.04, maximum_silence_s=0.3, evaluate_every_s=0.04, smoothing_s=0.1)
+    signal = wander(seed, 4, 40)
+    together = Play(trigger, signal)
     for row in range(4):
-        alone, mine, remembered = play(trigger, *(part[:, row : row + 1] for part in signal))
-        np.testing.assert_array_equal(alone[:, 0], together[:, row])
-        np.testing.assert_array_equal(remembered[0], memory[row])
-        np.testing.assert_array_equal(mine.position[0], told.position[row])
-        np.testing.assert_array_equal(mine.velocity[0], told.velocity[row])
-        assert mine.time[0] == told.time[row]
+        alone = Play(trigger, signal.of(row))
+        np.testing.assert_array_equal(alone.fired[:, 0], together.fired[:, row])
+        np.testing.assert_array_equal(alone.state[0], together.state[row])
+        for what in ("position", "velocity", "time", "offset", "energy"):
+            np.testing.assert_array_equal(getattr(alone.told, what)[0], getattr(together.told, what)[row])
 
 
 @pytest.mark.parametrize("name", NAMES)
 @FEW
 @given(seed=SEEDS)
-def test_who_never_spoke_speaks_when_first_asked(name, seed):
-    for options in ({}, {"minimum_interval_s": 0.5}, {"maximum_silence_s": 1.0}):
-        spoke, _, _ = play(made(name, **options), *wander(seed, 3, 1))
-        assert spoke.all()
+def test_who_had_no_event_has_one_when_first_asked(name, seed):
+    for options in ({}, {"minimum_interval_s": 0.5}, {"maximum_silence_s": 1.0}, {"evaluate_every_s": 0.5}):
+        assert Play(made(name, **options), wander(seed, 3, 1)).fired.all()
 
 
 @pytest.mark.parametrize("name", NAMES)
 @FEW
 @given(seed=SEEDS, ticks=st.integers(1, 15))
 def test_the_minimum_interval_is_kept(name, seed, ticks):
-    spoke, _, _ = play(made(name, minimum_interval_s=ticks * DT), *wander(seed, 4, 60))
-    for gap in gaps(spoke):
+    for gap in gaps(Play(made(name, minimum_interval_s=ticks * DT), wander(seed, 4, 60)).fired):
         assert (gap >= ticks).all()
 
 
@@ -92,42 +95,53 @@ def test_the_minimum_interval_is_kept(name, seed, ticks):
 @given(seed=SEEDS, ticks=st.integers(1, 15))
 def test_the_maximum_silence_is_kept(name, seed, ticks):
     signal = wander(seed, 4, 60)
-    signal[0][:], signal[1][:] = signal[0][:1], 0.0  # nobody moves: only silence makes them speak
-    spoke, _, _ = play(made(name, maximum_silence_s=ticks * DT), *signal)
-    for gap in gaps(spoke):
+    signal.position[:], signal.velocity[:] = signal.position[:1], 0.0  # nobody moves: only silence makes them speak
+    for gap in gaps(Play(made(name, maximum_silence_s=ticks * DT), signal).fired):
         assert len(gap) >= 60 // ticks - 1
         assert (gap <= ticks).all()
 
 
+@pytest.mark.parametrize("name", sorted(FAMILIES - {"periodic"}))
+@FEW
+@given(seed=SEEDS, ticks=st.integers(2, 10))
+def test_evaluated_periodically_it_is_as_if_it_were_asked_that_seldom(name, seed, ticks):
+    signal = wander(seed, 3, 60)
+    seldom = Play(made(name, evaluate_every_s=ticks * DT), signal).fired
+    assert not np.delete(seldom, slice(None, None, ticks), axis=0).any()
+    np.testing.assert_array_equal(seldom[::ticks], Play(made(name), signal.every(ticks), dt=ticks * DT).fired)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_parameters_have_units_in_their_descriptions(name):
-    hints = get_type_hints(plugins.struct(plugins.TRIGGERS, name), include_extras=True)
-    assert hints
-    for hint in hints.values():
-        assert any("[" in str(note) for note in getattr(hint, "__metadata__", ())), hint
+    kind = plugins.struct(plugins.TRIGGERS, name)
+    hints = get_type_hints(kind, include_extras=True)
+    assert kind.__struct_fields__
+    for field in kind.__struct_fields__:
+        assert any("[" in str(note) for note in getattr(hints[field], "__metadata__", ())), field
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_position_that_is_not_known_is_not_news(name):
+    rows = view([[np.nan] * 3], told([[0.0] * 3]), t=1e-3, error=1.0)
+    trigger = made(name)
+    if name != "relative-control":  # it looks at the offset alone
+        assert not len(trigger.due(rows, trigger.state(1)))
 
 
 @FEW
 @given(SEEDS, st.floats(0.002, 0.05))
 def test_send_on_delta_bounds_what_the_neighbours_do_not_know(seed, threshold):
-    positions, velocities, errors = wander(seed, 3, 80)
-    told, memory, trigger = Told.nothing(3), np.zeros((3, 0)), SendOnDelta(threshold=threshold)
-    moved = np.zeros(3)
-    for k, position in enumerate(positions):
-        if k:
-            moved = np.linalg.norm(position - positions[k - 1], axis=1)
-            before = np.linalg.norm(position - told.position, axis=1)  # just before it may speak again
-            assert (before <= threshold + moved + 1e-12).all()
-        now = trigger.speaks(View(k * DT, position, velocities[k], told, errors[k]), memory)
-        told.tell(now, k * DT, position, velocities[k])
-        assert (np.linalg.norm(position - told.position, axis=1) <= threshold).all()
+    signal = wander(seed, 3, 80)
+    play = Play(SendOnDelta(threshold=threshold), signal)
+    assert (play.gap_after <= threshold).all()
+    moved = np.linalg.norm(np.diff(signal.position, axis=0), axis=2)
+    assert (play.gap_before[1:] <= threshold + moved + 1e-12).all()
 
 
 def test_send_on_delta_speaks_beyond_the_threshold_and_not_at_it():
-    told = Told(np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3))
-    position = np.array([[0.25, 0.0, 0.0], [0.0, 0.0, 0.2500001], [0.2, 0.2, 0.0]])
-    view = View(9.0, position, np.zeros((3, 3)), told, np.zeros(3))
-    assert SendOnDelta(threshold=0.25).speaks(view, np.zeros((3, 0))).tolist() == [1, 2]
+    position = [[0.25, 0.0, 0.0], [0.0, 0.0, 0.2500001], [0.2, 0.2, 0.0]]
+    trigger = SendOnDelta(threshold=0.25)
+    assert trigger.due(view(position, told(np.zeros((3, 3))), t=9.0), trigger.state(3)).tolist() == [1, 2]
 
 
 @pytest.mark.parametrize(
@@ -141,23 +155,38 @@ def test_send_on_delta_speaks_beyond_the_threshold_and_not_at_it():
 )
 def test_periodic_counts_are_exact_however_long_it_runs(period, hz, begin_s, length_s, expected):
     trigger = Periodic(period_s=period)
-    told, still, memory = Told.nothing(1), np.zeros((1, 3)), np.zeros((1, 0))
-    sent = 0
+    said, state, sent = Told.nothing(1), trigger.state(1), 0
+    moment = view([[0.0] * 3], said)
     for tick in range(begin_s * hz, (begin_s + length_s) * hz):
-        t = tick / hz
-        if len(trigger.speaks(View(t, still, still, told, still[0]), memory)):
-            told.time[0] = t
+        moment.t = tick / hz
+        if len(trigger.due(moment, state)):
+            said.time[0] = moment.t
             sent += 1
     assert sent == expected
 
 
-def test_a_position_that_is_not_known_is_not_news():
-    told = Told(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
-    nowhere = np.full((1, 3), np.nan)
-    assert not len(SendOnDelta().speaks(View(1.0, nowhere, nowhere, told, np.zeros(1)), np.zeros((1, 0))))
-
-
 def test_a_trigger_must_say_when_it_fires():
-    view = View(0.0, np.zeros((1, 3)), np.zeros((1, 3)), Told.nothing(1), np.zeros(1))
     with pytest.raises(TypeError, match="Trigger must say when it fires"):
-        Trigger().speaks(view, np.zeros((1, 0)))
+        Trigger().due(view([[0.0] * 3], Told.nothing(1)), Trigger().state(1))
+
+
+def test_what_fires_must_be_one_bool_per_row():
+    class Wrong(Trigger, frozen=True):
+        def fires(self, view, memory):
+            return np.array([True])
+
+    with pytest.raises(ValueError, match=r"`fires` must give one bool per row, \(2,\), not \(1,\)"):
+        Wrong().due(view(np.zeros((2, 3)), Told.nothing(2)), Wrong().state(2))
+
+
+def test_the_table_of_the_docs_has_every_family_with_its_defaults():
+    text = (Path(__file__).parents[2] / "docs" / "triggers.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([a-z-]+)` \| .* \| (.*) \|$", text, re.MULTILINE)
+    told = {name: parameters for name, parameters in rows if name in NAMES}
+    assert set(told) >= FAMILIES
+    for name, parameters in told.items():
+        kind = plugins.struct(plugins.TRIGGERS, name)
+        defaults = {field.name: field.default for field in msgspec.structs.fields(kind)}
+        own = set(kind.__struct_fields__) - set(Trigger.__struct_fields__)
+        said = {field: float(value) for field, value in re.findall(r"`(\w+)` ([0-9]+(?:\.[0-9]+)?)", parameters)}
+        assert said == {field: defaults[field] for field in own}, name

@@ -19,7 +19,7 @@ number = st.floats(allow_nan=False, allow_infinity=False)
 vector = st.tuples(number, number, number)
 count = st.integers(0, 2**53)
 word = st.text(max_size=12)
-heard = st.builds(Heard, word, count, number, number, vector)
+heard = st.builds(Heard, word, count, number, number, vector, vector)
 messages = st.one_of(
     st.builds(Pose, word, count, number, vector, vector, number),
     st.builds(
@@ -142,7 +142,8 @@ def test_malformed(payload, mime):
 
 def test_the_largest_honest_state_fits():
     neighbours = [
-        Heard(f"Robot{k:03}", 12345, 1.7e9 + k, 1.7e9 + k, (-0.123456, -1.234567, 0.123456)) for k in range(100)
+        Heard(f"Robot{k:03}", 12345, 1.7e9 + k, 1.7e9 + k, (-0.123456, -1.234567, 0.123456), (-0.123456,) * 3)
+        for k in range(100)
     ]
     state = State(
         "Robot000", 12345, 1.7e9, "running", (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 0.0, None, None, 0.0, heard=neighbours

@@ -80,7 +80,7 @@ everything = st.builds(
     index=st.none() | st.integers(0, 2**63 - 1),
     last=word,
 )
-heard = st.builds(Heard, word, number, finite, finite, vector)
+heard = st.builds(Heard, word, number, finite, finite, vector, vector)
 state = st.builds(
     State,
     robot=word,

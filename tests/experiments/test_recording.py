@@ -141,7 +141,8 @@ def whole_run():
     messages = [begun(), status("TB01", at=0.0), status("CF01", at=0.0)]
     for k in range(11):
         at = k / 10
-        heard = [Heard("TB01", k, START + at - 0.05, START + at - 0.04, (at - 0.05, 0.0, 0.0))] if k else []
+        pose_heard = ((at - 0.05, 0.0, 0.0), (1.0, 0.0, 0.0))
+        heard = [Heard("TB01", k, START + at - 0.05, START + at - 0.04, *pose_heard)] if k else []
         messages += [
             state("TB01", k + 1, at, at, true_position=(at, 0.0, 0.01), true_yaw=0.1),
             state("CF01", k + 1, at, -at, heard=heard),
@@ -200,6 +201,7 @@ def test_a_run_is_read_back(path):
     assert set(zip(trace.heard.listener.tolist(), trace.heard.speaker.tolist(), strict=True)) == {(1, 0)}
     assert trace.heard.seq.tolist() == list(range(1, 11))
     np.testing.assert_allclose(trace.heard.position[:, 0], along[1:] - 0.05)
+    np.testing.assert_array_equal(trace.heard.velocity, np.tile([1.0, 0.0, 0.0], (10, 1)))
     assert trace.lost.tolist() == [1, 0]
     assert trace.ticks.tolist() == [100, 99]
     assert trace.missed_deadlines.tolist() == [3, 0]

@@ -108,7 +108,7 @@ def test_periodic_poses_are_all_sent_and_all_heard():
     assert np.bincount(row[run]).tolist() == [20, 20]
     for robot in range(2):
         np.testing.assert_array_equal(seq[row == robot], np.arange(1, (row == robot).sum() + 1))
-    arrival, link, number, stamp, place = log.heard
+    arrival, link, number, stamp, place, _ = log.heard
     np.testing.assert_allclose(arrival - stamp, 0.001, atol=1e-9)
     for this, (listener, speaker) in enumerate([(0, 1), (1, 0)]):
         assert listener != speaker

@@ -89,6 +89,7 @@ def trace(
             number[take],
             when[take],
             place[take],
+            np.zeros_like(place[take]),
         ),
         lost=np.zeros(rows, dtype=np.intp),
         missed_deadlines=np.zeros(rows, dtype=np.intp),

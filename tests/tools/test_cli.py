@@ -40,6 +40,8 @@ def test_commands():
                 "list",
                 "schema",
                 "bench",
+                "sweep",
+                "import",
                 "keys",
                 "echo",
                 "hz",

@@ -1,0 +1,76 @@
+"""What the experiment tells some of its robots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from agents import coordination
+from agents.anchors import Anchors
+from agents.avoidance import Avoidance
+from agents.graph import Links
+from agents.kinds import Kind
+from agents.planning import Leg
+from agents.prediction import HOLD, Predictor
+from agents.reshaping import Change, Presence
+from agents.rows import Array, Index, Mask
+from agents.safety import Limits
+from agents.triggers import Trigger
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """What the experiment tells some of its robots.
+
+    Attributes:
+        names: Of the rows (N).
+        kinds: Of the rows (N).
+        hover: (N,) height that a flying row holds [m]; NaN for ground robots.
+        speakers: Names of all robots of the experiment; `links.speaker` points here.
+        links: On which the rows listen.
+        law: Formation law.
+        trigger: Who speaks when.
+        predictor: Where a neighbour is believed to be between two messages.
+        update: When the law is computed anew; None: at every decision.
+        clamp: Largest step of a goal per axis and decision [m].
+        tracking_gain: k of (7) [1/(m² decision)].
+        legs: Plans: rows, and the legs that they follow.
+        limits: For `agents.safety`.
+        avoidance: How the rows keep clear of what they see and hear; None: they do not.
+        speaker_kinds: Kinds of all robots of the experiment.
+        watched: (E,) links that are only for avoidance: the law knows nothing of them; None: there are none.
+        avoids: (N,) rows that keep clear at all; None: all.
+        anchors: Distances that the rows keep to what stands still; None: none.
+        changes: What becomes of the links' targets, over all links.
+        presence: When the links are there, over all links; None: always.
+        body_hz: Rate of ticks.
+        pose_every: The trigger is asked on every so many ticks.
+        decide_every: A goal is decided on every so many ticks.
+        duration: Of the experiment [s].
+        patience_s: A row that misses a neighbour for this long is ready without it; None: never.
+    """
+
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+    hover: Array
+    speakers: tuple[str, ...]
+    links: Links
+    law: coordination.Law
+    trigger: Trigger
+    clamp: float
+    tracking_gain: float
+    legs: tuple[tuple[Index, tuple[Leg, ...]], ...]
+    limits: Limits
+    body_hz: float
+    pose_every: int
+    decide_every: int
+    duration: float
+    patience_s: float | None = None
+    predictor: Predictor = HOLD
+    update: Trigger | None = None
+    avoidance: Avoidance | None = None
+    speaker_kinds: tuple[Kind, ...] = ()
+    watched: Mask | None = None
+    avoids: Mask | None = None
+    anchors: Anchors | None = None
+    changes: tuple[Change, ...] = ()
+    presence: Presence | None = None

@@ -1,0 +1,102 @@
+"""What rows say of themselves: whose turn it is, and the pose that is said, smoothed if the trigger asks for it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.plugins import FAILURES, PluginError
+from agents.prediction import HOLD, Predictor
+from agents.rows import Array, Index, every
+from agents.triggers import Told, Trigger, View
+
+
+@dataclass(frozen=True)
+class Said:
+    """A moment of speaking: `rows` that speak, and of all rows the position and velocity (N, 3) to be said."""
+
+    rows: Index
+    position: Array
+    velocity: Array
+
+
+class Voice:
+    """Of N rows.
+
+    Attributes:
+        trigger: Who speaks when; may be replaced by one of the same kind.
+        told: What the neighbours were told.
+    """
+
+    def __init__(self, trigger: Trigger, rows: int, predictor: Predictor = HOLD) -> None:
+        self.trigger, self.told = trigger, Told.nothing(rows)
+        self._predictor, self._state = predictor, trigger.state(rows)
+        self._smoothed: LowPass | None = None
+
+    def speak(
+        self, t: float, position: Array, velocity: Array, *, error: Array, energy: Array, start: Array, offset: Array
+    ) -> Said:
+        """Who speaks at `t` [s], and what; rows that do not know where they are stay silent. See `View`.
+
+        Raises:
+            PluginError: If the trigger fails; it is named, for it may be somebody's first.
+        """
+        trigger = self.trigger
+        if trigger.smoothing_s > 0.0:
+            if self._smoothed is None:
+                self._smoothed = LowPass(len(position))
+            position, velocity = self._smoothed.after(t, position, velocity, trigger.smoothing_s)
+        view = View(
+            t, position, velocity, self.told,
+            error=error, energy=energy, start=start, offset=offset, predictor=self._predictor,
+        )  # fmt: skip
+        rows = asked(trigger, view, self._state)
+        if len(rows):
+            seen = np.isfinite(position[rows])
+            if not every(seen):
+                rows = rows[seen.all(axis=1)]
+            self.told.tell(rows, view)
+        return Said(rows, position, velocity)
+
+
+def asked(trigger: Trigger, view: View, state: Array) -> Index:
+    """`Trigger.due`; a trigger that fails is named.
+
+    Raises:
+        PluginError: See above.
+    """
+    try:
+        return trigger.due(view, state)
+    except FAILURES as error:
+        what = f"{type(error).__name__}: {error}"
+        raise PluginError(f"the trigger {type(trigger).__name__} failed: {what}") from error
+
+
+class LowPass:
+    """Positions without their jitter: carried on by the velocity, and drawn to what is measured with a time constant.
+
+    A bare low-pass of the position would lag by τ·v behind a robot that drives, 0.1 m at 0.15 m/s and 0.7 s. This one
+    does not: ṗ_f = v + (p − p_f)/τ and v̇_f = (v − v_f)/τ, with p − p_f and v as they are at the end of a step.
+    """
+
+    def __init__(self, rows: int) -> None:
+        self._t = -math.inf
+        self._position, self._velocity = np.full((rows, 3), np.nan), np.full((rows, 3), np.nan)
+
+    def after(self, t: float, position: Array, velocity: Array, constant_s: float) -> tuple[Array, Array]:
+        """Smoothed position [m] and velocity [m/s] (N, 3) at `t` [s], after these measured ones.
+
+        Rows begin with what is measured, and begin anew once they did not know it.
+        """
+        step = t - self._t if math.isfinite(self._t) else 0.0
+        share = -math.expm1(-step / constant_s)
+        carried = self._position + step * velocity
+        smoothed = carried + share * (position - carried)
+        slow = self._velocity + share * (velocity - self._velocity)
+        anew = np.isnan(smoothed) | np.isnan(slow)
+        if anew.any():
+            smoothed, slow = np.where(anew, position, smoothed), np.where(anew, velocity, slow)
+        self._t, self._position, self._velocity = t, smoothed, slow
+        return smoothed, slow

@@ -1,0 +1,131 @@
+"""The sampled loop near its target: does it settle, how fast, and what moves it not at all."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from agents.anchors import Anchors
+from agents.coordination import Law
+from agents.graph import Links
+from agents.rows import Array, Index, norm
+
+STEP: Final = 1e-4  # [m] of the differences that stand for the law's derivative
+STANDING: Final = 1e-6  # modes slower than the fastest by this factor do not move at all
+UNMOVED: Final = 1e-4  # of the fastest: a motion of the whole that the law answers by less is none of its business
+EVEN: Final = 1e-9  # of the fastest: a loop that is symmetric but for this has real modes, which are quicker to find
+
+
+@dataclass(frozen=True)
+class Modes:
+    """The sampled loop near its target.
+
+    Attributes:
+        gain: Largest real part of the eigenvalues of H M, what a decision takes from a mode; 2 is where it hunts.
+        radius: Largest |1 − λ|: above 1 something grows.
+        slowest_s: Time constant of the slowest mode that moves [s]; infinity where none does.
+    """
+
+    gain: float
+    radius: float
+    slowest_s: float
+
+
+def modes(
+    law: Law, links: Links, position: Array, closed: Array, hz: float, *, anchors: Anchors | None = None
+) -> Modes:
+    """Eigenvalues of p⁺ = p + H u(p) at `position`, over x and y of the robots that listen.
+
+    Translations and rotations that the law leaves alone are taken out before: left in, their rounded zeros would pass
+    for modes of hours.
+
+    Args:
+        law: Its offset is differentiated numerically.
+        links: Of the whole experiment.
+        position: (N, 3) where the formation is met [m].
+        closed: (N,) h_i, the share of a position error that robot i closes until its next decision.
+        hz: Decisions per second.
+        anchors: Distances to what stands still.
+    """
+    anchored = np.zeros(0, dtype=np.intp) if anchors is None else anchors.row
+    listeners = np.unique(np.concatenate([links.listener, anchored]))
+    share = np.repeat(closed[listeners], 2)
+    slope = -_derivative(law, links, position, anchors, listeners)
+    if not np.isfinite(slope).all():
+        return Modes(math.inf, math.inf, math.inf)
+    # H M and H^½ M H^½ have the same eigenvalues, and the second is symmetric where M is
+    root = np.sqrt(share)
+    taken = root[:, None] * slope * root[None, :]
+    taken = _without(taken, _whole(position, listeners, len(position)) / root[:, None])
+    scale = float(np.abs(taken).max(initial=0.0))
+    if np.abs(taken - taken.T).max(initial=0.0) <= EVEN * scale:
+        values = np.linalg.eigvalsh(0.5 * (taken + taken.T)).astype(complex)
+    else:
+        values = np.linalg.eigvals(taken).astype(complex)
+    moving = values[np.abs(values) > STANDING * np.abs(values).max(initial=0.0)]
+    left = np.abs(1.0 - moving)
+    decaying = left[left < 1.0]
+    with np.errstate(divide="ignore"):
+        slowest = -1.0 / (hz * np.log(decaying.max())) if len(decaying) else math.inf
+    return Modes(float(values.real.max(initial=0.0)), float(left.max(initial=0.0)), float(slowest))
+
+
+def _derivative(law: Law, links: Links, position: Array, anchors: Anchors | None, listeners: Index) -> Array:
+    """∂u/∂p (2 L, 2 L) of the listeners.
+
+    What a robot decides depends on where it is and on what it hears on its own links, and on nothing else. So all
+    robots may be moved at once while nobody hears of it, and then one link of every robot at once: two evaluations
+    for each coordinate and link of a robot, however many robots there are.
+    """
+    rows, count = len(position), len(listeners)
+    column = np.full(rows, -1)
+    column[listeners] = np.arange(count)
+    heard = position[links.speaker]
+    blocks = np.zeros((count, 2, count, 2))
+    rank = np.arange(len(links)) - np.searchsorted(links.listener, links.listener)
+    for axis in (0, 1):
+        step = np.zeros(3)
+        step[axis] = STEP
+        own = law.offset(position + step, heard, links) - law.offset(position - step, heard, links)
+        if anchors is not None:
+            own = own + anchors.offset(position + step) - anchors.offset(position - step)
+        blocks[np.arange(count), :, np.arange(count), axis] += own[listeners, :2] / (2.0 * STEP)
+        for turn in range(int(rank.max(initial=-1)) + 1):
+            mine = rank == turn
+            shift = mine[:, None] * step
+            answer = law.offset(position, heard + shift, links) - law.offset(position, heard - shift, links)
+            listener, speaker = links.listener[mine], column[links.speaker[mine]]
+            listens = speaker >= 0
+            at = column[listener[listens]], speaker[listens]
+            blocks[at[0], :, at[1], axis] += answer[listener[listens], :2] / (2.0 * STEP)
+    return blocks.reshape(2 * count, 2 * count)
+
+
+def _whole(position: Array, listeners: Index, rows: int) -> Array:
+    """Motions of the whole (2 L, 3): along x, along y, and turning, about the leaders if there are any."""
+    led = np.setdiff1d(np.arange(rows), listeners)
+    centre = position[led if len(led) else listeners].mean(axis=0)[:2]
+    way = position[listeners, :2] - centre
+    zero, one = np.zeros(len(listeners)), np.ones(len(listeners))
+    motions = ((one, zero), (zero, one), (-way[:, 1], way[:, 0]))
+    return np.stack([np.stack(each, axis=1).ravel() for each in motions], axis=1)
+
+
+def _without(taken: Array, whole: Array) -> Array:
+    """The loop on what is left when the motions of the whole (2 L, 3) that it does not answer are taken out."""
+    basis, size, _ = np.linalg.svd(whole, full_matrices=False)
+    basis = basis[:, size > 1e-9 * max(1e-300, float(size.max(initial=0.0)))]
+    if not basis.size:
+        return taken
+    answered = taken @ basis
+    _, strength, turned = np.linalg.svd(answered, full_matrices=False)
+    fastest = float(norm(taken).max(initial=0.0))
+    still = basis @ turned[strength <= UNMOVED * fastest].T
+    if not still.shape[1]:
+        return taken
+    rest, _ = np.linalg.qr(still, mode="complete")
+    rest = rest[:, still.shape[1] :]
+    return np.asarray(rest.T @ taken @ rest)

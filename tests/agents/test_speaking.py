@@ -1,0 +1,89 @@
+"""What is said: smoothed positions without lag, and nothing by those who do not know where they are."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.plugins import PluginError
+from agents.speaking import LowPass, Voice
+from agents.triggers import SendOnDelta, Trigger
+
+DT = 0.02
+
+
+def say(voice, t, position, velocity=None):
+    rows = len(position)
+    zeros = np.zeros(rows)
+    still = np.zeros((rows, 3)) if velocity is None else velocity
+    return voice.speak(t, position, still, error=zeros, energy=zeros, start=zeros, offset=np.zeros((rows, 3)))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(0.05, 2.0), st.floats(-0.5, 0.5))
+def test_the_low_pass_does_not_lag_behind_a_constant_velocity(constant, speed):
+    smooth, velocity = LowPass(1), np.array([[speed, 0.0, 0.0]])
+    for k in range(200):
+        position, moves = smooth.after(k * DT, velocity * (k * DT), velocity, constant)
+    np.testing.assert_allclose(position, velocity * (199 * DT), atol=1e-12)
+    np.testing.assert_allclose(moves, velocity, atol=1e-12)
+
+
+def test_the_low_pass_has_its_time_constant():
+    smooth, still = LowPass(1), np.zeros((1, 3))
+    smooth.after(0.0, still, still, 0.5)
+    step = np.array([[1.0, 0.0, 0.0]])
+    for k in range(1, 51):
+        position, velocity = smooth.after(k * 0.01, step, step, 0.5)
+    # the speed carries it on as well, by 1 m/s · τ · (1 − 1/e)
+    assert velocity[0, 0] == pytest.approx(1.0 - math.exp(-1.0), rel=1e-9)
+    assert position[0, 0] == pytest.approx((1.0 - math.exp(-1.0)) * 1.5, rel=0.01)
+
+
+def test_the_low_pass_takes_away_what_wobbles():
+    rng = np.random.default_rng(1)
+    noise = rng.normal(0.0, 0.01, (3000, 4, 3))
+    smooth = LowPass(4)
+    said = np.array([smooth.after(k * DT, at, np.zeros((4, 3)), 0.4)[0] for k, at in enumerate(noise)])
+    share = 1.0 - math.exp(-DT / 0.4)
+    assert said[200:].std() == pytest.approx(0.01 * math.sqrt(share / (2.0 - share)), rel=0.05)
+
+
+def test_who_was_lost_begins_anew_where_it_is():
+    smooth, here, there = LowPass(2), np.zeros((2, 3)), np.ones((2, 3))
+    lost = np.array([[np.nan] * 3, [0.0] * 3])
+    smooth.after(0.0, here, here, 1.0)
+    assert np.isnan(smooth.after(DT, lost, here, 1.0)[0][0]).all()
+    position, _ = smooth.after(2 * DT, there, here, 1.0)
+    np.testing.assert_array_equal(position[0], there[0])
+    assert 0.0 < position[1, 0] < 0.1
+
+
+def test_what_is_judged_is_what_is_said():
+    voice = Voice(SendOnDelta(threshold=0.01, smoothing_s=0.5), 1)
+    assert say(voice, 0.0, np.zeros((1, 3))).rows.tolist() == [0]
+    aside = np.array([[0.1, 0.0, 0.0]])
+    quiet = 0
+    while not len((said := say(voice, (quiet + 1) * DT, aside)).rows):
+        quiet += 1
+    assert quiet == math.floor(-0.5 * math.log(0.9) / DT)
+    np.testing.assert_array_equal(voice.told.position, said.position)
+    assert 0.01 < said.position[0, 0] < 0.0137
+
+
+def test_who_does_not_know_where_it_is_says_nothing():
+    voice = Voice(SendOnDelta(), 2)
+    said = say(voice, 0.0, np.array([[np.nan] * 3, [0.0] * 3]))
+    assert said.rows.tolist() == [1]
+    assert voice.told.time.tolist() == [-np.inf, 0.0]
+
+
+def test_a_trigger_that_fails_is_named():
+    class Broken(Trigger, frozen=True):
+        def fires(self, view, memory):
+            return view.nothing
+
+    with pytest.raises(PluginError, match="the trigger Broken failed: AttributeError"):
+        say(Voice(Broken(), 1), 0.0, np.zeros((1, 3)))

@@ -1,0 +1,158 @@
+"""Experiment files in the structure of Robotic Park's authors, made here; nothing of theirs is in them."""
+
+import numpy as np
+
+from experiments import layouts
+
+SECTIONS = """# an experiment in the structure of Robotic Park
+Operation:
+  mode: {mode}     # physical, virtual, hybrid
+  tool: Webots
+  world: empty.wbt
+
+Experience:
+  type: formation
+
+Architecture:
+  mode: {architecture}
+  node:
+    executable: none
+    name: none
+    pkg: none
+
+CPU_Monitoring:
+  enable: False
+
+Interface:
+  enable: False
+
+Data_Logging:
+  enable: {logging}
+  topics: /dron01/local_pose
+
+Robots:
+"""
+
+ROBOT = """  Robot{number:02d}:
+    type: {place}
+    name: {name}
+    control_mode: HighLevel
+    positioning: {positioning}
+    pose: {pose}
+    {address}
+    controller:
+      type: pid
+      enable: True
+      protocol: Continuous
+      period: 0.01
+      threshold:
+        type: Constant
+        co: 0.01
+        ai: 0.0
+    communication:
+      type: {speaks}
+      threshold:
+        type: Constant
+        co: {threshold}
+        ai: 0.0
+    local_pose:
+      enable: True
+      path: False
+      T: {pose_ms}
+    task:
+      enable: {task}
+      T: 100
+      Onboard: True
+      controller:
+        type: {law}
+        protocol: {protocol}
+        period: 0.1
+        upperLimit: 0.1
+        lowerLimit: -0.1
+        gain: {gain}
+        threshold:
+          type: Constant
+          co: 0.005
+          ai: 0.1
+      role: consensus
+      type: {kind}
+      relationship: {relationship}
+
+"""
+
+TAIL = """Supervisor:
+  enable: False
+
+Other:
+"""
+
+
+def robot(number, name, pose, relations, *, place="virtual", kind="distance", **more):
+    """One of their robots, as text."""
+    khepera = name.startswith("khepera")
+    address = (
+        f"agent_ip: 192.168.0.{20 + number}\n    port_number: 50000" if khepera else
+        f"uri: radio://0/80/2M/E7E7E7E7{number:02d}"
+    )  # fmt: skip
+    given = {
+        "number": number,
+        "name": name,
+        "pose": ", ".join(f"{value:.2f}" for value in pose),
+        "relationship": ", ".join(relations) or "none_1.0",
+        "task": bool(relations),
+        "place": place,
+        "kind": kind,
+        "address": address,
+        "positioning": "Intern",
+        "speaks": "EventBased",
+        "threshold": 0.01,
+        "pose_ms": 20,
+        "law": "gradient",
+        "protocol": "Continuous",
+        "gain": 0.25,
+    }
+    return ROBOT.format(**(given | more))
+
+
+def file(robots, mode="virtual", architecture="distributed", logging="False"):
+    """An experiment of theirs, as text."""
+    return SECTIONS.format(mode=mode, architecture=architecture, logging=logging) + "".join(robots) + TAIL
+
+
+def dome(count, *, origin=False, real=(), **more):
+    """Drones that spread over a dome, all from one height, their starts a third farther out than their places."""
+    made = layouts.hemisphere(count, 0.6, 0.25)
+    place = made.position
+    last = 1.0 - (count - 0.5) / count * (1.0 - layouts.RIM)  # cosine of the lowest one's angle from the top
+    radius = np.linalg.norm(place[-1, :2]) / np.sqrt(1.0 - last**2)
+    names = [f"dron{number:02d}" for number in range(1, count + 1)]
+    robots = []
+    for row, name in enumerate(names):
+        relations = []
+        for pair in made.pairs:
+            if row in pair:
+                other = int(pair.sum()) - row
+                relations.append(f"{names[other]}_{np.linalg.norm(place[row] - place[other]):.4f}")
+        if origin:
+            relations.append(f"origin_{radius:.4f}")
+        start = (*(1.3 * place[row, :2]), 0.7)
+        where = "physical" if row in real else "virtual"
+        robots.append(robot(row + 1, name, start, relations, place=where, **more))
+    return file(robots, "hybrid" if real else "virtual")
+
+
+def column(count, drones=0, *, real=(), **more):
+    """Robots in two rows behind a first one, each by its place behind two before it; the last of them drones."""
+    place = [(-0.4 * (k // 2), 0.5 * (k % 2), 0.7 if k >= count - drones else 0.0) for k in range(count)]
+    names = [f"dron{k:02d}" if k >= count - drones else f"khepera{k:02d}" for k in range(count)]
+    robots = []
+    for k, name in enumerate(names):
+        before = [j for j in (k - 1, k - 2) if j >= 0]
+        relations = [
+            f"{names[j]}_" + "_".join(f"{a - b:.2f}" for a, b in zip(place[k], place[j], strict=True)) for j in before
+        ]
+        x, y, z = place[k]
+        start = (x + 0.1 * (k % 3 - 1) + 1.5, 1.4 * (y - 0.25), z)
+        where = "digital_twin" if k in real else "virtual"
+        robots.append(robot(k + 1, name, start, relations, place=where, kind="pose", law="pid", **more))
+    return file(robots, "hybrid" if real else "virtual")

@@ -1,0 +1,332 @@
+"""Formations of every sort from their file to where robots end, and what `check` refuses."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents import plugins
+from agents.lifecycle import DONE
+from experiments import check, document, virtual
+from experiments.experiment import Start
+from experiments.feasibility import contradictions
+from experiments.formation import Pattern, anchors_of, errors
+from experiments.links import one_way_links
+from experiments.signals import net_rotation
+from tests.agents.swarm import Swarm
+
+ROBOTS = """title = "Four"
+duration_s = {duration}
+arena = {{ size = [4.0, 4.0, 2.5] }}
+[robots.A]
+kind = "khepera4"
+start = [-0.6, -0.5]
+[robots.B]
+kind = "khepera4"
+start = [0.6, -0.5]
+[robots.C]
+kind = "crazyflie"
+start = [0.5, 0.6]
+hover = 0.6
+[robots.D]
+kind = "crazyflie"
+start = [-0.5, 0.9]
+hover = 0.6
+"""
+SQUARE = """
+[formation]
+law = "displacement"
+[formation.links]
+"A - B" = { offset = [0.6, 0.0] }
+"B - C" = { offset = [0.0, 0.6] }
+"C - D" = { offset = [-0.6, 0.0, 0.0] }
+"D - A" = { offset = [0.0, -0.6] }
+"""
+BEARINGS = """
+[formation]
+law = "bearing"
+leader = "A"
+[formation.links]
+"A > B" = { bearing = [1.0, 0.0] }
+"B - C" = { bearing = [0.0, 1.0] }
+"C - D" = { bearing = [-1.0, 0.0] }
+"D - B" = { bearing = [1.0, -1.0] }
+"A > D" = { bearing = [0.0, 1.0] }
+[formation.anchors]
+B = 0.9
+"""
+MIXED = """
+[formation]
+law = "mixed"
+leader = "A"
+[formation.links]
+"A > B" = { offset = [0.6, 0.0] }
+"B - C" = 0.8
+"A > C" = 0.8
+"C - D" = 0.5
+"A > D" = { bearing = [0.0, 1.0] }
+"""
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Reads an experiment of four robots with this formation."""
+
+    def read(text, duration=40.0):
+        file = tmp_path / "formation.toml"
+        file.write_text(ROBOTS.format(duration=duration) + text)
+        return document.read(file)
+
+    return read
+
+
+def flown(experiment, seeds=(1,)):
+    """The true positions (T, N, 3) from the common start on, their times, and the links' errors (T, E)."""
+    log = virtual.simulate(experiment, seeds)
+    running = (log.time >= 0.0) & (log.time < experiment.duration_s)
+    time, position = log.time[running], log.true_position[running][:, : len(log.names)]
+    law = plugins.build(plugins.LAWS, experiment.formation.law)
+    return time, position, errors(law, Pattern.of(experiment, log.names), time, position)
+
+
+def codes(given):
+    return {each.code: each for each in check.check(given)}
+
+
+# ---------------------------------------------------------------- from the file
+
+
+def test_both_ends_of_a_link_are_asked_for_the_same(written):
+    experiment = written(SQUARE).experiment
+    asked = {(link.listener, link.speaker): link.wanted for link in one_way_links(experiment)}
+    assert asked["B", "A"].relative == (0.6, 0.0, 0.0)  # B stands 0.6 m along x from A
+    assert asked["A", "B"].relative == (-0.6, -0.0, -0.0)
+    assert asked["C", "B"].relative == (0.0, 0.6, 0.6)  # the heights that they hold
+    assert asked["B", "C"].distance == pytest.approx(np.hypot(0.6, 0.6))
+    assert {link.gain for link in one_way_links(experiment)} == {0.5}  # the stiffness, not the gain of distances
+
+
+def test_each_link_has_the_gain_of_what_it_asks_for(written):
+    links = one_way_links(written(MIXED).experiment)
+    assert {(link.listener, link.speaker): link.gain for link in links} == {
+        ("B", "A"): 0.5, ("B", "C"): 3.0, ("C", "B"): 3.0, ("C", "A"): 3.0, ("C", "D"): 3.0, ("D", "C"): 3.0,
+        ("D", "A"): 0.5,
+    }  # fmt: skip
+
+
+def test_a_law_of_distances_takes_offsets_for_distances(written):
+    given = written(SQUARE.replace('"displacement"', '"distance"'))
+    links = Pattern.of(given.experiment, "ABCD").links
+    assert links.distance[:2].tolist() == pytest.approx([0.6, np.hypot(0.6, 0.6)])
+    assert "realisable" in codes(given)
+
+
+def test_anchors_from_the_file(written):
+    anchors = anchors_of(
+        written(
+            "[formation.anchors]\nA = 1.0\nB = { along = [0.0, 2.0], to = [0.5, 0.0] }\nC = { across = [0, 0, 1], "
+            'distance = 0.6 }\nD = { distance = 0.7, gain = 9.0 }\n[formation.links]\n"A - B" = 0.5'
+        ).experiment,
+        ("A", "B", "C", "D"),
+    )
+    assert anchors.gain.tolist() == [6.0, 0.5, 6.0, 9.0]
+    place = np.array([[1.0, 0.0, 0.0], [0.5, 7.0, 0.0], [3.0, 4.0, 0.6], [0.0, 0.7, 0.0]])
+    np.testing.assert_allclose(anchors.error(place), 0.0, atol=1e-15)
+
+
+# ---------------------------------------------------------------- in motion
+
+
+@pytest.mark.parametrize(("text", "worst"), [(SQUARE, 0.015), (BEARINGS, 0.05), (MIXED, 0.06)], ids=["s", "b", "m"])
+def test_formations_come_together(written, text, worst):
+    given = written(text, 60.0)
+    assert not [each for each in check.check(given) if each.severity == "error"]
+    _, _, error = flown(given.experiment)
+    assert error[0].max() > 0.3
+    assert error[-50:].max() < worst
+
+
+def test_a_formation_that_turns_and_grows(written):
+    given = written(SQUARE + "[[formation.changes]]\nat_s = 10.0\nrotate = 1.5708\nscale = 1.4\n", 30.0)
+    time, position, error = flown(given.experiment)
+    before, after = position[time < 10.0][-1], position[-1]
+    assert error[time < 10.0][-1].max() < 0.02
+    assert error[-1].max() < 0.02
+    np.testing.assert_allclose((before[1] - before[0])[:2], [0.6, 0.0], atol=0.02)
+    np.testing.assert_allclose((after[1] - after[0])[:2], [0.0, 0.84], atol=0.02)
+    assert after[2, 2] == pytest.approx(0.6, abs=0.03)
+
+
+def test_distances_that_change(written):
+    text = '[formation]\n[formation.links]\n"A - B" = 0.5\n"B - C" = 0.8\n"C - A" = 0.8\n"D - C" = 0.5\n"D - A" = 0.9\n'
+    text += '[[formation.changes]]\nat_s = 15.0\nover_s = 3.0\nlinks = { "B - A" = 0.8, "D - C" = 0.7 }\n'
+    given = written(text)
+    _, position, error = flown(given.experiment)
+    assert error[-1].max() < 0.02
+    assert np.linalg.norm(position[-1, 0] - position[-1, 1]) == pytest.approx(0.8, abs=0.02)
+
+
+def test_links_by_range_and_by_the_clock(written):
+    text = "[formation]\ngain = 8.0\n[formation.proximity]\nrange = 1.1\ndistance = 0.75\n"
+    _, position, error = flown(written(text).experiment)
+    apart = np.linalg.norm(position[:, :, None] - position[:, None], axis=3)
+    there = ~np.isnan(error)
+    pairs = [(i, j) for i in range(4) for j in range(4) if i != j]
+    for k, (i, j) in enumerate(pairs):
+        assert not there[apart[:, i, j] > 1.21, k].any()
+        assert there[apart[:, i, j] <= 1.1, k].all()
+    assert 0 < there[0].sum() < len(pairs)
+    assert np.nanmax(error[-1]) < 0.05
+
+    text = (
+        '[formation.links]\n"A - B" = 0.5\n"C - D" = 0.5\n"B - C" = { distance = 0.8, from_s = 8.0, until_s = 20.0 }\n'
+    )
+    time, _, error = flown(written(text).experiment)
+    there = ~np.isnan(error)
+    assert (there.sum(axis=1) == np.where((time >= 8.0 - 1e-6) & (time < 20.0 - 1e-6), 6, 4)).all()
+
+
+def test_a_leader_that_listens_holds_its_plan_and_the_others_back(written):
+    """Dominance: the leader hears the others; heavier links from it draw them along (paper, section III)."""
+    text = (
+        '[formation]\nleader = "A"\ntracking_gain = 60.0\n[formation.links]\n"A > B" = { distance = 0.6, gain = 9.0 }\n'
+    )
+    text += '"B > A" = { distance = 0.6, gain = 1.0 }\n"A > C" = 0.9\n"B - C" = 0.9\n"C - D" = 0.5\n"B > D" = 0.9\n'
+    text += '[[timeline]]\nat_s = 0.0\nrobot = "A"\nplan = { kind = "hold", at = [-0.5, -0.5] }\n'
+    text += '[[timeline]]\nat_s = 15.0\nrobot = "A"\nplan = { kind = "line", move_by = [0.5, 0.3], speed = 0.05 }\n'
+    given = written(text, 45.0)
+    assert not [each for each in check.check(given) if each.severity == "error"]
+    _, position, error = flown(given.experiment)
+    np.testing.assert_allclose(position[-1, 0, :2], [0.0, -0.2], atol=0.06)
+    assert error[-1].max() < 0.05
+
+
+def test_everything_that_changes_is_the_same_whoever_shares_a_process(written):
+    text = MIXED + "[formation.anchors]\nD = { along = [1.0, 0.3] }\n[formation.proximity]\nrange = 1.4\n"
+    text += '[[formation.changes]]\nat_s = 1.0\nover_s = 2.0\nscale = 1.2\nrotate = 0.4\nlinks = { "C - D" = 0.6 }\n'
+    experiment = written(
+        text.replace('"B - C" = 0.8', '"B - C" = { distance = 0.8, from_s = 1.5, until_s = 3.0 }'), 4.0
+    )
+    experiment = experiment.experiment
+    names = tuple(experiment.robots)
+    together = Swarm(experiment, [names]).until(DONE)
+    apart = Swarm(experiment, [["C", "A"], ["B"], ["D"]]).until(DONE)
+    assert apart.sent == together.sent
+    for what in ("goal", "error", "setpoint", "truth"):
+        np.testing.assert_array_equal(apart.column(what), together.column(what), err_msg=what)
+
+
+def test_repetitions_side_by_side_are_as_they_are_alone(written):
+    text = SQUARE + "[formation.anchors]\nA = { distance = 0.4 }\n[[formation.changes]]\nat_s = 1.0\nrotate = 0.5\n"
+    experiment = msgspec.structs.replace(written(text, 4.0).experiment, start=Start(scatter=0.1))
+    both, alone = virtual.simulate(experiment, [3, 4]), virtual.simulate(experiment, [4])
+    np.testing.assert_array_equal(both.true_position[:, 4:], alone.true_position)
+
+
+def test_a_dead_zone_ends_the_rotation_of_an_event_triggered_ring():
+    """Five quadrotors, send-on-delta at 1 cm, nothing that disturbs them: see docs/formations.md."""
+    angle = 2 * np.pi * np.arange(5) / 5
+    place = 0.5104 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    robots = {f"R{i}": {"kind": "crazyflie", "start": (1.2 * place[i]).tolist(), "hover": 0.8} for i in range(5)}
+    links = {f"R{i} - R{j}": float(np.linalg.norm(place[i] - place[j])) for i in range(5) for j in range(i)}
+    given = {
+        "title": "ring", "duration_s": 60.0, "robots": robots, "formation": {"links": links},
+        "start": {"scatter": 0.1}, "trigger": {"kind": "send-on-delta", "threshold": 0.01},
+    }  # fmt: skip
+    rates, sent = [], []
+    for law in ({"kind": "distance"}, {"kind": "distance", "dead_zone": 0.01}):
+        given["formation"]["law"] = law
+        log = virtual.simulate(msgspec.convert(given, document.Experiment), [200, 201, 202])
+        late = (log.time > 30.0) & (log.time < 60.0)
+        turns = [net_rotation(log.true_position[late][:, 5 * k : 5 * k + 5], log.time[late]) for k in range(3)]
+        rates.append(np.abs(turns).max())
+        sent.append(len(log.sent[0]))
+    assert rates[0] > 1e-4
+    assert rates[1] < 1e-6
+    assert sent[1] < sent[0] / 2
+
+
+# ---------------------------------------------------------------- what is refused
+
+REFUSED = {
+    "no three": ('"A - B" = { distance = 0.5, offset = [0.5, 0.0] }', "one of the three"),
+    "none": ('"A - B" = { gain = 1.0 }', "one of the three"),
+    "no direction": ('"A - B" = { bearing = [0.0, 0.0] }', "no direction"),
+    "ends first": ('"A - B" = { distance = 0.5, from_s = 3.0, until_s = 2.0 }', "must be later than `from_s`"),
+    "after the end": ('"A - B" = { distance = 0.5, from_s = 99.0 }', "when the run of 40 s is over"),
+    "bearing for distances": ('"A - B" = { bearing = [1.0, 0.0] }', "needs a distance or an offset"),
+    "height": ('"A - C" = { offset = [0.5, 0.0, 0.2] }', "'C' is held 0.6 m above 'A', not 0.2 m"),
+    "nobody anchored": ('"A - B" = 0.5\n[formation.anchors]\nE = 1.0', "no robot is called 'E'"),
+    "line and plane": (
+        '"A - B" = 0.5\n[formation.anchors]\nA = { along = [1, 0], across = [1, 0] }', "give one of them"
+    ),
+    "no link to change": (
+        '"A - B" = 0.5\n[[formation.changes]]\nat_s = 1.0\nlinks = { "A - C" = 0.5 }', "none of the formation's links"
+    ),
+    "another sort": (
+        '"A - B" = 0.5\n[[formation.changes]]\nat_s = 1.0\nlinks = { "A - B" = { offset = [0.5, 0.0] } }',
+        "there is no way between them",
+    ),
+    "late change": ('"A - B" = 0.5\n[[formation.changes]]\nat_s = 50.0\nscale = 2.0', "when the run of 40 s is over"),
+    "turned distances": (
+        '"A - B" = 0.5\n[[formation.changes]]\nat_s = 1.0\nrotate = 2.0', "nothing here knows a direction"
+    ),
+    "near and far": ('"A - B" = 0.5\n[formation.proximity]\nrange = 1.0\nrelease = 0.9', "must not be nearer"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_makes_no_sense_is_refused_where_it_stands(written, name):
+    text, said = REFUSED[name]
+    with pytest.raises(document.DocumentError) as refused:
+        written(f"[formation.links]\n{text}\n")
+    (problem,) = refused.value.problems
+    assert said in f"{problem.message}; {problem.hint}"
+    assert problem.line > len(ROBOTS.splitlines())
+    assert problem.hint
+
+
+def test_a_law_that_needs_offsets_says_so(written):
+    with pytest.raises(document.DocumentError, match="needs an offset of every link"):
+        written('[formation]\nlaw = "displacement"\n[formation.links]\n"A - B" = 0.5\n')
+    with pytest.raises(document.DocumentError, match="there are no links"):
+        written("[formation.proximity]\nrange = 1.0\n")
+
+
+def test_offsets_that_do_not_add_up(written):
+    given = written(SQUARE.replace("[0.0, -0.6]", "[0.0, -0.7]"))
+    found = codes(given)["offsets-contradict"]
+    assert (found.severity, found.where.rsplit(":", 2)[1]) == ("error", "24")
+    assert "100.0 mm" in found.message
+    (first, *_) = contradictions(Pattern.of(given.experiment, "ABCD").links)
+    assert sorted(first.rows) == [0, 1, 2, 3]
+    assert contradictions(Pattern.of(written(SQUARE).experiment, "ABCD").links) == []
+
+
+def test_what_check_says_of_formations(written):
+    assert codes(written(SQUARE))["rigid"].message == (
+        "the formation is rigid, rank 6 of 6 in the motions that the robots have"
+    )
+    loose = codes(written(BEARINGS.replace('"D - B" = { bearing = [1.0, -1.0] }\n', "").replace("B = 0.9", "A = 0.8")))
+    assert "not-rigid" in loose
+    apart = SQUARE.replace('"B - C" = { offset = [0.0, 0.6] }\n', "").replace(
+        '"D - A" = { offset = [0.0, -0.6] }\n', ""
+    )
+    assert codes(written(apart))["parts"].severity == "error"
+    low = SQUARE + "[formation.anchors]\nC = 0.3\n"
+    assert codes(written(low))["anchor-not-realisable"].severity == "error"
+    odd = '[formation.links]\n"A - B" = 0.5\n"B - C" = 0.8\n"C - A" = 0.8\n[[formation.changes]]\nat_s = 10.0\n'
+    odd += 'links = { "A - B" = 1.5 }\n'
+    found = codes(written(odd + "[formation.anchors]\nD = 0.9\n"))
+    assert found["change-not-realisable"].severity == "error"
+    stiff = SQUARE.replace('"displacement"', '"displacement"\nstiffness = 9.0')
+    assert "stiffness" in codes(written(stiff))["hunts"].remedy
+
+
+def test_links_that_leave_robots_alone(written):
+    text = (
+        '[formation.links]\n"A - B" = 0.5\n"C - D" = 0.5\n"B - C" = { distance = 0.8, from_s = 8.0, until_s = 20.0 }\n'
+    )
+    found = codes(written(text))["comes-apart"]
+    assert "falls into 2 parts from 0.0 s to 8.0 s" in found.message
+    always = SQUARE + "[formation.proximity]\nrange = 3.0\n"
+    assert codes(written(always))["whole"].severity == "note"

@@ -1,0 +1,143 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments import assign, document, virtual
+from experiments.check import check, figures
+from experiments.generate import Wanted, command, experiment_file, layout
+from experiments.layouts import LayoutError
+from experiments.problem import DocumentError
+
+
+def written(tmp_path, what, size, wanted=None, jumps=(1, 2)):
+    wanted = wanted or Wanted()
+    path = tmp_path / f"{what}.toml"
+    path.write_text(experiment_file(layout(what, size, wanted, jumps), wanted))
+    return document.read(path)
+
+
+@pytest.mark.parametrize(
+    ("what", "size", "kind"),
+    [
+        ("polygon", "3", "khepera4"),
+        ("polygon", "9", "crazyflie"),
+        ("grid", "3x4", "turtlebot3"),
+        ("hemisphere", "4", "crazyflie"),
+        ("hemisphere", "40", "crazyflie"),
+        ("hemisphere", "12", "tello"),
+        ("henneberg", "2", "crazyflie"),
+        ("henneberg", "15", "khepera4"),
+        ("circulant", "24", "crazyflie"),
+    ],
+)
+def test_files_pass_the_check_without_a_word(tmp_path, what, size, kind):
+    read = written(tmp_path, what, size, Wanted(kind=kind))
+    assert [found for found in check(read) if found.severity != "note"] == []
+    numbers = figures(read.experiment)
+    assert numbers.residual_mm < 0.3
+    assert 0.3 < numbers.loop_gain < 1.1
+    assert {robot.kind for robot in read.experiment.robots.values()} == {kind}
+
+
+def test_every_robot_and_every_link_has_a_line(tmp_path):
+    made = layout("hemisphere", "100", Wanted())
+    lines = experiment_file(made, Wanted()).splitlines()
+    assert 'CF001 = { kind = "crazyflie", start = [' in "\n".join(lines)
+    assert sum(line.startswith("CF") for line in lines) == 100
+    assert sum(line.startswith('"CF') for line in lines) == len(made.pairs)
+    assert max(map(len, lines)) < 100
+    read = written(tmp_path, "hemisphere", "100")
+    heights = [robot.hover for robot in read.experiment.robots.values()]
+    assert min(heights) == pytest.approx(0.4)
+    assert len(set(heights)) > 90
+
+
+def test_what_can_be_lost_of_a_hemisphere_and_of_a_minimal_frame(tmp_path):
+    numbers = figures(written(tmp_path, "hemisphere", "40").experiment)
+    assert numbers.vital_links == numbers.vital_robots == ()
+    assert numbers.spare_robots == 40
+    minimal = figures(written(tmp_path, "henneberg", "15").experiment)
+    assert (minimal.spare_links, len(minimal.vital_links)) == (0, 27)
+
+
+def test_starts_do_not_overlap_whatever_the_seed(tmp_path):
+    experiment = written(tmp_path, "hemisphere", "40").experiment
+    names = tuple(experiment.robots)
+    for seed in range(5):
+        place, _ = assign.scattered(experiment, names, seed)
+        apart = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(40, 1)]
+        assert apart.min() > 2 * 0.065
+        assert np.abs(place - assign.start(experiment, names)[0]).max() > 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_hundred_drones_form_their_hemisphere_from_random_starts(tmp_path, seed):
+    experiment = written(tmp_path, "hemisphere", "100", Wanted(duration_s=25.0)).experiment
+    log = virtual.simulate(experiment, [seed])
+    net = assign.all_links(experiment)
+    apart = np.linalg.norm(log.true_position[:, net.listener] - log.true_position[:, net.speaker], axis=2)
+    worst = np.abs(apart - net.distance).max(axis=1)
+    running = (log.time >= 0.0) & (log.time <= 25.0)
+    assert worst[running][0] > 0.25
+    assert worst[running][-250:].max() < experiment.tolerance
+
+
+@pytest.mark.slow
+def test_by_offsets_they_come_from_anywhere(tmp_path):
+    wanted = Wanted(law="displacement", scatter=3.0, duration_s=30.0)
+    read = written(tmp_path, "hemisphere", "60", wanted)
+    assert [found for found in check(read) if found.severity != "note"] == []
+    log = virtual.simulate(read.experiment, [1])
+    net = assign.all_links(read.experiment)
+    law = assign.assign(read.experiment, tuple(read.experiment.robots)).law
+    begin, end = (log.true_position[np.searchsorted(log.time, at)] for at in (0.0, 29.9))
+    assert law.error(begin, begin[net.speaker], net).max() > 3.0
+    assert law.error(end, end[net.speaker], net).max() < 0.07  # three times the threshold at which robots speak
+
+
+def test_large_formations_say_less_of_themselves(tmp_path):
+    assert written(tmp_path, "circulant", "100").experiment.rates.state_hz == 50.0
+    large = written(tmp_path, "circulant", "1000").experiment
+    assert large.rates.state_hz == 5.0
+    assert len(large.robots) == 1000
+
+
+def test_another_seed_is_another_frame_and_the_same_one_the_same():
+    one, same, other = (
+        experiment_file(layout("henneberg", "12", wanted), wanted)
+        for wanted in (Wanted(seed=1), Wanted(seed=1), Wanted(seed=2))
+    )
+    assert one == same
+    assert one.replace("seed = 1", "") != other.replace("seed = 2", "")
+
+
+@pytest.mark.parametrize(
+    ("what", "size", "wanted", "said"),
+    [
+        ("hemisphere", "9", {"kind": "khepera4"}, "robots that fly"),
+        ("polygon", "5", {"kind": "kehpera4"}, "khepera4"),
+        ("polygon", "5", {"spacing": 0.1}, "0.23 m or more"),
+        ("polygon", "5", {"law": "bearing"}, "distance or displacement"),
+        ("grid", "5", {}, "such as 5x8"),
+        ("grid", "5xx", {}, "such as 5x8"),
+    ],
+)
+def test_what_cannot_be_had(what, size, wanted, said):
+    chosen = dataclasses.replace(Wanted(), **wanted)
+    with pytest.raises(LayoutError, match=said):
+        experiment_file(layout(what, size, chosen), chosen)
+
+
+def test_the_command_writes_a_file_and_never_over_another(tmp_path, capsys):
+    target = tmp_path / "nine.toml"
+    assert command("polygon", "9", str(target), Wanted()) == 0
+    assert "18 links" in capsys.readouterr().out
+    assert (tmp_path / "zenpark.schema.json").exists()
+    with pytest.raises(DocumentError, match="exists already"):
+        command("polygon", "9", str(target), Wanted())
+    with pytest.raises(DocumentError, match="--jumps 1;2"):
+        command("circulant", "9", str(tmp_path / "other.toml"), Wanted(), "1;2")
+    with pytest.raises(DocumentError, match="cannot be written"):
+        command("polygon", "9", str(tmp_path / "no" / "where.toml"), Wanted())

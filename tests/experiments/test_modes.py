@@ -1,0 +1,100 @@
+"""Stiffest and slowest mode of the sampled loop."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.anchors import Anchors
+from agents.coordination import Displacement, Distance
+from agents.graph import BY_RELATIVE, Links, links
+from experiments import assign, document, layouts
+from experiments.feasibility import realise
+from experiments.modes import modes
+
+PUBLISHED = np.array(
+    [
+        (0, 0, 0), (0.6, 0, 0), (0.6, -0.6, 0), (0, -0.6, 0),
+        (0.3, 0.098, 0.8), (0.3, -0.502, 0.8), (-0.2196, -0.2021, 0.8),
+    ]
+)  # fmt: skip
+
+
+def both_ways(made, gain):
+    pairs = [(int(i), int(j)) for i, j in made.pairs for i, j in ((i, j), (j, i))]
+    distance = [float(np.linalg.norm(made.position[i] - made.position[j])) for i, j in pairs]
+    return links(pairs, distance, [gain] * len(pairs))
+
+
+def by_hand(law, net, position, share, anchors=None):
+    """Eigenvalues by moving one coordinate of one robot at a time, with everybody hearing of it."""
+    step, rows = 1e-4, len(position)
+    listeners = np.unique(np.concatenate([net.listener, [] if anchors is None else anchors.row])).astype(int)
+    columns = []
+    for row in listeners:
+        for axis in (0, 1):
+            answers = []
+            for sign in (1.0, -1.0):
+                moved = position.copy()
+                moved[row, axis] += sign * step
+                offset = law.offset(moved, moved[net.speaker], net)
+                offset = offset if anchors is None else offset + anchors.offset(moved)
+                answers.append(offset[listeners, :2].ravel())
+            columns.append((answers[0] - answers[1]) / (2.0 * step))
+    taken = -np.repeat(share[listeners], 2)[:, None] * np.stack(columns, axis=1)
+    assert rows >= len(listeners)
+    return np.linalg.eigvals(taken)
+
+
+def test_stiffest_and_slowest_mode_of_the_reference():
+    reference = assign.all_links(document.read("robotic-park").experiment)
+    shape = realise(reference, [PUBLISHED], np.arange(7) > 0)[0]
+    hz = 1000.0  # u applied as a velocity: h = 1 / hz
+    found = modes(Distance(), reference, shape.position, np.full(7, 1.0 / hz), hz)
+    gain = 3.0
+    assert found.slowest_s * gain == pytest.approx(108.0, abs=0.5)
+    assert 2.0 / (found.gain * hz / gain) == pytest.approx(1.05, abs=0.005)
+    assert found.radius < 1.0
+
+
+def test_a_rounded_shape_without_a_leader_has_no_modes_of_hours():
+    made = layouts.hemisphere(8, 0.6, 0.25)
+    net = both_ways(made, 1.5)
+    rounded = Links(net.listener, net.speaker, np.round(net.distance, 4), net.gain)
+    shape = realise(rounded, [made.position], np.ones(8, dtype=bool))[0]
+    share = np.full(8, 0.18)
+    found = modes(Distance(), rounded, shape.position, share, 10.0)
+    values = np.sort(by_hand(Distance(), rounded, shape.position, share).real)
+    assert np.abs(values[:3]).max() < 1e-5  # two translations and a turn, rounded
+    assert found.slowest_s == pytest.approx(-0.1 / np.log(1.0 - values[3]), rel=1e-3)
+    assert found.gain == pytest.approx(values[-1])
+    assert found.radius < 1.0
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(3, 8), st.booleans())
+def test_one_link_of_every_robot_at_once_tells_as_much_as_one_robot_at_a_time(seed, rows, anchored):
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(-1.0, 1.0, (rows, 3))
+    pairs = [(i, j) for i in range(rows) for j in range(rows) if i != j and rng.random() < 0.6] or [(1, 0)]
+    distance = [float(np.linalg.norm(position[i] - position[j])) for i, j in pairs]
+    net = links(pairs, distance, rng.uniform(0.2, 0.6, len(pairs)).tolist())
+    anchors = None
+    if anchored:
+        one, zero = np.ones(1), np.zeros((1, 3))
+        reach = np.linalg.norm(position[:1], axis=1)
+        anchors = Anchors(np.array([0]), zero, zero, one, 0.0 * one, reach, 0.5 * one)
+    share = rng.uniform(0.05, 0.2, rows)
+    values = by_hand(Distance(), net, position, share, anchors)
+    found = modes(Distance(), net, position, share, 10.0, anchors=anchors)
+    assert found.gain == pytest.approx(max(values.real.max(), 0.0), abs=1e-5)
+
+
+def test_relative_positions_leave_no_turn_free():
+    relative = np.array([(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)])
+    net = Links(
+        np.array([0, 1]), np.array([1, 0]), np.ones(2), np.full(2, 0.5), relative, relative, np.full(2, BY_RELATIVE)
+    )
+    found = modes(Displacement(), net, np.array([(1.0, 0, 0), (0, 0, 0)]), np.full(2, 0.2), 10.0)
+    assert found.gain == pytest.approx(0.2)  # twice the stiffness, by the share
+    assert found.slowest_s == pytest.approx(-0.1 / np.log(0.8))

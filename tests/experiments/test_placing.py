@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments.placing import Wanted, placed
+
+NOWHERE = np.zeros(0)
+
+
+def asked(position, *, points=(), relative=False):
+    pairs = np.stack(np.triu_indices(len(position), 1), axis=1)
+    apart = position[pairs[:, 0]] - position[pairs[:, 1]]
+    distance = np.linalg.norm(apart, axis=1)
+    rows = np.array(points, dtype=np.intp)
+    return Wanted(
+        pairs,
+        np.full(len(pairs), np.nan) if relative else distance,
+        apart,
+        rows,
+        np.zeros((len(rows), 3)),
+        np.linalg.norm(position[rows], axis=1),
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(4, 9), st.booleans())
+def test_a_shape_is_found_again_from_nearby(seed, rows, relative):
+    rng = np.random.default_rng(seed)
+    shape = rng.uniform(-1.0, 1.0, (rows, 3))
+    start = shape + rng.uniform(-0.02, 0.02, shape.shape)
+    found = placed(asked(shape, points=[0, 1], relative=relative), start, np.ones(rows, dtype=bool))
+    assert found.worst < 1e-4
+
+
+def test_drones_from_one_plane_find_their_dome_and_robots_stay_on_the_floor():
+    ring = np.array([(np.cos(a), np.sin(a), 0.0) for a in 2.0 * np.pi * np.arange(5) / 5])
+    shape = np.concatenate([ring, [[0.0, 0.0, 1.0]]])
+    climbs = np.arange(6) == 5
+    flat = shape * [1.2, 1.2, 0.1]
+    found = placed(asked(shape), flat, climbs)
+    assert found.worst < 1e-4
+    assert found.position[:5, 2] == pytest.approx(np.zeros(5))
+    assert found.position[5, 2] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_what_contradicts_itself_is_measured():
+    wanted = Wanted(
+        np.array([[0, 1], [1, 2], [0, 2]]), np.array([1.0, 1.0, 2.3]), np.zeros((3, 3)),
+        np.zeros(0, dtype=np.intp), np.zeros((0, 3)), NOWHERE,
+    )  # fmt: skip
+    start = np.array([(0.0, 0, 0), (1.0, 0.1, 0), (2.0, 0, 0)])
+    found = placed(wanted, start, np.zeros(3, dtype=bool))
+    assert found.links == pytest.approx(0.1, abs=1e-3)  # 0.3 m, shared by three
+    assert found.points == 0.0

@@ -1,0 +1,235 @@
+"""Sweeps: the numbers of the table, that nothing is run twice, and that only the seeds decide what comes out."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import sweep as sweeps
+from experiments import sweep_page, sweep_table
+from experiments.experiment import Experiment
+from experiments.metrics import measure
+from experiments.pareto import curves, front, pareto
+from experiments.problem import DocumentError
+from experiments.run import load, simulate
+from experiments.seeds import student_95
+from experiments.sweep import side_by_side, sweep
+from experiments.sweep_command import Bar, Request, command
+from experiments.sweep_runs import Stuck
+from experiments.sweep_workers import Processes, SweepError, Work, workers
+
+SHORT = ["duration_s=4.0"]
+AXIS = "trigger.threshold=0.005,0.02"
+
+
+class Progress:
+    """What a sweep told."""
+
+    def __init__(self, end_after=None):
+        self.told, self._end_after = [], end_after
+
+    def __call__(self, done, of):
+        self.told.append((done, of))
+        if self._end_after is not None and done >= self._end_after:
+            raise KeyboardInterrupt
+
+    @property
+    def ran(self):
+        return self.told[-1][0] if self.told else 0
+
+
+def swept(folder, *given, tell=None, **more):
+    options = {"settings": SHORT, "processes": 1, "out": folder, **more}
+    return sweep("triangle", given or [AXIS, "seeds=3"], tell=tell or Progress(), **options)
+
+
+def tables(found):
+    """The files of the table, as bytes."""
+    sweep_table.write_csv(found.folder / "t.csv", found.rows)
+    sweep_table.write_json(found.folder / "t.json", sweep_table.document("T", found.seeds, found.rows))
+    return (found.folder / "t.csv").read_bytes(), (found.folder / "t.json").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    return swept(tmp_path_factory.mktemp("done"))
+
+
+def test_the_table_has_the_figures_of_single_runs(done):
+    periodic, _, event = done.rows
+    assert (periodic.case, periodic.parameters, periodic.reference, periodic.seeds) == ("periodic", {}, True, 3)
+    assert (event.case, event.parameters, event.reference) == ("event", {"trigger.threshold": 0.02}, False)
+    read = load("triangle", *SHORT, "cases.event.trigger.threshold=0.02")
+    single = [simulate(read, seed=seed) for seed in (1, 2, 3)]
+    mine = [run.metrics["event"].mean["iae"] for run in single]
+    theirs = [run.metrics["periodic"].mean["iae"] for run in single]
+    ratios = np.array(mine) / np.array(theirs)
+    assert event.mean["iae"].mean == pytest.approx(np.mean(mine), rel=1e-12)
+    assert event.ratio["iae"].mean == pytest.approx(ratios.mean(), rel=1e-12)
+    half = student_95(2) * ratios.std(ddof=1) / np.sqrt(3)
+    assert event.ratio["iae"].ci95 == pytest.approx(half, rel=1e-9)
+    assert event.mean["messages"].mean == np.mean([run.metrics["event"].mean["messages"] for run in single])
+    assert periodic.ratio["messages"].mean == 1.0
+    gaps = [robot.gap_min_s for run in single for robot in measure(run.traces["event"]).robots]
+    assert event.gap_min_s == pytest.approx(min(gap for gap in gaps if gap is not None))
+
+
+def test_nothing_is_run_twice(done):
+    progress = Progress()
+    again = swept(done.folder, tell=progress)
+    assert (progress.ran, again.rows, again.notes) == (0, done.rows, ())
+    more = swept(done.folder, AXIS, "seeds=4", tell=progress)
+    assert (progress.ran, more.rows[0].seeds) == (3, 4)
+    progress = Progress()
+    swept(done.folder, "trigger.threshold=0.005,0.01,0.02", "seeds=2:4", tell=progress)
+    assert progress.ran == 3
+
+
+def test_batches_do_not_change_the_table(done, tmp_path, monkeypatch):
+    monkeypatch.setattr(sweeps, "MOST_SEEDS", 1)
+    assert tables(swept(tmp_path)) == tables(done)
+
+
+def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path, monkeypatch):
+    monkeypatch.setattr(sweeps, "MOST_SEEDS", 2)
+    progress = Progress(end_after=3)
+    part = swept(tmp_path, tell=progress)
+    assert (part.missing, [row.seeds for row in part.rows]) == (6, [3])
+    with (tmp_path / "runs.jsonl").open("ab") as file:
+        file.write(b'{"cell":"cut off in mid')
+    progress = Progress()
+    whole = swept(tmp_path, tell=progress)
+    assert (progress.ran, whole.missing) == (6, 0)
+    assert tables(whole) == tables(done)
+    assert swept(tmp_path, tell=(quiet := Progress())).rows == done.rows
+    assert quiet.ran == 0
+
+
+def test_a_changed_file_is_noticed_and_runs_anew_what_it_changes(tmp_path):
+    file = tmp_path / "mine.toml"
+    text = load("triangle").text.replace("duration_s = 15.0", "duration_s = 3.0")
+    file.write_text(text)
+    folder = tmp_path / "runs"
+    sweep(file, [AXIS, "seeds=2"], out=folder, processes=1)
+    file.write_text(text.replace("threshold = 0.01", "threshold = 0.01, minimum_interval_s = 0.1"))
+    found = sweep(file, [AXIS, "seeds=2"], out=folder, processes=1, tell=(progress := Progress()))
+    assert found.notes == ("the experiment file has changed: what it changes is run anew",)
+    assert progress.ran == 4  # the two cells of `event`; `periodic` is as it was
+    assert min(row.gap_min_s for row in found.rows if row.case == "event") == pytest.approx(0.1)
+
+
+def test_another_version_is_noticed(tmp_path, monkeypatch):
+    swept(tmp_path, "seeds=1")
+    monkeypatch.setattr(sweeps, "version", lambda _name: "99.0")
+    assert swept(tmp_path, "seeds=1").notes == ("this is zenpark 99.0, not 0.1.0: all runs are made anew",)
+
+
+def test_runs_that_fail_are_counted_and_named(tmp_path, monkeypatch):
+    from experiments import sweep_runs  # noqa: PLC0415
+
+    real = sweep_runs.simulate
+
+    def stuck(experiment, seeds, *, lean):
+        if isinstance(experiment.trigger, dict) and experiment.trigger.get("threshold") == 0.02 and 2 in seeds:
+            raise Stuck("not airborne after 60 s: CF01")
+        return real(experiment, seeds, lean=lean)
+
+    monkeypatch.setattr(sweep_runs, "simulate", stuck)
+    found = swept(tmp_path)
+    assert [(row.seeds, row.failed) for row in found.rows] == [(3, 0), (3, 0), (2, 1)]
+    assert found.failures == ("event trigger.threshold=0.02, seed 2: not airborne after 60 s: CF01",)
+    assert found.rows[2].ratio["iae"].n == 2
+
+
+def test_two_sweeps_do_not_share_a_folder(tmp_path):
+    def meanwhile(_done, _of):
+        with pytest.raises(DocumentError, match="another sweep is at work in it"):
+            swept(tmp_path, "seeds=1")
+
+    swept(tmp_path, "seeds=1", tell=meanwhile)
+
+
+def test_a_tuning_word_and_a_range_without_a_number_are_for_the_search(tmp_path):
+    with pytest.raises(DocumentError, match="there is nothing to tune"):
+        swept(tmp_path, "tuning=5")
+    with pytest.raises(DocumentError, match="how many values"):
+        swept(tmp_path, "trigger.threshold=0.01:0.02:log")
+
+
+def test_how_many_fly_side_by_side_depends_on_their_number():
+    triangle = load("triangle").experiment
+    assert side_by_side(triangle) == 100
+    many = {f"R{k}": triangle.robots["KH01"] for k in range(1000)}
+    assert side_by_side(Experiment(title="t", robots=many, duration_s=45.0)) == 1
+
+
+def test_workers_with_other_code_are_refused():
+    with Processes(1) as crew, pytest.raises(SweepError, match="another version of zenpark"):
+        list(crew.done([Work("x", b'{"title":"","robots":{},"duration_s":1}', (1,), "other")]))
+
+
+def test_a_scheduler_that_is_none():
+    with pytest.raises(SweepError, match=r"--scheduler nonsense: this is no address; write one as tcp://"):
+        workers("nonsense", None).__enter__()
+
+
+def test_the_front_has_what_no_other_beats(done):
+    rows = [row for row in done.rows if not row.reference]
+    best = front(rows)
+    for row in rows:
+        beaten = any(
+            other.ratio["messages"].mean <= row.ratio["messages"].mean
+            and other.ratio["iae"].mean < row.ratio["iae"].mean
+            for other in rows
+        )
+        assert (row in best) != beaten
+
+
+def test_curves_go_along_the_first_parameter(tmp_path):
+    found = swept(tmp_path, "trigger.threshold=0.005,0.02", "formation.gain=2,3", "seeds=1")
+    drawn = curves([row for row in found.rows if not row.reference])
+    assert {name: len(rows) for name, rows in drawn.items()} == {"event, gain=2": 2, "event, gain=3": 2}
+    assert [row.parameters["trigger.threshold"] for row in drawn["event, gain=2"]] == [0.005, 0.02]
+    axes = pareto(found.rows).axes[0]
+    assert axes.get_xlabel() == "messages relative to periodic"
+    assert [text.get_text() for text in axes.texts] == ["0.005", "0.02"] * 2
+
+
+def test_a_figure_of_nothing_but_the_reference(done):
+    pareto(done.rows[:1]).canvas.draw()
+
+
+def asked(folder, *given, **more):
+    plain = {"cases": [], "scheduler": None, "processes": 1, "optimize": None, "as_json": False, "anyway": False}
+    return Request("triangle", given, SHORT, out=str(folder), report=True, open_report=False, **{**plain, **more})
+
+
+def test_the_command_writes_table_figures_and_page(done, capsys):
+    assert command(asked(done.folder, AXIS, "seeds=3")) == 0
+    said = capsys.readouterr().out
+    assert "event     threshold=0.02" in said
+    assert (done.folder / "sweep.csv").read_text().startswith("case,trigger.threshold,reference,seeds,failed,f_hz,")
+    table = json.loads((done.folder / "sweep.json").read_text())
+    assert (table["reference"], table["seeds"], len(table["cells"])) == ("periodic", [1, 2, 3], 3)
+    assert table["cells"][2]["ratio"]["iae"]["mean"] == done.rows[2].ratio["iae"].mean
+    page = (done.folder / "sweep.html").read_text()
+    assert "zenpark sweep triangle trigger.threshold=0.005,0.02 seeds=3 --set duration_s=4.0" in page
+    assert page.count("<svg") == 2
+    assert {file.name for file in (done.folder / "figures").iterdir()} == {
+        f"pareto_{index}.{kind}" for index in ("iae", "itae") for kind in ("svg", "pdf")
+    }
+    assert command(asked(done.folder, AXIS, "seeds=3", as_json=True)) == 0
+    assert json.loads(capsys.readouterr().out)["cells"] == table["cells"]
+
+
+def test_the_page_says_who_needs_fewest_messages(done):
+    found = [finding.text for finding in sweep_page._fewest(done.rows)]
+    assert all(text.startswith("Fewest messages with an IAE ratio of at most ") for text in found)
+
+
+def test_progress_is_lines_without_a_terminal(capsys):
+    with Bar() as bar:
+        bar.show("runs", 0, 4)
+        bar.show("runs", 1, 4)
+        bar.show("runs", 4, 4)
+    assert capsys.readouterr().err == "runs 0 of 4\nruns 4 of 4\n"

@@ -1,0 +1,101 @@
+"""The figures of a run in a sweep: those of the report to the bit, whoever flies beside it; and what outdates them."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from experiments import metrics, sweep_runs
+from experiments.experiment import Channel, Start
+from experiments.logbook import Logbook
+from experiments.run import load
+from experiments.sweep_runs import Outcome, code_of, digest, figures_of, fly
+from experiments.virtual import simulate
+
+
+@pytest.fixture(scope="module")
+def park():
+    return msgspec.structs.replace(load("robotic-park").cases()["event"], duration_s=6.0, timeline=[])
+
+
+def test_a_lean_log_gives_the_figures_of_the_report_to_the_bit(park):
+    seeds = [3, 8]
+    lean, whole = simulate(park, seeds, lean=True), simulate(park, seeds)
+    found = figures_of(lean, park)
+    assert found == figures_of(whole, park)
+    for copy, figures in enumerate(found):
+        measured = metrics.measure(Logbook(whole, park, "event", copy).trace())
+        assert figures.seed == seeds[copy]
+        for index in ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s"):
+            assert getattr(figures, index) == measured.mean[index], index
+        assert figures.gap_min_s == min(robot.gap_min_s for robot in measured.robots if robot.gap_min_s is not None)
+        assert figures.lost == measured.lost
+        followers = [robot.updates for robot in measured.robots if robot.robot not in measured.leaders]
+        assert figures.updates == np.mean(followers)
+
+
+def test_a_lean_log_is_small(park):
+    lean = simulate(park, [1], lean=True)
+    assert lean.true_position.shape == (len(lean.time), 7, 3)
+    for column in (lean.position, lean.velocity, lean.goal, lean.setpoint, lean.error, lean.phase, lean.heard[0]):
+        assert column.size == 0
+    assert len(lean.sent[0]) > 50
+
+
+def flown(experiment, seeds):
+    return msgspec.json.decode(fly(msgspec.json.encode(experiment), seeds, code_of(experiment)), type=Outcome)
+
+
+@pytest.mark.slow
+def test_a_run_comes_out_the_same_whoever_flies_beside_it(park):
+    """With a jitter of the size of the orders' raster, seeds are ready at different orders: some are flown again."""
+    lossy = msgspec.structs.replace(
+        park, duration_s=2.0, channel=Channel(delay_s=0.05, jitter_s=0.4, loss=0.2), start=Start(scatter=0.05)
+    )
+    seeds = list(range(1, 7))
+    together = flown(lossy, seeds)
+    assert [run.seed for run in together.runs] == seeds
+    assert simulate(lossy, seeds, lean=True).waited.any()
+    assert together.runs == [flown(lossy, [seed]).runs[0] for seed in seeds]
+    assert flown(lossy, [5, 2]).runs == [together.runs[4], together.runs[1]]
+    assert sum(run.lost for run in together.runs) > 0
+
+
+def test_a_run_that_is_stuck_does_not_take_the_others_with_it(park, monkeypatch):
+    real = sweep_runs.simulate
+
+    def fails_with_2(experiment, seeds, *, lean):
+        if 2 in seeds:
+            raise sweep_runs.Stuck("not airborne after 60 s: CF01")
+        return real(experiment, seeds, lean=lean)
+
+    monkeypatch.setattr(sweep_runs, "simulate", fails_with_2)
+    short = msgspec.structs.replace(park, duration_s=1.0)
+    outcome = flown(short, [1, 2, 3])
+    assert [run.seed for run in outcome.runs] == [1, 3]
+    assert outcome.failed == {2: "not airborne after 60 s: CF01"}
+
+
+def test_work_for_other_code_is_refused(park):
+    answer = msgspec.json.decode(fly(msgspec.json.encode(park), [1], "of another version"), type=Outcome)
+    assert answer.runs == []
+    assert answer.stranger.endswith("not of another version")
+
+
+def test_what_does_not_change_a_run_does_not_change_its_digest(park):
+    same = msgspec.structs.replace(park, title="Another", source="", seed=99, cases={"a": {}})
+    assert digest(same) == digest(park)
+    other = msgspec.structs.replace(park, duration_s=6.02)
+    assert digest(other) != digest(park)
+
+
+def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
+    file = tmp_path / "my_triggers.py"
+    file.write_text("one")
+    before = code_of(park)
+    real = sweep_runs.getfile
+    monkeypatch.setattr(sweep_runs, "getfile", lambda of: str(file) if of.__name__ == "SendOnDelta" else real(of))
+    foreign = code_of(park)
+    sweep_runs._file_digest.cache_clear()
+    file.write_text("two")
+    assert len({before, foreign, code_of(park)}) == 3
+    sweep_runs._file_digest.cache_clear()

@@ -1,0 +1,200 @@
+"""Triggers, prediction and updates of an experiment file: how they are chosen, refused, recorded and counted."""
+
+import dataclasses
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.prediction import HOLD, ConstantVelocity
+from experiments import assign, checks, document, metrics, signals, virtual
+from experiments.experiment import Channel, Formation
+from experiments.logbook import Logbook
+from tests.agents.swarm import changed
+
+CHOSEN = {"kind": "predictive", "threshold": 0.011, "smoothing_s": 0.4}
+
+
+@pytest.fixture(scope="module")
+def park():
+    return document.read("robotic-park").cases()["periodic"]
+
+
+def measured(experiment, seeds):
+    log = virtual.simulate(experiment, seeds)
+    return [metrics.measure(Logbook(log, experiment, "", copy).trace()) for copy in range(len(seeds))]
+
+
+def mean(cases, index):
+    return np.mean([case.mean[index] for case in cases])
+
+
+# ---------------------------------------------------------------- what is chosen
+
+
+def test_prediction_is_what_the_trigger_needs_unless_it_is_said(park):
+    assert assign.predictor(park) is HOLD
+    assert assign.predictor(changed(park, trigger="predictive")) == ConstantVelocity()
+    assert assign.predictor(changed(park, trigger=CHOSEN)) == ConstantVelocity()
+    said = {"kind": "constant-velocity", "horizon_s": 0.5}
+    assert assign.predictor(changed(park, trigger=CHOSEN, prediction=said)) == ConstantVelocity(horizon_s=0.5)
+    assert assign.predictor(changed(park, prediction="constant-velocity")) == ConstantVelocity()
+    assert assign.predictor(changed(park, prediction="hold")) is HOLD
+
+
+def updating(park, update):
+    return changed(park, formation=msgspec.structs.replace(park.formation, update=update))
+
+
+@pytest.mark.parametrize(
+    ("change", "path", "message", "hint"),
+    [
+        ({"trigger": "relative-control"}, ("trigger",), "when the law is computed anew", "update = 'relative-control'"),
+        ({"trigger": CHOSEN, "prediction": "hold"}, ("prediction",), "neighbours that extrapolate", "leave prediction"),
+        ({"update": "predictive"}, ("formation", "update"), "when a robot speaks", "relative-control"),
+        (
+            {"update": {"kind": "mixed", "smoothing_s": 0.1}},
+            ("formation", "update", "smoothing_s"),
+            "for what is said",
+            "leave it out",
+        ),
+    ],
+)
+def test_triggers_where_they_make_no_sense_are_refused(park, change, path, message, hint):
+    rest = {key: value for key, value in change.items() if key != "update"}
+    wrong = changed(updating(park, change.get("update")), **rest)
+    (fault,) = checks.faults(wrong)
+    assert fault.path == path
+    assert message in fault.message
+    assert hint in fault.hint
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"trigger": CHOSEN},
+        {"trigger": CHOSEN, "prediction": {"kind": "constant-velocity", "horizon_s": 1.0}},
+        {"trigger": "send-on-delta", "prediction": "hold"},
+        {"update": "relative-control"},
+        {"update": {"kind": "send-on-delta", "threshold": 0.02}},
+    ],
+)
+def test_triggers_where_they_make_sense_are_not(park, change):
+    rest = {key: value for key, value in change.items() if key != "update"}
+    assert not list(checks.faults(changed(updating(park, change.get("update")), **rest)))
+
+
+# ---------------------------------------------------------------- what is sent, believed and counted
+
+
+@pytest.fixture(scope="module")
+def flown(park):
+    """A short run with the chosen trigger on a network with a delay, as a log and as a trace."""
+    experiment = changed(park, trigger=CHOSEN, duration_s=8.0, timeline=[], channel=Channel(delay_s=0.05))
+    log = virtual.simulate(experiment, [4])
+    return log, Logbook(log, experiment, "predictive").trace()
+
+
+def test_what_is_heard_is_what_was_said_velocity_and_all(flown):
+    _, trace = flown
+    sent = {
+        (robot, seq): (*place, *moves)
+        for robot, seq, place, moves in zip(
+            trace.sent.robot.tolist(), trace.sent.seq.tolist(), trace.sent.position.tolist(),
+            trace.sent.velocity.tolist(), strict=True,
+        )
+    }  # fmt: skip
+    heard = trace.heard
+    known = [k for k in range(len(heard.seq)) if (heard.speaker[k], heard.seq[k]) in sent]
+    assert len(known) > 30
+    for k in known:
+        assert sent[heard.speaker[k], heard.seq[k]] == (*heard.position[k].tolist(), *heard.velocity[k].tolist())
+    assert np.abs(trace.heard.velocity).max() > 0.05
+
+
+def test_what_is_said_is_smoothed(flown):
+    log, trace = flown
+    drone = trace.robots.index("CF02")
+    mine = trace.sent.robot == drone
+    at = np.searchsorted(trace.time, trace.sent.time[mine] - 1e-9)
+    off = trace.sent.position[mine] - trace.position[at, drone]
+    assert 0.002 < np.sqrt((off[:, :2] ** 2).mean()) < 0.03
+    assert log.sent[3].shape == log.sent[4].shape
+
+
+def test_belief_error_is_that_of_the_prediction(flown):
+    _, trace = flown
+    net = signals.links_of(trace)
+    found = signals.beliefs(trace, net)
+    listener, speaker, heard = net.listener, net.speaker, trace.heard
+    for link in np.flatnonzero(speaker > 0)[::5]:  # the leader stands, and says nothing after the start
+        mine = np.flatnonzero((heard.listener == listener[link]) & (heard.speaker == speaker[link]))
+        for k in (150, 300, 399):
+            last = mine[heard.time[mine] <= trace.time[k]][-1]
+            ahead = heard.position[last] + heard.velocity[last] * (trace.time[k] - heard.stamp[last])
+            wanted = math.dist(ahead, trace.true_position[k, speaker[link]])
+            assert found[k, link] == pytest.approx(wanted, abs=1e-12)
+    held = dataclasses.replace(trace, experiment=changed(trace.experiment, trigger="send-on-delta"))
+    assert np.nanmean(signals.beliefs(held, net) ** 2) > 4.0 * np.nanmean(found**2)
+
+
+def test_updates_are_counted_for_each_robot(park):
+    experiment = changed(updating(park, {"kind": "send-on-delta", "threshold": 0.02}), duration_s=12.0, timeline=[])
+    log = virtual.simulate(experiment, [1, 2])
+    assert log.updates.reshape(2, 7)[:, 0].tolist() == [log.decisions] * 2 == [120] * 2
+    for copy in range(2):
+        logbook = Logbook(log, experiment, "", copy)
+        trace = logbook.trace()
+        np.testing.assert_array_equal(trace.decisions, log.updates.reshape(2, 7)[copy])
+        assert (trace.decisions[1:] < 120).all()
+        assert (trace.decisions[1:] > 10).all()
+        case = metrics.measure(trace)
+        assert [robot.updates for robot in case.robots] == trace.decisions.tolist()
+        counted = {status.robot: status.decisions for status in logbook._statuses()}
+        assert [counted[name] for name in trace.robots] == trace.decisions.tolist()
+    assert not np.array_equal(log.updates[:7], log.updates[7:])  # each repetition by itself
+
+
+def test_repetitions_side_by_side_are_what_each_is_alone_with_all_of_it(park):
+    noisy = Channel(delay_s=0.05, jitter_s=0.01, loss=0.1)
+    experiment = changed(updating(park, "self-triggered"), trigger=CHOSEN, duration_s=4.0, timeline=[], channel=noisy)
+    both = virtual.simulate(experiment, [5, 6])
+    for copy, seed in enumerate((5, 6)):
+        alone = virtual.simulate(experiment, [seed])
+        if len(alone.time) == len(both.time) and not both.waited.any():
+            rows = slice(7 * copy, 7 * copy + 7)
+            np.testing.assert_array_equal(both.true_position[:, rows], alone.true_position)
+            np.testing.assert_array_equal(both.updates[rows], alone.updates)
+
+
+# ---------------------------------------------------------------- what it is good for
+
+
+@pytest.mark.slow
+def test_prediction_on_a_smoothed_value_saves_97_percent_and_costs_nothing(park):
+    seeds = range(1, 11)  # chosen on 1001 to 1010
+    periodic, predictive = measured(park, seeds), measured(changed(park, trigger=CHOSEN), seeds)
+    assert mean(predictive, "f_hz") <= 0.03 * mean(periodic, "f_hz")
+    assert mean(predictive, "iae") <= 1.01 * mean(periodic, "iae")
+    assert mean(predictive, "itae") <= 1.05 * mean(periodic, "itae")
+    assert all(None not in case.acquired_s for case in predictive)
+
+
+@pytest.mark.slow
+def test_a_maximum_silence_keeps_prediction_from_running_away_on_a_bad_network(park):
+    bad = changed(park, trigger={**CHOSEN, "maximum_silence_s": 2.0}, channel=Channel(delay_s=0.05, loss=0.1))
+    cases = measured(bad, range(1, 6))
+    assert all(None not in case.acquired_s for case in cases)
+    assert mean(cases, "iae") < 1.03 * mean(measured(park, range(1, 6)), "iae")
+
+
+def test_a_formation_without_links_has_no_law_to_gate(park):
+    alone = changed(
+        park,
+        robots={"KH01": park.robots["KH01"]},
+        formation=Formation(update="send-on-delta"),
+        timeline=[],
+        duration_s=2.0,
+    )
+    assert virtual.simulate(alone, [1]).updates.tolist() == [20]

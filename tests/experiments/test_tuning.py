@@ -1,0 +1,112 @@
+"""The search for parameters: what a wish means, and that what is found keeps its limits on seeds that it never saw."""
+
+import pytest
+
+from experiments.problem import DocumentError
+from experiments.seeds import Spread
+from experiments.sweep_command import Request, command
+from experiments.sweep_table import MEANS, RATIOS, Row
+from experiments.tuning import BROKEN, Limit, Wish, searched, tune, wish_of
+
+SHORT = ["duration_s=4.0"]
+
+
+def row(**ratios):
+    found = {index: Spread(ratios.get(index, 1.0), 0.0, 0.01, 9) for index in RATIOS}
+    mean = {index: Spread(1.0, 0.0, 0.01, 9) for index in MEANS}
+    return Row("event", {}, False, 9, 0, mean, found, 1.0, 0.02)
+
+
+def test_a_wish():
+    wish = wish_of("messages, iae<=1.01 ,ITAE < 1.05, acquired<=12")
+    assert wish == Wish("messages", (Limit("iae", 1.01), Limit("itae", 1.05), Limit("acquired_s", 12.0)))
+    assert [str(limit) for limit in wish.limits] == ["IAE ratio <= 1.01", "ITAE ratio <= 1.05", "acquired_s <= 12"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message", "hint"),
+    [
+        ("", "what is to be least", "messages, iae<=1.01"),
+        ("iae<=1.01", "what is to be least", "messages, iae<=1.01"),
+        ("messages", "without a limit", "iae<=1.01"),
+        ("messages, iea<=1.01", "no index is called 'iea'", "'iae'?"),
+        ("mesages, iae<=1.01", "no index is called 'mesages'", "'messages'?"),
+        ("messages, iae>=1.01", "'iae>=1.01' is no limit", "iae<=1.01"),
+        ("messages, iae<=", "'iae<=' is no limit", "iae<=1.01"),
+        ("messages, iae<=1.0.1", "'iae<=1.0.1' is no limit", "iae<=1.01"),
+    ],
+)
+def test_what_is_wrong_with_a_wish(text, message, hint):
+    with pytest.raises(DocumentError) as caught:
+        wish_of(text)
+    (problem,) = caught.value.problems
+    assert problem.file == f'--optimize "{text}"'
+    assert message in problem.message
+    assert hint in problem.hint
+
+
+def test_limits_come_before_messages_and_count_with_their_interval():
+    wish = wish_of("messages, iae<=1.05")
+    assert wish.rank(row(messages=0.2, iae=1.03)) == 0.2
+    assert wish.rank(row(messages=0.1, iae=1.045)) > BROKEN  # 1.045 ± 0.01
+    assert wish.rank(row(iae=1.2)) > wish.rank(row(iae=1.1)) > BROKEN
+    assert wish.kept(row(iae=1.045))
+    assert not wish.kept(row(iae=1.06))
+
+
+def test_a_third_of_the_tuning_seeds_serves_the_search():
+    assert searched(range(1001, 1061)) == tuple(range(1001, 1021))
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory):
+    pytest.importorskip("cma")
+    given = ["trigger.threshold=0.002:0.1:log", "seeds=6", "tuning=101:118"]
+    options = {"settings": SHORT, "out": tmp_path_factory.mktemp("tuned"), "processes": 1}
+    return tune("triangle", given, "messages, iae<=1.02", **options), given, options
+
+
+@pytest.mark.slow
+def test_the_search_finds_the_fewest_messages_within_the_limit(tuned):
+    found, given, options = tuned
+    reference, best = found.rows
+    assert (reference.case, reference.reference, best.case, best.seeds) == ("periodic", True, "event", 6)
+    assert found.wish.kept(best)
+    assert best.ratio["messages"].mean < 0.3
+    assert best.parameters == found.chosen[0].parameters
+    assert found.chosen[0].seeds == 12
+    assert {each.seeds for each in found.tried} == {6}
+    assert not set(found.tuning) & set(found.seeds)
+    within = [each for each in found.tried if found.wish.rank(each) < BROKEN]
+    assert len(within) >= 3
+    again = tune("triangle", given, "messages, iae<=1.02", **options)
+    assert (again.rows, again.tried) == (found.rows, found.tried)
+
+
+@pytest.mark.slow
+def test_the_command_tells_on_which_seeds(tuned, capsys):
+    found, given, options = tuned
+    request = Request(
+        "triangle", given, SHORT, [], str(options["out"]), None, 1, "messages, iae<=1.02", False, False, True, False
+    )
+    assert command(request) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("tuned on seeds 101 to 118, reported on seeds 1 to 6\n")
+    assert f"{found.rows[1].label}: keeps IAE ratio <= 1.02" in said
+    assert len((options["out"] / "tried.csv").read_text().splitlines()) == 1 + len(found.tried)
+    assert "On seeds 1 to 6, which no choice has seen." in (options["out"] / "sweep.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["trigger.threshold=0.01:0.02:log", "tuning=1:30"], "seed 1 is to be tuned and reported on"),
+        (["trigger.threshold=0.01:0.02:log", "tuning=101:103"], "3 seeds are too few to tune on"),
+        (["trigger.threshold=0.01,0.02"], "the search needs a range"),
+        (["trigger.threshold=0.01"], "there is nothing to change"),
+        (["trigger.period_s=0.02:0.1:log"], "no case that is looked at has it"),
+    ],
+)
+def test_what_cannot_be_tuned(tmp_path, given, message):
+    with pytest.raises(DocumentError, match=message):
+        tune("triangle", given, "messages, iae<=1.02", out=tmp_path)

@@ -1,0 +1,161 @@
+"""Sweeps in several processes: interrupted, killed, continued, and on a cluster of which half dies; always the same."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import contextmanager
+
+import psutil
+import pytest
+
+from tests.system.lab import ENVIRONMENT, ROOT, until
+
+pytestmark = pytest.mark.system
+
+GIVEN = ["trigger.threshold=0.002:0.05:log9", "seeds=12"]
+SETTINGS = ["duration_s=3.0"]
+RUNS = 10 * 12
+
+
+@contextmanager
+def started(*command, **options):
+    """A process of the test, ended with its children whatever happens."""
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(
+        [sys.executable, *command], cwd=ROOT, env={**ENVIRONMENT, "OMP_NUM_THREADS": "1"}, **{**streams, **options}
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            for each in [*psutil.Process(process.pid).children(recursive=True), process]:
+                each.kill()
+        process.wait()
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+def zenpark(folder, *more):
+    settings = [part for setting in SETTINGS for part in ("--set", setting)]
+    return started(
+        "-m", "tools.guard", "sweep", "triangle", *GIVEN, *settings, "--out", str(folder), "--no-report", *more
+    )
+
+
+def seeds_done(folder):
+    """Every run that is kept, as cell and seed; a line that is being written does not count."""
+    path = folder / "runs.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+    records = [json.loads(line) for line in lines if line.endswith(b"\n")]
+    return [(record["cell"], run["seed"]) for record in records for run in record["runs"]]
+
+
+def tables(folder):
+    return [(folder / f"sweep.{kind}").read_bytes() for kind in ("csv", "json")]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The table of the same sweep in one process."""
+    folder = tmp_path_factory.mktemp("whole")
+    with zenpark(folder, "--processes", "1") as process:
+        process.communicate()
+        assert process.returncode == 0
+    return tables(folder)
+
+
+def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, whole):
+    with zenpark(tmp_path, "--processes", "2") as process:
+        until(lambda: seeds_done(tmp_path), "a cell is done")
+        children = psutil.Process(process.pid).children(recursive=True)
+        assert len(children) >= 2
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate()
+        assert process.returncode == 130
+        assert "the same command goes on from here" in said
+        assert "Traceback" not in said
+        assert not psutil.wait_procs(children, timeout=5.0)[1]
+    before = seeds_done(tmp_path)
+    assert 0 < len(before) < RUNS
+    with zenpark(tmp_path, "--processes", "2") as process:
+        process.communicate()
+        assert process.returncode == 0
+    done = seeds_done(tmp_path)
+    assert len(done) == len(set(done)) == RUNS
+    assert done[: len(before)] == before
+    assert tables(tmp_path) == whole
+
+
+def test_a_sweep_that_is_killed_leaves_no_process_and_goes_on(tmp_path, whole):
+    with zenpark(tmp_path, "--processes", "2") as process:
+        until(lambda: seeds_done(tmp_path), "a cell is done")
+        children = psutil.Process(process.pid).children(recursive=True)
+        process.kill()
+        assert not psutil.wait_procs(children, timeout=10.0)[1]
+    before = seeds_done(tmp_path)
+    with zenpark(tmp_path, "--processes", "2") as process:
+        process.communicate()
+        assert process.returncode == 0
+    assert seeds_done(tmp_path)[: len(before)] == before
+    assert tables(tmp_path) == whole
+
+
+def test_a_process_that_is_killed_is_explained(tmp_path):
+    with zenpark(tmp_path, "--processes", "2") as process:
+        until(lambda: seeds_done(tmp_path), "a cell is done")
+        children = psutil.Process(process.pid).children(recursive=True)
+        max(children, key=lambda child: child.memory_info().rss).kill()
+        _, said = process.communicate()
+        assert process.returncode == 2
+        assert "a process of the sweep was killed" in said
+        assert "Traceback" not in said
+        assert not psutil.wait_procs(children, timeout=5.0)[1]
+
+
+def test_a_cluster_of_which_a_worker_is_killed_half_way_gives_the_same_table(tmp_path, whole):
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address = f"tcp://127.0.0.1:{port}"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    scheduler = ["-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+    worker = ["-m", "distributed.cli.dask_worker", address, "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny"]
+    worker += ["--no-dashboard", "--local-directory"]
+    folder = tmp_path / "sweep"
+    with (
+        started(*scheduler, **quiet),
+        started(*worker, str(tmp_path / "one"), **quiet) as one,
+        started(*worker, str(tmp_path / "two"), **quiet) as two,
+        zenpark(folder, "--scheduler", address) as process,
+    ):
+        until(lambda: seeds_done(folder), "a cell is done")
+        (one if process.pid % 2 else two).kill()
+        assert len(seeds_done(folder)) < RUNS
+        _, said = process.communicate()
+        assert process.returncode == 0, said
+    done = seeds_done(folder)
+    assert len(done) == len(set(done)) == RUNS
+    assert tables(folder) == whole
+
+
+SCRIPT = """
+from experiments.sweep import sweep
+from experiments.sweep_table import write_csv
+
+if __name__ == "__main__":
+    found = sweep("triangle", {given}, settings={settings}, out={folder!r}, processes=2)
+    write_csv(found.folder / "sweep.csv", found.rows)
+"""
+
+
+def test_the_same_from_a_script(tmp_path, whole):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.format(given=GIVEN, settings=SETTINGS, folder=str(tmp_path)))
+    with started(str(script)) as process:
+        _, said = process.communicate()
+    assert (process.returncode, said) == (0, "")
+    assert (tmp_path / "sweep.csv").read_bytes() == whole[0]
