@@ -1,7 +1,7 @@
 """How near robots came to each other and to what stands in the arena, surface to surface, and what touched.
 
-Robots are upright cylinders of the radius and height of their kind: those that drive stand on their position, those
-that fly are about it. Everything is taken on true positions, at the samples of the trace; unknown ones touch nothing.
+Robots are upright cylinders of the radius and height of their kind: a position is that of the
+lowest point. Everything is taken on true positions, at the samples of the trace; unknown ones touch nothing.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class _Cylinders:
         kinds = [KINDS[trace.experiment.robots[name].kind] for name in trace.robots]
         height = np.array([kind.height for kind in kinds])
         radius, flies = np.array([kind.radius for kind in kinds]), np.array([kind.flies for kind in kinds])
-        bottom = trace.true_position[..., 2] - np.where(flies, 0.5 * height, 0.0)
+        bottom = trace.true_position[..., 2]
         return cls(trace.true_position[..., :2], radius, bottom, bottom + height, flies)
 
     def between(self, i: int) -> Array:

@@ -86,7 +86,7 @@ class PlanarEngine(Models):
         self._found: list[Touch] = []
         rows = len(stage.kinds)
         self._layers = _layers(stage)
-        self._half = 0.5 * np.array([stage.kinds[row].height for row in self.in_air])
+        self._tall = np.array([stage.kinds[row].height for row in self.in_air])
         mass = np.array([MASSES[stage.kinds[row].name] for row in self.in_air])
         self._force = (mass / self._step)[:, None]  # that changes the speed by 1 m/s in one step
         self._settle(stage, choice)
@@ -232,7 +232,7 @@ class PlanarEngine(Models):
         # all in the first step of the tick: then the tick is one of the point-mass engine, whose steps are ticks
         bodies = self._bodies_in_air
         self._state[bodies, PUSH] = (target + drift - self._state[bodies, MOVE]) * self._force
-        self._layers.bottom[air], self._layers.top[air] = height - self._half, height + self._half
+        self._layers.bottom[air], self._layers.top[air] = height, height + self._tall
         if not aloft or some(self._stands):
             self._stand(~flight.flying & (height <= TOUCHDOWN) & (drift == 0.0).all(axis=1))
         return target, drift
@@ -256,8 +256,8 @@ class PlanarEngine(Models):
         state[slots, YAW] = np.nan_to_num(yaw)
         aloft = np.isin(self._mirrored, self.in_air)
         rows, height = self._mirrored[aloft], position[aloft, 2]
-        half = self._half[np.searchsorted(self.in_air, rows)]
-        self._layers.bottom[rows], self._layers.top[rows] = height - half, height + half
+        tall = self._tall[np.searchsorted(self.in_air, rows)]
+        self._layers.bottom[rows], self._layers.top[rows] = height, height + tall
 
     def _carry(self, t: float) -> None:
         """Moves obstacles by their plans, with the speed that takes them there in this tick."""
