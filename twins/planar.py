@@ -34,24 +34,24 @@ AWAY: Final = 1e6  # [m] where mirrored robots are that are not there
 UNFELT: Final = 1e-12  # [m/s] change of speed that is only rounding
 LEAP: Final = 10.0  # [m/s] what a plan moves faster than this, it puts there
 
-Share = Annotated[float, Meta(ge=0.0, le=1.0)]
-Friction = Annotated[float, Meta(ge=0.0, le=10.0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Friction = Annotated[float, Meta(ge=0, le=10)]
 
 
 class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Parameters of the pymunk engine; all are choices, of hulls of plastic and wheels of rubber."""
 
-    step_s: Annotated[float, Meta(gt=0.0, le=0.05, description="longest internal step [s]")] = 0.005
+    step_s: Annotated[float, Meta(gt=0, le=0.05, description="longest internal step [s]")] = 0.005
     friction: Annotated[Friction, Meta(description="coefficient between robots")] = 0.3
     wall_friction: Annotated[Friction, Meta(description="coefficient between robots and walls or obstacles")] = 0.3
     restitution: Annotated[Share, Meta(description="speed after a blow, as a share of the speed before")] = 0.1
     traction: Annotated[Friction, Meta(description="coefficient of wheels, and of landed robots, on the floor")] = 0.7
-    tilt: Annotated[float, Meta(gt=0.0, le=1.2, description="largest tilt of flying robots [rad]")] = math.radians(20.0)
+    tilt: Annotated[float, Meta(gt=0, le=1.2, description="largest tilt of flying robots [rad]")] = math.radians(20.0)
     slide: Annotated[
-        float, Meta(gt=0.0, le=2.0, description="speed at which what came from above slides aside [m/s]")
+        float, Meta(gt=0, le=2, description="speed at which what came from above slides aside [m/s]")
     ] = 0.5
     approach: Annotated[
-        float, Meta(gt=0.0, le=20.0, description="closing speed up to which nothing overlaps [m/s]")
+        float, Meta(gt=0, le=20, description="closing speed up to which nothing overlaps [m/s]")
     ] = 3.0
     iterations: Annotated[int, Meta(ge=1, le=200, description="of the contact solver in each step")] = 10
 
