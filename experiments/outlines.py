@@ -1,4 +1,4 @@
-"""What stands in an arena, seen from above: outlines, where they are over time, how far points are from them."""
+"""What stands in an arena, seen from above: outlines, and how far points are from them."""
 
 from __future__ import annotations
 
@@ -8,22 +8,6 @@ import numpy as np
 
 from agents.rows import Array, Mask, norm
 from twins.scene import Scene
-
-
-def along(scene: Scene, time: Array) -> Array:
-    """Poses (T, M, 3) of all obstacles, x, y [m] and yaw [rad], at times (T,) since the common start [s].
-
-    What can be pushed is where it stood at the start.
-    """
-    pose = np.tile(scene.pose, (len(time), 1, 1))
-    elapsed = np.maximum(time, 0.0)
-    for k, plan in enumerate(scene.plans):
-        if plan is not None:
-            anchor = np.tile([*scene.pose[k, :2], 0.0], (len(time), 1))
-            place, yaw = plan.target(elapsed, anchor, np.full(len(time), scene.pose[k, 2]))
-            pose[:, k, :2] = place[:, :2]
-            pose[:, k, 2] = np.where(np.isfinite(yaw), yaw, scene.pose[k, 2])
-    return pose
 
 
 def corners(outline: Array, pose: Array) -> Array:

@@ -47,12 +47,10 @@ class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     restitution: Annotated[Share, Meta(description="speed after a blow, as a share of the speed before")] = 0.1
     traction: Annotated[Friction, Meta(description="coefficient of wheels, and of landed robots, on the floor")] = 0.7
     tilt: Annotated[float, Meta(gt=0, le=1.2, description="largest tilt of flying robots [rad]")] = math.radians(20.0)
-    slide: Annotated[
-        float, Meta(gt=0, le=2, description="speed at which what came from above slides aside [m/s]")
-    ] = 0.5
-    approach: Annotated[
-        float, Meta(gt=0, le=20, description="closing speed up to which nothing overlaps [m/s]")
-    ] = 3.0
+    slide: Annotated[float, Meta(gt=0, le=2, description="speed at which what came from above slides aside [m/s]")] = (
+        0.5
+    )
+    approach: Annotated[float, Meta(gt=0, le=20, description="closing speed up to which nothing overlaps [m/s]")] = 3.0
     iterations: Annotated[int, Meta(ge=1, le=200, description="of the contact solver in each step")] = 10
 
     contacts: ClassVar[bool] = True
