@@ -10,6 +10,7 @@ from experiments.experiment import Channel
 from experiments.virtual import simulate
 
 BARRIER = {"kind": "barrier", "hears": "all"}
+SOME = (("khepera4", "turtlebot3"), ("tello", "tello"))  # `zenpark bench encounters` has them all
 FOUR = ("khepera4", "turtlebot3", "crazyflie", "tello")
 
 
@@ -67,7 +68,7 @@ def test_a_thousand_random_encounters_with_the_barrier_and_no_collision():
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_potential_keeps_pairs_apart_as_well():
-    whole = Outcome.joined(random_pairs({"kind": "potential", "hears": "all"}, 8).values())
+    whole = Outcome.joined([met(kinds, {"kind": "potential", "hears": "all"}, 10) for kinds in SOME])
     assert whole.collided.sum() == 0
     assert whole.arrived.all()
 
@@ -75,7 +76,7 @@ def test_the_potential_keeps_pairs_apart_as_well():
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_one_that_does_not_avoid_is_avoided():
-    whole = Outcome.joined(random_pairs(BARRIER, 8, stubborn=1).values())
+    whole = Outcome.joined([met(kinds, BARRIER, 10, stubborn=1) for kinds in SOME])
     assert whole.collided.sum() == 0
     assert whole.arrived.all()
 
@@ -90,7 +91,7 @@ def test_four_of_all_kinds_change_sides():
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "sensors"), [("turtlebot3", ["lds01"]), ("khepera4", ["infrared", "ultrasonic"])])
 def test_two_that_only_see_each_other_keep_clear(kind, sensors):
-    outcome = met((kind, kind), {"kind": "barrier"}, 10, sensors=sensors)
+    outcome = met((kind, kind), {"kind": "barrier"}, 4, sensors=sensors)
     assert outcome.collided.sum() == 0
     assert outcome.arrived.all()
 
