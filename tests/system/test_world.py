@@ -210,7 +210,7 @@ def test_climbs_and_landings_go_on_in_the_next_world(router: RouterProcess, file
             assert watcher.order(name, wire.Order("takeoff")).ok
         watcher.until(lambda: min(map(height, both)) > 0.25, "they climb")
         world = again()
-        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in both), "they arrive", 8.0)
+        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in both), "they arrive", 15.0)
         assert min(map(height, both)) > 0.54
         for name in both:
             assert watcher.order(name, wire.Order("land")).ok
