@@ -87,7 +87,7 @@ class Self:
         velocity: (N, 3) measured or estimated, 0 where unknown [m/s].
         yaw: (N,) measured [rad].
         radius: (N,) [m]
-        height: (N,) vertical size, about the position of a flying robot, from the floor for others [m].
+        height: (N,) vertical size, from the position up [m].
         speed: (N,) limit [m/s].
         turn_rate: (N,) limit [rad/s].
         response: (N,) rate at which a body that takes positions closes a position error [1/s].

@@ -18,7 +18,7 @@ class Kind:
         takes: The setpoint that its body takes.
         flies: Takes off and lands.
         radius: Horizontal half-size [m].
-        height: Vertical size [m].
+        height: Vertical size [m]; a position is that of the lowest point, so a body reaches from z to z + height.
         speed: Largest speed [m/s]; per axis for flying robots.
         turn_rate: Largest yaw rate [rad/s].
         response: Rate at which its position controller closes a position error [1/s].

@@ -58,13 +58,10 @@ class Sight:
         self._turn_rate, self._response = _column(kinds, "turn_rate"), _column(kinds, "response")
         self._lag = _column(kinds, "lag")
         self._flies = np.array([kind.flies for kind in kinds], dtype=bool)
-        self._below, self._above = _extent(self._flies, self._height)
-        self._eye = np.where(self._flies, 0.0, 0.5 * self._height)
         self._listener = links.listener
         speaks = [speaker_kinds[speaker] for speaker in links.speaker.tolist()]
         self._their_radius, self._their_lag = _column(speaks, "radius"), _column(speaks, "lag")
-        flying = np.array([kind.flies for kind in speaks], dtype=bool)
-        self._their_below, self._their_above = _extent(flying, _column(speaks, "height"))
+        self._their_height = _column(speaks, "height")
         self._rays: Rays | None = None
         self._points = _Points.nothing()
 
@@ -99,8 +96,8 @@ class Sight:
         apart = state.position[row] - position
         near = (np.vecdot(apart[:, :2], apart[:, :2]) <= REACH**2) & aware[row]
         # their lower end under my upper one, and the other way round; `apart` is how much higher I am
-        near &= apart[:, 2] + self._above[row] - self._their_below + self._clearance > 0.0
-        near &= apart[:, 2] + self._below[row] - self._their_above - self._clearance < 0.0
+        near &= apart[:, 2] + self._height[row] + self._clearance > 0.0
+        near &= apart[:, 2] - self._their_height - self._clearance < 0.0
         near &= t - heard.gone <= self._limits.link_silence_s
         which = np.flatnonzero(near)
         z, believed = position[which, 2], age[which] <= BELIEVED_S
@@ -109,8 +106,8 @@ class Sight:
             position[which, :2],
             np.where(believed[:, None], heard.velocity[which, :2], 0.0),
             self._their_radius[which],
-            z + self._their_below[which],
-            z + self._their_above[which],
+            z,
+            z + self._their_height[which],
             np.ones(len(which), dtype=bool),
             self._their_lag[which],
         )
@@ -143,7 +140,7 @@ class Sight:
         bearing = state.yaw[row] + rays.bearing[ray]
         out = distance * flat[ray]
         place = eye[:, :2] + out[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-        height = eye[:, 2] + self._eye[row] + distance * np.sin(rays.elevation[ray])
+        height = eye[:, 2] + 0.5 * self._height[row] + distance * np.sin(rays.elevation[ray])
         return _Points(ray, row, time, distance, place, height)
 
     def _known(self, found: _Points, heard: Heard, position: Array) -> Mask:
@@ -163,7 +160,7 @@ class Sight:
         apart = found.place[point] - place[:, :2]
         outline = self._their_radius[link] + OUTLINE + OUTLINE_SHARE * found.distance[point]
         up = found.height[point] - place[:, 2]
-        beside = (up > self._their_below[link] - OUTLINE) & (up < self._their_above[link] + OUTLINE)
+        beside = (up > -OUTLINE) & (up < self._their_height[link] + OUTLINE)
         known[point[(np.vecdot(apart, apart) <= outline**2) & beside]] = True
         return known
 
@@ -172,7 +169,7 @@ class Sight:
         points = self._points
         row = points.row
         up = points.height - state.position[row, 2]
-        near = (up < self._above[row] + self._clearance) & (up > self._below[row] - self._clearance)
+        near = (up < self._height[row] + self._clearance) & (up > -self._clearance)
         near &= aware[row] & (t - points.time <= SCAN_S)
         if not every(near):
             points = points.of(near)
@@ -212,8 +209,3 @@ class _Points:
 
 def _column(kinds: Sequence[Kind], name: str) -> Array:
     return np.array([getattr(kind, name) for kind in kinds], dtype=float)
-
-
-def _extent(flies: Mask, height: Array) -> tuple[Array, Array]:
-    """Lower and upper ends over the measured position [m]: half above and half below it, or all above."""
-    return np.where(flies, -0.5 * height, 0.0), np.where(flies, 0.5 * height, height)

@@ -27,11 +27,9 @@ Action = Literal["drive", "takeoff", "land", "stop"]
 OPEN_S: Final = 5.0  # for the router to answer and a first position of every row to come
 LOOK_S: Final = 0.02  # between looks for it
 STALE_S: Final = 0.5  # what the robots bear
-GAP_S: Final = 0.25  # after a longer silence it may be another process that answers, which knows of no earlier order
-AGAIN_S: Final = 1.0  # so long it is told what was under way
 WORLD: Final = "world"  # the address of robots that the twin service carries
 REPEAT_S: Final = 0.1  # an order is said again this often: the publisher drops what does not fit
-TAKEOFF_S: Final = 3.0  # for so long
+HALT_S: Final = 3.0  # a robot on wheels that was told to land is told so this long
 LANDING_S: Final = 10.0  # a robot that was told to land this long ago, and cannot be seen, is taken for down
 AWAY_M: Final = 0.05  # higher above the place of take-off than this it is in the air, lower it is down
 SETTLED: Final = 0.1  # [m/s] slower than this it is down
@@ -43,14 +41,14 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Standing(msgspec.Struct):
-    """An order that is repeated, under the number that it had, until `until` [s] or until its effect is seen.
+    """An order that is repeated, under the number that it had, until it is obeyed or `until` [s].
 
-    One that is said `again` to a far end that may have lost it is said for its whole time: the robot is in the air.
+    Obeyed to the end, not begun: half-way through a climb or a landing another process may answer at the far end, as
+    soon as the first one died, and it knows of no earlier order.
     """
 
     order: wire.Command
     until: float
-    again: bool = False
 
 
 class ExternalBody:
@@ -86,8 +84,6 @@ class ExternalBody:
         # so that numbers grow over restarts: a simulator that outlives this process knows new orders from old
         self._sent = [round(1e3 * self._utc)] * rows
         self._standing: dict[int, _Standing] = {}
-        self._under_way: dict[int, wire.Command] = {}  # climbs and landings that have not ended yet
-        self._silent = np.zeros(rows, dtype=bool)
         self._repeat = 0.0
         self._trouble = [""] * rows
         self._malformed = [0] * rows
@@ -142,8 +138,8 @@ class ExternalBody:
         for row in np.flatnonzero(given).tolist():
             x, y, z, w = values[row]
             self._say(row, "drive", setpoint=(x, y, z, w))
-            if self._under_way:
-                self._under_way.pop(row, None)
+            if (standing := self._standing.get(row)) is not None and standing.order.action == "takeoff":
+                del self._standing[row]  # who is steered need not climb
         now = self._now()
         if self._standing and now >= self._repeat:
             self._repeat = now + REPEAT_S
@@ -160,21 +156,18 @@ class ExternalBody:
                 z = self._seen.position[row, 2]
                 self._ground[row] = z if isfinite(z) else 0.0
                 self._flying[row], self._landing[row], self._stopped[row] = True, np.inf, False
-                self._under_way[row] = self._say(row, "takeoff", height=up)
-                self._stand(row, self._under_way[row], TAKEOFF_S)
+                self._stand(row, self._say(row, "takeoff", height=up), np.inf)
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
         for row in rows.tolist():
             self._landing[row] = self._now()
-            self._under_way[row] = self._say(row, "land")
-            self._stand(row, self._under_way[row], LANDING_S if self._flying[row] else TAKEOFF_S)
+            self._stand(row, self._say(row, "land"), LANDING_S if self._flying[row] else HALT_S)
 
     def stop(self, rows: Index) -> None:
         """See `Body.stop`; said again for as long as this process lives."""
         self._flying[rows], self._stopped[rows] = False, True
         for row in rows.tolist():
-            self._under_way.pop(row, None)
             self._stand(row, self._say(row, "stop"), np.inf)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
@@ -238,30 +231,18 @@ class ExternalBody:
         return "`zenpark world` with this experiment" if self._addresses[row] == WORLD else "the simulator"
 
     def _settle(self) -> None:
-        """Ends what has come to its end: climbs, landings; says what had not to a far end that begins anew."""
-        now = self._now()
-        age = now - self._seen.time
-        silent = age > GAP_S
-        back = self._silent & ~silent
-        self._silent = silent
-        if self._under_way and some(back):
-            for row in np.flatnonzero(back).tolist():
-                if (order := self._under_way.get(row)) is not None:
-                    self._standing[row] = _Standing(order, now + AGAIN_S, again=True)
-        if not (self._standing or self._under_way):
+        """Ends the landings that have come to their end."""
+        landing = self._flying & np.isfinite(self._landing)
+        if not some(landing):
             return
+        now = self._now()
         high = self._seen.position[:, 2] - self._ground > AWAY_M
         slow = np.abs(self._seen.velocity[:, 2]) < SETTLED
-        aged = age > STALE_S
-        down = self._flying & np.isfinite(self._landing)
-        down &= np.where(aged, now - self._landing > LANDING_S, ~high & slow)
+        aged = now - self._seen.time > STALE_S
+        down = landing & np.where(aged, now - self._landing > LANDING_S, ~high & slow)
         self._flying &= ~down
-        for row, standing in list(self._standing.items()):
-            climbs = standing.order.action == "takeoff" and high[row] and not (aged[row] or standing.again)
-            if climbs or (standing.order.action == "land" and down[row]):
-                del self._standing[row]
         for row in np.flatnonzero(down).tolist():
-            self._under_way.pop(row, None)
+            self._standing.pop(row, None)
 
     def _notes(self) -> tuple[str, ...]:
         age = self._now() - self._seen.time

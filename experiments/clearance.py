@@ -1,7 +1,7 @@
 """How near robots came to each other and to what stands in the arena, surface to surface, and what touched.
 
-Robots are upright cylinders of the radius and height of their kind: those that drive stand on their position, those
-that fly are about it. Everything is taken on true positions, at the samples of the trace; unknown ones touch nothing.
+Robots are upright cylinders of the radius and height of their kind; a position is that of the lowest point. Everything
+is taken on true positions, at the samples of the trace; unknown ones touch nothing.
 """
 
 from __future__ import annotations
@@ -9,18 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from agents import plugins
 from agents.kinds import KINDS
 from agents.rows import Array, Mask, norm
-from experiments import assign
+from experiments import assign, outlines
 from experiments.contacts import WALL
 from experiments.measured import Approach, Collision
 from experiments.trace import Trace
-from twins.scene import Scene
 
 TOUCH_M = 1e-6  # [m] less overlap than this is rounding
 
@@ -97,7 +95,7 @@ class _Cylinders:
         kinds = [KINDS[trace.experiment.robots[name].kind] for name in trace.robots]
         height = np.array([kind.height for kind in kinds])
         radius, flies = np.array([kind.radius for kind in kinds]), np.array([kind.flies for kind in kinds])
-        bottom = trace.true_position[..., 2] - np.where(flies, 0.5 * height, 0.0)
+        bottom = trace.true_position[..., 2]
         return cls(trace.true_position[..., :2], radius, bottom, bottom + height, flies)
 
     def between(self, i: int) -> Array:
@@ -143,46 +141,13 @@ def _spans(inside: Mask) -> list[tuple[int, int]]:
 def _to_things(trace: Trace, solid: _Cylinders) -> Iterator[tuple[str, Array]]:
     """Each obstacle, and the arena's walls, with the gaps (T, N) of all robots to it."""
     scene = assign.scene(trace.experiment)
-    poses = _poses(scene, trace.time)
+    poses = scene.along(trace.time)
     for k, name in enumerate(scene.names):
         if trace.contacts is not None and math.isfinite(scene.mass[k]):
             continue
-        level = _outline_distance(scene, k, solid.axis - poses[:, k, None, :2], poses[:, k, 2]) - solid.radius
+        level = outlines.distance(scene, k, poses[:, k, None], solid.axis) - solid.radius
         upright = np.maximum(scene.bottom[k] - solid.top, solid.bottom - scene.top[k])
         yield name, _gap(level, upright, solid.flies)
     if scene.walled:
         room = np.minimum(solid.axis - scene.low[:2], scene.high[:2] - solid.axis).min(axis=2)
         yield WALL, np.where(np.isfinite(room), room - solid.radius, np.inf)
-
-
-def _poses(scene: Scene, time: Array) -> Array:
-    """(T, M, 3) x, y, yaw of the obstacles over time."""
-    if not len(scene.moving):
-        return np.broadcast_to(scene.pose, (len(time), *scene.pose.shape))
-    return np.array([scene.at(t) for t in time.tolist()])
-
-
-def _outline_distance(scene: Scene, k: int, way: Array, yaw: Array) -> Array:
-    """Distance of points (T, N) from the outline of obstacle k, seen from above; negative inside of it [m].
-
-    Args:
-        scene: The arena.
-        k: Which obstacle.
-        way: (T, N, 2) from its middle to the points, in the room [m].
-        yaw: (T,) its yaw [rad].
-    """
-    outline = scene.outline[k]
-    if outline is None:
-        return np.asarray(norm(way) - scene.radius[k])
-    cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-    place = np.stack([cos * way[..., 0] + sin * way[..., 1], cos * way[..., 1] - sin * way[..., 0]], axis=-1)
-    if scene.closed[k]:
-        beyond = np.abs(place) - np.abs(outline).max(axis=0)
-        return np.asarray(norm(np.maximum(beyond, 0.0)) + np.minimum(beyond.max(axis=-1), 0.0))
-    nearest = np.full(place.shape[:2], np.inf)
-    for begin, end in pairwise(outline):
-        along = end - begin
-        length = float(along @ along)
-        share = np.clip((place - begin) @ along / length, 0.0, 1.0) if length else np.zeros(place.shape[:2])
-        nearest = np.minimum(nearest, norm(place - begin - share[..., None] * along))
-    return nearest

@@ -64,11 +64,10 @@ def run(
     if not runs[0].traces:
         print(f"interrupted before the common start: there is nothing to report; logs: {folder / 'logs'}")
         return 130
-    page = (
-        _keep(runs, folder, _command(file, virtual=virtual, changes=changes, cases=cases, seeds=seeds))
-        if report
-        else None
-    )
+    again = _command(
+        file, virtual=virtual, changes=changes, cases=cases, seeds=seeds, bodies=bodies, anyway=anyway
+    )  # fmt: skip
+    page = _keep(runs, folder, again) if report else None
     summary: dict[str, Any] = runs[0].summary()
     if seeds > 1:
         summary["across"] = across_seeds([each.summary() for each in runs])
@@ -142,11 +141,22 @@ def list_all() -> int:
     return 0
 
 
-def _command(file: str, *, virtual: bool, changes: Sequence[str], cases: Sequence[str], seeds: int) -> str:
+def _command(
+    file: str,
+    *,
+    virtual: bool,
+    changes: Sequence[str],
+    cases: Sequence[str],
+    seeds: int,
+    bodies: str | None,
+    anyway: bool,
+) -> str:
     parts = ["zenpark", "run", file, *(["--virtual"] if virtual else [])]
     parts += [part for case in cases for part in ("--case", case)]
     parts += [part for change in changes for part in ("--set", f"'{change}'")]
-    return " ".join(parts + (["--seeds", str(seeds)] if seeds > 1 else []))
+    parts += ["--seeds", str(seeds)] if seeds > 1 else []
+    parts += ["--bodies", bodies] if bodies is not None else []
+    return " ".join([*parts, *(["--anyway"] if anyway else [])])
 
 
 def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
@@ -184,12 +194,15 @@ def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> No
             means = across["cases"][name]
             mean, ratio = ({k: v["mean"] for k, v in means[what].items()} for what in ("mean", "ratio"))
             spread = {k: f" ± {_figure(means['mean'][k]['std'])}" for k in spread}
-        acquired = "never" if mean["acquired_s"] is None else f"{mean['acquired_s']:.1f} s"
-        line = (
-            f"{name:>12}: {_figure(mean['f_hz'])}{spread['f_hz']} messages/s, IAE {_figure(mean['iae'])}{spread['iae']}"
-        )
-        line += f", RMSE {_figure(mean['rmse'])}{spread['rmse']} m"
-        line += f", acquired {acquired} (mean), lost {sum(r['lost'] for r in case['robots'].values())}"
+        lost = sum(r["lost"] for r in case["robots"].values())
+        line = f"{name:>12}: {_figure(mean['f_hz'])}{spread['f_hz']} messages/s"
+        if mean["iae"] is None:
+            line += ", no link was measured"
+        else:
+            acquired = "never" if mean["acquired_s"] is None else f"{mean['acquired_s']:.1f} s"
+            line += f", IAE {_figure(mean['iae'])}{spread['iae']}, RMSE {_figure(mean['rmse'])}{spread['rmse']} m"
+            line += f", acquired {acquired} (mean)"
+        line += f", lost {lost}"
         if name != next(iter(summary["cases"])):
             line += f"   (ratios: f {_figure(ratio['f_hz'])}, IAE {_figure(ratio['iae'])})"
         print(line)

@@ -89,7 +89,7 @@ def encounter(
         duration_s: How long they have for it [s].
     """
     low = [KINDS[kind].height for kind in kinds if not KINDS[kind].flies]
-    height = 0.5 * min(low) + 0.02 if low else IN_THE_AIR  # beside what drives
+    height = 0.5 * min(low) if low else IN_THE_AIR  # beside what drives
     robots, timeline = {}, []
     for number, kind in enumerate(kinds):
         angle = number * (between if len(kinds) == 2 else 2.0 * math.pi / len(kinds))
@@ -148,14 +148,13 @@ def _outcome(experiment: Experiment, log: Log) -> Outcome:
     names, copies = log.names, len(log.seeds)
     kinds = [KINDS[robot.kind] for robot in experiment.robots.values()]
     radius, height = np.array([kind.radius for kind in kinds]), np.array([kind.height for kind in kinds])
-    below = np.array([0.5 * kind.height if kind.flies else 0.0 for kind in kinds])
     going = (log.phase == RUNNING).all(axis=1)
     place = log.true_position[going].reshape(-1, copies, len(names), 3)
     gap = np.full(copies, np.inf)
     for i, j in itertools.combinations(range(len(names)), 2):
         apart = place[:, :, i] - place[:, :, j]
         over = norm(apart[..., :2]) - radius[i] - radius[j]
-        up = apart[..., 2] - below[i] + below[j]  # of the lower end of one over that of the other
+        up = apart[..., 2]
         beside = (up < height[j]) & (up > -height[i])
         gap = np.minimum(gap, np.where(beside, over, np.inf).min(axis=0))
     goals = {leg.robot: leg.plan["points"][-1] for leg in experiment.timeline if isinstance(leg.plan, dict)}

@@ -108,6 +108,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
         collisions: How often it touched another robot or what stands in the arena.
         impulse: Hardest of these [N s], None if none is known.
         overlap: Deepest of these [m], None if it touched nothing.
+        short: How far from where its plan wanted it a robot with a plan was at the end [m]; None without one.
         near: Closest approach to another robot.
         near_arena: Closest approach to an obstacle or a wall.
         interventions: Ticks on which safety changed what had been decided.
@@ -145,6 +146,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     collisions: int
     impulse: float | None
     overlap: float | None
+    short: float | None
     near: Approach | None
     near_arena: Approach | None
     interventions: int

@@ -14,6 +14,8 @@ from typing import Final
 
 import numpy as np
 
+from agents.graph import Links
+from agents.rows import norm
 from experiments.clearance import Clearance, collisions
 from experiments.measured import INDICES, Approach, Belief, CaseMetrics, Collision, Phase, RobotMetrics
 from experiments.shadows import agreement
@@ -159,7 +161,10 @@ def _robots(
     settled = after_last(~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0)), time)
     sent, recorded = transmissions(trace)
     size = np.bincount(trace.sent.robot, weights=trace.sent.bytes, minlength=rows)
-    heard = np.bincount(trace.heard.speaker, minlength=rows)
+    linked = np.zeros((rows, rows), dtype=bool)  # what only avoidance listens to does not belong to the formation
+    linked[errors.net.listener, errors.net.speaker] = True
+    by_listeners = linked[trace.heard.listener, trace.heard.speaker]
+    heard = np.bincount(trace.heard.speaker[by_listeners], minlength=rows)
     listeners = np.bincount(errors.net.speaker, minlength=rows)
     waits = [(wait.min(), float(np.median(wait)), wait.max()) if len(wait) else (np.nan,) * 3 for wait in gaps(trace)]
     own = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
@@ -194,6 +199,7 @@ def _robots(
             collisions=len(own[i]),
             impulse=max((each.impulse for each in own[i] if each.impulse is not None), default=None),
             overlap=max((each.overlap for each in own[i]), default=None),
+            short=_short(trace, errors.net, i),
             near=clearance.robots[i],
             near_arena=clearance.arena[i],
             interventions=int(trace.interventions[i]),
@@ -204,6 +210,14 @@ def _robots(
         )
         for i, name in enumerate(trace.robots)
     )
+
+
+def _short(trace: Trace, net: Links, row: int) -> float | None:
+    """How far a robot that had a plan was from where that wanted it, at the end [m]; None: no plan, or not known."""
+    began = [leg for leg in trace.experiment.timeline if leg.robot == trace.robots[row] and leg.at_s < trace.time[-1]]
+    if not began or row in net.listener:
+        return None
+    return _number(float(norm(trace.goal[-1, row] - trace.position[-1, row])))
 
 
 def _share(part: float, whole: float) -> float | None:

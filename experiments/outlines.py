@@ -1,4 +1,4 @@
-"""What stands in an arena, seen from above: outlines, where they are over time, how far points are from them."""
+"""What stands in an arena, seen from above: outlines, and how far points are from them."""
 
 from __future__ import annotations
 
@@ -10,27 +10,20 @@ from agents.rows import Array, Mask, norm
 from twins.scene import Scene
 
 
-def along(scene: Scene, time: Array) -> Array:
-    """Poses (T, M, 3) of all obstacles, x, y [m] and yaw [rad], at times (T,) since the common start [s].
-
-    What can be pushed is where it stood at the start.
-    """
-    pose = np.tile(scene.pose, (len(time), 1, 1))
-    elapsed = np.maximum(time, 0.0)
-    for k, plan in enumerate(scene.plans):
-        if plan is not None:
-            anchor = np.tile([*scene.pose[k, :2], 0.0], (len(time), 1))
-            place, yaw = plan.target(elapsed, anchor, np.full(len(time), scene.pose[k, 2]))
-            pose[:, k, :2] = place[:, :2]
-            pose[:, k, 2] = np.where(np.isfinite(yaw), yaw, scene.pose[k, 2])
-    return pose
-
-
 def corners(outline: Array, pose: Array) -> Array:
     """Corners (..., k, 2) in the room [m] of an outline (k, 2) at poses (..., 3)."""
     cos, sin = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
     x, y = outline[:, 0], outline[:, 1]
     return np.stack([cos * x - sin * y + pose[..., 0, None], sin * x + cos * y + pose[..., 1, None]], axis=-1)
+
+
+def reach(scene: Scene, obstacle: int) -> tuple[Array, Array]:
+    """Least and largest x, y (2,) [m] that an obstacle reaches to, where it stands at the start."""
+    pose, outline = scene.pose[obstacle], scene.outline[obstacle]
+    if outline is None:
+        return pose[:2] - scene.radius[obstacle], pose[:2] + scene.radius[obstacle]
+    points = corners(outline, pose)
+    return points.min(axis=0), points.max(axis=0)
 
 
 def distance(scene: Scene, obstacle: int, pose: Array, point: Array) -> Array:

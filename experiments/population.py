@@ -19,7 +19,7 @@ from agents import plugins
 from agents.body import BodyState
 from agents.kinds import KINDS, Kind
 from agents.rows import Array, Index, Mask
-from experiments import assign
+from experiments import assign, outlines
 from experiments.experiment import Experiment, Robot
 from twins.body import TwinBody
 from twins.scene import Obstacle, Scene
@@ -231,15 +231,15 @@ class Population:
         numbers = [alone.pose, alone.radius, alone.bottom, alone.top, *(o for o in alone.outline if o is not None)]
         if not all(np.isfinite(value).all() for value in numbers):
             raise Refused(f"{name} is no obstacle: a number is not finite")
-        corners = _corners(alone, 0)
-        if (corners < alone.low[:2] - ROUNDING).any() or (corners > alone.high[:2] + ROUNDING).any():
+        low, high = outlines.reach(alone, 0)
+        if (low < alone.low[:2] - ROUNDING).any() or (high > alone.high[:2] + ROUNDING).any():
             x, y = 2.0 * alone.high[:2]
             raise Refused(f"{name} would reach out of the arena, which is {x:g} by {y:g} m around the origin")
         position = self.body.engine.position
         for row, kind in enumerate(self._kinds):
             z = position[row, 2]
             level = alone.bottom[0] < z + kind.height and z < alone.top[0]
-            if level and _gap(alone, 0, alone.pose[0], position[row, :2]) < kind.radius:
+            if level and outlines.distance(alone, 0, alone.pose[0], position[row, :2]) < kind.radius:
                 raise Refused(f"{name} would overlap {self.names[row]}; put it elsewhere, or remove that first")
         self._obstacles[name] = obstacle
         self._change(obstacles={**self._standing(), name: obstacle})
@@ -327,7 +327,7 @@ class Population:
                         f"{name} would overlap {self.names[row]} by {-1e3 * gap:.0f} mm; choose another place"
                     )
         for k, obstacle in enumerate(self._scene.names):
-            gap = _gap(self._scene, k, self.body.engine.obstacles[0, k], place) - own.radius
+            gap = float(outlines.distance(self._scene, k, self.body.engine.obstacles[0, k], place)) - own.radius
             if self._scene.bottom[k] < own.height and gap < 0.0:
                 raise Refused(f"{name} would overlap {obstacle} by {-1e3 * gap:.0f} mm; choose another place")
 
@@ -335,31 +335,3 @@ class Population:
 def _require_numbers(*values: float) -> None:
     if not all(math.isfinite(value) for value in values):
         raise Refused("a place needs finite numbers [m, rad]")
-
-
-def _corners(scene: Scene, k: int) -> Array:
-    """(c, 2) points of an obstacle that lie farthest out, in the room."""
-    x, y, yaw = scene.pose[k]
-    outline = scene.outline[k]
-    if outline is None:
-        reach = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-        return np.asarray(scene.pose[k, :2] + scene.radius[k] * reach)
-    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
-    return np.asarray(outline @ turn + [x, y])
-
-
-def _gap(scene: Scene, k: int, pose: Array, place: Array) -> float:
-    """From a point (2) in the room to an obstacle at `pose` (3) [m]; negative inside."""
-    x, y, yaw = pose.tolist()
-    away = place - [x, y]
-    outline = scene.outline[k]
-    if outline is None:
-        return float(math.hypot(*away) - scene.radius[k])
-    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-    local = away @ turn
-    if scene.closed[k]:  # a box about its own middle
-        beyond = np.abs(local) - outline.max(axis=0)
-        return float(math.hypot(*np.maximum(beyond, 0.0)) + min(float(beyond.max()), 0.0))
-    start, along = outline[:-1], np.diff(outline, axis=0)
-    share = np.clip(((local - start) * along).sum(axis=1) / np.maximum((along * along).sum(axis=1), 1e-12), 0.0, 1.0)
-    return float(np.hypot(*(local - start - share[:, None] * along).T).min())

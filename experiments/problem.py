@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from experiments.locate import Path, line_column
 
 SHOWN = 100  # characters of a source line; longer ones are cut around the place
+MOST = 20  # problems that are told at once
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,10 @@ class DocumentError(ValueError):
     """An experiment that cannot be read, with everything that is wrong with it."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
-        super().__init__("\n".join(map(str, problems)))
+        told = [str(problem) for problem in problems[:MOST]]
+        if len(problems) > MOST:
+            told.append(f"and {len(problems) - MOST} more")
+        super().__init__("\n".join(told))
         self.problems = list(problems)
 
 

@@ -146,7 +146,13 @@ def write(
             (PROOF,),
             proof_tables(cases),
         ),
-        Section("Time between transmissions", tables=(gaps_table(cases),)),
+        Section(
+            "Time between transmissions",
+            prose=(
+                "Between two transmissions within the run; silence before the first and after the last is not counted.",
+            ),
+            tables=(gaps_table(cases),),
+        ),
         Section(
             "What neighbours hold",
             ("How far the last pose heard on each link, carried on by the prediction, is from where its robot is.",),

@@ -87,13 +87,13 @@ def number(value: float | None, scale: float = 1.0) -> str:
     if value is None:
         return NONE
     size = abs(value * scale)
-    if size == 0.0 or size >= 1000.0 or isinstance(value, int):
+    if size < 1e-9 or size >= 1000.0 or isinstance(value, int):
         text = f"{size:,.0f}".replace(",", "\u202f")
     elif size < 0.001:
         text = f"{size:.1e}"
     else:
         text = f"{size:.{min(4, 2 - math.floor(math.log10(size)))}f}"
-    return f"−{text}" if value < 0.0 else text
+    return f"−{text}" if value < 0.0 and text != "0" else text
 
 
 def interval(values: Spread, scale: float = 1.0) -> str:

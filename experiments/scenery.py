@@ -167,7 +167,7 @@ def _style(scene: Scene, k: int) -> dict[str, Any]:
 
 def _ways(experiment: Experiment, scene: Scene) -> Array:
     """Poses (T, M, 3) of obstacles over the run, as finely as a picture shows them."""
-    return outlines.along(scene, np.linspace(0.0, experiment.duration_s, 400))
+    return scene.along(np.linspace(0.0, experiment.duration_s, 400))
 
 
 def _ring(scene: Scene, k: int, pose: Array) -> Array:

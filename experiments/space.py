@@ -152,7 +152,7 @@ def _draw_spatial(axes: Axes3D, trace: Trace, place: Array, columns: int) -> Non
     net = links_of(trace)
     pairs = edges(net.listener, net.speaker)
     thin = (1.0 if len(trace.robots) <= MANY else 0.5) / math.sqrt(columns)
-    for where, colour, width, order in ((starts, INK, 0.6, 1), (ends, MAGENTA, 0.9, 4)):
+    for where, colour, width, order in ((starts, INK, 0.6, 1), (ends, MAGENTA, 0.9, 4)) if pairs else ():
         lines = [where[[i, j]] for i, j in pairs]
         axes.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=width * thin, alpha=0.8, zorder=order))
     few = slice(None, None, max(1, len(place) // 400))

@@ -146,16 +146,17 @@ def _positioning(
     if experiment.positioning is None or not measured:
         return []
     started = []
+    network = [*connect, "--realm", experiment.network.realm, "--lifeline"]
     host = experiment.positioning.removeprefix(VICON)
     if experiment.positioning == VICON_TWIN:
         sigma = max(assign.disturbance(experiment, name).position_sigma or 0.0 for name in measured)
         noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
-        arguments = ["--listen", "127.0.0.1:0", "--robots", *measured, *noise, *connect, "--lifeline"]
+        arguments = ["--listen", "127.0.0.1:0", "--robots", *measured, *noise, *network]
         twin = launcher.start(f"{prefix}-{VICON_TWIN}", "twins.vicon", *arguments)
         started.append(twin.name)
         host = _said(twin, r"^vicon (ready on) (\S+)$", 1, interrupted)["ready on"]
     maps = [part for name in measured for part in ("--map", f"{name}={name}")]
-    bridge = launcher.start(f"{prefix}-vicon", "bridges.vicon", host, *maps, *connect, "--lifeline")
+    bridge = launcher.start(f"{prefix}-vicon", "bridges.vicon", host, *maps, *network)
     return [*started, bridge.name]
 
 

@@ -39,7 +39,7 @@ def obstacles(analysis: Analysis) -> Iterator[Claim]:
         return
     radius = np.array([kind.radius for kind in analysis.assignment.kinds])
     low, high = _heights(analysis, prediction.position[..., 2])
-    poses = outlines.along(scene, prediction.time)
+    poses = scene.along(prediction.time)
     avoids = _avoids(analysis)
     met = []
     for number in range(len(scene.names)):

@@ -43,14 +43,16 @@ def network(analysis: Analysis) -> Iterator[Claim]:
             message = f"{who} cannot hear of the leader ({listed(leaders)}), neither directly nor through others"
             remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
             problems.append(Claim("error", "leader-unknown", message, remedy, path))
+    linked = np.union1d(links.listener, links.speaker)
+    parts = analysis.parts - (rows - len(linked))  # robots without links go their own way
     apart = analysis.experiment.avoidance is not None and len(leaders) >= analysis.parts
-    if analysis.parts > 1 and anchors is not None and reached(links, rows, anchors.row).all():
-        yield Claim("note", "parts", f"{analysis.parts} formations, each of which is anchored", "", path)
-    elif analysis.parts > 1 and apart:
-        message = f"{analysis.parts} formations that know of each other only to keep clear"
+    if parts > 1 and anchors is not None and reached(links, rows, anchors.row)[linked].all():
+        yield Claim("note", "parts", f"{parts} formations, each of which is anchored", "", path)
+    elif parts > 1 and apart:
+        message = f"{parts} formations that know of each other only to keep clear"
         yield Claim("note", "parts", message, "", path)
-    elif analysis.parts > 1:
-        message = f"the network falls into {analysis.parts} parts that know nothing of each other"
+    elif parts > 1:
+        message = f"the network falls into {parts} parts that know nothing of each other"
         problems.append(Claim("error", "parts", message, "join them by links, or make them separate experiments", path))
     deaf = [names[row] for row in analysis.silent if names[row] not in leaders]
     if deaf:

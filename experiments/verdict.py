@@ -13,6 +13,7 @@ from experiments.seeds import by_case, ratios, same_length, spread
 
 Mark = Literal["good", "fair", "bad", "plain"]
 KEPT_UP = 0.99  # a world that is slower than this share of real time falls behind
+UNFINISHED_M = 0.3  # a robot that is nearer to where its plan wants it merely lags
 NAMED = 3  # so many collisions, or twins, are named; the tables have them all
 
 
@@ -31,15 +32,21 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *_nothing_lost(cases),
         *_deadlines(cases),
         *_died(cases),
-        *_acquired(cases),
-        _worst_link(cases),
-        *_against_the_first(cases),
+        *_formation(cases),
         *contacts(cases),
         *_avoided(cases),
+        *_unfinished(cases),
         *_room(cases),
         *_pace(cases),
         *_shadows(cases),
     ]
+
+
+def _formation(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """What became of the formation, where there is one."""
+    if not any(robot.listeners for case in cases for robot in case.robots):
+        return []
+    return [*_acquired(cases), _worst_link(cases), *_against_the_first(cases)]
 
 
 def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -245,6 +252,17 @@ def _shadows(cases: Sequence[CaseMetrics]) -> list[Finding]:
         shown.append(f"{robot.robot} to {number(shadow.rmse, 100.0)} cm RMSE {ahead} ({case.case})")
     rest = "; the others more closely" if len(found) > NAMED else ""
     return [Finding("plain", f"Twins beside robots foresaw {_list(shown)}{rest}.")]
+
+
+def _unfinished(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Robots that did not get where their plan wanted them."""
+    found = []
+    for case in cases:
+        short = [each for each in case.robots if each.short is not None and each.short > UNFINISHED_M]
+        if short:
+            who = _list([f"{each.robot} by {number(each.short, 100.0)} cm" for each in short])
+            found.append(Finding("bad", f"Not where the plan wanted them at the end of {case.case}: {who}."))
+    return found
 
 
 def _room(cases: Sequence[CaseMetrics]) -> list[Finding]:

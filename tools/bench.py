@@ -18,19 +18,10 @@ from typing import Final
 
 import msgspec
 
-REPEATS: Final = 5
+from tools import bench_world
+from tools.figure import REPEATS, Figure, cpu
+
 FLIGHT_S: Final = 20.0
-
-
-class Figure(msgspec.Struct, frozen=True):
-    """One measured figure, and its ratio to a baseline of the same run."""
-
-    benchmark: str
-    name: str
-    value: float
-    unit: str
-    ratio: float
-    baseline: str
 
 
 def unit_of_work() -> float:
@@ -44,37 +35,27 @@ def unit_of_work() -> float:
     return time.process_time() - begin
 
 
-def _cpu(work: Callable[[], object], repeats: int = REPEATS) -> float:
-    """Median CPU time of a piece of work [s]."""
-    taken = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        work()
-        taken.append(time.process_time() - begin)
-    return statistics.median(taken)
-
-
 def virtual() -> Iterator[Figure]:
     """The reference experiment in virtual time, with and without a recording."""
     from experiments.run import load, simulate, simulate_seeds  # noqa: PLC0415
 
     read = load("robotic-park")
     span = read.experiment.duration_s
-    yardstick = _cpu(unit_of_work)
+    yardstick = cpu(unit_of_work)
     yield Figure("virtual", "10,000 numpy operations", yardstick, "s CPU", 1.0, "yardstick")
     for case in read.cases():
         simulate(read, cases=[case])  # warm up
-        taken = _cpu(lambda case=case: simulate(read, cases=[case]))  # type: ignore[misc]
+        taken = cpu(lambda case=case: simulate(read, cases=[case]))  # type: ignore[misc]
         yield Figure("virtual", f"{case}, {span:g} s", taken, "s CPU", span / taken, "× real time")
 
         def recorded(case: str = case) -> None:
             with tempfile.TemporaryDirectory() as folder:
                 simulate(read, cases=[case], folder=Path(folder))
 
-        taken = _cpu(recorded)
+        taken = cpu(recorded)
         yield Figure("virtual", f"{case}, {span:g} s, recorded", taken, "s CPU", span / taken, "× real time")
     seeds = 20
-    taken = _cpu(lambda: simulate_seeds(read, range(seeds), cases=["event"]), 1)
+    taken = cpu(lambda: simulate_seeds(read, range(seeds), cases=["event"]), 1)
     yield Figure("virtual", f"event, {seeds} seeds side by side", taken, "s CPU", seeds * span / taken, "× real time")
 
 
@@ -95,7 +76,7 @@ def codec() -> Iterator[Figure]:
                 wire.encode(pose, encoding)
                 wire.decode(payload, mime, wire.Pose)
 
-        taken = _cpu(both) / count * 1e6
+        taken = cpu(both) / count * 1e6
         first = first or taken
         yield Figure(
             "codec", f"pose out and in, {encoding} ({len(payload)} B)", taken, "µs CPU", taken / first, "× JSON"
@@ -174,6 +155,8 @@ BENCHMARKS: Final[dict[str, Callable[[], Iterator[Figure]]]] = {
     "codec": codec,
     "virtual": virtual,
     "process": process,
+    "world": bench_world.world,
+    "encounters": bench_world.encounters,
 }
 
 
@@ -188,9 +171,10 @@ def command(names: Sequence[str], *, as_json: bool) -> int:
         for figure in BENCHMARKS[name]():
             figures.append(figure)
             if not as_json:
-                value = f"{figure.value:10.3g} {figure.unit:<12}"
+                value = f"{figure.name:<50} {figure.value:10.3g} {figure.unit:<12}"
                 print(
-                    f"{figure.benchmark:<8} {figure.name:<42} {value} {figure.ratio:8.3g} {figure.baseline}", flush=True
+                    f"{figure.benchmark:<10} {value} {figure.ratio:8.3g} {figure.baseline}",
+                    flush=True,
                 )
     if as_json:
         print(json.dumps(msgspec.to_builtins(figures)))

@@ -51,6 +51,8 @@ def command(
             raise WorldOrderError(f"--obstacle {obstacle}: {error}; write a JSON object, as in the file") from None
         if at is not None:
             given["at"] = at
+        if what == "spawn" and not given.keys() & {"at", "wall"}:
+            raise WorldOrderError(f"{name or 'the obstacle'} has no place; say where, with --at X Y")
     order = wire.WorldOrder(what, steps=steps, name=name, kind=kind, at=at, yaw=yaw, obstacle=given)  # type: ignore[arg-type]
     with network.open_session(list(connect) or [network.DEFAULT_ENDPOINT], name="world-order", wait_s=2.0) as session:
         reply = orders.give_world(session, Keys(realm), order)

@@ -34,25 +34,23 @@ AWAY: Final = 1e6  # [m] where mirrored robots are that are not there
 UNFELT: Final = 1e-12  # [m/s] change of speed that is only rounding
 LEAP: Final = 10.0  # [m/s] what a plan moves faster than this, it puts there
 
-Share = Annotated[float, Meta(ge=0.0, le=1.0)]
-Friction = Annotated[float, Meta(ge=0.0, le=10.0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Friction = Annotated[float, Meta(ge=0, le=10)]
 
 
 class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Parameters of the pymunk engine; all are choices, of hulls of plastic and wheels of rubber."""
 
-    step_s: Annotated[float, Meta(gt=0.0, le=0.05, description="longest internal step [s]")] = 0.005
+    step_s: Annotated[float, Meta(gt=0, le=0.05, description="longest internal step [s]")] = 0.005
     friction: Annotated[Friction, Meta(description="coefficient between robots")] = 0.3
     wall_friction: Annotated[Friction, Meta(description="coefficient between robots and walls or obstacles")] = 0.3
     restitution: Annotated[Share, Meta(description="speed after a blow, as a share of the speed before")] = 0.1
     traction: Annotated[Friction, Meta(description="coefficient of wheels, and of landed robots, on the floor")] = 0.7
-    tilt: Annotated[float, Meta(gt=0.0, le=1.2, description="largest tilt of flying robots [rad]")] = math.radians(20.0)
-    slide: Annotated[
-        float, Meta(gt=0.0, le=2.0, description="speed at which what came from above slides aside [m/s]")
-    ] = 0.5
-    approach: Annotated[
-        float, Meta(gt=0.0, le=20.0, description="closing speed up to which nothing overlaps [m/s]")
-    ] = 3.0
+    tilt: Annotated[float, Meta(gt=0, le=1.2, description="largest tilt of flying robots [rad]")] = math.radians(20.0)
+    slide: Annotated[float, Meta(gt=0, le=2, description="speed at which what came from above slides aside [m/s]")] = (
+        0.5
+    )
+    approach: Annotated[float, Meta(gt=0, le=20, description="closing speed up to which nothing overlaps [m/s]")] = 3.0
     iterations: Annotated[int, Meta(ge=1, le=200, description="of the contact solver in each step")] = 10
 
     contacts: ClassVar[bool] = True
@@ -86,7 +84,7 @@ class PlanarEngine(Models):
         self._found: list[Touch] = []
         rows = len(stage.kinds)
         self._layers = _layers(stage)
-        self._half = 0.5 * np.array([stage.kinds[row].height for row in self.in_air])
+        self._tall = np.array([stage.kinds[row].height for row in self.in_air])
         mass = np.array([MASSES[stage.kinds[row].name] for row in self.in_air])
         self._force = (mass / self._step)[:, None]  # that changes the speed by 1 m/s in one step
         self._settle(stage, choice)
@@ -232,7 +230,7 @@ class PlanarEngine(Models):
         # all in the first step of the tick: then the tick is one of the point-mass engine, whose steps are ticks
         bodies = self._bodies_in_air
         self._state[bodies, PUSH] = (target + drift - self._state[bodies, MOVE]) * self._force
-        self._layers.bottom[air], self._layers.top[air] = height - self._half, height + self._half
+        self._layers.bottom[air], self._layers.top[air] = height, height + self._tall
         if not aloft or some(self._stands):
             self._stand(~flight.flying & (height <= TOUCHDOWN) & (drift == 0.0).all(axis=1))
         return target, drift
@@ -256,8 +254,8 @@ class PlanarEngine(Models):
         state[slots, YAW] = np.nan_to_num(yaw)
         aloft = np.isin(self._mirrored, self.in_air)
         rows, height = self._mirrored[aloft], position[aloft, 2]
-        half = self._half[np.searchsorted(self.in_air, rows)]
-        self._layers.bottom[rows], self._layers.top[rows] = height - half, height + half
+        tall = self._tall[np.searchsorted(self.in_air, rows)]
+        self._layers.bottom[rows], self._layers.top[rows] = height, height + tall
 
     def _carry(self, t: float) -> None:
         """Moves obstacles by their plans, with the speed that takes them there in this tick."""

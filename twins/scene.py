@@ -111,18 +111,21 @@ class Scene:
         """Obstacles that have a plan."""
         return np.array([k for k, plan in enumerate(self.plans) if plan is not None], dtype=np.intp)
 
-    def at(self, t: float) -> Array:
-        """(M, 3) poses at `t` [s] after the common start; what can be pushed is where it stood at the start."""
-        pose = self.pose.copy()
-        elapsed = np.array([max(t, 0.0)])
+    def along(self, time: Array) -> Array:
+        """Poses (T, M, 3) at times (T,) after the common start [s]; what can be pushed is where it stood then."""
+        pose = np.tile(self.pose, (len(time), 1, 1))
+        elapsed = np.maximum(time, 0.0)
         for k, plan in enumerate(self.plans):
             if plan is not None:
-                anchor = np.array([[*self.pose[k, :2], 0.0]])
-                position, yaw = plan.target(elapsed, anchor, self.pose[k, 2:])
-                pose[k, :2] = position[0, :2]
-                if np.isfinite(yaw[0]):
-                    pose[k, 2] = yaw[0]
+                anchor = np.tile([*self.pose[k, :2], 0.0], (len(time), 1))
+                place, yaw = plan.target(elapsed, anchor, np.full(len(time), self.pose[k, 2]))
+                pose[:, k, :2] = place[:, :2]
+                pose[:, k, 2] = np.where(np.isfinite(yaw), yaw, self.pose[k, 2])
         return pose
+
+    def at(self, t: float) -> Array:
+        """Poses (M, 3) at `t` [s], see `along`."""
+        return np.asarray(self.along(np.array([t]))[0])
 
     def edges(self) -> tuple[Array, Index]:
         """Straight edges (S, 2, 2), each in the frame of its obstacle, and the number (S,) of that obstacle.

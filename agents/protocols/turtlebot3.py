@@ -59,7 +59,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     endpoint: str | None = None
     origin: Literal["open", "boot"] = "open"
     style: Style = "ros2dds"
-    watchdog_s: Annotated[float, Meta(gt=0.0)] | None = None
+    watchdog_s: Annotated[float, Meta(gt=0)] | None = None
 
 
 @dataclass(frozen=True)

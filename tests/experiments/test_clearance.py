@@ -57,13 +57,13 @@ def test_every_time_together_is_one_collision_as_deep_as_it_became():
 
 def test_a_drone_over_a_ground_robot_is_as_far_off_as_it_is_high():
     above = pair(along_x(np.full(50, 0.02), 0.5), ("turtlebot3", "crazyflie"))
-    gap = 0.5 - 0.5 * CRAZYFLIE.height - TURTLEBOT3.height
+    gap = 0.5 - TURTLEBOT3.height
     assert Clearance.of(above).robots[0].gap == pytest.approx(gap)
     assert Clearance.of(above).overlaps == ()
     beside = pair(along_x(np.full(50, 0.5), 0.5), ("turtlebot3", "crazyflie"))
     level = 0.5 - CRAZYFLIE.radius - TURTLEBOT3.radius
     assert Clearance.of(beside).robots[0].gap == pytest.approx(math.hypot(level, gap))
-    into = pair(along_x(np.full(50, 0.02), TURTLEBOT3.height), ("turtlebot3", "crazyflie"))
+    into = pair(along_x(np.full(50, 0.02), TURTLEBOT3.height - 0.5 * CRAZYFLIE.height), ("turtlebot3", "crazyflie"))
     assert Clearance.of(into).overlaps == (Collision(0.0, "A", "B", None, pytest.approx(0.5 * CRAZYFLIE.height)),)
 
 

@@ -9,7 +9,10 @@ from experiments.encounters import ANGLES, Outcome, encounter, meet, random_pair
 from experiments.experiment import Channel
 from experiments.virtual import simulate
 
+pytestmark = pytest.mark.slow
+
 BARRIER = {"kind": "barrier", "hears": "all"}
+SOME = (("khepera4", "turtlebot3"), ("tello", "tello"))  # `zenpark bench encounters` has them all
 FOUR = ("khepera4", "turtlebot3", "crazyflie", "tello")
 
 
@@ -53,7 +56,6 @@ def test_an_encounter_is_the_same_alone_and_beside_others():
         assert single.avoided[0] == together.avoided[number]
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_thousand_random_encounters_with_the_barrier_and_no_collision():
     outcomes = random_pairs(BARRIER, 50)
@@ -64,38 +66,33 @@ def test_a_thousand_random_encounters_with_the_barrier_and_no_collision():
     assert whole.arrived.all()
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_potential_keeps_pairs_apart_as_well():
-    whole = Outcome.joined(random_pairs({"kind": "potential", "hears": "all"}, 8).values())
+    whole = Outcome.joined([met(kinds, {"kind": "potential", "hears": "all"}, 10) for kinds in SOME])
     assert whole.collided.sum() == 0
     assert whole.arrived.all()
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_one_that_does_not_avoid_is_avoided():
-    whole = Outcome.joined(random_pairs(BARRIER, 8, stubborn=1).values())
+    whole = Outcome.joined([met(kinds, BARRIER, 10, stubborn=1) for kinds in SOME])
     assert whole.collided.sum() == 0
     assert whole.arrived.all()
 
 
-@pytest.mark.slow
 def test_four_of_all_kinds_change_sides():
     outcome = meet(encounter(FOUR, BARRIER), range(1, 41))
     assert outcome.collided.sum() == 0
     assert outcome.arrived.mean() >= 0.95
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "sensors"), [("turtlebot3", ["lds01"]), ("khepera4", ["infrared", "ultrasonic"])])
 def test_two_that_only_see_each_other_keep_clear(kind, sensors):
-    outcome = met((kind, kind), {"kind": "barrier"}, 10, sensors=sensors)
+    outcome = met((kind, kind), {"kind": "barrier"}, 4, sensors=sensors)
     assert outcome.collided.sum() == 0
     assert outcome.arrived.all()
 
 
-@pytest.mark.slow
 def test_a_network_that_loses_and_delays_does_not_bring_them_together():
     bad = Channel(delay_s=0.02, jitter_s=0.02, loss=0.2)
     for kinds in (("tello", "tello"), ("crazyflie", "turtlebot3")):

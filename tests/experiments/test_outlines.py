@@ -68,7 +68,7 @@ def test_poses_over_time_are_those_of_the_scene():
     plans = {"o0": Line(move_by=[1.0, 0.5], speed_=0.2), "o1": Circle(radius=0.5, period_s=10.0)}
     there = scene(BOX, POST, FENCE, plans=plans)
     time = np.linspace(-1.0, 20.0, 43)
-    assert outlines.along(there, time) == pytest.approx(np.array([there.at(t) for t in time]))
+    assert there.along(time) == pytest.approx(np.array([there.at(t) for t in time]))
 
 
 def test_heights_overlap_only_between_bottom_and_top():

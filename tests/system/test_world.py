@@ -210,7 +210,7 @@ def test_climbs_and_landings_go_on_in_the_next_world(router: RouterProcess, file
             assert watcher.order(name, wire.Order("takeoff")).ok
         watcher.until(lambda: min(map(height, both)) > 0.25, "they climb")
         world = again()
-        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in both), "they arrive", 8.0)
+        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in both), "they arrive", 15.0)
         assert min(map(height, both)) > 0.54
         for name in both:
             assert watcher.order(name, wire.Order("land")).ok
@@ -247,7 +247,7 @@ def test_pause_step_and_resume(world: WorldProcess, desk: Desk) -> None:
 def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
     desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH01")[0] > 0.1, "it moves")
     assert desk.give("reset", name="KH01").ok
-    desk.until(lambda: desk.x("KH01") == [0.0, 0.0, 0.0], "it is back")
+    desk.until(lambda: np.abs(desk.x("KH01")).max() < 0.03, "it is back, but for commands that were on their way")
 
     def refusal(order: str, **fields: object) -> str:
         reply = desk.give(order, **fields)

@@ -318,6 +318,7 @@ def twin(robots, nature=None):
     return TwinBody(assign.request(experiment, names, (3,)), assign.world(experiment, names))
 
 
+@pytest.mark.slow
 def test_hover_jitter_is_flown():
     robots = {f"F{k}": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.5) for k in range(12)}
     body = twin(robots, {"all": Disturbance(hover_jitter=Jitter(0.01, 0.5))})
