@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import subprocess
 import sys
@@ -77,18 +76,7 @@ def eventually() -> Callable[[Callable[[], object]], None]:
 
 
 @pytest.fixture(autouse=True)
-def one_at_a_time(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """System tests of parallel workers wait for each other: their processes want the cores for themselves."""
-    if request.node.get_closest_marker("system") is None or "PYTEST_XDIST_WORKER" not in os.environ:
-        yield
-        return
-    with (tmp_path_factory.getbasetemp().parent / "system.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-
-
-@pytest.fixture(autouse=True)
-def no_orphans(request: pytest.FixtureRequest, one_at_a_time: None) -> Iterator[None]:
+def no_orphans(request: pytest.FixtureRequest) -> Iterator[None]:
     """After a system test no process and no thread that it started is left."""
     if request.node.get_closest_marker("system") is None:
         yield
