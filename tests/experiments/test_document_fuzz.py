@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from experiments import catalogue
 from experiments.document import DocumentError, read, write_json
+from experiments.problem import MOST
 
 PARK = (catalogue.FOLDER / "robotic-park.toml").read_text("utf-8")
 LINES = PARK.split("\n")
@@ -37,7 +38,8 @@ def reads_or_refuses(content, suffix=".toml", overrides=()):
         assert all(write_json(case) for case in cases.values())
     else:
         assert refusal.problems
-        assert all(problem.message and str(problem) in str(refusal) for problem in refusal.problems)
+        assert all(problem.message for problem in refusal.problems)
+        assert all(str(problem) in str(refusal) for problem in refusal.problems[:MOST])
         assert str(refusal).encode("utf-8")
 
 
