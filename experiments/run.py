@@ -8,7 +8,7 @@ In a notebook:
     run.metrics["event"].mean["iae"]
     run.figures()["errors"].savefig("errors.pdf")
 
-An experiment may stand in the notebook itself: `loads` takes its text. How figures are shown there: `experiments.notebook`.
+An experiment may stand in the notebook itself: `loads` takes its text. `experiments.notebook` shows figures there.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Consensus and the Laplacian
 #
-# Six drones want to meet. Each hears some of the others, and flies a little toward those that it hears. Do they meet,
-# where, and how soon? One matrix answers, before anything moves: the Laplacian of the graph of who hears whom.
+# Six drones want to meet. Each hears some of the others, and flies a little toward those that it hears. Do they
+# meet, where, and how soon? One matrix answers, before anything moves: the Laplacian of the graph of who hears
+# whom.
 #
 # The lesson computes the answer, has six simulated drones fly it, and compares. Every claim below stands beside an
 # `assert` of it. You need eigenvalues and first-order differential equations, and about an hour.
@@ -17,8 +18,8 @@ from agents.graph import components, laplacian, links
 from agents.kinds import CRAZYFLIE
 from agents.rows import Array
 from experiments.check import check, figures
-from experiments.drawing import CASES, MAGENTA, WIDTH, styled
 from experiments.document import Document
+from experiments.drawing import CASES, MAGENTA, WIDTH, styled
 from experiments.feasibility import algebraic_connectivity
 from experiments.notebook import folder, show
 from experiments.prediction import closed
@@ -51,10 +52,10 @@ def laplacian_of(pairs: Pairs) -> Array:
 print(laplacian_of(GRAPHS["path"]))
 
 # %% [markdown]
-# On the diagonal is how many a robot hears; off it, −1 for each of them. So every row adds up to zero: L times a vector
-# of equal numbers is zero, and 0 is always an eigenvalue, λ₁. Without directions L is symmetric, the eigenvalues are real
-# and none is negative. The next one, λ₂, is the *algebraic connectivity* (Fiedler, 1973): it is zero if and only if the
-# graph falls into parts. For some graphs the eigenvalues are known in closed form.
+# On the diagonal is how many a robot hears; off it, −1 for each of them. So every row adds up to zero: L times a
+# vector of equal numbers is zero, and 0 is always an eigenvalue, λ₁. Without directions L is symmetric, the
+# eigenvalues are real and none is negative. The next one, λ₂, is the *algebraic connectivity* (Fiedler, 1973): it
+# is zero if and only if the graph falls into parts. For some graphs the eigenvalues are known in closed form.
 
 # %%
 KNOWN = {
@@ -100,7 +101,7 @@ def spectra() -> Figure:
         values = np.linalg.eigvalsh(laplacian_of(pairs))
         below.plot(values, np.zeros(N), "o", color=CASES[k], alpha=0.6, clip_on=False)
         below.plot(values[1], 0.0, "o", markersize=10, fillstyle="none", color=MAGENTA)
-        below.set(xlim=(-0.4, 6.4), ylim=(-1.0, 1.0), yticks=[], xlabel=r"$\lambda$ (ring: $\lambda_2$)")
+        below.set(xlim=(-0.4, 6.4), ylim=(-1.0, 1.0), yticks=[], xlabel=r"$\lambda$; circled: $\lambda_2$")
         below.spines["left"].set_visible(False)
     return figure
 
@@ -110,12 +111,13 @@ show(spectra(), OUT / "consensus-spectra")
 # %% [markdown]
 # ## 2. The experiment
 #
-# The law `displacement` moves the goal of robot i by uᵢ = −k Σⱼ (xᵢ − xⱼ − dᵢⱼ) over the robots j that it hears. With all
-# offsets dᵢⱼ = 0 that is −k times row i of L x: consensus. k is the `stiffness`, the share of a difference that one
-# decision takes; there are ten decisions in a second.
+# The law `displacement` moves the goal of robot i by uᵢ = −k Σⱼ (xᵢ − xⱼ − dᵢⱼ) over the robots j that it hears.
+# With all offsets dᵢⱼ = 0 that is −k times row i of L x: consensus. k is the `stiffness`, the share of a difference
+# that one decision takes; there are ten decisions in a second.
 #
-# All meet in one point of the plane, so each drone holds a height of its own, 0.4 m above the next. What happens along z
-# is no part of the law. The network is perfect, and nobody wobbles: what we see is the law and the drones' own dynamics.
+# All meet in one point of the plane, so each drone holds a height of its own, 0.4 m above the next. What happens
+# along z is no part of the law. The network is perfect, and nobody wobbles: what we see is the law and the drones'
+# own dynamics.
 
 # %%
 START = [(-1.0, 0.6), (-0.4, -0.9), (0.9, -0.5), (0.2, 1.0), (1.1, 0.7), (-0.8, -0.2)]  # x, y [m]
@@ -131,7 +133,8 @@ def rendezvous(pairs: Pairs, stiffness: float, duration_s: float) -> Document:
     return loads(
         "\n".join(
             [
-                f'title = "Six drones meet"\nduration_s = {duration_s}\ntrigger = {{ kind = "periodic", period_s = 0.02 }}',
+                f'title = "Six drones meet"\nduration_s = {duration_s}',
+                'trigger = { kind = "periodic", period_s = 0.02 }',
                 "[arena]\nsize = [6.0, 6.0, 3.0]",
                 f'[formation]\nlaw = "displacement"\nstiffness = {stiffness}\nclamp = 1.0',
                 "[robots]",
@@ -148,9 +151,9 @@ experiments = {name: rendezvous(pairs, GAIN, DURATION_S) for name, pairs in GRAP
 print("\n".join(str(finding) for finding in check(experiments["ring"])))
 
 # %% [markdown]
-# `check` knows what we do: the network is whole and has no leader, the loop settles. It warns us that drones would land
-# on each other, and it is right. Meeting is a law for a lesson and for particles; robots have a size and take offsets
-# that are not zero. Nothing below changes with them, see exercise 1.
+# `check` knows what we do: the network is whole and has no leader, the loop settles. It warns us that drones would
+# land on each other, and it is right. Meeting is a law for a lesson and for particles; robots have a size and take
+# offsets that are not zero. Nothing below changes with them, see exercise 1.
 
 # %%
 codes = {finding.code for finding in check(experiments["ring"]) if finding.severity != "note"}
@@ -181,9 +184,9 @@ def motions() -> Figure:
 show(motions(), OUT / "consensus-motions")
 
 # %% [markdown]
-# *Where* do they meet? L is symmetric, so 1ᵀ L = 0: the law moves the sum of all x by nothing, and the meeting place can
-# only be the mean of the starts, the dashed line, whatever the graph. (A message takes 20 ms at most until it is heard;
-# that costs less than a millimetre.)
+# *Where* do they meet? L is symmetric, so 1ᵀ L = 0: the law moves the sum of all x by nothing, and the meeting
+# place can only be the mean of the starts, the dashed line, whatever the graph. (A message takes 20 ms at most
+# until it is heard; that costs less than a millimetre.)
 
 # %%
 for name, trace in runs.items():
@@ -195,9 +198,10 @@ for name, trace in runs.items():
 # %% [markdown]
 # ## 3. How fast: the rate predicted
 #
-# Write x in the eigenvectors of L: x = Σ zᵢ vᵢ. The modes do not hear of each other. *First prediction*, with robots that
-# close a distance to their goal at the rate c (`response`, 2 per second for a Crazyflie): żᵢ = −c k λᵢ zᵢ. Every mode
-# decays at its own rate c k λᵢ; the slowest is that of λ₂, so **the algebraic connectivity is the rate of convergence**.
+# Write x in the eigenvectors of L: x = Σ zᵢ vᵢ. The modes do not hear of each other. *First prediction*, with
+# robots that close a distance to their goal at the rate c (`response`, 2 per second for a Crazyflie): żᵢ = −c k λᵢ
+# zᵢ. Every mode decays at its own rate c k λᵢ; the slowest is that of λ₂, so **the algebraic connectivity is the
+# rate of convergence**.
 #
 # We can measure each mode alone: project the true positions onto its eigenvector, and fit a line to the logarithm.
 
@@ -227,15 +231,16 @@ print(f"{len(measured)} modes, measured over predicted: {off.min():+.1%} to {off
 assert np.all(np.abs(off) < 0.10)
 
 # %% [markdown]
-# A prediction by hand, over a range of rates of more than 20, and no mode is off by more than a tenth. But the errors
-# are no accident: slow modes are slower than predicted, and fast ones faster. Both have a reason.
+# A prediction by hand, over a range of rates of more than 20, and no mode is off by more than a tenth. But the
+# errors are no accident: slow modes are slower than predicted, and fast ones faster. Both have a reason.
 #
-# *Sampling.* The goal is decided anew ten times in a second, and stands in between. Of a distance to its goal a robot then
-# closes h = 1 − exp(−c/10), and a decision leaves 1 − h k λ of a mode. That is what `check` computes; its `slowest_mode_s`
-# is the time constant of λ₂.
+# *Sampling.* The goal is decided anew ten times in a second, and stands in between. Of a distance to its goal a
+# robot then closes h = 1 − exp(−c/10), and a decision leaves 1 − h k λ of a mode. That is what `check` computes;
+# its `slowest_mode_s` is the time constant of λ₂.
 #
 # *Lag.* A quadrotor must get up to speed first: its velocity follows what its position controller wants at the rate
-# k_v = 3.5 per second. So it has two states, and a decision is a 2 × 2 matrix; its larger eigenvalue is what is left.
+# k_v = 3.5 per second. So it has two states, and a decision is a 2 × 2 matrix; its larger eigenvalue is what is
+# left.
 
 # %%
 HZ = 10.0  # decisions in a second
@@ -273,9 +278,9 @@ assert np.all(np.abs(measured / sampled - 1.0) < 0.13)
 assert np.all(np.abs(measured / lagging - 1.0) < 0.005)
 
 # %% [markdown]
-# With both, twenty modes of four graphs are predicted to half a percent. Sampling alone explains why slow modes are slower;
-# it does worse than our guess by hand for fast ones, where two errors happened to cancel. That is worth remembering:
-# a better model of one thing need not be a better model.
+# With both, twenty modes of four graphs are predicted to half a percent. Sampling alone explains why slow modes are
+# slower; it does worse than our guess by hand for fast ones, where two errors happened to cancel. That is worth
+# remembering: a better model of one thing need not be a better model.
 
 
 # %%
@@ -308,10 +313,10 @@ show(rates(), OUT / "consensus-rates")
 # %% [markdown]
 # ## 4. How large may a step be?
 #
-# A larger k makes all modes faster, until a decision overshoots: 1 − h k λ is negative from h k λ = 1 on, and below −1
-# from **h k λ_max = 2** on. So the largest eigenvalue of L limits the step, and the smallest but one the rate; the best that
-# any k can do depends on λ_max/λ₂ alone. `check` refuses what lies beyond 2. It warns from 1.2 on, because it leaves room
-# for what its model does not have. Is that room needed?
+# A larger k makes all modes faster, until a decision overshoots: 1 − h k λ is negative from h k λ = 1 on, and below
+# −1 from **h k λ_max = 2** on. So the largest eigenvalue of L limits the step, and the smallest but one the rate;
+# the best that any k can do depends on λ_max/λ₂ alone. `check` refuses what lies beyond 2. It warns from 1.2 on,
+# because it leaves room for what its model does not have. Is that room needed?
 
 # %%
 largest = float(spectrum["ring"][0][-1])
@@ -335,13 +340,14 @@ assert said == [{"stable"}] * 3 + [{"rings"}] * 2 + [{"hunts"}] * 2
 assert max(left_over[:3]) < 1e-4  # they meet
 assert left_over[3] < 0.01  # they still do, but take long
 assert min(left_over[5:]) > 0.03  # they never do
-assert left_over == sorted(left_over[:6]) + left_over[6:]
+assert left_over[:6] == sorted(left_over[:6])
 
 # %% [markdown]
-# Beyond the limit they do not fly away, as the linear model says they would: speed limits turn the growth into a dance
-# that never ends, in which neighbours on the ring swap sides (the eigenvector of λ_max has alternating signs). Just
-# below the limit everything still settles, with a lag, a delay of a message and all; it only takes longer and longer. The
-# room between 1.2 and 2 is for that.
+# Beyond the limit they do not fly away, as the linear model says they would: speed limits turn the growth into a
+# dance that never ends, in which neighbours on the ring swap sides (the eigenvector of λ_max has alternating
+# signs). Just below the limit everything still settles, with a lag, a delay of a message and all; it only takes
+# longer and longer. The room between 1.2 and 2 is for that. And the meeting place is no longer the mean of the
+# starts: a goal that is cut off knows nothing of 1ᵀ L = 0.
 
 
 # %%
@@ -366,9 +372,10 @@ show(step_sizes(), OUT / "consensus-steps")
 # %% [markdown]
 # ## Exercises
 #
-# 1. Give the links the offsets of a hexagon of 0.6 m instead of zeros. Show that with y = x − (its corners) nothing in
-#    section 3 changes, and measure the rates again. Which warnings of `check` are gone?
-# 2. Let D0 hear nobody (`"D0 > D1"` instead of `"D0 - D1"`), in the path and in the star. L is not symmetric now: where do
-#    they meet, and why? Delete row and column of D0 from L: its smallest eigenvalue is the new rate. Predict it, then run.
-# 3. You may place one more edge in the path of six. Which one makes λ₂ largest? Try all ten by eigenvalues, then fly the
-#    best and the worst.
+# 1. Give the links the offsets of a hexagon of 0.6 m instead of zeros. Show that with y = x − (its corners) nothing
+#    in section 3 changes, and measure the rates again. Which warnings of `check` are gone?
+# 2. Let D0 hear nobody (`"D0 > D1"` instead of `"D0 - D1"`), in the path and in the star. L is not symmetric now:
+#    where do they meet, and why? Delete row and column of D0 from L: its smallest eigenvalue is the new rate.
+#    Predict it, then run.
+# 3. You may place one more edge in the path of six. Which one makes λ₂ largest? Try all ten by eigenvalues, then
+#    fly the best and the worst.

@@ -1,12 +1,12 @@
 # %% [markdown]
 # # Rigidity, and why heights matter
 #
-# Robots that keep distances to each other hold a shape only if the distances leave no other one nearby. Whether they do is
-# a question about the rank of a matrix. And where some of the robots fly, the heights at which they hover decide what can
-# be met at all, and how firmly it is held.
+# Robots that keep distances to each other hold a shape only if the distances leave no other one nearby. Whether
+# they do is a question about the rank of a matrix. And where some of the robots fly, the heights at which they
+# hover decide what can be met at all, and how firmly it is held.
 #
-# Every claim below stands beside an `assert` of it. You need linear algebra (rank, null space, eigenvalues), and about an
-# hour. The lesson on consensus comes before this one.
+# Every claim below stands beside an `assert` of it. You need linear algebra (rank, null space, eigenvalues), and
+# about an hour. The lesson on consensus comes before this one.
 
 # %%
 from __future__ import annotations
@@ -44,13 +44,13 @@ def in_the_plane(position: Array) -> Mask:
 # %% [markdown]
 # ## 1. A square is flexible
 #
-# Four robots on the corners of a square, linked along its sides. Let them move with velocities v. The length of the side
-# from i to j stays as it is if (pᵢ − pⱼ)ᵀ(vᵢ − vⱼ) = 0. One such equation for each edge makes the *rigidity matrix* R, and
-# the motions that change no length are its null space.
+# Four robots on the corners of a square, linked along its sides. Let them move with velocities v. The length of the
+# side from i to j stays as it is if (pᵢ − pⱼ)ᵀ(vᵢ − vⱼ) = 0. One such equation for each edge makes the *rigidity
+# matrix* R, and the motions that change no length are its null space.
 #
-# In the plane a framework of N robots has 2N coordinates. Two translations and a rotation change no length, so the rank
-# of R is 2N − 3 at most. A framework that reaches it is *infinitesimally rigid*. For the square 2N − 3 = 5, and there are
-# only four sides.
+# In the plane a framework of N robots has 2N coordinates. Two translations and a rotation change no length, so the
+# rank of R is 2N − 3 at most. A framework that reaches it is *infinitesimally rigid*. For the square 2N − 3 = 5,
+# and there are only four sides.
 
 # %%
 SIDE = 0.8  # m
@@ -66,8 +66,8 @@ assert rank(square, braced, held) == (5, 5)
 assert rigid_motions(square, held) == 3
 
 # %% [markdown]
-# Four equations for eight unknowns: four independent motions change no side. Three of them move the square as a whole.
-# What is left when those are taken out is the *flex*.
+# Four equations for eight unknowns: four independent motions change no side. Three of them move the square as a
+# whole. What is left when those are taken out is the *flex*.
 
 
 # %%
@@ -103,9 +103,13 @@ def frameworks() -> Figure:
         for i, j in pairs:
             axes.plot(square[[i, j], 0], square[[i, j], 1], color=CASES[0] if (i, j) in sides else MAGENTA)
         axes.plot(square[:, 0], square[:, 1], "o", color="#000000", markersize=5)
-        axes.set(title=title, aspect="equal", xlim=(-0.35, 1.15), ylim=(-0.35, 1.15), xlabel="$x$ [m]", ylabel="$y$ [m]")
+        axes.set(
+            title=title, aspect="equal", xlim=(-0.35, 1.15), ylim=(-0.35, 1.15), xlabel="$x$ [m]", ylabel="$y$ [m]"
+        )
         if pairs is sides:
-            axes.quiver(*square[:, :2].T, *flex.T, color=CASES[1], angles="xy", scale_units="xy", scale=2.0, width=0.012)
+            axes.quiver(
+                *square[:, :2].T, *flex.T, color=CASES[1], angles="xy", scale_units="xy", scale=2.0, width=0.012
+            )
     return figure
 
 
@@ -114,8 +118,8 @@ show(frameworks(), OUT / "rigidity-frameworks")
 # %% [markdown]
 # ## 2. The same square in the air
 #
-# Four drones at one height, the law `distance`, two different starts; with sides only, then with a brace. The brace is
-# the diagonal from A to C.
+# Four drones at one height, the law `distance`, two different starts; with sides only, then with a brace. The brace
+# is the diagonal from A to C.
 
 # %%
 CORNERS = "ABCD"
@@ -159,8 +163,8 @@ for lengths, what in ((SIDES, "sides"), (BRACED, "braced")):
         assert right_one == (what == "braced")  # but only the brace makes it a square
 
 # %% [markdown]
-# With sides only the drones do all that is asked of them, and end as two different rhombi: the law closes the errors and
-# knows nothing of the rest. `check` says so before anything flies.
+# With sides only the drones do all that is asked of them, and end as two different rhombi: the law closes the
+# errors and knows nothing of the rest. `check` says so before anything flies.
 
 # %%
 said = {finding.code: str(finding) for finding in check(formation(STARTS["first"], [0.8] * 4, SIDES))}
@@ -192,10 +196,10 @@ show(squares(), OUT / "rigidity-squares")
 # %% [markdown]
 # ## 3. In space
 #
-# In space there are 3N coordinates and six motions of the whole, three translations and three rotations: the rank that
-# is needed is 3N − 6. The last note of `check` above says that the braced square has 5 of 6 there: it can fold along its
-# brace. Both diagonals together are six edges, but in a flat square that does not help: to first order no distance in
-# the plane changes when a corner leaves it. Lift one corner, and it does.
+# In space there are 3N coordinates and six motions of the whole, three translations and three rotations: the rank
+# that is needed is 3N − 6. The last note of `check` above says that the braced square has 5 of 6 there: it can fold
+# along its brace. Both diagonals together are six edges, but in a flat square that does not help: to first order no
+# distance in the plane changes when a corner leaves it. Lift one corner, and it does.
 
 # %%
 both: Pairs = [*braced, (1, 3)]
@@ -206,9 +210,9 @@ assert rank(square, both) == (5, 6)
 assert rank(lifted, both) == (6, 6)
 
 # %% [markdown]
-# That is many links: 3N − 6 against 2N − 3. But drones hold their heights by themselves, and ground robots have no choice.
-# **With heights held, a formation of distances in space needs the rank of the plane, 2N − 3.** The reference experiment
-# lives on that: seven robots, three of them in the air, twelve pairs.
+# That is many links: 3N − 6 against 2N − 3. But drones hold their heights by themselves, and ground robots have no
+# choice. **With heights held, a formation of distances in space needs the rank of the plane, 2N − 3.** The
+# reference experiment lives on that: seven robots, three of them in the air, twelve pairs.
 
 # %%
 park = load("robotic-park")
@@ -222,10 +226,10 @@ assert (numbers.rank_space, numbers.rank_space_needed) == (12, 3 * 7 - 6)
 # %% [markdown]
 # ## 4. What heights can be met
 #
-# Now the price. A link is as long as it is in space; what is left of it in the plane depends on the heights. Take a *tent*:
-# two drones at 0.4 m, 0.6 m apart, and a third one above, 0.86 m from either. (TB01, KH01 and CF01 of the reference
-# experiment stand so.) If the third hovers higher by z, the legs measure √(0.86² − z²) in the plane, and the triangle
-# closes only while that is half the base or more: z ≤ √(0.86² − 0.3²).
+# Now the price. A link is as long as it is in space; what is left of it in the plane depends on the heights. Take a
+# *tent*: two drones at 0.4 m, 0.6 m apart, and a third one above, 0.86 m from either. (TB01, KH01 and CF01 of the
+# reference experiment stand so.) If the third hovers higher by z, the legs measure √(0.86² − z²) in the plane, and
+# the triangle closes only while that is half the base or more: z ≤ √(0.86² − 0.3²).
 
 # %%
 BASE, LEG, LOW = 0.6, 0.86, 0.4  # m
@@ -248,10 +252,11 @@ assert error.code == "too-high"
 assert f"lower than {LOW + LIMIT:.3f} m" in error.remedy
 
 # %% [markdown]
-# `check` refuses it, and names the height that would do. What happens if it is flown anyway? The law goes down the gradient
-# of Σ (d² − ‖pᵢ − pⱼ‖²)². Let the top stand over the middle of the base, and s be the square of the base: the square of a leg
-# is z² + s/4. Setting the derivative to zero, 4 (s − 0.6²) = 2 (0.86² − z² − s/4), gives s: the base is pulled together, the
-# legs stay too long, and all three errors are known by hand. Below the limit all three are zero.
+# `check` refuses it, and names the height that would do. What happens if it is flown anyway? The law goes down the
+# gradient of Σ (d² − ‖pᵢ − pⱼ‖²)². Let the top stand over the middle of the base, and s be the square of the base:
+# the square of a leg is z² + s/4. Setting the derivative to zero, 4 (s − 0.6²) = 2 (0.86² − z² − s/4), gives s: the
+# base is pulled together, the legs stay too long, and all three errors are known by hand. Below the limit all three
+# are zero.
 
 # %%
 RISES = (0.5, 0.7, 0.8, 0.82, 0.85, 0.9, 0.95)
@@ -271,26 +276,29 @@ for rise in RISES:
     base, leg, other = (float(norm(place[[i]] - place[[j]])[0]) for i, j in ((0, 1), (0, 2), (1, 2)))
     flown.append((BASE - base, leg - LEG))
     predicted = compromise(rise)
-    print(f"z = {rise:.2f} m: base {1e3 * flown[-1][0]:6.2f} mm short, legs {1e3 * flown[-1][1]:6.2f} mm long; by hand ", end="")
-    print(f"{1e3 * predicted[0]:6.2f} and {1e3 * predicted[1]:6.2f}")
+    short, long = 1e3 * np.array([flown[-1], predicted]).T
+    print(f"z = {rise:.2f} m: base {short[0]:6.2f} mm short (by hand {short[1]:6.2f}), ", end="")
+    print(f"legs {long[0]:6.2f} mm long ({long[1]:6.2f})")
     assert abs(leg - other) < 1e-4
     assert np.allclose(flown[-1], predicted, atol=3e-4)
 
 # %% [markdown]
 # ## 5. Near the limit a formation goes slack
 #
-# Meeting the distances is not all. Close to the target an error p̃ of the positions obeys p̃⁺ = p̃ − h μ RᵀR p̃, with the
-# columns of R that are free: the smallest eigenvalue of RᵀR (motions of the whole left out) is to a formation what λ₂ is
-# to consensus. As the tent rises, its legs stand steeper, and there is less and less of them in the plane. At the limit
-# the three stand in one line, seen from above, and R has lost a rank: pushing the top sideways changes no length to first
-# order, and nothing pulls it back. (It is a motion of the whole: a tent that stands upright in a vertical plane can tilt
-# about a line in that plane, which to first order lifts nobody. So `rigidity` counts four such motions there, and asks for
-# a rank of 2 only. Rank says yes or no; how firmly is a question for the eigenvalue.)
+# Meeting the distances is not all. Close to the target an error e of the positions becomes e − h μ RᵀR e with every
+# decision, with the columns of R that are free: the smallest eigenvalue of RᵀR (motions of the whole left out) is
+# to a formation what λ₂ is to consensus. As the tent rises, its legs stand steeper, and there is less and less of
+# them in the plane. At the limit the three stand in one line, seen from above, and R has lost a rank: pushing the
+# top sideways changes no length to first order, and nothing pulls it back. (It is a motion of the whole: a tent
+# that stands upright in a vertical plane can tilt about a line in that plane, which to first order lifts nobody. So
+# `rigidity` counts four such motions there, and asks for a rank of 2 only. Rank says yes or no; how firmly is a
+# question for the eigenvalue.)
 
 # %%
 line = np.array([[-BASE / 2.0, 0.0, LOW], [BASE / 2.0, 0.0, LOW], [0.0, 0.0, LOW + LIMIT]])
 triangle: Pairs = [(0, 1), (0, 2), (1, 2)]
-leaning = line + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]
+leaning = line.copy()
+leaning[2, 1] = 0.1
 assert rank(leaning, triangle, in_the_plane(line)) == (3, 3)
 assert rank(line, triangle, in_the_plane(line)) == (2, 2)
 assert rigid_motions(line, in_the_plane(line)) == 4
@@ -326,9 +334,9 @@ assert np.all(faster < 0.3)
 assert np.all(faster[3:] < 0.08)
 
 # %% [markdown]
-# Between 0.7 m and 0.795 m the time constant grows from one second to eleven, and beyond 0.806 m nothing closes. The
-# prediction is the better the slower the mode, for the reason that the lesson on consensus found: it knows nothing of
-# the lag with which a drone gets up to speed.
+# Between 0.7 m and 0.795 m the time constant grows from one second to eleven, and beyond 0.806 m nothing closes.
+# The prediction is the better the slower the mode, for the reason that the lesson on consensus found: it knows
+# nothing of the lag with which a drone gets up to speed.
 #
 # The reference experiment has its three drones at 0.80 m. That is 6 mm below the limit. What does that cost?
 
@@ -350,9 +358,10 @@ assert firmness[0.75] > 15.0 * firmness[0.805]
 assert patience[0.8] > 3.0 * patience[0.75]
 
 # %% [markdown]
-# All of them have full rank, and all distances can be met exactly. Up to 0.75 m another part of the formation gives way
-# first, and hovering higher even helps. Then the tents do: at 0.80 m the formation is held a third as firmly as at 0.75 m,
-# and needs more than three times as long; another 5 mm, and a hover that is a little off its height is enough to lose it.
+# All of them have full rank, and all distances can be met exactly. Up to 0.75 m another part of the formation gives
+# way first, and hovering higher even helps. Then the tents do: at 0.80 m the formation is held a third as firmly as
+# at 0.75 m, and needs more than three times as long; another 5 mm, and a hover that is a little off its height is
+# enough to lose it.
 
 
 # %%
@@ -384,9 +393,10 @@ show(heights(), OUT / "rigidity-heights")
 # %% [markdown]
 # ## Exercises
 #
-# 1. Start the braced square with B and D on the same side of the brace. All five distances are met at the end: where are B
-#    and D? Infinitesimally rigid means that there is no other shape *nearby*. Which sixth link leaves only one shape?
+# 1. Start the braced square with B and D on the same side of the brace. All five distances are met at the end:
+#    where are B and D? Infinitesimally rigid means that there is no other shape *nearby*. Which sixth link leaves
+#    only one shape?
 # 2. A colleague measures the legs of the tent in the plane, seen from above, and the base as well, all three as
 #    √(0.86² − z²) and 0.6 m, but the drones measure in space. Predict what they do at z = 0.5 m, and fly it.
-# 3. Which single pairs can the reference experiment lose (`figures(...).vital_links`)? Hover CF03 alone at 1.1 m: which
-#    distances have to change, and how does the smallest eigenvalue?
+# 3. Which single pairs can the reference experiment lose (`figures(...).vital_links`)? Hover CF03 alone at 1.1 m:
+#    which distances have to change, and how does the smallest eigenvalue?
