@@ -398,5 +398,5 @@ show(heights(), OUT / "rigidity-heights")
 #    only one shape?
 # 2. A colleague measures the legs of the tent in the plane, seen from above, and the base as well, all three as
 #    √(0.86² − z²) and 0.6 m, but the drones measure in space. Predict what they do at z = 0.5 m, and fly it.
-# 3. Which single pairs can the reference experiment lose (`figures(...).vital_links`)? Hover CF03 alone at 1.1 m:
-#    which distances have to change, and how does the smallest eigenvalue?
+# 3. Which single pairs can the reference experiment not lose (`figures(...).vital_links`)? Hover CF03 alone at 1.1 m:
+#    do any distances have to change, and what becomes of the smallest eigenvalue? At which height do they?
