@@ -109,13 +109,17 @@ class Links:
         return self.listener, self.speaker, self.distance, self.gain, self.relative, self.bearing, self.wants
 
 
-def links(pairs: Sequence[tuple[int, int]], distance: Sequence[float], gain: Sequence[float]) -> Links:
-    """Links by distance from (listener, speaker) pairs in any order."""
+def links(
+    pairs: Sequence[tuple[int, int]], distance: Sequence[float] | float = np.nan, gain: Sequence[float] | float = 1.0
+) -> Links:
+    """Links by distance from (listener, speaker) pairs in any order; one number is for all of them.
+
+    For a graph of which only the matrices are wanted the pairs are enough: `laplacian(links(pairs), rows)`.
+    """
     both = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     order = np.lexsort((both[:, 1], both[:, 0]))
-    return Links(
-        both[order, 0], both[order, 1], np.array(distance, dtype=float)[order], np.array(gain, dtype=float)[order]
-    )
+    wanted, gains = (np.broadcast_to(np.asarray(each, dtype=float), len(both))[order] for each in (distance, gain))
+    return Links(both[order, 0], both[order, 1], wanted, gains)
 
 
 def adjacency(net: Links, rows: int) -> Array:

@@ -58,6 +58,10 @@ class Finding:
     remedy: str
     where: str
 
+    def __str__(self) -> str:
+        """As a line for people."""
+        return f"{MARK[self.severity]} {self.message}" + (f"; {self.remedy}" if self.remedy else "")
+
 
 class Figures(msgspec.Struct, frozen=True, kw_only=True):
     """The numbers of one case; None where they have no meaning, as those of a formation without links.

@@ -86,9 +86,7 @@ def sound(read: document.Document, changes: Sequence[str]) -> bool:
 
     found = [finding for finding in check(read, changes) if finding.severity != "note"]
     for finding in found:
-        mark = "✗" if finding.severity == "error" else "!"
-        remedy = f"; {finding.remedy}" if finding.remedy else ""
-        print(f"{mark} {finding.message}{remedy}", file=sys.stderr)
+        print(finding, file=sys.stderr)
     return all(finding.severity != "error" for finding in found)
 
 

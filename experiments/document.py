@@ -30,10 +30,11 @@ from experiments.syntax import LARGEST, content, decoded, parsed, reason
 
 __all__ = [
     "LARGEST", "Document", "DocumentError", "Problem", "catalogue_path", "copy", "names", "parse_links", "read",
-    "schema", "write_json", "write_schema",
+    "read_text", "schema", "write_json", "write_schema",
 ]  # fmt: skip
 
 _Table = dict[str, Any]
+TEXT: Final = "text"  # what an experiment is called that stands in no file
 _ABOVE: Final = (("arena",), ("arena", "file"))  # changes after which the arena may begin with another file
 
 
@@ -88,6 +89,19 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
         text = decoded(content(file, label), label)
     except FileNotFoundError:
         raise DocumentError([_no_entry(label)]) from None
+    return _document(file, label, text, overrides)
+
+
+def read_text(text: str, overrides: Sequence[str] = ()) -> Document:
+    """As `read`, of an experiment that stands in no file: its text, in TOML; arena files are those of this folder.
+
+    Raises:
+        DocumentError: As `read`; places are those in `TEXT`.
+    """
+    return _document(Path(TEXT), TEXT, decoded(text.encode(), TEXT), overrides)
+
+
+def _document(file: Path, label: str, text: str, overrides: Sequence[str]) -> Document:
     is_json = file.suffix.lower() == ".json"
     try:
         return _Reading(file, label, text, is_json, parsed(text, label, json=is_json), tuple(overrides)).document()

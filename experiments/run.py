@@ -7,6 +7,8 @@ In a notebook:
     run.traces["event"].true_position      # (T, N, 3) [m]
     run.metrics["event"].mean["iae"]
     run.figures()["errors"].savefig("errors.pdf")
+
+An experiment may stand in the notebook itself: `loads` takes its text. `experiments.notebook` shows figures there.
 """
 
 from __future__ import annotations
@@ -83,6 +85,15 @@ def load(file: str | Path, *changes: str) -> Document:
         DocumentError: With everything that is wrong and where.
     """
     return document.read(file, changes)
+
+
+def loads(text: str, *changes: str) -> Document:
+    """As `load`, of an experiment that is written where it is used, in a notebook or a script.
+
+    Raises:
+        DocumentError: With everything that is wrong and where.
+    """
+    return document.read_text(text, changes)
 
 
 def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Experiment]:

@@ -4,6 +4,7 @@ In a notebook:
 
     from experiments.sweep import sweep
     found = sweep("robotic-park", ["trigger.threshold=0.002:0.05:log12", "seeds=50"])
+    print(found)
     found.rows[3].ratio["iae"].mean
     found.pareto().savefig("pareto.pdf")
 
@@ -64,6 +65,10 @@ class Found:
     missing: int
     folder: Path
     notes: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """The table, as the command prints it."""
+        return "\n".join(sweep_table.text(self.rows))
 
     def pareto(self) -> Figure:
         """Messages against error, see `experiments.pareto`."""

@@ -76,7 +76,7 @@ def _swept(asked: Request) -> int:
     if asked.as_json:
         print(json.dumps(table))
     else:
-        print("\n".join(sweep_table.text(found.rows)))
+        print(found)
         _tell(found.folder, found.notes, page)
     for failure in found.failures[:3]:
         print(f"failed: {failure}", file=sys.stderr)

@@ -26,6 +26,7 @@ EXPLAINED: Final = (
     ("agents.plugins", "PluginError"),
     ("experiments.problem", "DocumentError"),
     ("experiments.records", "RecordingError"),
+    ("experiments.export", "ExportError"),
     ("experiments.conductor", "RunFailed"),
     ("experiments.virtual", "Stuck"),
     ("experiments.sweep_workers", "SweepError"),
@@ -259,6 +260,20 @@ def report(
     from experiments.commands import report as command  # noqa: PLC0415
 
     raise typer.Exit(command(runs, out=out))
+
+
+@app.command()
+def export(
+    folder: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    target: Annotated[
+        str | None, typer.Argument(metavar="FILE", help="FILE.mat or FILE.csv. [run.mat in the run's folder]")
+    ] = None,
+    as_csv: Annotated[bool, typer.Option("--csv", help="A table of trajectories: case, time, robot, x, ...")] = False,
+) -> None:
+    """Write a run for MATLAB, or its trajectories as one table."""
+    from experiments.export import command  # noqa: PLC0415
+
+    raise typer.Exit(command(folder, target, as_csv=as_csv))
 
 
 @app.command()

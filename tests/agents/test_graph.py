@@ -262,3 +262,11 @@ def test_rigid_motions_that_held_coordinates_allow(position, free, motions):
 
 def test_links_know_their_number():
     assert len(Links(np.array([0, 0]), np.array([1, 2]), np.ones(2), np.ones(2))) == 2
+
+
+def test_pairs_are_enough_for_the_matrices():
+    path = links([(1, 0), (0, 1), (2, 1), (1, 2)])
+    assert laplacian(path, 3).tolist() == [[1, -1, 0], [-1, 2, -1], [0, -1, 1]]
+    assert np.isnan(path.distance).all()
+    assert links([(1, 0), (2, 0)], 0.6, 3.0).distance.tolist() == [0.6, 0.6]
+    assert links([(1, 0), (2, 0)], 0.6, [3.0, 4.0]).gain.tolist() == [3.0, 4.0]

@@ -35,6 +35,7 @@ def test_commands():
                 "router",
                 "check",
                 "report",
+                "export",
                 "recover",
                 "new",
                 "list",

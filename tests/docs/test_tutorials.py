@@ -1,0 +1,72 @@
+"""The lessons of docs/tutorials: what they claim is true, and they open as notebooks."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = ROOT / "docs" / "tutorials"
+FIGURES = {
+    "consensus": ["consensus-motions", "consensus-rates", "consensus-spectra", "consensus-steps"],
+    "rigidity": ["rigidity-frameworks", "rigidity-heights", "rigidity-squares"],
+    "events": ["events-intervals", "events-pareto", "events-raster"],
+}
+LEAST = {"consensus": 20, "rigidity": 40, "events": 25}  # assertions
+
+
+def cells(lesson):
+    """Markdown and code cells, in order."""
+    text = (FOLDER / f"{lesson}.py").read_text("utf-8")
+    assert text.startswith("# %%")
+    parts = re.split(r"^# %%( \[markdown\])?\n", text, flags=re.MULTILINE)[1:]
+    return [(bool(mark), body) for mark, body in zip(parts[::2], parts[1::2], strict=True)]
+
+
+def test_every_lesson_is_known():
+    assert sorted(FIGURES) == sorted(path.stem for path in FOLDER.glob("*.py"))
+    readme = (FOLDER / "README.md").read_text("utf-8")
+    assert all(f"[{lesson}.py]({lesson}.py)" in readme for lesson in FIGURES)
+
+
+@pytest.mark.parametrize("lesson", FIGURES)
+def test_a_lesson_is_a_notebook(lesson):
+    found = cells(lesson)
+    words = [body for is_text, body in found if is_text]
+    code = [body for is_text, body in found if not is_text]
+    assert all(line.startswith("#") for body in words for line in body.strip().splitlines())
+    assert words[0].startswith("# # ")
+    trees = [ast.parse(body) for body in code]  # each cell stands alone
+    named = {node.id for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    assert "__file__" not in named  # notebooks have none
+    assert sum(isinstance(node, ast.Assert) for tree in trees for node in ast.walk(tree)) >= LEAST[lesson]
+    assert "# ## Exercises" in words[-1]
+    assert len(re.findall(r"^# [1-9]\. ", words[-1], re.MULTILINE)) in (2, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("lesson", FIGURES)
+def test_what_a_lesson_claims_is_true(lesson, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-W", "error", FOLDER / f"{lesson}.py", tmp_path / "figures"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=280,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    drawn = sorted(path.stem for path in (tmp_path / "figures").glob("*.svg"))
+    assert drawn == FIGURES[lesson]
+    for name in drawn:
+        svg = (tmp_path / "figures" / f"{name}.svg").read_text("utf-8")
+        assert svg.count("<path") > 20
+        assert "NaN" not in svg
+        assert len((tmp_path / "figures" / f"{name}.pdf").read_bytes()) > 5_000

@@ -1,0 +1,177 @@
+import csv
+import math
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.graph import laplacian
+from experiments import export
+from experiments.export import KEYWORDS, UNITS, ExportError, matlab_names, structure
+from experiments.run import SOURCE, load, loads, simulate
+from experiments.signals import formation_errors, links_of
+
+scipy_io = pytest.importorskip("scipy.io")
+
+SHORT = ("duration_s=4.0", "timeline=[]")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """The folder of a run of the first experiment, 4 s of it, and the run."""
+    folder = tmp_path_factory.mktemp("run")
+    read = load("triangle", *SHORT)
+    read.keep(folder / SOURCE)
+    return folder, simulate(read, folder=folder)
+
+
+@pytest.fixture(scope="module")
+def mat(flown):
+    """The run as it is read back from the file that the command writes."""
+    assert export.command(str(flown[0]), None, as_csv=False) == 0
+    return scipy_io.loadmat(flown[0] / "run.mat", simplify_cells=True)
+
+
+@pytest.mark.parametrize("case", ["periodic", "event"])
+def test_arrays_come_back_as_they_were(flown, mat, case):
+    trace, read = flown[1].traces[case], mat[case]
+    assert (read["case"], read["clock"], read["seed"]) == (case, "virtual", 1.0)
+    assert tuple(read["robots"]) == trace.robots
+    assert list(read["kinds"]) == ["khepera4", "khepera4", "crazyflie"]
+    for name in ("time", "position", "yaw", "true_position", "goal", "setpoint"):
+        assert read[name].dtype == float
+        assert read[name] == pytest.approx(getattr(trace, name), abs=1e-6, nan_ok=True)  # through the recording
+    assert read["position"].shape == (201, 3, 3)
+    assert read["error"] == pytest.approx(formation_errors(trace), abs=1e-6)
+
+
+def test_who_spoke_and_who_listens_count_from_one(flown, mat):
+    trace, read = flown[1].traces["event"], mat["event"]
+    assert read["sent"]["time"] == pytest.approx(trace.sent.time, abs=1e-6)
+    assert read["sent"]["robot"].tolist() == (trace.sent.robot + 1.0).tolist()
+    assert read["sent"]["position"] == pytest.approx(trace.sent.position, abs=1e-6)
+    net = links_of(trace)
+    assert read["links"]["listener"].tolist() == (net.listener + 1.0).tolist()
+    assert read["links"]["speaker"].tolist() == (net.speaker + 1.0).tolist()
+    assert read["links"]["distance"].tolist() == net.distance.tolist()
+    assert (np.diag(read["adjacency"].sum(axis=1)) - read["adjacency"]).tolist() == laplacian(net, 3).tolist()
+    assert min(read["sent"]["robot"]) >= 1.0
+    assert max(read["sent"]["robot"]) == 3.0
+
+
+def test_metrics_are_those_of_the_report(flown, mat):
+    measured, read = flown[1].metrics["event"], mat["event"]["metrics"]
+    assert list(read["robot"]) == [robot.robot for robot in measured.robots]
+    assert read["iae"] == pytest.approx([robot.iae for robot in measured.robots], rel=1e-6)
+    assert read["messages"].tolist() == [robot.messages for robot in measured.robots]
+    assert read["mean"]["itae"] == pytest.approx(measured.mean["itae"], rel=1e-6)
+    assert read["j2"] == pytest.approx(measured.j2, rel=1e-6)
+    assert np.isnan(read["impulse"]).all()  # nothing touched: unknown
+    by_hand = np.bincount(mat["event"]["sent"]["robot"].astype(int))[1:] / 4.0
+    assert read["f_hz"] == pytest.approx(by_hand)
+
+
+def test_a_struct_is_a_cell_array_and_columns_as_matlab_has_them(flown, mat):
+    raw = scipy_io.loadmat(flown[0] / "run.mat")["event"][0, 0]
+    assert raw["robots"].shape == (3, 1)
+    assert raw["robots"].dtype == object
+    assert raw["time"].shape == (201, 1)
+    assert raw["sent"][0, 0]["robot"].shape[1] == 1
+
+
+def test_units_are_of_what_is_there(flown, mat):
+    def fits(units, values):
+        for name, unit in units.items():
+            if isinstance(unit, dict):
+                fits(unit, values[name])
+            elif name not in ("relative", "bearing"):  # only where links ask for them
+                assert name in values
+            assert re.fullmatch("[a-z][a-z0-9_]*", name)
+
+    made = structure(flown[1].traces["event"], flown[1].metrics["event"])
+    fits(UNITS, made)
+    arrays = {name for name, value in made.items() if isinstance(value, np.ndarray) and value.dtype == float}
+    assert arrays <= set(UNITS)
+    assert mat["event"]["units"]["sent"]["velocity"] == "m/s"
+
+
+def test_what_links_ask_for_besides_distances_is_told():
+    read = loads(
+        'title = "Two"\nduration_s = 1.0\n[robots]\n'
+        'KH01 = { kind = "khepera4", start = [-0.5, 0.0] }\nKH02 = { kind = "khepera4", start = [0.5, 0.0] }\n'
+        '[formation]\nlaw = "displacement"\n[formation.links]\n"KH01 > KH02" = { offset = [0.8, 0.1] }\n'
+    )
+    run = simulate(read)
+    made = structure(run.traces["default"], run.metrics["default"])
+    assert made["links"]["relative"][0, :2].tolist() == [0.8, 0.1]  # KH02 from KH01
+    assert (made["links"]["listener"].tolist(), made["links"]["speaker"].tolist()) == ([2.0], [1.0])
+    assert made["adjacency"].tolist() == [[0.0, 0.0], [1.0, 0.0]]
+
+
+def test_the_table_has_a_line_for_each_robot_and_time(flown, tmp_path):
+    assert export.command(str(flown[0]), str(tmp_path / "way.csv"), as_csv=False) == 0
+    with (tmp_path / "way.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 2 * 201 * 3
+    trace = flown[1].traces["event"]
+    last = rows[-1]
+    assert (last["case"], last["robot"], float(last["time"])) == ("event", "CF01", pytest.approx(4.0))
+    assert float(last["true_z"]) == pytest.approx(trace.true_position[-1, 2, 2], abs=1e-6)
+    assert float(last["error"]) == pytest.approx(formation_errors(trace)[-1, 2], abs=1e-6)
+    assert not any("nan" in row.values() for row in rows)
+
+
+@settings(max_examples=30)
+@given(st.lists(st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]*", fullmatch=True), unique=True, max_size=20))
+def test_names_are_valid_in_matlab(names):
+    found = matlab_names(names)
+    assert list(found) == names
+    assert len(set(found.values())) == len(names)
+    for name in found.values():
+        assert re.fullmatch("[A-Za-z][A-Za-z0-9_]{0,62}", name)
+        assert name not in KEYWORDS
+
+
+def test_names_that_are_valid_stay():
+    given_names = ["periodic", "5mm", "a.b", "a-b", "end", "x" * 70, "x" * 71]
+    assert list(matlab_names(given_names).values()) == [
+        "periodic", "case_5mm", "a_b", "a_b_2", "case_end", "x" * 63, "x" * 61 + "_2",
+    ]  # fmt: skip
+
+
+def test_what_cannot_be_exported_is_explained(flown, tmp_path, monkeypatch):
+    folder, run = flown
+    with pytest.raises(ExportError, match=r"run\.txt: is no name"):
+        export.command(str(folder), str(tmp_path / "run.txt"), as_csv=False)
+    with pytest.raises(ExportError, match=r"end with \.mat or \.csv"):
+        export.command(str(folder), str(tmp_path / "run.mat"), as_csv=True)
+    for name in ("run.mat", "run.csv"):
+        with pytest.raises(ExportError, match="cannot be written: No such file or directory"):
+            export.command(str(folder), str(tmp_path / "nowhere" / name), as_csv=False)
+    monkeypatch.setattr(export, "LARGEST", 1000)
+    with pytest.raises(ExportError, match=r"periodic has 0\.0 GB"):
+        export.write_mat(run, tmp_path / "run.mat")
+
+
+def test_without_scipy_it_says_what_to_install(flown, monkeypatch):
+    def missing(name):
+        raise ModuleNotFoundError(name)
+
+    monkeypatch.setattr(export, "import_module", missing)
+    with pytest.raises(ExportError, match=r"\./zenpark install scipy"):
+        export.command(str(flown[0]), None, as_csv=False)
+    assert export.command(str(flown[0]), None, as_csv=True) == 0
+
+
+def test_a_run_without_a_case_has_nothing(monkeypatch, tmp_path):
+    monkeypatch.setattr(export, "reopen", lambda _folder: SimpleNamespace(traces={}))
+    with pytest.raises(ExportError, match="nothing to export"):
+        export.command(str(tmp_path), None, as_csv=True)
+
+
+def test_unknown_numbers_become_nan():
+    assert math.isnan(export._number(None))
+    assert export._numbers([1, None, 2.5])[[0, 2]].tolist() == [1.0, 2.5]
