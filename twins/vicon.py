@@ -22,8 +22,8 @@ import msgspec
 import numpy as np
 import zenoh
 
+from agents import plausibility, wire
 from agents import session as network
-from agents import wire
 from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
@@ -237,7 +237,7 @@ class Truths:
     def _take(self, vicon: ViconTwin, row: int, sample: zenoh.Sample, now: float) -> None:
         try:
             truth = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
-            wire.check_position(truth, robot=self._robots[row], now=now, reach=REACH)
+            plausibility.check_position(truth, robot=self._robots[row], now=now, reach=REACH)
         except wire.Malformed:
             return
         self._stamp[row] = truth.stamp
