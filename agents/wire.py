@@ -154,12 +154,18 @@ class Contact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     overlap: float
 
 
+class Standing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An obstacle by name, with x, y [m] and yaw [rad]."""
+
+    name: str
+    pose: Vector
+
+
 class WorldState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a world says of itself, at 1 Hz and on every change.
 
     `factor` is simulated over real time of the last second, `load` the share of it that the work took; `time` is
-    simulated since it began [s]. `robots` are carried, `mirrored` are elsewhere and seen here; `obstacles` by name
-    with x, y [m], yaw [rad].
+    simulated since it began [s]. `robots` are carried, `mirrored` are elsewhere and seen here.
     """
 
     stamp: float
@@ -170,7 +176,7 @@ class WorldState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     paused: bool
     robots: list[str]
     mirrored: list[str]
-    obstacles: dict[str, Vector]
+    obstacles: list[Standing]
     contacts: int
     refused: int
     malformed: int

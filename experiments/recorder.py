@@ -120,8 +120,8 @@ class Recorder:
     def _said_by_world(self, sample: zenoh.Sample) -> None:
         said = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.WorldState)
         self._finite(sample, said.stamp, said.time, said.factor, said.load)
-        for pose in said.obstacles.values():
-            self._finite(sample, *pose)
+        for standing in said.obstacles:
+            self._finite(sample, *standing.pose)
         self._recording.world(said)
 
     @staticmethod

@@ -199,7 +199,7 @@ class WorldProcess:
             paused=self.paused,
             robots=self._carried,
             mirrored=exchange.mirrored(),
-            obstacles=population.obstacles(),
+            obstacles=[wire.Standing(name, pose) for name, pose in population.obstacles().items()],
             contacts=exchange.contacts,
             refused=exchange.refused,
             malformed=exchange.malformed,

@@ -278,10 +278,13 @@ def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
     assert desk.at["KH02"].yaw == 0.5
     desk.drive_until("KH02", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH02")[0] > 1.05, "and can be driven")
     assert desk.give("spawn", name="box", obstacle={"box": [0.2, 0.2], "at": [-1.0, -1.0]}).ok
-    desk.until(lambda: desk.world and "box" in desk.world.obstacles, "it stands")
+    desk.until(lambda: desk.world and len(desk.world.obstacles) == 2, "it stands")
     assert desk.world is not None
     assert desk.world.robots == ["KH01", "CF01", "TE01", "KH02"]
-    assert desk.world.obstacles == {"post": (1.5, 1.5, 0.0), "box": (-1.0, -1.0, 0.0)}
+    assert desk.world.obstacles == [
+        wire.Standing("post", (1.5, 1.5, 0.0)),
+        wire.Standing("box", (-1.0, -1.0, 0.0)),
+    ]
 
     assert desk.give("remove", name="CF01").ok
     assert desk.give("remove", name="box").ok
