@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import argparse
 import selectors
-import signal
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from types import FrameType
 from typing import Final
 
 import msgspec
@@ -28,6 +26,7 @@ from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.kinds import KINDS
 from agents.lifeline import Lifeline
+from agents.process import told_to_end
 from experiments import assign, document
 from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
@@ -155,15 +154,9 @@ def _serve(
     """Runs a device until it is told to end, or its lifeline is lost and the robots are gone."""
     names = request.body.names
     over, lost = threading.Event(), threading.Event()
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        over.set()
-
-    signal.signal(signal.SIGINT, end)
-    signal.signal(signal.SIGTERM, end)
     if lifeline:
         Lifeline(lost).start()
-    with ExitStack() as stack:
+    with told_to_end(over.set), ExitStack() as stack:
         session = None
         if connect:
             session = stack.enter_context(network.open_session(connect, name=word, stop=over))
