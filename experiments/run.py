@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from agents.session import free_endpoint
 from experiments import document, metrics, playback, results, virtual
-from experiments.conductor import Conductor, Result, start_router
+from experiments.conductor import Conductor, Result
+from experiments.crew import start_router
 from experiments.document import Document
 from experiments.experiment import Experiment
 from experiments.launcher import Launcher
