@@ -27,7 +27,7 @@ from agents.keys import Keys
 from agents.kinds import KINDS
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
-from experiments import assign, document
+from experiments import assign, document, json_text
 from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
 from twins.device import Device, DeviceRequest, Faults
@@ -170,16 +170,12 @@ def _serve(
 
 def command(kind: str, count: int, *, faults: str, device: str, connect: Sequence[str]) -> int:
     """`zenpark twin`: as `by_hand`, with faults and settings as JSON."""
-    try:
-        wrong = msgspec.json.decode(faults, type=Faults)
-    except msgspec.MsgspecError as error:
-        raise DocumentError([Problem(f"--faults {faults}", 0, 0, str(error), "see twins/device.py")]) from None
-    try:
-        settings = msgspec.json.decode(device, type=dict[str, object])
-    except msgspec.MsgspecError as error:
-        hint = "write a JSON object"
-        raise DocumentError([Problem(f"--device {device}", 0, 0, str(error), hint)]) from None
-    return by_hand(kind, count, faults=wrong, device=settings, connect=connect)
+    settings = json_text.table("--device", device)
+    return by_hand(kind, count, faults=_faults(faults), device=settings, connect=connect)
+
+
+def _faults(text: str) -> Faults:
+    return msgspec.convert(json_text.table("--faults", text, Faults), Faults)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -192,13 +188,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent")
     chosen = parser.parse_args(arguments)
     try:
-        faults = msgspec.json.decode(chosen.faults, type=Faults)
+        faults = _faults(chosen.faults)
         return stand_in(chosen.file, chosen.names, faults=faults, connect=chosen.connect, lifeline=chosen.lifeline)
-    except msgspec.MsgspecError as error:
-        print(f"zenpark: --faults {chosen.faults}: {error}", file=sys.stderr)
     except EXPLAINED as error:
         print(f"zenpark: {error}", file=sys.stderr)
-    return 2
+        return 2
 
 
 if __name__ == "__main__":
