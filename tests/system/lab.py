@@ -35,7 +35,24 @@ def until(true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) ->
         pause.wait(0.01)
 
 
-class Watcher:
+class Looking:
+    """Something that takes in what is said whenever it looks."""
+
+    def look(self) -> None:
+        """Takes in what came since the last look."""
+        raise NotImplementedError
+
+    def until(self, true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
+        """Looks until something is true."""
+
+        def seen() -> object:
+            self.look()
+            return true()
+
+        until(seen, what, limit_s)
+
+
+class Watcher(Looking):
     """Everything that robots say, from a session of the test's own; poll with `look`."""
 
     def __init__(self, endpoint: str) -> None:
@@ -59,15 +76,6 @@ class Watcher:
         for sample in network.received(self._alive.handler):
             robot = self.keys.robot(str(sample.key_expr))
             (self.alive.discard if sample.kind == zenoh.SampleKind.DELETE else self.alive.add)(robot)
-
-    def until(self, true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
-        """Looks until something is true."""
-
-        def seen() -> object:
-            self.look()
-            return true()
-
-        until(seen, what, limit_s)
 
     def phase(self, robot: str) -> str:
         return self.status[robot].phase if robot in self.status else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from agents import wire
 from agents.keys import Keys
 from experiments import orders, playback
 from tests.conftest import RouterProcess
-from tests.system.lab import Flight, RobotProcess, Watcher, WorldProcess, gone, until
+from tests.system.lab import Flight, Looking, RobotProcess, Watcher, WorldProcess, gone, until
 
 pytestmark = pytest.mark.system
 
@@ -52,7 +52,7 @@ def file(tmp_path: Path) -> Path:
     return made
 
 
-class Desk:
+class Desk(Looking):
     """The world as an operator, and a robot's process, see it."""
 
     def __init__(self, endpoint: str) -> None:
@@ -79,13 +79,6 @@ class Desk:
             ranges = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Ranges)
             self.ranges[ranges.robot] = ranges
 
-    def until(self, true: object, what: str, limit_s: float = 10.0) -> None:
-        def seen() -> object:
-            self.look()
-            return true()  # type: ignore[operator]
-
-        until(seen, what, limit_s)
-
     def x(self, name: str) -> list[float]:
         return list(self.at[name].position)
 
@@ -97,17 +90,16 @@ class Desk:
         command = wire.Command(name, self._seq, time.time(), action, **fields)  # type: ignore[arg-type]
         self.session.put(KEYS.setpoint(name), wire.encode(command), encoding=wire.JSON)
 
-    def drive_until(self, name: str, setpoint: tuple[float, ...], true: object, what: str) -> None:
+    def drive_until(self, name: str, setpoint: tuple[float, ...], true: Callable[[], object], what: str) -> None:
         due = [0.0]
 
         def seen() -> object:
             if time.monotonic() > due[0]:
                 due[0] = time.monotonic() + 0.02
                 self.tell(name, "drive", setpoint=setpoint)
-            self.look()
-            return true()  # type: ignore[operator]
+            return true()
 
-        until(seen, what, 10.0)
+        self.until(seen, what, 10.0)
 
     def close(self) -> None:
         self.session.close()  # type: ignore[no-untyped-call]
