@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import zenoh
 
+from agents import plausibility, wire
 from agents import session as network
-from agents import wire
 from agents.body import RangeScan, Rays
 from agents.keys import Keys
 from agents.rows import Index
@@ -72,7 +72,7 @@ class HeardRanges:
     def _take(self, row: int, sample: zenoh.Sample, utc: float, now: float) -> bool:
         try:
             said = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Ranges)
-            wire.check_ranges(said, robot=self._names[row], now=utc + now)
+            plausibility.check_ranges(said, robot=self._names[row], now=utc + now)
         except wire.Malformed as error:
             self.malformed += 1
             self.trouble = str(error)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 import threading
 from collections.abc import Sequence
-from types import FrameType
 
 from agents.lifeline import Lifeline
+from agents.process import told_to_end
 from agents.session import DEFAULT_ENDPOINT, EndpointError, serve_router
 
 
@@ -26,13 +25,7 @@ def serve(endpoints: Sequence[str], *, lifeline: bool = False, linger_s: float =
     Raises:
         EndpointError: If it cannot listen there.
     """
-    stop = threading.Event()
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    lost = threading.Event()
+    stop, lost = threading.Event(), threading.Event()
     rope = Lifeline(lost)
 
     def leave() -> None:
@@ -40,14 +33,11 @@ def serve(endpoints: Sequence[str], *, lifeline: bool = False, linger_s: float =
         stop.wait(linger_s)
         stop.set()
 
-    if lifeline:
-        rope.start()
-        threading.Thread(target=leave, name="linger", daemon=True).start()
-    try:
+    with told_to_end(stop.set):
+        if lifeline:
+            rope.start()
+            threading.Thread(target=leave, name="linger", daemon=True).start()
         serve_router(endpoints, stop, ready=lambda: print(f"router ready on {', '.join(endpoints)}", flush=True))
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     if rope.reason is not None:
         print(f"router: {rope.reason}", file=sys.stderr)
     return 0

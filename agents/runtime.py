@@ -18,8 +18,8 @@ from typing import Final, Literal
 import numpy as np
 import zenoh
 
+from agents import plausibility, wire
 from agents import session as network
-from agents import wire
 from agents.agent import Actions, Agent, links_by_speaker
 from agents.assignment import Assignment
 from agents.body import Body
@@ -224,7 +224,7 @@ class Runtime:
         """Where a row is, as something outside of it says."""
         try:
             measured = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
-            wire.check_position(measured, robot=self._names[row], now=self._utc + t, reach=self._reach)
+            plausibility.check_position(measured, robot=self._names[row], now=self._utc + t, reach=self._reach)
         except wire.Malformed:
             self._counts.malformed += 1
             return
@@ -246,7 +246,7 @@ class Runtime:
         now = self._utc + t
         try:
             pose = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Pose)
-            wire.check_pose(pose, robot=neighbour.name, now=now, reach=self._reach)
+            plausibility.check_pose(pose, robot=neighbour.name, now=now, reach=self._reach)
         except wire.Malformed:
             self._counts.malformed += 1
             return

@@ -2,12 +2,11 @@
 
 JSON is the default (every Zenoh tool prints it), MessagePack a setting for thin links; a reader tells them apart by
 the sample's encoding. What arrives is checked before it is believed: `decode` raises `Malformed` for anything that is
-not the struct, `check_pose` for a pose that no robot can have.
+not the struct, `agents.plausibility` for one that cannot be true.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Final, Literal, TypeVar
 
 import msgspec
@@ -22,11 +21,6 @@ MSGPACK: Final = "application/msgpack"
 MIME: Final[dict[Encoding, str]] = {"json": JSON, "msgpack": MSGPACK}
 
 MAX_PAYLOAD: Final = 64 * 1024  # [bytes]; the largest honest message (state of a robot with 100 neighbours) has 20 kB
-FUTURE_S: Final = 5.0  # a stamp further ahead is a broken clock or a forgery, and would silence honest samples
-MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
-ABSURD: Final = 1e6  # [m, m/s, rad, rad/s] no setpoint is that large; NaN is not smaller either
-MAX_RAYS: Final = 720  # of one sweep; the finest scanner here has 360
-MAX_RANGE: Final = 100.0  # [m]; no range sensor here sees farther
 
 
 class Malformed(ValueError):
@@ -160,12 +154,18 @@ class Contact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     overlap: float
 
 
+class Standing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An obstacle by name, with x, y [m] and yaw [rad]."""
+
+    name: str
+    pose: Vector
+
+
 class WorldState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a world says of itself, at 1 Hz and on every change.
 
     `factor` is simulated over real time of the last second, `load` the share of it that the work took; `time` is
-    simulated since it began [s]. `robots` are carried, `mirrored` are elsewhere and seen here; `obstacles` by name
-    with x, y [m], yaw [rad].
+    simulated since it began [s]. `robots` are carried, `mirrored` are elsewhere and seen here.
     """
 
     stamp: float
@@ -176,7 +176,7 @@ class WorldState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     paused: bool
     robots: list[str]
     mirrored: list[str]
-    obstacles: dict[str, Vector]
+    obstacles: list[Standing]
     contacts: int
     refused: int
     malformed: int
@@ -322,99 +322,3 @@ def decode(payload: bytes, mime: str, kind: type[M]) -> M:
         raise Malformed(f"not a {kind.__name__}: {error}") from None
     assert isinstance(message, kind)
     return message
-
-
-def check_position(measured: Position, *, robot: str, now: float, reach: Vector) -> None:
-    """Refuses a measured position that cannot be true.
-
-    Raises:
-        Malformed: As `check_pose`.
-    """
-    if measured.robot != robot:
-        raise Malformed(f"position of '{measured.robot}' on the key of '{robot}'")
-    if not (math.isfinite(measured.stamp) and 0.0 < measured.stamp < now + FUTURE_S):
-        raise Malformed(f"stamp {measured.stamp} is impossible")
-    if not all(abs(value) <= limit for value, limit in zip(measured.position, reach, strict=True)):
-        raise Malformed(f"position {measured.position} is outside the arena")
-    if measured.yaw is not None and not abs(measured.yaw) <= 1e3:
-        raise Malformed(f"yaw {measured.yaw} is impossible")
-
-
-def check_ranges(ranges: Ranges, *, robot: str, now: float) -> None:
-    """Refuses a sweep of range sensors that cannot be true.
-
-    Raises:
-        Malformed: If the name is another's, the stamp is not finite or lies in the future, there is no ray or too many,
-            the lists differ in length, an angle or a distance is not finite, or a distance is no sensor's.
-    """
-    if ranges.robot != robot:
-        raise Malformed(f"ranges of '{ranges.robot}' on the key of '{robot}'")
-    if not (math.isfinite(ranges.stamp) and 0.0 < ranges.stamp < now + FUTURE_S):
-        raise Malformed(f"stamp {ranges.stamp} is impossible")
-    if not 1 <= len(ranges.distance) <= MAX_RAYS:
-        raise Malformed(f"{len(ranges.distance)} rays; a sweep has 1 to {MAX_RAYS}")
-    if not len(ranges.bearing) == len(ranges.elevation) == len(ranges.distance):
-        raise Malformed("bearings, elevations and distances differ in number")
-    if not all(abs(angle) <= 2.0 * math.pi for angle in (*ranges.bearing, *ranges.elevation)):  # NaN fails too
-        raise Malformed("a bearing or an elevation is no angle in radians")
-    if not all(value is None or 0.0 <= value <= MAX_RANGE for value in ranges.distance):
-        raise Malformed(f"a distance is not between 0 and {MAX_RANGE:g} m")
-
-
-def check_command(command: Command, *, robot: str) -> None:
-    """Refuses a command that no body can carry out.
-
-    Raises:
-        Malformed: If the name is another's, the sequence number is impossible, `drive` has no finite setpoint, or
-            `takeoff` no height.
-    """
-    if command.robot != robot:
-        raise Malformed(f"command of '{command.robot}' on the key of '{robot}'")
-    if not 0 < command.seq < 2**53:
-        raise Malformed(f"sequence number {command.seq} is impossible")
-    if command.action == "drive":
-        x, y, z, w = command.setpoint or (math.nan,) * 4
-        # a world checks twenty thousand of these in a second: a generator would cost it three times as much
-        if not (abs(x) <= ABSURD and abs(y) <= ABSURD and abs(z) <= ABSURD and abs(w) <= ABSURD):
-            raise Malformed(f"drive with the setpoint {command.setpoint}")
-    elif command.action == "takeoff" and not (command.height is not None and 0.0 < command.height <= MAX_RANGE):
-        raise Malformed(f"takeoff with the height {command.height}")
-
-
-def check_state(state: State, *, robot: str, now: float, reach: Vector) -> None:
-    """Refuses telemetry whose pose cannot be true.
-
-    Raises:
-        Malformed: As `check_pose`.
-    """
-    if state.robot != robot:
-        raise Malformed(f"state of '{state.robot}' on the key of '{robot}'")
-    if not (math.isfinite(state.stamp) and 0.0 < state.stamp < now + FUTURE_S):
-        raise Malformed(f"stamp {state.stamp} is impossible")
-    if not all(abs(value) <= limit for value, limit in zip(state.position, reach, strict=True)):
-        raise Malformed(f"position {state.position} is outside the arena")
-    if not all(abs(value) <= MAX_SPEED for value in state.velocity) or not abs(state.yaw) <= 1e3:
-        raise Malformed(f"velocity {state.velocity} or yaw {state.yaw} is impossible")
-
-
-def check_pose(pose: Pose, *, robot: str, now: float, reach: Vector) -> None:
-    """Refuses a pose that cannot be true.
-
-    Args:
-        pose: What arrived.
-        robot: Whose key it arrived on.
-        now: UTC time of arrival [s].
-        reach: Largest |x|, |y|, |z| [m] that a robot of this experiment can have.
-
-    Raises:
-        Malformed: If the name is another's, a number is not finite, the stamp lies in the future, the position is out
-            of reach, or the velocity is no robot's.
-    """
-    if pose.robot != robot:
-        raise Malformed(f"pose of '{pose.robot}' on the key of '{robot}'")
-    if not (0 < pose.seq < 2**53 and math.isfinite(pose.stamp) and 0.0 < pose.stamp < now + FUTURE_S):
-        raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
-    if not all(abs(value) <= limit for value, limit in zip(pose.position, reach, strict=True)):  # NaN fails too
-        raise Malformed(f"position {pose.position} is outside the arena")
-    if not all(abs(value) <= MAX_SPEED for value in pose.velocity) or not abs(pose.yaw) <= 1e3:
-        raise Malformed(f"velocity {pose.velocity} or yaw {pose.yaw} is impossible")

@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 import zenoh
 
+from agents import plausibility, wire
 from agents import session as network
-from agents import wire
 from agents.body import BodyError, BodyRequest, BodyState
 from agents.positioning import External
 from agents.ranging import HeardRanges
@@ -196,7 +196,7 @@ class ExternalBody:
         now = self._now()
         try:
             measured = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
-            wire.check_position(measured, robot=self._names[row], now=self._utc + now, reach=REACH)
+            plausibility.check_position(measured, robot=self._names[row], now=self._utc + now, reach=REACH)
         except wire.Malformed as error:
             self._malformed[row] += 1
             self._trouble[row] = str(error)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import re
-import signal
 import sys
 import threading
 import time
@@ -15,7 +14,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from math import atan2, cos, isfinite, sin
-from types import FrameType
 from typing import Final, get_args
 
 import zenoh
@@ -25,6 +23,7 @@ from agents import wire
 from agents.body import BodyError
 from agents.keys import Keys
 from agents.lifeline import Lifeline
+from agents.process import add_network, told_to_end
 from agents.protocols import ros2
 from agents.protocols.ros2 import Distro, Message, Types
 from agents.rosnode import Participant, Publisher, Subscriber
@@ -246,36 +245,27 @@ def serve(
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
     parser = argparse.ArgumentParser(prog="zenpark bridge ros2", description="The robots as ROS 2 topics.")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help=f"default: {network.DEFAULT_ENDPOINT}")
+    add_network(parser)
     parser.add_argument("--ros", action="append", default=[], metavar="ENDPOINT", help="router of ROS 2, if another")
-    parser.add_argument("--realm", default="park", help="first chunk of the robots' keys")
     parser.add_argument("--domain", type=int, default=0, choices=range(ros2.MAX_DOMAIN + 1), metavar="0..232")
     parser.add_argument("--distro", default="jazzy", choices=get_args(Distro))
-    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent")
     chosen = parser.parse_args(arguments)
     stop = threading.Event()
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     if chosen.lifeline:
         Lifeline(stop).start()
     try:
-        serve(
-            chosen.connect or [network.DEFAULT_ENDPOINT],
-            ros_endpoints=chosen.ros,
-            realm=chosen.realm,
-            domain=chosen.domain,
-            distro=chosen.distro,
-            stop=stop,
-        )
+        with told_to_end(stop.set):
+            serve(
+                chosen.connect or [network.DEFAULT_ENDPOINT],
+                ros_endpoints=chosen.ros,
+                realm=chosen.realm,
+                domain=chosen.domain,
+                distro=chosen.distro,
+                stop=stop,
+            )
     except (BodyError, network.EndpointError, network.Unreachable) as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     return 0
 
 

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from types import FrameType
 from typing import Final
 
 import numpy as np
@@ -25,6 +23,7 @@ from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
 from agents.positioning import External
+from agents.process import add_network, told_to_end
 from agents.protocols import datastream
 from agents.protocols.datastream import Malformed, Segment
 from bridges.datastream import Frame, Reader
@@ -207,25 +206,17 @@ def bridge(
     host, port = split(server)
     stop, lost = threading.Event(), threading.Event()
 
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        stop.set()
-
     def say(line: str) -> None:
         print(f"vicon: {line}", file=sys.stderr, flush=True)
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     if lifeline:
         Lifeline(lost).start()
-    try:
-        with network.open_session(endpoints, name="vicon", stop=stop) as session:
-            keys, robots = Keys(realm), list(subjects)
-            farewell = Farewell(session, keys, robots, lost)
-            made = Bridge(host, port, Sieve(subjects, say), Positions(session, keys, robots), say)
-            if made.run(lambda: stop.is_set() or farewell.over()):
-                return 0
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with told_to_end(stop.set), network.open_session(endpoints, name="vicon", stop=stop) as session:
+        keys, robots = Keys(realm), list(subjects)
+        farewell = Farewell(session, keys, robots, lost)
+        made = Bridge(host, port, Sieve(subjects, say), Positions(session, keys, robots), say)
+        if made.run(lambda: stop.is_set() or farewell.over()):
+            return 0
     say(
         f"nobody answered at {host}:{port} in {FIRST_S:g} s. Is that the computer that runs Tracker or Nexus, is it on "
         f"this network (ping {host}), and does its firewall let TCP port {port} in?"
@@ -270,9 +261,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--map", action="append", required=True, metavar="ROBOT[=SUBJECT]", help="a robot, and what the Vicon calls it"
     )
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help=f"default: {network.DEFAULT_ENDPOINT}")
-    parser.add_argument("--realm", default=Keys().realm, help="first chunk of the keys")
-    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent for 3 s")
+    add_network(parser)
     chosen = parser.parse_args(arguments)
     endpoints = chosen.connect or [network.DEFAULT_ENDPOINT]
     try:

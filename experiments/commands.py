@@ -11,6 +11,7 @@ from typing import Any
 
 from agents import plugins
 from experiments import document, results, verdict
+from experiments.bar import Bar
 from experiments.problem import DocumentError, Problem
 from experiments.progress import shown
 from experiments.records import RecordingError
@@ -52,7 +53,14 @@ def run(
     interrupted = Interrupts()
     if virtual:
         first = read.experiment.seed
-        runs = simulate_seeds(read, range(first, first + seeds), cases=cases, folder=folder)
+        with Bar(passing=True) as bar:
+            runs = simulate_seeds(
+                read,
+                range(first, first + seeds),
+                cases=cases,
+                folder=folder,
+                tell=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
+            )
     else:
         with interrupted:
             show = shown(quiet=as_json)

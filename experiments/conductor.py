@@ -1,4 +1,4 @@
-"""The conductor of one case in real time: starts the processes, gives the common start, walks the phases, lands.
+"""The conductor of one case in real time: waits until all are ready, gives the common start, walks the phases, lands.
 
 It decides nothing that a robot needs: if it dies, the robots land by themselves and the recorder finishes its file.
 """
@@ -18,20 +18,16 @@ from agents import session as network
 from agents import wire
 from agents.keys import Keys
 from experiments import orders
-from experiments import standins as standins_of
-from experiments.document import write_json
+from experiments.crew import Crew
 from experiments.experiment import Experiment
-from experiments.launcher import LAND_S, ROUTER, Launcher, Process
+from experiments.launcher import LAND_S, Launcher
 
 POLL_S: Final = 0.05
 LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then
 CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
 ROUTER_S: Final = 10.0
 FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
-LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
-ROUTERS: Final = 5  # a router that dies more often is not helped by starting it again,
-WORLDS: Final = 5  # nor is a world
 
 M = TypeVar("M", wire.Status, wire.State)
 
@@ -126,17 +122,22 @@ class Conductor:
             interrupted: Asked whether the user wants to end it.
         """
         self._experiment, self._case = experiment, case
-        self._file, self._source = file, source
+        self._file = file
         self._recording = folder / f"{case}.mcap"
-        self._endpoints, self._launcher = list(endpoints), launcher
+        self._endpoints = list(endpoints)
         self._show, self._interrupted = show, interrupted
         self._keys = Keys(experiment.network.realm)
         self._robots = {name: Seen() for name in experiment.robots}
-        self._groups: dict[str, list[str]] = {}
-        for name, robot in experiment.robots.items():
-            self._groups.setdefault(robot.process or name, []).append(name)
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
-        self._routers = self._worlds = 1
+        self._crew = Crew(
+            experiment,
+            case,
+            file=file,
+            source=source,
+            recording=self._recording,
+            endpoints=self._endpoints,
+            launcher=launcher,
+        )
 
     def run(self) -> Result:
         """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
@@ -145,26 +146,9 @@ class Conductor:
             RunFailed: If robots are not ready in time and the file says that the run must not go on without them.
         """
         began = time.monotonic()
-        connect = [part for endpoint in self._endpoints for part in ("--connect", endpoint)]
-        self._connect = connect
-        self._launcher.start(
-            f"{self._case}-recorder",
-            "experiments.recorder",
-            str(self._file),
-            str(self._recording),
-            "--case",
-            self._case,
-            "--source",
-            str(self._source),
-            *connect,
-        )
         start = ready = None
-        standins: tuple[str, ...] = ()
         try:
-            addressed, standins = self._stand_in(connect)
-            for group, names in self._groups.items():
-                process = self._process(group)
-                self._launcher.start(process, "experiments.robot", str(addressed), *names, *connect, "--lifeline")
+            self._crew.start(self._interrupted)
             with ExitStack() as stack:
                 self._join(stack)
                 if self._until("ready", self._patience(), recorder=True):
@@ -181,27 +165,9 @@ class Conductor:
             self._show(self._progress)
             raise
         finally:
-            self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
-            self._launcher.end([f"{self._case}-recorder"], grace_s=5.0)
-            self._launcher.end(standins, grace_s=2.0)
+            self._crew.end()
         gone = tuple(name for name, seen in self._robots.items() if seen.gone)
         return Result(self._recording, self._interrupted(), start, ready, gone)
-
-    def _stand_in(self, connect: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
-        """Starts world, protocol twins and positioning; the case as a file with addresses, and the processes' names."""
-        experiment, started = standins_of.start(
-            self._experiment,
-            self._file,
-            prefix=self._case,
-            launcher=self._launcher,
-            connect=connect,
-            interrupted=self._interrupted,
-        )
-        if not started:
-            return self._file, ()
-        file = self._file.with_name(f"{self._case}-addressed.json")
-        file.write_bytes(write_json(experiment))
-        return file, started
 
     # ------------------------------------------------------------------ phases
 
@@ -311,8 +277,12 @@ class Conductor:
             seen = self._robots.get(self._keys.robot(str(sample.key_expr)))
             if seen is not None:
                 seen.alive = sample.kind == zenoh.SampleKind.PUT
-        for process in self._launcher.died():
-            self._mourn(process)
+        for death in self._crew.deaths():
+            self._say(death.kind, death.source, death.text)
+            if death.kind == "recorder":
+                self._recording_begun = True  # nothing to wait for
+            elif death.kind == "lost":
+                self._robots[death.source].gone, self._robots[death.source].alive = True, False
         for name, seen in self._robots.items():
             if seen.gone and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
                 seen.gone = False  # somebody started it again
@@ -340,36 +310,6 @@ class Conductor:
             seen.counted = (status.stamp, status.sent)
         seen.status = status
 
-    def _mourn(self, process: Process) -> None:
-        """A process has ended that should not have."""
-        if process.name == ROUTER:
-            self._routers += 1
-            if self._routers < ROUTERS:
-                start_router(self._launcher, self._endpoints)
-            what = "started again" if self._routers < ROUTERS else "given up: the robots hold, and land at the end"
-            self._say("router", "conductor", f"the router ended ({process.exit}); {what}")
-            return
-        if process.name == standins_of.world_name(self._case):
-            self._worlds += 1
-            last = process.tail().strip().splitlines()[-1:]
-            if self._worlds < WORLDS:
-                standins_of.start_world(
-                    self._experiment, self._file, prefix=self._case, launcher=self._launcher, connect=self._connect
-                )
-            what = "started again: robots hold until then" if self._worlds < WORLDS else "given up"
-            why = "".join(f": {line}" for line in last)
-            self._say("world", "conductor", f"the world ended ({process.exit}); {what}{why}")
-            return
-        if process.name == f"{self._case}-recorder":
-            self._say("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
-            self._recording_begun = True  # nothing to wait for
-            return
-        for name in self._groups.get(process.name.removeprefix(f"{self._case}-"), []):
-            self._robots[name].gone = True
-            self._robots[name].alive = False
-            last = process.tail().strip().splitlines()[-1:]
-            self._say("lost", name, f"its process ended ({process.exit})" + (f": {last[0]}" if last else ""))
-
     def _order(self, order: wire.Order, only: str | None = None) -> None:
         """Gives an order to every robot that is left; what is refused is said."""
         for name, seen in self._robots.items():
@@ -386,9 +326,6 @@ class Conductor:
 
     # ------------------------------------------------------------------ words
 
-    def _process(self, group: str) -> str:
-        return f"{self._case}-{group}"
-
     def _count(self, phase: str) -> int:
         return sum(seen.reached(phase) for seen in self._robots.values())
 
@@ -401,17 +338,9 @@ class Conductor:
     def _excuse(self, names: Sequence[str], what: str) -> str:
         lines = [f"{', '.join(names)}: {what}; nothing has moved or all have landed"]
         for name in names:
-            group = next(group for group, members in self._groups.items() if name in members)
-            log = self._recording.parent / "logs" / f"{self._process(group)}.log"
-            text = log.read_text(errors="replace").strip() if log.exists() else ""
-            lines.append(f"  {name}: {self._why(name)}" + (f"\n    {text.splitlines()[-1]}" if text else ""))
+            last = self._crew.last_line(name)
+            lines.append(f"  {name}: {self._why(name)}" + (f"\n    {last}" if last else ""))
         ended = all(self._robots[name].gone for name in names)
         remedy = "mend that" if ended else "give them more time with start.deadline_s"
         lines.append(f"  {remedy}, or go on without them with start.missing = 'go-on'")
         return "\n".join(lines)
-
-
-def start_router(launcher: Launcher, endpoints: Sequence[str]) -> None:
-    """A router of our own, which outlives a killed launcher by as long as robots take to land."""
-    listen = [part for endpoint in endpoints for part in ("--listen", endpoint)]
-    launcher.start(ROUTER, "agents.router", *listen, "--lifeline", "--linger", str(LINGER_S))

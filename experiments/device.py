@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import argparse
 import selectors
-import signal
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from types import FrameType
 from typing import Final
 
 import msgspec
@@ -28,7 +26,8 @@ from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.kinds import KINDS
 from agents.lifeline import Lifeline
-from experiments import assign, document
+from agents.process import told_to_end
+from experiments import assign, document, json_text
 from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
 from twins.device import Device, DeviceRequest, Faults
@@ -155,15 +154,9 @@ def _serve(
     """Runs a device until it is told to end, or its lifeline is lost and the robots are gone."""
     names = request.body.names
     over, lost = threading.Event(), threading.Event()
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        over.set()
-
-    signal.signal(signal.SIGINT, end)
-    signal.signal(signal.SIGTERM, end)
     if lifeline:
         Lifeline(lost).start()
-    with ExitStack() as stack:
+    with told_to_end(over.set), ExitStack() as stack:
         session = None
         if connect:
             session = stack.enter_context(network.open_session(connect, name=word, stop=over))
@@ -177,16 +170,12 @@ def _serve(
 
 def command(kind: str, count: int, *, faults: str, device: str, connect: Sequence[str]) -> int:
     """`zenpark twin`: as `by_hand`, with faults and settings as JSON."""
-    try:
-        wrong = msgspec.json.decode(faults, type=Faults)
-    except msgspec.MsgspecError as error:
-        raise DocumentError([Problem(f"--faults {faults}", 0, 0, str(error), "see twins/device.py")]) from None
-    try:
-        settings = msgspec.json.decode(device, type=dict[str, object])
-    except msgspec.MsgspecError as error:
-        hint = "write a JSON object"
-        raise DocumentError([Problem(f"--device {device}", 0, 0, str(error), hint)]) from None
-    return by_hand(kind, count, faults=wrong, device=settings, connect=connect)
+    settings = json_text.table("--device", device)
+    return by_hand(kind, count, faults=_faults(faults), device=settings, connect=connect)
+
+
+def _faults(text: str) -> Faults:
+    return msgspec.convert(json_text.table("--faults", text, Faults), Faults)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -199,13 +188,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent")
     chosen = parser.parse_args(arguments)
     try:
-        faults = msgspec.json.decode(chosen.faults, type=Faults)
+        faults = _faults(chosen.faults)
         return stand_in(chosen.file, chosen.names, faults=faults, connect=chosen.connect, lifeline=chosen.lifeline)
-    except msgspec.MsgspecError as error:
-        print(f"zenpark: --faults {chosen.faults}: {error}", file=sys.stderr)
     except EXPLAINED as error:
         print(f"zenpark: {error}", file=sys.stderr)
-    return 2
+        return 2
 
 
 if __name__ == "__main__":

@@ -150,10 +150,25 @@ def copy(name: str, target: Path) -> Path:
             that name is there.
     """
     source = catalogue_path(name)
-    target = target / source.name if target.is_dir() else target
+    return write_new(source.read_text("utf-8"), target / source.name if target.is_dir() else target, furnished=True)
+
+
+def write_new(text: str, target: Path, *, furnished: bool = False) -> Path:
+    """Writes a new experiment file, with the schema beside it that its first line shows to editors.
+
+    Args:
+        text: Of the file.
+        target: The file.
+        furnished: The text is a catalogue entry's: the arena file that it names comes along.
+
+    Returns:
+        The file.
+
+    Raises:
+        DocumentError: If the target exists or cannot be written, or another arena file of that name is there.
+    """
     try:
-        text = source.read_text("utf-8")
-        beside = _arena_beside(text, target.parent)
+        beside = _arena_beside(text, target.parent) if furnished else None
         with target.open("x", encoding="utf-8") as new:
             new.write(text)
         if beside is not None:

@@ -25,6 +25,7 @@ CIRCLE: Final = 0.8  # [m] robots begin about here and want to go to the other s
 SCATTER: Final = 0.35  # [m] on each axis
 ARRIVED: Final = 0.05  # [m] nearer than this to its goal at the end a robot has arrived
 SPEED: Final = {"twist": 0.2, "velocity": 0.4, "position": 0.4}  # [m/s] of the plans
+PATIENCE: Final = 3.0  # times the time that the way would take alone; avoiding each other takes up to 2.6 of them
 IN_THE_AIR: Final = 0.5  # [m] height of drones among themselves
 BATCH: Final = 100  # encounters that are flown side by side
 ANGLES: Final = (math.pi, 0.5 * math.pi)  # head-on, and across
@@ -76,7 +77,7 @@ def encounter(
     between: float = math.pi,
     stubborn: int = 0,
     sensors: Sequence[str] = (),
-    duration_s: float = 30.0,
+    duration_s: float | None = None,
 ) -> Experiment:
     """Robots that want to change sides of a circle, all at the same time.
 
@@ -86,10 +87,11 @@ def encounter(
         between: Angle between the places where one robot and the next begin [rad]; more than two are spread evenly.
         stubborn: So many of them, from the last, avoid nobody.
         sensors: Range sensors of all of them; none: they only hear each other.
-        duration_s: How long they have for it [s].
+        duration_s: How long they have for it [s]; `PATIENCE` times the slowest's way if left out.
     """
     low = [KINDS[kind].height for kind in kinds if not KINDS[kind].flies]
     height = 0.5 * min(low) if low else IN_THE_AIR  # beside what drives
+    speeds = [SPEED[KINDS[kind].takes] for kind in kinds]
     robots, timeline = {}, []
     for number, kind in enumerate(kinds):
         angle = number * (between if len(kinds) == 2 else 2.0 * math.pi / len(kinds))
@@ -102,13 +104,13 @@ def encounter(
             sensors=list(sensors),
             avoids=number < len(kinds) - stubborn,
         )
-        plan = {"kind": "waypoints", "points": [[-x, -y]], "speed": SPEED[KINDS[kind].takes]}
+        plan = {"kind": "waypoints", "points": [[-x, -y]], "speed": speeds[number]}
         timeline.append(Leg(at_s=0.0, robot=name, plan=plan))
     wobble = Disturbance(hover_jitter=Jitter(0.01))
     return Experiment(
         title="Robots that change sides",
         robots=robots,
-        duration_s=duration_s,
+        duration_s=2.0 * CIRCLE / min(speeds) * PATIENCE if duration_s is None else duration_s,
         arena=Arena(size=(4.0, 4.0, 2.5)),
         rates=Rates(state_hz=100.0),
         timeline=timeline,

@@ -16,7 +16,7 @@ import numpy as np
 import zenoh
 from zenoh.handlers import Handler
 
-from agents import ranging, wire
+from agents import plausibility, ranging, wire
 from agents import session as network
 from agents.body import RangeScan, Rays
 from agents.keys import Keys
@@ -173,7 +173,7 @@ class Exchange:
                 continue
             try:
                 command = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Command)
-                wire.check_command(command, robot=self._names[row])
+                plausibility.check_command(command, robot=self._names[row])
             except wire.Malformed as error:
                 self._deplore(error)
                 continue
@@ -270,7 +270,7 @@ class Exchange:
         for sample in network.received(handler):
             try:
                 state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
-                wire.check_state(state, robot=name, now=time.time(), reach=self._reach)
+                plausibility.check_state(state, robot=name, now=time.time(), reach=self._reach)
             except wire.Malformed as error:
                 self._deplore(error)
                 continue

@@ -21,7 +21,6 @@ from experiments import catalogue, document, layouts
 from experiments.layouts import Layout, LayoutError
 from experiments.prediction import closed
 from experiments.problem import DocumentError, Problem
-from experiments.syntax import reason
 
 PREFIX: Final = {"crazyflie": "CF", "tello": "DT", "khepera4": "KH", "turtlebot3": "TB"}
 LAWS: Final = ("distance", "displacement")
@@ -160,26 +159,6 @@ def experiment_file(made: Layout, wanted: Wanted) -> str:
     )
 
 
-def write(text: str, target: Path) -> Path:
-    """Writes a new experiment file, with the schema beside it that its first line shows to editors.
-
-    Raises:
-        DocumentError: If the target exists or cannot be written.
-    """
-    try:
-        with target.open("x", encoding="utf-8") as new:
-            new.write(text)
-        if not (target.parent / catalogue.SCHEMA).exists():
-            document.write_schema(target.parent / catalogue.SCHEMA)
-    except FileExistsError:
-        hint = "choose another name; nothing was changed"
-        raise DocumentError([Problem(str(target), 0, 0, "exists already", hint)]) from None
-    except (OSError, ValueError) as error:
-        hint = "choose a place that exists and may be written to"
-        raise DocumentError([Problem(str(target), 0, 0, f"cannot be written: {reason(error)}", hint)]) from error
-    return target
-
-
 def command(what: str, size: str, target: str | None, wanted: Wanted, jumps: str = "1,2") -> int:
     """`zenpark new --WHAT SIZE [TARGET]`; returns the exit code.
 
@@ -198,7 +177,7 @@ def command(what: str, size: str, target: str | None, wanted: Wanted, jumps: str
     except LayoutError as error:
         message, _, hint = str(error).partition(": ")
         raise DocumentError([Problem(flag, 0, 0, message, hint)]) from None
-    path = write(text, Path(target or f"{what}-{size.lower().replace('×', 'x')}.toml"))
+    path = document.write_new(text, Path(target or f"{what}-{size.lower().replace('×', 'x')}.toml"))
     print(f"{path}: {made.title}, {len(made.pairs)} links; `zenpark check {path}`, `zenpark run {path} --virtual`")
     return 0
 

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from agents.kinds import KINDS
-from experiments import catalogue, document, generate
+from experiments import catalogue, document
 from experiments.importing_links import Described, Notes, described, tasks
 from experiments.importing_shape import Heights, heights_of
 from experiments.problem import DocumentError, Problem
@@ -53,7 +53,7 @@ def command(file: str, target: str | None, duration_s: float) -> int:
         hint = "name an experiment file of Robotic Park's authors (.yaml)"
         raise DocumentError([Problem(file, 0, 0, "there is no such file", hint)]) from None
     made, notes = imported(text, file, duration_s)
-    path = generate.write(made, Path(target) if target else Path(f"{source.stem}.toml"))
+    path = document.write_new(made, Path(target) if target else Path(f"{source.stem}.toml"))
     document.read(path)
     print(f"{path}: from {file}; `zenpark check {path}`, `zenpark run {path} --virtual`")
     if notes:

@@ -266,7 +266,9 @@ class Logbook:
                 paused=False,
                 robots=list(log.names),
                 mirrored=[],
-                obstacles={name: tuple(pose) for name, pose in zip(scene.names, moved[k].tolist(), strict=True)},
+                obstacles=[
+                    wire.Standing(*each) for each in zip(scene.names, map(tuple, moved[k].tolist()), strict=True)
+                ],
                 contacts=int(np.searchsorted(touched, t, side="right")),
                 refused=0,
                 malformed=0,

@@ -18,7 +18,7 @@ from agents.wire import Contact, Event, State, Status, WorldState
 from experiments.cdr import Undecodable, codec
 from experiments.contacts import ROUNDING_S, looked_for, within
 from experiments.experiment import Experiment
-from experiments.recording import JSON, METADATA, SentPose, World
+from experiments.recording import JSON, METADATA, SentPose
 from experiments.records import RecordingError, Records
 from experiments.resample import HOLE_S, attitude, line, step, turn
 from experiments.trace import HeardPoses, Sent, Trace
@@ -111,7 +111,6 @@ class _Content:
 
     def fill(self) -> int:
         """Reads all messages and counts them; those of other types are passed over."""
-        worlds: list[World] = []
         known = dict(
             [
                 _reader(State, self.states),
@@ -119,7 +118,7 @@ class _Content:
                 _reader(Status, self.statuses),
                 _reader(Event, self.events),
                 _reader(Contact, self.contacts),
-                _reader(World, worlds),
+                _reader(WorldState, self.world),
             ]
         )
         readers: dict[int, Callable[[bytes], None] | None] = {}
@@ -134,7 +133,6 @@ class _Content:
                     take(message.data)
                 except Undecodable as error:
                     raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
-        self.world += [each.said() for each in worlds]
         return count
 
     def start(self, announced: float | None) -> float | None:

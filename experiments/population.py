@@ -19,7 +19,7 @@ from agents import plugins
 from agents.body import BodyState
 from agents.kinds import KINDS, Kind
 from agents.rows import Array, Index, Mask
-from experiments import assign, outlines
+from experiments import assign, outlines, shape
 from experiments.experiment import Experiment, Robot
 from twins.body import TwinBody
 from twins.scene import Obstacle, Scene
@@ -222,11 +222,10 @@ class Population:
         if name in self._scene.names or name in self.names:
             raise Refused(f"there is something called {name} already; choose another name, or remove it first")
         self._require_name(name)
-        try:
-            obstacle = msgspec.convert(dict(given), Obstacle)
-            plan = {} if obstacle.plan is None else {name: plugins.build(plugins.PLANNERS, obstacle.plan)}
-        except (msgspec.ValidationError, plugins.PluginError) as error:
-            raise Refused(f"{name} is no obstacle: {error}") from None
+        for fault in shape.faults(given, Obstacle, ("arena", "obstacles", name)):
+            raise Refused(f"{name} is no obstacle: {fault.message}" + (f"; {fault.hint}" if fault.hint else ""))
+        obstacle = msgspec.convert(dict(given), Obstacle)
+        plan = {} if obstacle.plan is None else {name: plugins.build(plugins.PLANNERS, obstacle.plan)}
         alone = Scene.furnished(self._experiment.arena.size, {name: obstacle}, plan, walled=False)
         numbers = [alone.pose, alone.radius, alone.bottom, alone.top, *(o for o in alone.outline if o is not None)]
         if not all(np.isfinite(value).all() for value in numbers):

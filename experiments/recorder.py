@@ -6,14 +6,12 @@ A process of its own, so that the death of the conductor costs no recording: it 
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
-from types import FrameType
 from typing import Final
 
 import msgspec
@@ -23,6 +21,7 @@ from agents import session as network
 from agents import wire
 from agents.keys import Keys
 from agents.lifeline import Lifeline
+from agents.process import told_to_end
 from experiments import document
 from experiments.problem import DocumentError
 from experiments.recording import Recording
@@ -120,8 +119,8 @@ class Recorder:
     def _said_by_world(self, sample: zenoh.Sample) -> None:
         said = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.WorldState)
         self._finite(sample, said.stamp, said.time, said.factor, said.load)
-        for pose in said.obstacles.values():
-            self._finite(sample, *pose)
+        for standing in said.obstacles:
+            self._finite(sample, *standing.pose)
         self._recording.world(said)
 
     @staticmethod
@@ -149,15 +148,10 @@ def record(file: str, target: Path, *, case: str, source: Path, connect: Sequenc
     """
     experiment = document.read(file).experiment
     lost, asked = threading.Event(), threading.Event()
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        asked.set()
-
-    signal.signal(signal.SIGINT, end)
-    signal.signal(signal.SIGTERM, end)
     Lifeline(lost).start()
     text = source.read_text("utf-8")
     with (
+        told_to_end(asked.set),
         network.open_session(connect, name="recorder", stop=asked) as session,
         Recording(target, experiment, text, case=case, seed=experiment.seed, clock="real") as recording,
     ):

@@ -5,7 +5,7 @@
     /<robot>/true_pose  geometry_msgs/PoseStamped     the same place in a type that every viewer draws
     /<robot>/status     zenpark_msgs/Status
     /world/contact      zenpark_msgs/Contact          what touched in the world, when it began
-    /world/state        zenpark_msgs/World            what the world says of itself
+    /world/state        zenpark_msgs/WorldState       what the world says of itself
     /events             zenpark_msgs/Event
 
 Attached are the experiment as it was written (`experiment.toml`) and this case with its overrides (`experiment.json`);
@@ -51,42 +51,6 @@ class SentPose(msgspec.Struct, frozen=True):
     size: int
 
 
-class Standing(msgspec.Struct, frozen=True):
-    """An obstacle by name, with x, y [m] and yaw [rad]."""
-
-    name: str
-    pose: Vector
-
-
-class World(msgspec.Struct, frozen=True):
-    """What a world said of itself, see `agents.wire.WorldState`."""
-
-    stamp: float
-    engine: str
-    time: float
-    factor: float
-    load: float
-    paused: bool
-    robots: list[str]
-    mirrored: list[str]
-    obstacles: list[Standing]
-    contacts: int
-    refused: int
-    malformed: int
-    trouble: str
-
-    @classmethod
-    def of(cls, said: WorldState) -> World:
-        """As it is recorded."""
-        fields = {name: getattr(said, name) for name in cls.__struct_fields__}
-        return cls(**fields | {"obstacles": [Standing(name, pose) for name, pose in said.obstacles.items()]})
-
-    def said(self) -> WorldState:
-        """As it was said."""
-        fields = {name: getattr(self, name) for name in self.__struct_fields__}
-        return WorldState(**fields | {"obstacles": {each.name: each.pose for each in self.obstacles}})
-
-
 class Recording:
     """Writes one recording; used by one thread.
 
@@ -129,7 +93,7 @@ class Recording:
         self._state = _topic("state", State)
         self._status = _topic("status", Status)
         self._event = _topic("events", Event)
-        self._contact, self._world = _topic("contact", Contact), _topic("state", World)
+        self._contact, self._world = _topic("contact", Contact), _topic("state", WorldState)
         self._drawn = _Topic("true_pose", POSE_STAMPED, POSE_STAMPED_SCHEMA, _drawing())
         self._over = ""  # why nothing more can be written
         try:
@@ -193,7 +157,7 @@ class Recording:
         Raises:
             RecordingError: If it cannot be written; what was written before stays.
         """
-        self._record(self._world, WORLD, World.of(said), said.stamp, said.stamp)
+        self._record(self._world, WORLD, said, said.stamp, said.stamp)
 
     def event(self, event: Event) -> None:
         """Records something that happened, and brings all so far to the disk: events are few, and explain the rest.

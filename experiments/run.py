@@ -13,18 +13,21 @@ An experiment may stand in the notebook itself: `loads` takes its text. `experim
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
 from agents.session import free_endpoint
 from experiments import document, metrics, playback, results, virtual
-from experiments.conductor import Conductor, Result, start_router
+from experiments.conductor import Conductor, Result
+from experiments.crew import start_router
 from experiments.document import Document
 from experiments.experiment import Experiment
 from experiments.launcher import Launcher
@@ -110,6 +113,9 @@ def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Experiment]:
     return {name: case for name, case in cases.items() if not names or name in names}
 
 
+Told = Callable[[str, int, int], None]  # a case, seconds of it that are simulated, and how many it has
+
+
 def simulate(read: Document, *, cases: Sequence[str] = (), seed: int | None = None, folder: Path | None = None) -> Run:
     """Runs an experiment in virtual time.
 
@@ -127,18 +133,31 @@ def simulate(read: Document, *, cases: Sequence[str] = (), seed: int | None = No
 
 
 def simulate_seeds(
-    read: Document, seeds: Sequence[int], *, cases: Sequence[str] = (), folder: Path | None = None
+    read: Document,
+    seeds: Sequence[int],
+    *,
+    cases: Sequence[str] = (),
+    folder: Path | None = None,
+    tell: Told = lambda *_: None,
 ) -> list[Run]:
-    """As `simulate`, once for each seed, side by side; recordings are made of the first seed only."""
+    """As `simulate`, once for each seed, side by side; recordings are made of the first seed only.
+
+    `tell` is called again and again with how far it is.
+    """
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     for name, experiment in chosen(read, cases).items():
-        log = virtual.simulate(experiment, seeds)
+        log = virtual.simulate(experiment, seeds, tell=partial(_pass_on, tell, name, experiment.duration_s))
+        _pass_on(tell, name, experiment.duration_s, math.inf)
         for copy in range(len(seeds)):
             logbook = Logbook(log, experiment, name, copy)
             traces[copy][name] = logbook.trace()
             if folder is not None and copy == 0:
                 logbook.record(folder / f"{name}.mcap", read.text)
     return [_measured(read.experiment.title, mine, folder, read.listing) for mine in traces]
+
+
+def _pass_on(tell: Told, case: str, duration_s: float, elapsed: float) -> None:
+    tell(case, int(min(elapsed, duration_s)) if elapsed > 0.0 else 0, math.ceil(duration_s))
 
 
 def fly(

@@ -50,9 +50,12 @@ def storable(value: object, path: Path = ()) -> Iterator[Fault]:
         yield Fault(path, f"'{_name(path)}' has more digits than a 64-bit integer holds", "give a smaller number")
 
 
-def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment) -> list[Fault]:
-    """Everything by which a document is not what it should be; empty if `msgspec.convert` takes it."""
-    found = _table(document, struct, ())
+def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment, path: Path = ()) -> list[Fault]:
+    """Everything by which a document is not what it should be; empty if `msgspec.convert` takes it.
+
+    A part of one may be looked at by itself: `path` is where it stands in the whole.
+    """
+    found = _table(document, struct, path)
     strayed = {str(fault.path[-1]) for fault in found if "belongs at the top" in fault.hint}
     return [
         fault for fault in found if fault.path or not any(f"'{key}' is missing" == fault.message for key in strayed)

@@ -5,22 +5,19 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-import time
 import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any
 
 from experiments import sweep_table
+from experiments.bar import Bar
 from experiments.commands import sound
 from experiments.run import load
 from experiments.sweep import Found, sweep
 from experiments.sweep_table import Row
 from experiments.tuning import Tuned, tune
-
-LINE_S: Final = 5.0  # where there is no terminal, progress is a line now and then
 
 
 @dataclass(frozen=True)
@@ -149,47 +146,3 @@ def _open(asked: Request, page: Path | None) -> None:
 
 def _ends(seeds: Sequence[int]) -> str:
     return str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
-
-
-class Bar:
-    """Progress on standard error: a bar in a terminal, a line every few seconds elsewhere."""
-
-    def __init__(self) -> None:
-        self._bar: Any = None
-        self._task: Any = None
-        self._what = ""
-        self._next = 0.0
-
-    def __enter__(self) -> Self:
-        if sys.stderr.isatty():
-            from rich.console import Console  # noqa: PLC0415 - 60 ms that only a terminal needs
-            from rich.progress import (  # noqa: PLC0415
-                BarColumn,
-                MofNCompleteColumn,
-                Progress,
-                TextColumn,
-                TimeElapsedColumn,
-                TimeRemainingColumn,
-            )
-
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-            self._bar = Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True))
-            self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def show(self, what: str, done: int, of: int) -> None:
-        """So much of so much is done."""
-        if self._bar is not None:
-            if what != self._what:
-                self._task = self._bar.add_task(what, total=of)
-            self._bar.update(self._task, completed=done)
-        elif (now := time.monotonic()) >= self._next or done == of:
-            self._next = now + LINE_S
-            print(f"{what} {done} of {of}", file=sys.stderr)
-        self._what = what

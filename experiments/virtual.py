@@ -7,7 +7,7 @@ a lossy network makes one so much later ready that the others get their orders a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -114,7 +114,11 @@ class _Samples:
 
 
 def simulate(  # noqa: PLR0915 - one loop, told in order
-    experiment: Experiment, seeds: Sequence[int], *, lean: bool = False
+    experiment: Experiment,
+    seeds: Sequence[int],
+    *,
+    lean: bool = False,
+    tell: Callable[[float], object] = lambda _: None,
 ) -> Log:
     """Flies one case of an experiment once for each seed.
 
@@ -123,6 +127,7 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
         seeds: One for each repetition.
         lean: Keep `true_position` and who sent when, and nothing of the other columns: a seventh of the memory, for
             sweeps. They are empty, and so is everything that was heard.
+        tell: Called at state_hz with how far it is, in the time of the experiment [s]; NaN before its start is known.
 
     Raises:
         Stuck: If robots do not become ready, airborne or done.
@@ -173,6 +178,7 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
                 avoided += actions.avoided
         touches += twin.touches()
         if (agent.tick - 1) % log_every == 0:  # the agent's count begins anew at the common start
+            tell(t - conductor.start_at)
             whole = (agent.life.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
             states.add(t, *((*blank, state.true_position, *blank) if lean else whole))
             more = () if lean else tuple(value for value in _extra(state) if value is not None)

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import argparse
 import gc
-import signal
 import sys
 import threading
 import time
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
-from types import FrameType
 from typing import Final
 
 import msgspec
@@ -26,6 +24,7 @@ from agents.body import BodyError
 from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
+from agents.process import told_to_end
 from experiments import document
 from experiments.assign import WORLD
 from experiments.exchange import Exchange
@@ -199,7 +198,7 @@ class WorldProcess:
             paused=self.paused,
             robots=self._carried,
             mirrored=exchange.mirrored(),
-            obstacles=population.obstacles(),
+            obstacles=[wire.Standing(name, pose) for name, pose in population.obstacles().items()],
             contacts=exchange.contacts,
             refused=exchange.refused,
             malformed=exchange.malformed,
@@ -230,23 +229,22 @@ def serve(
     endpoints = list(connect) or experiment.network.connect or [network.DEFAULT_ENDPOINT]
     over, lost = threading.Event(), threading.Event()
 
-    def end(_signal: int, _frame: FrameType | None) -> None:
+    def end() -> None:
         (over if lost.is_set() else lost).set()  # asked a second time it does not wait for robots to land
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, end)
     if lifeline:
         Lifeline(lost).start()
-    population = Population(experiment)
-    with network.open_session(endpoints, name="world", stop=lost) as session:
-        keys = Keys(experiment.network.realm)
-        _refuse_doubles(session, keys)
-        # asked before anything watches those tokens: a session that has begun to watch answers from what it has heard
-        there = _alive(session, keys)
-        world = WorldProcess(experiment, population, session, lost)
-        back = world.find(there)
-        print(_ready(experiment, population, endpoints, back), flush=True)
-        world.run(over)
+    with told_to_end(end):
+        population = Population(experiment)
+        with network.open_session(endpoints, name="world", stop=lost) as session:
+            keys = Keys(experiment.network.realm)
+            _refuse_doubles(session, keys)
+            # before anything watches those tokens: a session that has begun to watch answers from what it has heard
+            there = _alive(session, keys)
+            world = WorldProcess(experiment, population, session, lost)
+            back = world.find(there)
+            print(_ready(experiment, population, endpoints, back), flush=True)
+            world.run(over)
     return 0
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-import msgspec
-
 from agents import session as network
 from agents import wire
 from agents.keys import Keys
 from agents.plugins import did_you_mean
-from experiments import orders
+from experiments import json_text, orders
+from twins.scene import Obstacle
 
 KINDS = ("pause", "resume", "step", "reset", "spawn", "remove")
 
@@ -38,17 +37,15 @@ def command(
         The exit code: 0, or 1 if it refused.
 
     Raises:
-        WorldOrderError: If there is no such order, or the obstacle is no JSON object.
+        WorldOrderError: If there is no such order, or what is put in has no place.
+        DocumentError: If the obstacle is none.
         EndpointError, Unreachable: If no router can be reached.
     """
     if what not in KINDS:
         raise WorldOrderError(f"no order '{what}' to a world; {did_you_mean(what, KINDS)}")
     given = None
     if obstacle is not None:
-        try:
-            given = msgspec.json.decode(obstacle, type=dict[str, object])
-        except msgspec.MsgspecError as error:
-            raise WorldOrderError(f"--obstacle {obstacle}: {error}; write a JSON object, as in the file") from None
+        given = json_text.table("--obstacle", obstacle, Obstacle, ("arena", "obstacles", name or "it"))
         if at is not None:
             given["at"] = at
         if what == "spawn" and not given.keys() & {"at", "wall"}:
@@ -59,5 +56,23 @@ def command(
     if not reply.ok:
         print(f"no: {reply.reason}", file=sys.stderr)
         return 1
-    print(f"yes, {'paused' if reply.paused else 'running'} at {reply.time:.2f} s")
+    print(f"{done(order)}; the world {'stands still' if reply.paused else 'runs'} at {reply.time:.2f} s")
     return 0
+
+
+def done(order: wire.WorldOrder) -> str:
+    """What a world did that obeyed."""
+    match order.order:
+        case "pause":
+            return "paused"
+        case "resume":
+            return "goes on"
+        case "step":
+            return f"makes {order.steps} tick{'s' * (order.steps != 1)}"
+        case "reset":
+            return f"{order.name} is back at its start" if order.name else "all are back at their starts"
+        case "remove":
+            return f"{order.name} is out"
+    what = order.name if order.kind is None else f"{order.name}, a {order.kind},"
+    where = "" if order.at is None else f" at x = {order.at[0]:g} m, y = {order.at[1]:g} m"
+    return f"{what} is in{where}"

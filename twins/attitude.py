@@ -22,7 +22,7 @@ from agents.rows import Array, Index, Mask, clamp, norm, some
 from twins.airframe import AIRFRAMES, mjcf
 from twins.engine import Stage
 from twins.firmware import RATE_HZ, Firmware
-from twins.pilot import Pilot
+from twins.pilot import Piloted
 from twins.pointmass import PointMassEngine
 from twins.quadrotor import GRAVITY
 from twins.scene import Scene
@@ -88,7 +88,7 @@ class RigidBodyEngine(PointMassEngine):
         self.attitude[self._mirrored] = _upright(self.yaw[self._mirrored])
 
 
-class Drones:
+class Drones(Piloted):
     """Rows of rigid quadrotors; implements `twins.pointmass.Flight`.
 
     Attributes:
@@ -116,6 +116,7 @@ class Drones:
                 "the engine mujoco needs a library that is an extra: ./zenpark install mujoco-core, or "
                 "uv pip install 'zenpark[mujoco]'"
             ) from None
+        super().__init__(kinds, start, yaw, dt)
         rows = len(kinds)
         self._ticks = max(1, math.ceil(dt * RATE_HZ - 1e-6))
         self._dt = dt / self._ticks
@@ -129,15 +130,12 @@ class Drones:
         self._hover = np.array([0.25 * GRAVITY * frame.mass for frame in frames])
         self._speed = np.array([kind.speed for kind in kinds])[:, None]
         self._control = int(mujoco.mjtState.mjSTATE_CTRL.value)
-        self._pilot = Pilot(kinds, start, yaw, dt)
         self._firmware = Firmware(rows, self._dt)
         self._state = np.zeros((rows, FULL_STATE))
         self._quiet = np.zeros(rows)  # for how long each has been still [s]
         self._wobble, self._drift = np.zeros((rows, 2)), np.zeros((rows, 2))
         self._angles = np.zeros((rows, 3))
         self._heading = np.array(yaw, dtype=float)
-        self.flying = self._pilot.flying
-        self.yaw = np.array(yaw, dtype=float)
         self._put(np.arange(rows), start, yaw, self.flying)
 
     @property
@@ -150,10 +148,6 @@ class Drones:
         """See the class."""
         return self._state[:, LIFT]
 
-    def command(self, setpoint: Array) -> None:
-        """See `Engine.command`."""
-        self._pilot.command(setpoint)
-
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Engine.takeoff`; what lies on its side or back stays there."""
         upright = self._up(rows) > TIPPED
@@ -163,15 +157,7 @@ class Drones:
         self._heading[fresh] = self.yaw[fresh]
         self._pilot.heading[fresh] = self.yaw[fresh]
         self._quiet[rows] = 0.0
-        self._pilot.takeoff(rows, height, self.position)
-
-    def land(self, rows: Index) -> None:
-        """See `Engine.land`."""
-        self._pilot.land(rows, self.position)
-
-    def stop(self, rows: Index) -> None:
-        """See `Engine.stop`: what is in the air falls and tumbles."""
-        self._pilot.stop(rows)
+        super().takeoff(rows, height)
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
         """See `Engine.place`."""

@@ -104,3 +104,38 @@ class Pilot:
         self._from[rows], self._to[rows] = position[rows, 2], height
         self._elapsed[rows] = 0.0
         self._span[rows] = np.maximum(np.abs(height - position[rows, 2]) / CLIMB, SHORTEST_S)
+
+
+class Piloted:
+    """Rows of quadrotors under a pilot: the orders of `twins.pointmass.Flight`; what moves the rows adds the motion.
+
+    Attributes:
+        position: (n, 3) [m].
+        velocity: (n, 3) [m/s].
+        yaw: (n,) [rad].
+        flying: (n,) motors on.
+    """
+
+    def __init__(self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float) -> None:
+        """At rest at `start` (n, 3) [m] with `yaw` (n,) [rad], motors off."""
+        self._pilot = Pilot(kinds, start, yaw, dt)
+        self.position = np.array(start, dtype=float)
+        self.velocity = np.zeros_like(self.position)
+        self.yaw = np.array(yaw, dtype=float)
+        self.flying = self._pilot.flying
+
+    def command(self, setpoint: Array) -> None:
+        """Position and yaw, or velocity and yaw rate (n, 4); rows of NaN, on the ground or landing keep theirs."""
+        self._pilot.command(setpoint)
+
+    def takeoff(self, rows: Index, height: Array) -> None:
+        """Motors on, and up to `height` (len(rows),) [m] over the present place."""
+        self._pilot.takeoff(rows, height, self.position)
+
+    def land(self, rows: Index) -> None:
+        """Down over the present place, then motors off."""
+        self._pilot.land(rows, self.position)
+
+    def stop(self, rows: Index) -> None:
+        """Motors off: what is in the air falls."""
+        self._pilot.stop(rows)

@@ -11,7 +11,7 @@ import numpy as np
 
 from agents.kinds import Kind
 from agents.rows import Array, Index, Mask, clamp, every, some
-from twins.pilot import TOUCHDOWN, Pilot
+from twins.pilot import TOUCHDOWN, Piloted
 
 GRAVITY: Final = 9.81  # [m/s²]
 
@@ -45,18 +45,12 @@ LEANING: Final[dict[str, Response]] = {
 }
 
 
-class Quadrotor:
-    """Rows of quadrotors.
-
-    Attributes:
-        position: (n, 3) where the on-board controller has them [m].
-        velocity: (n, 3) [m/s].
-        yaw: (n,) [rad].
-        flying: (n,) motors on.
-    """
+class Quadrotor(Piloted):
+    """Rows of quadrotors; `position` is where the on-board controller has them."""
 
     def __init__(self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float, *, leaning: bool = False) -> None:
         """With `leaning` they have to lean before they accelerate."""
+        super().__init__(kinds, start, yaw, dt)
         responses = [(LEANING if leaning else RESPONSES)[kind.name] for kind in kinds]
         rows = len(responses)
         self._dt = dt
@@ -68,27 +62,6 @@ class Quadrotor:
         self._change = np.zeros((rows, 3))  # of velocity in a step, as it comes about [m/s]
         turns = [kind.turn_response if r.turn is None else r.turn for kind, r in zip(kinds, responses, strict=True)]
         self._turn = np.array(turns)
-        self._pilot = Pilot(kinds, start, yaw, dt)
-        self.position = np.array(start, dtype=float)
-        self.velocity = np.zeros_like(self.position)
-        self.yaw = np.array(yaw, dtype=float)
-        self.flying = self._pilot.flying
-
-    def command(self, setpoint: Array) -> None:
-        """Position and yaw, or velocity and yaw rate (n, 4); rows of NaN, on the ground or landing keep theirs."""
-        self._pilot.command(setpoint)
-
-    def takeoff(self, rows: Index, height: Array) -> None:
-        """Motors on, and up to `height` (len(rows),) [m] over the present place."""
-        self._pilot.takeoff(rows, height, self.position)
-
-    def land(self, rows: Index) -> None:
-        """Down over the present place, then motors off."""
-        self._pilot.land(rows, self.position)
-
-    def stop(self, rows: Index) -> None:
-        """Motors off: what is in the air falls."""
-        self._pilot.stop(rows)
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
         """Puts rows at (len(rows), 3) [m] with yaw [rad], at rest; those that fly hold that place."""

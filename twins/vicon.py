@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import select
-import signal
 import socket
 import sys
 import threading
@@ -15,18 +14,18 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from types import FrameType
 from typing import Final
 
 import msgspec
 import numpy as np
 import zenoh
 
+from agents import plausibility, wire
 from agents import session as network
-from agents import wire
 from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
+from agents.process import add_network, told_to_end
 from agents.protocols import datastream
 from agents.protocols.datastream import Framer, Kind, Malformed, Segment
 from agents.rows import Array
@@ -237,7 +236,7 @@ class Truths:
     def _take(self, vicon: ViconTwin, row: int, sample: zenoh.Sample, now: float) -> None:
         try:
             truth = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
-            wire.check_position(truth, robot=self._robots[row], now=now, reach=REACH)
+            plausibility.check_position(truth, robot=self._robots[row], now=now, reach=REACH)
         except wire.Malformed:
             return
         self._stamp[row] = truth.stamp
@@ -279,28 +278,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="vicon twin", description="A simulated Vicon that sees simulated robots.")
     parser.add_argument("--robots", nargs="+", required=True, metavar="ROBOT", help="their names are the subjects'")
     parser.add_argument("--listen", type=_address, default=("127.0.0.1", 0), metavar="HOST:PORT")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help=f"default: {network.DEFAULT_ENDPOINT}")
-    parser.add_argument("--realm", default=Keys().realm, help="first chunk of the keys")
+    add_network(parser)
     parser.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="frames per second")
     parser.add_argument("--sigma", type=float, default=0.0003, metavar="METRES", help="noise of the positions")
     parser.add_argument("--seed", type=int, default=0, help="of the noise")
     parser.add_argument("--faults", type=_faults, default=Faults(), metavar="JSON", help="what goes wrong on purpose")
-    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent for 3 s")
     chosen = parser.parse_args(arguments)
     if not (1.0 <= chosen.rate <= 1000.0 and 0.0 <= chosen.sigma < 1.0 and chosen.seed >= 0):
         parser.error("--rate is 1 to 1000 Hz, --sigma 0 to 1 m, --seed not negative")
     stop, lost = threading.Event(), threading.Event()
 
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     if chosen.lifeline:
         Lifeline(lost).start()
     host, port = chosen.listen
     endpoints = chosen.connect or [network.DEFAULT_ENDPOINT]
     try:
-        with network.open_session(endpoints, name="vicon twin", stop=stop) as session:
+        with told_to_end(stop.set), network.open_session(endpoints, name="vicon twin", stop=stop) as session:
             vicon = ViconTwin(
                 chosen.robots,
                 rate_hz=chosen.rate,
@@ -324,9 +317,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         print(f"vicon twin: cannot listen on {host}:{port}: {error.strerror}; choose another port", file=sys.stderr)
         return 2
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     return 0
 
 

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents import ranging, wire
+from agents import plausibility, ranging, wire
 from agents import session as network
 from agents.body import RangeScan, Rays
 from agents.keys import Keys
@@ -29,7 +29,7 @@ def scan(t: float, *distance: float) -> RangeScan:
 def test_a_sweep_as_a_message() -> None:
     said = ranging.message("KH01", 1000.0, scan(2.5, 0.12345678, np.nan, 1.0))
     assert said == wire.Ranges("KH01", 1002.5, [0.0, 0.5, 1.0], [0.0, 0.0, 0.0], [0.123457, None, 1.0])
-    wire.check_ranges(said, robot="KH01", now=1002.5)
+    plausibility.check_ranges(said, robot="KH01", now=1002.5)
 
 
 @pytest.mark.parametrize(
@@ -49,9 +49,9 @@ def test_a_sweep_as_a_message() -> None:
     ],
 )
 def test_what_no_sensor_sees_is_refused(field: str, value: object, why: str) -> None:
-    wire.check_ranges(GOOD, robot="KH01", now=1000.0)
+    plausibility.check_ranges(GOOD, robot="KH01", now=1000.0)
     with pytest.raises(wire.Malformed, match=why):
-        wire.check_ranges(msgspec.structs.replace(GOOD, **{field: value}), robot="KH01", now=1000.0)
+        plausibility.check_ranges(msgspec.structs.replace(GOOD, **{field: value}), robot="KH01", now=1000.0)
 
 
 def test_what_is_heard_takes_the_place_of_what_is_seen() -> None:

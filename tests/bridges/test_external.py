@@ -438,7 +438,7 @@ def test_the_triangle_forms_up_in_a_strangers_simulator(
     router: RouterProcess, simulator: Simulator, tmp_path: Path
 ) -> None:
     settings = [*elsewhere(*PLACES), "--set", f'network.connect=["{router.endpoint}"]', "--set", "duration_s=8"]
-    flight = Flight(tmp_path / "run", "triangle", "--json", "--case", "event", *settings)
+    flight = Flight(tmp_path / "run", "triangle", "--json", "--no-report", "--case", "event", *settings)
     code, out = flight.finish(60.0)
     assert code == 0, out
     robots = json.loads(out)["cases"]["event"]["robots"]

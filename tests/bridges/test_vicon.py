@@ -23,6 +23,7 @@ from agents import wire
 from agents.keys import Keys
 from agents.protocols import datastream
 from agents.protocols.datastream import Segment
+from bridges import vicon
 from bridges.datastream import Frame
 from bridges.vicon import Sieve, heading, pairs, split
 from experiments import document
@@ -297,14 +298,17 @@ def test_a_server_that_goes_and_one_that_talks_nonsense_are_survived(
 
 
 @pytest.mark.system
-def test_a_wrong_host_is_said_and_ends_it(start: Start) -> None:
+def test_a_wrong_host_is_said_and_ends_it(
+    start: Start, router: RouterProcess, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     with socket.create_server(("127.0.0.1", 0)) as closed:
         port = closed.getsockname()[1]
-    bridge = start(f"127.0.0.1:{port}", "--map", "CF01")
-    assert bridge.wait() == 2
-    assert bridge.lines[0] == f"vicon: no connection to 127.0.0.1:{port}: Connection refused; trying again"
-    assert f"nobody answered at 127.0.0.1:{port} in 5 s" in bridge.lines[-1]
-    assert "firewall let TCP port" in bridge.lines[-1]
+    monkeypatch.setattr(vicon, "FIRST_S", 0.8)
+    assert vicon.main([f"127.0.0.1:{port}", "--map", "CF01", "--connect", router.endpoint]) == 2
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert first == f"vicon: no connection to 127.0.0.1:{port}: Connection refused; trying again"
+    assert f"nobody answered at 127.0.0.1:{port} in 0.8 s" in last
+    assert "firewall let TCP port" in last
     wrong = start("127.0.0.1:vicon", "--map", "CF01")
     assert wrong.wait() == 2
     assert wrong.lines == ["zenpark: '127.0.0.1:vicon' is neither HOST nor HOST:PORT, such as 192.168.0.10:801"]

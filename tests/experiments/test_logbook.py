@@ -96,8 +96,9 @@ def test_each_repetition_has_its_own_contacts(log):
 def test_the_world_is_said_once_a_second_with_what_moves_in_it(log):
     world = Logbook(log, experiment(), "only").trace().world
     assert [round(said.stamp, 6) for said in world] == [0.0, 1.0, 2.0, 3.0]
-    assert [said.obstacles["cart"][0] for said in world] == pytest.approx([-0.8, -0.7, -0.6, -0.5])
-    assert {said.obstacles["post"] for said in world} == {(1.0, 1.0, 0.0)}
+    assert [[standing.name for standing in said.obstacles] for said in world] == [["post", "cart"]] * 4
+    assert [said.obstacles[1].pose[0] for said in world] == pytest.approx([-0.8, -0.7, -0.6, -0.5])
+    assert {said.obstacles[0].pose for said in world} == {(1.0, 1.0, 0.0)}
     assert [said.contacts for said in world] == [1, 2, 2, 2]
     assert {(said.engine, said.factor, said.paused) for said in world} == {("point-mass", 1.0, False)}
 

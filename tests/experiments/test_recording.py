@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from agents.wire import Contact, Event, Heard, Pose, State, Status, WorldState
+from agents.wire import Contact, Event, Heard, Pose, Standing, State, Status, WorldState
 from experiments.experiment import Experiment, Rates, Robot
 from experiments.playback import NotStarted, read
 from experiments.recording import Recording
@@ -127,7 +127,7 @@ def world(at, engine="pymunk", **more):
         "paused": False,
         "robots": ["TB01"],
         "mirrored": ["CF01"],
-        "obstacles": {"box": (1.0, 0.5 * at, 0.1), "post": (0.0, 0.0, 0.0)},
+        "obstacles": [Standing("box", (1.0, 0.5 * at, 0.1)), Standing("post", (0.0, 0.0, 0.0))],
         "contacts": 2,
         "refused": 0,
         "malformed": 1,

@@ -14,7 +14,7 @@ from experiments.problem import DocumentError
 from experiments.run import load, simulate
 from experiments.seeds import student_95
 from experiments.sweep import side_by_side, sweep
-from experiments.sweep_command import Bar, Request, command
+from experiments.sweep_command import Request, command
 from experiments.sweep_runs import Stuck
 from experiments.sweep_workers import Processes, SweepError, Work, workers
 
@@ -225,11 +225,3 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
 def test_the_page_says_who_needs_fewest_messages(done):
     found = [finding.text for finding in sweep_page._fewest(done.rows)]
     assert all(text.startswith("Fewest messages with an IAE ratio of at most ") for text in found)
-
-
-def test_progress_is_lines_without_a_terminal(capsys):
-    with Bar() as bar:
-        bar.show("runs", 0, 4)
-        bar.show("runs", 1, 4)
-        bar.show("runs", 4, 4)
-    assert capsys.readouterr().err == "runs 0 of 4\nruns 4 of 4\n"

@@ -35,7 +35,24 @@ def until(true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) ->
         pause.wait(0.01)
 
 
-class Watcher:
+class Looking:
+    """Something that takes in what is said whenever it looks."""
+
+    def look(self) -> None:
+        """Takes in what came since the last look."""
+        raise NotImplementedError
+
+    def until(self, true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
+        """Looks until something is true."""
+
+        def seen() -> object:
+            self.look()
+            return true()
+
+        until(seen, what, limit_s)
+
+
+class Watcher(Looking):
     """Everything that robots say, from a session of the test's own; poll with `look`."""
 
     def __init__(self, endpoint: str) -> None:
@@ -60,15 +77,6 @@ class Watcher:
             robot = self.keys.robot(str(sample.key_expr))
             (self.alive.discard if sample.kind == zenoh.SampleKind.DELETE else self.alive.add)(robot)
 
-    def until(self, true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
-        """Looks until something is true."""
-
-        def seen() -> object:
-            self.look()
-            return true()
-
-        until(seen, what, limit_s)
-
     def phase(self, robot: str) -> str:
         return self.status[robot].phase if robot in self.status else ""
 
@@ -79,69 +87,56 @@ class Watcher:
         self.session.close()  # type: ignore[no-untyped-call]
 
 
-class RobotProcess:
-    """`zenpark agent`, started by hand as a user would, with its standard input held open."""
+class Started:
+    """A process started by hand as a user would, with its standard input held open."""
+
+    patience_s = 20.0  # for its end
+
+    def __init__(self, module: str, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            cwd=ROOT,
+            env=ENVIRONMENT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def end(self) -> int:
+        """SIGTERM: robots land and a world's are waited for, then it ends."""
+        self.process.terminate()
+        return self.wait()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.wait()
+
+    def wait(self, limit_s: float | None = None) -> int:
+        code = self.process.wait(self.patience_s if limit_s is None else limit_s)
+        for stream in (self.process.stdin, self.process.stdout):
+            assert stream is not None
+            stream.close()
+        return code
+
+
+class RobotProcess(Started):
+    """`zenpark agent`."""
 
     def __init__(self, endpoint: str, file: str | Path, *names: str, lifeline: bool = False) -> None:
-        command = [sys.executable, "-m", "experiments.robot", str(file), *names, "--connect", endpoint]
-        self.process = subprocess.Popen(
-            [*command, *(["--lifeline"] if lifeline else [])],
-            cwd=ROOT,
-            env=ENVIRONMENT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-
-    def end(self) -> int:
-        """SIGTERM: it lands and ends."""
-        self.process.terminate()
-        return self.wait()
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.wait()
-
-    def wait(self, limit_s: float = 20.0) -> int:
-        code = self.process.wait(limit_s)
-        for stream in (self.process.stdin, self.process.stdout):
-            assert stream is not None
-            stream.close()
-        return code
+        more = ["--lifeline"] if lifeline else []
+        super().__init__("experiments.robot", str(file), *names, "--connect", endpoint, *more)
 
 
-class WorldProcess:
-    """`zenpark world`, started by hand as a user would, with its standard input held open."""
+class WorldProcess(Started):
+    """`zenpark world`, whose first line is `ready`."""
+
+    patience_s = 25.0
 
     def __init__(self, endpoint: str, file: str | Path, *arguments: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "experiments.world", str(file), "--connect", endpoint, *arguments],
-            cwd=ROOT,
-            env=ENVIRONMENT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        super().__init__("experiments.world", str(file), "--connect", endpoint, *arguments)
         assert self.process.stdout is not None
         self.ready = self.process.stdout.readline().strip()
-
-    def end(self) -> int:
-        """SIGTERM: it ends as soon as its robots are down."""
-        self.process.terminate()
-        return self.wait()
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.wait()
-
-    def wait(self, limit_s: float = 25.0) -> int:
-        code = self.process.wait(limit_s)
-        for stream in (self.process.stdin, self.process.stdout):
-            assert stream is not None
-            stream.close()
-        return code
 
 
 class Flight:

@@ -124,7 +124,7 @@ def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> Non
 
 def test_a_killed_router_comes_back_and_the_formation_holds(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    flight = Flight(folder, "triangle", "--case", "event", "--json", "--set", "duration_s=8")
+    flight = Flight(folder, "triangle", "--case", "event", "--json", "--no-report", "--set", "duration_s=8")
     flight.until_said(r"phase conductor: formation")
     everyone = list(flight.children().values())
     flight.children()["router"].kill()

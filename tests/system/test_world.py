@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from agents import wire
 from agents.keys import Keys
 from experiments import orders, playback
 from tests.conftest import RouterProcess
-from tests.system.lab import Flight, RobotProcess, Watcher, WorldProcess, gone, until
+from tests.system.lab import Flight, Looking, RobotProcess, Watcher, WorldProcess, gone, until
 
 pytestmark = pytest.mark.system
 
@@ -53,7 +53,7 @@ def file(tmp_path: Path) -> Path:
     return made
 
 
-class Desk:
+class Desk(Looking):
     """The world as an operator, and a robot's process, see it."""
 
     def __init__(self, endpoint: str) -> None:
@@ -80,13 +80,6 @@ class Desk:
             ranges = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Ranges)
             self.ranges[ranges.robot] = ranges
 
-    def until(self, true: object, what: str, limit_s: float = 10.0) -> None:
-        def seen() -> object:
-            self.look()
-            return true()  # type: ignore[operator]
-
-        until(seen, what, limit_s)
-
     def x(self, name: str) -> list[float]:
         return list(self.at[name].position)
 
@@ -98,17 +91,16 @@ class Desk:
         command = wire.Command(name, self._seq, time.time(), action, **fields)  # type: ignore[arg-type]
         self.session.put(KEYS.setpoint(name), wire.encode(command), encoding=wire.JSON)
 
-    def drive_until(self, name: str, setpoint: tuple[float, ...], true: object, what: str) -> None:
+    def drive_until(self, name: str, setpoint: tuple[float, ...], true: Callable[[], object], what: str) -> None:
         due = [0.0]
 
         def seen() -> object:
             if time.monotonic() > due[0]:
                 due[0] = time.monotonic() + 0.02
                 self.tell(name, "drive", setpoint=setpoint)
-            self.look()
-            return true()  # type: ignore[operator]
+            return true()
 
-        until(seen, what, 10.0)
+        self.until(seen, what, 10.0)
 
     def close(self) -> None:
         self.session.close()  # type: ignore[no-untyped-call]
@@ -280,10 +272,13 @@ def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
     assert desk.at["KH02"].yaw == 0.5
     desk.drive_until("KH02", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH02")[0] > 1.05, "and can be driven")
     assert desk.give("spawn", name="box", obstacle={"box": [0.2, 0.2], "at": [-1.0, -1.0]}).ok
-    desk.until(lambda: desk.world and "box" in desk.world.obstacles, "it stands")
+    desk.until(lambda: desk.world and len(desk.world.obstacles) == 2, "it stands")
     assert desk.world is not None
     assert desk.world.robots == ["KH01", "CF01", "TE01", "KH02"]
-    assert desk.world.obstacles == {"post": (1.5, 1.5, 0.0), "box": (-1.0, -1.0, 0.0)}
+    assert desk.world.obstacles == [
+        wire.Standing("post", (1.5, 1.5, 0.0)),
+        wire.Standing("box", (-1.0, -1.0, 0.0)),
+    ]
 
     assert desk.give("remove", name="CF01").ok
     assert desk.give("remove", name="box").ok

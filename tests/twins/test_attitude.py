@@ -12,6 +12,7 @@ from agents.kinds import CRAZYFLIE, KHEPERA4, TELLO
 from experiments import assign, document
 from experiments.experiment import Experiment, Robot, World
 from experiments.virtual import simulate
+from tests.twins.runge_kutta import runge_kutta
 from twins.airframe import AIRFRAMES
 from twins.body import TwinBody
 from twins.engine import Stage
@@ -86,11 +87,7 @@ def linear_cascade(step, seconds, h=0.0005):
     for tick in range(round(seconds / h)):
         if tick % round(DT / h) == 0:
             path.append(s[0])
-        k1 = slope(s)
-        k2 = slope(s + 0.5 * h * k1)
-        k3 = slope(s + 0.5 * h * k2)
-        k4 = slope(s + h * k3)
-        s = s + h / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
+        s = runge_kutta(slope, s, h)
     return np.array(path[1:])
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from agents.kinds import CRAZYFLIE, TELLO
+from tests.twins.runge_kutta import runge_kutta
 from twins.pilot import CLIMB, TOUCHDOWN
 from twins.quadrotor import RESPONSES, Quadrotor
 
@@ -38,11 +39,7 @@ def exact(target, kp, kv, limit, times):
     y, found, h = np.zeros(2), [], times[1] - times[0]
     for _ in times[1:]:
         found.append(y[0])
-        k1 = slope(y)
-        k2 = slope(y + 0.5 * h * k1)
-        k3 = slope(y + 0.5 * h * k2)
-        k4 = slope(y + h * k3)
-        y = y + h / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
+        y = runge_kutta(slope, y, h)
     return np.array([*found, y[0]])
 
 

@@ -1,0 +1,135 @@
+"""The checks of what arrived and is well formed: numbers that no robot, clock or sensor can have are refused.
+
+`agents.wire` decodes; what it lets through may still be NaN, of another robot, or from the future. NaN fails each
+comparison here, because they all ask whether a number lies inside.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from agents.wire import Command, Malformed, Pose, Position, Ranges, State, Vector
+
+FUTURE_S: Final = 5.0  # a stamp further ahead is a broken clock or a forgery, and would silence honest samples
+MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
+ABSURD: Final = 1e6  # [m, m/s, rad, rad/s] no setpoint is that large
+MAX_RAYS: Final = 720  # of one sweep; the finest scanner here has 360
+MAX_RANGE: Final = 100.0  # [m]; no range sensor here sees farther
+MAX_YAW: Final = 1e3  # [rad]; yaw is counted on over full turns
+
+
+def check_pose(pose: Pose, *, robot: str, now: float, reach: Vector) -> None:
+    """Refuses a pose that cannot be true.
+
+    Args:
+        pose: What arrived.
+        robot: Whose key it arrived on.
+        now: UTC time of arrival [s].
+        reach: Largest |x|, |y|, |z| [m] that a robot of this experiment can have.
+
+    Raises:
+        Malformed: If the name is another's, a number is not finite, the stamp lies in the future, the position is out
+            of reach, or the velocity is no robot's.
+    """
+    if pose.robot != robot:
+        raise Malformed(f"pose of '{pose.robot}' on the key of '{robot}'")
+    if not (_counted(pose.seq) and _past(pose.stamp, now)):
+        raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
+    _refuse_place(pose.position, reach)
+    _refuse_motion(pose.velocity, pose.yaw)
+
+
+def check_state(state: State, *, robot: str, now: float, reach: Vector) -> None:
+    """Refuses telemetry whose pose cannot be true.
+
+    Raises:
+        Malformed: As `check_pose`.
+    """
+    if state.robot != robot:
+        raise Malformed(f"state of '{state.robot}' on the key of '{robot}'")
+    _refuse_stamp(state.stamp, now)
+    _refuse_place(state.position, reach)
+    _refuse_motion(state.velocity, state.yaw)
+
+
+def check_position(measured: Position, *, robot: str, now: float, reach: Vector) -> None:
+    """Refuses a measured position that cannot be true.
+
+    Raises:
+        Malformed: As `check_pose`.
+    """
+    if measured.robot != robot:
+        raise Malformed(f"position of '{measured.robot}' on the key of '{robot}'")
+    _refuse_stamp(measured.stamp, now)
+    _refuse_place(measured.position, reach)
+    if measured.yaw is not None and not abs(measured.yaw) <= MAX_YAW:
+        raise Malformed(f"yaw {measured.yaw} is impossible")
+
+
+def check_ranges(ranges: Ranges, *, robot: str, now: float) -> None:
+    """Refuses a sweep of range sensors that cannot be true.
+
+    Raises:
+        Malformed: If the name is another's, the stamp is not finite or lies in the future, there is no ray or too many,
+            the lists differ in length, an angle or a distance is not finite, or a distance is no sensor's.
+    """
+    if ranges.robot != robot:
+        raise Malformed(f"ranges of '{ranges.robot}' on the key of '{robot}'")
+    _refuse_stamp(ranges.stamp, now)
+    if not 1 <= len(ranges.distance) <= MAX_RAYS:
+        raise Malformed(f"{len(ranges.distance)} rays; a sweep has 1 to {MAX_RAYS}")
+    if not len(ranges.bearing) == len(ranges.elevation) == len(ranges.distance):
+        raise Malformed("bearings, elevations and distances differ in number")
+    if not _within((*ranges.bearing, *ranges.elevation), 2.0 * math.pi):
+        raise Malformed("a bearing or an elevation is no angle in radians")
+    if not all(value is None or 0.0 <= value <= MAX_RANGE for value in ranges.distance):
+        raise Malformed(f"a distance is not between 0 and {MAX_RANGE:g} m")
+
+
+def check_command(command: Command, *, robot: str) -> None:
+    """Refuses a command that no body can carry out.
+
+    Raises:
+        Malformed: If the name is another's, the sequence number is impossible, `drive` has no finite setpoint, or
+            `takeoff` no height.
+    """
+    if command.robot != robot:
+        raise Malformed(f"command of '{command.robot}' on the key of '{robot}'")
+    if not _counted(command.seq):
+        raise Malformed(f"sequence number {command.seq} is impossible")
+    if command.action == "drive":
+        x, y, z, w = command.setpoint or (math.nan,) * 4
+        # a world checks twenty thousand of these in a second: a generator would cost it three times as much
+        if not (abs(x) <= ABSURD and abs(y) <= ABSURD and abs(z) <= ABSURD and abs(w) <= ABSURD):
+            raise Malformed(f"drive with the setpoint {command.setpoint}")
+    elif command.action == "takeoff" and not (command.height is not None and 0.0 < command.height <= MAX_RANGE):
+        raise Malformed(f"takeoff with the height {command.height}")
+
+
+def _counted(seq: int) -> bool:
+    return 0 < seq < 2**53  # what JSON carries exactly
+
+
+def _past(stamp: float, now: float) -> bool:
+    return 0.0 < stamp < now + FUTURE_S
+
+
+def _within(values: Sequence[float], limit: float) -> bool:
+    return all(abs(value) <= limit for value in values)
+
+
+def _refuse_stamp(stamp: float, now: float) -> None:
+    if not _past(stamp, now):
+        raise Malformed(f"stamp {stamp} is impossible")
+
+
+def _refuse_place(position: Vector, reach: Vector) -> None:
+    if not all(abs(value) <= limit for value, limit in zip(position, reach, strict=True)):
+        raise Malformed(f"position {position} is outside the arena")
+
+
+def _refuse_motion(velocity: Vector, yaw: float) -> None:
+    if not _within(velocity, MAX_SPEED) or not abs(yaw) <= MAX_YAW:
+        raise Malformed(f"velocity {velocity} or yaw {yaw} is impossible")

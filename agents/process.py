@@ -1,0 +1,37 @@
+"""What processes that stand by themselves have in common: arguments of the network, and how they are told to end."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from agents.keys import Keys
+from agents.lifeline import SILENCE_S
+from agents.session import DEFAULT_ENDPOINT
+
+
+@contextmanager
+def told_to_end(end: Callable[[], object]) -> Iterator[None]:
+    """Inside, SIGINT and SIGTERM call `end`, as often as they come; afterwards they do what they did before."""
+
+    def heed(_signal: int, _frame: FrameType | None) -> None:
+        end()
+
+    before = {number: signal.signal(number, heed) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def add_network(parser: argparse.ArgumentParser) -> None:
+    """Adds `--connect` (a list, or None), `--realm` and `--lifeline`."""
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
+    parser.add_argument("--realm", default=Keys().realm, help="first chunk of the robots' keys")
+    parser.add_argument(
+        "--lifeline", action="store_true", help=f"end when standard input ends or is silent for {SILENCE_S:g} s"
+    )

@@ -1,0 +1,153 @@
+"""The processes of one case: recorder, stand-ins for hardware, robots, and the router that all of them meet at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from experiments import standins
+from experiments.document import write_json
+from experiments.experiment import Experiment
+from experiments.launcher import LAND_S, ROUTER, Launcher, Process
+
+LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
+ROUTERS: Final = 5  # a router that dies more often is not helped by starting it again,
+WORLDS: Final = 5  # nor is a world
+
+
+@dataclass(frozen=True)
+class Death:
+    """A process has ended that should not have: what it was (`lost`: a robot's), whom it concerns, what is done."""
+
+    kind: Literal["router", "world", "recorder", "lost"]
+    source: str
+    text: str
+
+
+class Crew:
+    """Starts, watches and ends the processes of one case."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        case: str,
+        *,
+        file: Path,
+        source: Path,
+        recording: Path,
+        endpoints: Sequence[str],
+        launcher: Launcher,
+    ) -> None:
+        """Nothing is started yet.
+
+        Args:
+            experiment: The case, overrides applied.
+            case: Its name, with which the names of the processes begin.
+            file: The same as a file, for the processes.
+            source: The experiment file as it was written, for the recording.
+            recording: Where it is recorded; the processes' output goes to `logs/` beside it.
+            endpoints: Routers.
+            launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
+        """
+        self._experiment, self._case = experiment, case
+        self._file, self._source, self._recording = file, source, recording
+        self._endpoints, self._launcher = endpoints, launcher
+        self._connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
+        self._groups: dict[str, list[str]] = {}
+        for name, robot in experiment.robots.items():
+            self._groups.setdefault(robot.process or name, []).append(name)
+        self._recorder = f"{case}-recorder"
+        self._standins: tuple[str, ...] = ()
+        self._routers = self._worlds = 1
+
+    def start(self, interrupted: Callable[[], bool]) -> None:
+        """Starts all but the router: the recorder, then what robots need, then the robots.
+
+        Args:
+            interrupted: Asked while it waits whether the user wants to end it.
+
+        Raises:
+            StandInError: If a protocol twin or a positioning system does not start in time.
+        """
+        case = ["--case", self._case, "--source", str(self._source)]
+        file = str(self._file)
+        self._launcher.start(self._recorder, "experiments.recorder", file, str(self._recording), *case, *self._connect)
+        addressed = self._stand_in(interrupted)
+        for group, names in self._groups.items():
+            arguments = [str(addressed), *names, *self._connect, "--lifeline"]
+            self._launcher.start(self._process(group), "experiments.robot", *arguments)
+
+    def end(self) -> None:
+        """Ends all but the router: robots land first, and the recorder sees it."""
+        self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
+        self._launcher.end([self._recorder], grace_s=5.0)
+        self._launcher.end(self._standins, grace_s=2.0)
+
+    def deaths(self) -> Iterator[Death]:
+        """What has died since the last call; router and world are started again, a few times."""
+        for process in self._launcher.died():
+            if process.name == ROUTER:
+                yield self._router_died(process)
+            elif process.name == standins.world_name(self._case):
+                yield self._world_died(process)
+            elif process.name == self._recorder:
+                yield Death("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
+            else:
+                for name in self._groups.get(process.name.removeprefix(f"{self._case}-"), []):
+                    yield Death("lost", name, f"its process ended ({process.exit}){_because(process)}")
+
+    def last_line(self, robot: str) -> str:
+        """The last line that the process of a robot wrote; empty if it wrote none."""
+        group = next(group for group, members in self._groups.items() if robot in members)
+        log = self._recording.parent / "logs" / f"{self._process(group)}.log"
+        return "".join(log.read_text(errors="replace").strip().splitlines()[-1:]) if log.exists() else ""
+
+    def _process(self, group: str) -> str:
+        return f"{self._case}-{group}"
+
+    def _stand_in(self, interrupted: Callable[[], bool]) -> Path:
+        """Starts world, protocol twins and positioning; returns the case as a file with the addresses of robots."""
+        experiment, self._standins = standins.start(
+            self._experiment,
+            self._file,
+            prefix=self._case,
+            launcher=self._launcher,
+            connect=self._connect,
+            interrupted=interrupted,
+        )
+        if not self._standins:
+            return self._file
+        file = self._file.with_name(f"{self._case}-addressed.json")
+        file.write_bytes(write_json(experiment))
+        return file
+
+    def _router_died(self, process: Process) -> Death:
+        self._routers += 1
+        again = self._routers < ROUTERS
+        if again:
+            start_router(self._launcher, self._endpoints)
+        what = "started again" if again else "given up: the robots hold, and land at the end"
+        return Death("router", "conductor", f"the router ended ({process.exit}); {what}")
+
+    def _world_died(self, process: Process) -> Death:
+        self._worlds += 1
+        again, why = self._worlds < WORLDS, _because(process)
+        if again:
+            standins.start_world(
+                self._experiment, self._file, prefix=self._case, launcher=self._launcher, connect=self._connect
+            )
+        what = "started again: robots hold until then" if again else "given up"
+        return Death("world", "conductor", f"the world ended ({process.exit}); {what}{why}")
+
+
+def start_router(launcher: Launcher, endpoints: Sequence[str]) -> None:
+    """A router of our own, which outlives a killed launcher by as long as robots take to land."""
+    listen = [part for endpoint in endpoints for part in ("--listen", endpoint)]
+    launcher.start(ROUTER, "agents.router", *listen, "--lifeline", "--linger", str(LINGER_S))
+
+
+def _because(process: Process) -> str:
+    """Its last words, behind a colon."""
+    return "".join(f": {line}" for line in process.tail().strip().splitlines()[-1:])

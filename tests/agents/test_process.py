@@ -1,0 +1,35 @@
+"""Signals are heeded inside and only there; the arguments of the network are the same for every process."""
+
+import argparse
+import os
+import signal
+
+import pytest
+
+from agents.process import add_network, told_to_end
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_each_signal_is_heeded_each_time_and_then_no_more(number):
+    before = signal.getsignal(number)
+    told = []
+    with told_to_end(lambda: told.append(1)):
+        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), number)
+    assert told == [1, 1]
+    assert signal.getsignal(number) is before
+
+
+def test_what_was_before_comes_back_after_an_error():
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(ZeroDivisionError), told_to_end(print):
+        _ = 1 / 0
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_the_arguments_of_the_network():
+    parser = argparse.ArgumentParser()
+    add_network(parser)
+    assert vars(parser.parse_args([])) == {"connect": None, "realm": "park", "lifeline": False}
+    given = parser.parse_args(["--connect", "tcp/a:1", "--connect", "tcp/b:2", "--realm", "hall", "--lifeline"])
+    assert vars(given) == {"connect": ["tcp/a:1", "tcp/b:2"], "realm": "hall", "lifeline": True}

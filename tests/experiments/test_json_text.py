@@ -1,0 +1,46 @@
+"""What stands behind a flag as JSON is the struct that it must be, or the place and the remedy are said."""
+
+import pytest
+
+from experiments.json_text import OBJECT, table
+from experiments.problem import DocumentError
+from twins.device import Faults
+from twins.scene import Obstacle
+
+PLACE = ("arena", "obstacles", "box")
+
+
+def test_an_object_is_read():
+    assert table("--device", '{"rc_hz": 20.0}') == {"rc_hz": 20.0}
+    assert table("--faults", '{"loss": 0.05}', Faults) == {"loss": 0.05}
+    assert table("--faults", "{}", Faults) == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("[1]", f"is no JSON object\n  {OBJECT}"),
+        ("", f"is not JSON: Input data was truncated\n  {OBJECT}"),
+        ('{"radius": }', f"is not JSON: invalid character (byte 11)\n  {OBJECT}"),
+        ("[" * 6000, f"is not JSON: maximum recursion depth exceeded while deserializing an object\n  {OBJECT}"),
+        ('{"radius": -1}', "'radius' must be a number > 0, not -1\n  of a cylinder [m]"),
+        (
+            '{"radius": 0.1, "plan": "dance"}',
+            "no 'dance' among the planners\n  known: circle, hold, lemniscate, line, waypoints",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said_with_the_remedy(text, why):
+    with pytest.raises(DocumentError) as refused:
+        table("--obstacle", text, Obstacle, PLACE)
+    assert str(refused.value).endswith(f": {why}")
+    assert str(refused.value).startswith("--obstacle ")
+
+
+def test_everything_that_is_wrong_is_said():
+    with pytest.raises(DocumentError) as refused:
+        table("--faults", '{"los": 1, "battery": "full"}', Faults)
+    assert [problem.message for problem in refused.value.problems] == [
+        "unknown key 'los'",
+        "'battery' must be a number, not 'full'",
+    ]
