@@ -110,6 +110,7 @@ class Channel:
     Attributes:
         dropped: (E,) samples that were lost.
         limited: Some link has a bandwidth: sizes must be given.
+        ideal: Nothing is lost or takes time on any link: whoever wants to save time need not send.
     """
 
     def __init__(self, conditions: Conditions) -> None:
@@ -123,6 +124,7 @@ class Channel:
         self._loses = bool(conditions.loss.any())
         self.limited = bool(np.isfinite(conditions.bandwidth).any())
         self._plain = not (self._jitters or self._loses or self.limited or conditions.outages)
+        self.ideal = self._plain and not conditions.delay.any()
         self._in_order = isinstance(self._delay, float) and not (self._jitters or self.limited)
         self._enter, self._leave = _thresholds(conditions)
         self._free = np.full(len(conditions), -np.inf)  # when each link has sent all that it has taken

@@ -262,17 +262,21 @@ class Runtime:
         if 0 < neighbour.seq < pose.seq:
             neighbour.lost += pose.seq - neighbour.seq - 1
         neighbour.seq, neighbour.stamp = pose.seq, pose.stamp
-        links = neighbour.links
-        self._channel.send(
+        links, count = neighbour.links, len(neighbour.links)
+        said = Samples(
             links,
-            np.full(len(links), pose.seq),
-            np.full(len(links), pose.stamp - self._utc),
-            np.array([pose.position] * len(links)),
-            np.array([pose.velocity] * len(links)),
-            start=self.agent.life.start_at[self._assignment.links.listener[links]],
-            size=np.full(len(links), len(payload)),
-            now=t,
+            np.full(count, t),
+            np.full(count, pose.stamp - self._utc),
+            np.full(count, pose.seq),
+            np.array([pose.position] * count),
+            np.array([pose.velocity] * count),
         )
+        if self._channel.ideal:
+            self._believe(said)
+            return
+        start = self.agent.life.start_at[self._assignment.links.listener[links]]
+        size = np.full(count, len(payload))
+        self._channel.send(links, said.seq, said.stamp, said.position, said.velocity, start=start, size=size, now=t)
 
     def _believe(self, got: Samples) -> None:
         """Poses have got through."""

@@ -155,10 +155,14 @@ def test_what_the_real_network_took_counts_towards_the_delay():
 
 def test_an_ideal_network_adds_nothing():
     channel = Channel(Conditions.ideal(2))
+    assert channel.ideal
     say(channel, [0, 1], 1, 0.97, now=1.0)
     got = heard(channel, 1.0)
     assert got.arrival.tolist() == [1.0, 1.0]
     assert channel.due(2.0) is None
+    out = Outage(0.0, 1.0, np.array([True]))
+    for value in ({"delay": 0.01}, {"jitter": 0.01}, {"loss": 0.1}, {"bandwidth": 1e4}, {"outages": (out,)}):
+        assert not Channel(conditions(**value)).ideal
 
 
 def test_it_waits_until_its_time_has_come():
