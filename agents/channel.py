@@ -8,7 +8,7 @@ running number (see `agents.chance`), so that both lose the same samples. docs/n
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -80,7 +80,10 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Samples:
-    """Poses on their way (M): link, arrival time, sample time [s], number, position and velocity (M, 3)."""
+    """Poses on their way (M): link, arrival time, sample time [s], number, position and velocity (M, 3).
+
+    `extra` (M, k) is what else is told with them, for those who need it: with all that go over a channel, or with none.
+    """
 
     link: Index
     arrival: Array
@@ -88,6 +91,7 @@ class Samples:
     seq: Index
     position: Array
     velocity: Array
+    extra: Array | None = None
 
     def take(self, which: Index | Mask) -> Samples:
         """Some of them."""
@@ -98,10 +102,11 @@ class Samples:
             self.seq[which],
             self.position[which],
             self.velocity[which],
+            None if self.extra is None else self.extra[which],
         )
 
 
-COLUMNS: Final = tuple(field.name for field in fields(Samples))
+COLUMNS: Final = tuple(field.name for field in fields(Samples) if field.name != "extra")
 
 
 class Channel:
@@ -110,6 +115,7 @@ class Channel:
     Attributes:
         dropped: (E,) samples that were lost.
         limited: Some link has a bandwidth: sizes must be given.
+        instant: Nothing takes time on any link: what is said is known at once, or lost.
         ideal: Nothing is lost or takes time on any link: whoever wants to save time need not send.
     """
 
@@ -124,7 +130,8 @@ class Channel:
         self._loses = bool(conditions.loss.any())
         self.limited = bool(np.isfinite(conditions.bandwidth).any())
         self._plain = not (self._jitters or self._loses or self.limited or conditions.outages)
-        self.ideal = self._plain and not conditions.delay.any()
+        self.instant = not (conditions.delay.any() or self._jitters or self.limited)
+        self.ideal = self._plain and self.instant
         self._in_order = isinstance(self._delay, float) and not (self._jitters or self.limited)
         self._enter, self._leave = _thresholds(conditions)
         self._free = np.full(len(conditions), -np.inf)  # when each link has sent all that it has taken
@@ -141,6 +148,7 @@ class Channel:
         start: Array | float = np.inf,
         size: Index | None = None,
         now: float = -np.inf,
+        extra: Array | None = None,
     ) -> None:
         """Samples set out, on each link at most one.
 
@@ -158,6 +166,7 @@ class Channel:
             size: (M,) of their payloads [bytes]; needed on links of limited bandwidth.
             now: At the listener of a real network, where they have arrived by now [s]: the time that it took counts
                 towards the delay.
+            extra: (M, k) that goes along.
         """
         delay = self._delay if isinstance(self._delay, float) else self._delay[link]
         if self._plain:
@@ -169,10 +178,11 @@ class Channel:
                 self.dropped[link[~passes]] += 1
                 link, seq, stamp, arrival = link[passes], seq[passes], stamp[passes], arrival[passes]
                 position, velocity = position[passes], velocity[passes]
+                extra = None if extra is None else extra[passes]
         if now > -np.inf:
             arrival, self._in_order = np.maximum(arrival, now), False  # speakers are asked one after the other
         if len(link):
-            self._flying.append(Samples(link, arrival, stamp, seq, position, velocity))
+            self._flying.append(Samples(link, arrival, stamp, seq, position, velocity, extra))
 
     def due(self, t: float) -> Samples | None:
         """What gets through by `t` [s], in order of arrival."""
@@ -261,7 +271,9 @@ class Channel:
     def _pool(self) -> Samples:
         if len(self._flying) == 1:
             return self._flying[0]
-        return Samples(*(np.concatenate([getattr(each, column) for each in self._flying]) for column in COLUMNS))
+        pool = Samples(*(np.concatenate([getattr(each, column) for each in self._flying]) for column in COLUMNS))
+        extra = [each.extra for each in self._flying if each.extra is not None]
+        return replace(pool, extra=np.concatenate(extra)) if extra else pool
 
 
 def _thresholds(conditions: Conditions) -> tuple[Array, Array]:

@@ -32,13 +32,16 @@ def of_link(channel: Channel, own: LinkChannel = _PLAIN) -> LinkChannel:
     return LinkChannel(**{name: getattr(channel, name) if value is None else value for name, value in given.items()})
 
 
-def virtual(experiment: Experiment, links: Links, seeds: Sequence[int]) -> Conditions:
-    """Of all links of all repetitions, those of the first seed first; rows are the robots in the order of the file."""
+def virtual(experiment: Experiment, links: Links, seeds: Sequence[int], *, stream: str = "") -> Conditions:
+    """Of all links of all repetitions, those of the first seed first; rows are the robots in the order of the file.
+
+    What else goes between the same robots has another `stream`, and its own luck.
+    """
     ends = _Ends.of(experiment, links.take(np.arange(len(links) // len(seeds))), tuple(experiment.robots))
-    return Conditions.side_by_side(_seeded(_of(experiment.channel, ends, experiment.duration_s), ends, seeds))
+    return Conditions.side_by_side(_seeded(_of(experiment.channel, ends, experiment.duration_s), ends, seeds, stream))
 
 
-def at_listeners(experiment: Experiment, links: Links, listeners: Sequence[str]) -> Conditions:
+def at_listeners(experiment: Experiment, links: Links, listeners: Sequence[str], *, stream: str = "") -> Conditions:
     """Of the links on which robots of one process listen, on a real network, which has a delay of its own.
 
     `links.listener` counts in `listeners`, `links.speaker` in the robots of the file.
@@ -46,7 +49,7 @@ def at_listeners(experiment: Experiment, links: Links, listeners: Sequence[str])
     ends = _Ends.of(experiment, links, listeners)
     bare = _of(experiment.channel, ends, experiment.duration_s)
     bare = replace(bare, delay=np.where(bare.delay > OWN_S, bare.delay, 0.0))
-    return _seeded(bare, ends, [experiment.seed])[0]
+    return _seeded(bare, ends, [experiment.seed], stream)[0]
 
 
 @dataclass(frozen=True)
@@ -100,9 +103,10 @@ def _of(channel: Channel, ends: _Ends, duration: float) -> Conditions:
     )
 
 
-def _seeded(bare: Conditions, ends: _Ends, seeds: Sequence[int]) -> list[Conditions]:
+def _seeded(bare: Conditions, ends: _Ends, seeds: Sequence[int], stream: str) -> list[Conditions]:
     """For each seed, with keys of its own if anything is left to chance."""
     if not (bare.loss.any() or bare.jitter.any()):
         return [bare] * len(seeds)
-    both = list(zip(ends.speaker.tolist(), ends.listener.tolist(), strict=True))
+    more = (stream,) if stream else ()
+    both = [(*each, *more) for each in zip(ends.speaker.tolist(), ends.listener.tolist(), strict=True)]
     return [replace(bare, key=np.array([chance.key(seed, *each) for each in both], dtype=np.uint64)) for seed in seeds]

@@ -183,9 +183,9 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
                 (nothing[speak],) * 3 if lean else (actions.position[speak], actions.velocity[speak], state.yaw[speak])
             )
             sent.add(np.full(len(speak), t), speak, seq[speak], *said)
-            channel.send(t, speak, seq, actions.position, actions.velocity, yaw=state.yaw)
+            channel.send(t, speak, seq, actions.position, actions.velocity, yaw=state.yaw, start=conductor.start_at)
         conductor.look(t, dt)
-        twin.begun_at = channel.start = conductor.start_at
+        twin.begun_at = conductor.start_at
         tick += 1
     begin = conductor.start_at
     time, phase, position, velocity, yaw, true_position, true_yaw, goal, setpoint, error = states.stacked()

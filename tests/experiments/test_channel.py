@@ -30,7 +30,7 @@ class Talk:
         rows = len(names)
         self.rows, self.seq, self.tick = rows * len(seeds), np.zeros(rows * len(seeds), dtype=np.intp), 0
         self.channel = Channel(crowd(parameters, names, **parts), net.repeated(len(seeds), rows), seeds)
-        self.channel.start = start
+        self.start = start
         self.heard = []
 
     def step(self, speak=()):
@@ -42,7 +42,7 @@ class Talk:
         if len(speak):
             self.seq[speak] += 1
             position = np.stack([np.arange(self.rows), np.full(self.rows, t), self.seq], axis=1).astype(float)
-            self.channel.send(t, speak, self.seq, position, -position, yaw=np.zeros(self.rows))
+            self.channel.send(t, speak, self.seq, position, -position, yaw=np.zeros(self.rows), start=self.start)
         self.tick += 1
 
     def run(self, ticks, speak):
@@ -203,3 +203,38 @@ def test_the_default_is_what_it_was():
         "delay_s": 0.001, "jitter_s": 0.0, "loss": 0.0, "burst": None, "bandwidth": None, "queue_s": 0.5,
         "outages": [], "links": {},
     }  # fmt: skip
+
+
+def test_what_goes_along_arrives_with_its_pose():
+    channel = Channel(crowd(Parameters(delay_s=0.01, loss=0.4)), NET, [1], stream="goals")
+    still, yaw = np.zeros((3, 3)), np.zeros(3)
+    for k in range(100):
+        place = np.full((3, 3), float(k))
+        channel.send(
+            0.02 * k, np.array([0, 1]), np.full(3, k), place, still, yaw=yaw, start=0.0, extra=place[:, :2] + 0.5
+        )
+    got = channel.due(10.0)
+    assert len(got.link) == 400 - channel.lost.sum() < 300
+    np.testing.assert_array_equal(got.extra, got.position[:, :2] + 0.5)
+
+
+def test_streams_have_their_own_luck():
+    gone = []
+    for stream in ("", "goals"):
+        channel = Channel(crowd(Parameters(loss=0.5)), NET, [1], stream=stream)
+        gone.append(channel._channel.lost(np.zeros(2000, dtype=np.intp), np.arange(2000)))
+    assert (gone[0] & gone[1]).mean() == pytest.approx(0.25, abs=0.04)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "instant"),
+    [
+        (Parameters(), False),
+        (Parameters(delay_s=0.0), True),
+        (Parameters(delay_s=0.0, loss=0.5), True),
+        (Parameters(delay_s=0.0, jitter_s=0.1), False),
+        (Parameters(delay_s=0.0, bandwidth=1e6), False),
+    ],
+)
+def test_what_takes_no_time_is_known_at_once(parameters, instant):
+    assert Channel(crowd(parameters), NET, [1]).instant == instant
