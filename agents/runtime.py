@@ -23,6 +23,7 @@ from agents import session as network
 from agents.agent import Actions, Agent, links_by_speaker
 from agents.assignment import Assignment
 from agents.body import Body
+from agents.channel import Channel, Conditions, Samples
 from agents.keys import Keys
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
@@ -51,6 +52,7 @@ class Setup:
         located: Which rows get their position from outside.
         ranging: Where each row's range readings come from: its body; the world, which says them on the row's key
             `ranges` ("world"); or that key too, but the body hears them by itself ("far"). Left out: the bodies.
+        conditions: What is done to poses that have come from neighbours, on each link; None: nothing.
     """
 
     keys: Keys
@@ -60,6 +62,7 @@ class Setup:
     lifeline: bool
     located: Sequence[bool]
     ranging: Sequence[Ranging] = ()
+    conditions: Conditions | None = None
 
 
 @dataclass
@@ -72,7 +75,6 @@ class _Neighbour:
     alive: network.Polled[zenoh.Sample]
     seq: int = 0
     stamp: float = 0.0
-    heard: int = 0
     lost: int = 0
 
 
@@ -91,6 +93,7 @@ class Runtime:
         self._dt = 1.0 / assignment.body_hz
         self._state_every = round(assignment.body_hz / setup.state_hz)
         self._counts = Counts.nothing(len(self._names))
+        self._channel = Channel(setup.conditions or Conditions.ideal(len(assignment.links)))
         self._state_slot = 0
         self._stopping: str | None = None
         self._utc = self._now = self._next = 0.0
@@ -192,6 +195,7 @@ class Runtime:
             self._setup.encoding,
             agent=self.agent,
             speakers=self._neighbours,
+            dropped=self._channel.dropped,
             counts=self._counts,
             ranged=[source == "body" for source in ranging],
         )
@@ -206,9 +210,12 @@ class Runtime:
                 self._hear(neighbour, sample, t)
             for sample in network.received(neighbour.alive):
                 if sample.kind == zenoh.SampleKind.DELETE:
+                    self._channel.forget(neighbour.links)
                     agent.lose(neighbour.links, t)
                 else:
                     agent.find(neighbour.links)
+        if (got := self._channel.due(t)) is not None:
+            self._believe(got)
         for sample in network.received(self._estop.handler):
             self._stop(sample)
         for row, positions in self._located:
@@ -242,11 +249,11 @@ class Runtime:
             self.agent.life.stop(row, f"emergency stop by {stop.who}: {stop.reason}")
 
     def _hear(self, neighbour: _Neighbour, sample: zenoh.Sample, t: float) -> None:
-        """One pose of a neighbour: checked, counted, believed."""
-        now = self._utc + t
+        """One pose of a neighbour has come: checked, counted, and given to the modelled network."""
+        payload = sample.payload.to_bytes()
         try:
-            pose = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Pose)
-            plausibility.check_pose(pose, robot=neighbour.name, now=now, reach=self._reach)
+            pose = wire.decode(payload, str(sample.encoding), wire.Pose)
+            plausibility.check_pose(pose, robot=neighbour.name, now=self._utc + t, reach=self._reach)
         except wire.Malformed:
             self._counts.malformed += 1
             return
@@ -255,19 +262,36 @@ class Runtime:
         if 0 < neighbour.seq < pose.seq:
             neighbour.lost += pose.seq - neighbour.seq - 1
         neighbour.seq, neighbour.stamp = pose.seq, pose.stamp
-        neighbour.heard += 1
-        links = neighbour.links
-        full = np.full(len(links), pose.stamp - self._utc)
-        self.agent.hear(
+        links, count = neighbour.links, len(neighbour.links)
+        said = Samples(
             links,
-            np.repeat(np.array([pose.position]), len(links), axis=0),
-            np.repeat(np.array([pose.velocity]), len(links), axis=0),
-            full,
-            np.full(len(links), t),
+            np.full(count, t),
+            np.full(count, pose.stamp - self._utc),
+            np.full(count, pose.seq),
+            np.array([pose.position] * count),
+            np.array([pose.velocity] * count),
         )
-        news = wire.Heard(neighbour.name, pose.seq, pose.stamp, now, pose.position, pose.velocity)
-        for row in self._assignment.links.listener[links]:
+        if self._channel.ideal:
+            self._believe(said)
+            return
+        start = self.agent.life.start_at[self._assignment.links.listener[links]]
+        size = np.full(count, len(payload))
+        self._channel.send(links, said.seq, said.stamp, said.position, said.velocity, start=start, size=size, now=t)
+
+    def _believe(self, got: Samples) -> None:
+        """Poses have got through."""
+        self.agent.hear(got.link, got.position, got.velocity, got.stamp, got.arrival)
+        links, speakers = self._assignment.links, self._assignment.speakers
+        columns = (links.listener[got.link], links.speaker[got.link], got.seq, got.stamp, got.arrival)
+        pose = (got.position.tolist(), got.velocity.tolist())
+        for row, who, seq, stamp, arrival, position, velocity in zip(
+            *(c.tolist() for c in columns), *pose, strict=True
+        ):
+            news = wire.Heard(
+                speakers[who], seq, self._utc + stamp, self._utc + arrival, tuple(position), tuple(velocity)
+            )
             self._telemetry.news[row].append(news)
+            self._counts.heard[row] += 1
 
     def _obey(self, row: int, query: zenoh.Query, t: float) -> None:
         """One order to one row; it always gets a reply."""

@@ -28,11 +28,10 @@ STATUS_S: Final = 1.0
 
 
 class Speaker(Protocol):
-    """What is counted of somebody who is listened to: on which links, and how many samples came and are missing."""
+    """What is counted of somebody who is listened to: on which links, and how many samples are missing."""
 
     name: str
     links: Index
-    heard: int
     lost: int
 
 
@@ -42,6 +41,7 @@ class Counts:
 
     Attributes:
         sent: (n) poses said.
+        heard: (n) poses of neighbours that reached the decision.
         interventions: (n,) ticks on which safety changed what had been decided.
         avoided: (n,) ticks on which avoidance did.
         malformed: Payloads that were refused.
@@ -52,6 +52,7 @@ class Counts:
     """
 
     sent: list[int]
+    heard: Index
     interventions: Index
     avoided: Index
     malformed: int = 0
@@ -63,7 +64,7 @@ class Counts:
     @classmethod
     def nothing(cls, rows: int) -> Counts:
         """Before anything was counted."""
-        return cls([0] * rows, np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp))
+        return cls([0] * rows, *np.zeros((3, rows), dtype=np.intp))
 
     def begin(self) -> None:
         """At the common start."""
@@ -88,6 +89,7 @@ class Telemetry:
         *,
         agent: Agent,
         speakers: Sequence[Speaker],
+        dropped: Index,
         counts: Counts,
         ranged: Sequence[bool],
     ) -> None:
@@ -99,11 +101,12 @@ class Telemetry:
             encoding: Of payloads.
             agent: Whose rows they are.
             speakers: Whom the rows listen to.
+            dropped: (E,) samples that the modelled network dropped, kept by the runtime.
             counts: Kept by the runtime.
             ranged: (n) rows whose range readings are their own: the others' come from the network, where they need
                 not be said again.
         """
-        self._agent, self._speakers, self._counts = agent, speakers, counts
+        self._agent, self._speakers, self._dropped, self._counts = agent, speakers, dropped, counts
         self._encoding = encoding
         names = self._names = agent.assignment.names
         mime = wire.MIME[encoding]
@@ -190,8 +193,9 @@ class Telemetry:
                 body=state.notes[row] if state is not None and state.notes else "",
                 battery=battery if isfinite(battery) else None,
                 sent=counts.sent[row],
-                heard=sum(speaker.heard for speaker in mine),
+                heard=int(counts.heard[row]),
                 lost={speaker.name: speaker.lost for speaker in mine},
+                dropped=self._dropped_of(row),
                 malformed=counts.malformed,
                 refused=counts.refused,
                 ticks=counts.ticks,
@@ -209,6 +213,13 @@ class Telemetry:
             self._statuses[row].put(wire.encode(status, self._encoding))
         if everything:
             counts.late_s = 0.0
+
+    def _dropped_of(self, row: int) -> dict[str, int]:
+        """How many samples of whom a row did not get because the modelled network dropped them."""
+        assignment = self._agent.assignment
+        at = np.flatnonzero((self._dropped > 0) & (assignment.links.listener == row))
+        speakers = assignment.links.speaker[at].tolist()
+        return {assignment.speakers[j]: int(n) for j, n in zip(speakers, self._dropped[at].tolist(), strict=True)}
 
 
 def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it

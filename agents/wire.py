@@ -81,7 +81,9 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How a robot is: lifecycle phase, what holds it, what its body says, its counters since the process began.
 
     `missing` names neighbours that were never heard or are gone; `lost` counts, per neighbour, samples that the
-    sequence numbers prove were sent and never heard. `late_s` is the largest lateness of a tick since the last status.
+    sequence numbers prove were sent and never came, `dropped` those that came and that the modelled network dropped
+    (`agents.channel`; names without any are left out). `late_s` is the largest lateness of a tick since the last
+    status.
     `started` is the UTC time at which the robot began to run the experiment (0 before). From there `ticks` count, and
     `decisions`, at which it computed its goal. `interventions` are ticks on which safety changed what had been decided,
     `avoided` those of them, and of changed goals, that kept clear of something.
@@ -96,6 +98,7 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sent: int
     heard: int
     lost: dict[str, int]
+    dropped: dict[str, int]
     malformed: int
     refused: int
     ticks: int

@@ -1,97 +1,87 @@
-"""The network of a run in virtual time: delay, jitter and loss on each link."""
+"""The network of a run in virtual time: what rows say goes over each link as `agents.channel` has it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
+from agents import channel, wire
+from agents.channel import Samples
 from agents.graph import Links
-from agents.rows import Array, Index, Mask, every, some
-from experiments.experiment import Channel as Parameters
+from agents.rows import Array, Index
+from experiments import conditions
+from experiments.experiment import Experiment
 
-ROUNDING_S = 1e-9  # sums of binary fractions miss the ticks by less than this
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Poses on their way (M): link, arrival time, sample time [s], number, position and velocity (M, 3)."""
-
-    link: Index
-    arrival: Array
-    stamp: Array
-    seq: Index
-    position: Array
-    velocity: Array
-
-    def take(self, which: Index | Mask) -> Samples:
-        """Some of them."""
-        return Samples(
-            self.link[which],
-            self.arrival[which],
-            self.stamp[which],
-            self.seq[which],
-            self.position[which],
-            self.velocity[which],
-        )
+EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
 
 
 class Channel:
-    """Carries what rows say to whoever listens; each repetition has a random stream of its own."""
+    """Carries what rows say to whoever listens; each repetition has its own luck.
 
-    def __init__(self, links: Links, parameters: Parameters, seeds: Sequence[int]) -> None:
-        """`links` of all repetitions, those of the first seed first."""
-        self._links = links
-        self._delay, self._jitter, self._loss = parameters.delay_s, parameters.jitter_s, parameters.loss
-        self._generators = [np.random.default_rng([seed, 0x636861]) for seed in seeds]
-        self._per_copy = len(links) // len(seeds)
-        self._flying: list[Samples] = []
-        self.lost = np.zeros(len(links), dtype=np.intp)
+    Attributes:
+        instant: What is said on a tick is known to all, or lost, before they decide on it.
+    """
+
+    def __init__(self, experiment: Experiment, links: Links, seeds: Sequence[int], *, stream: str = "") -> None:
+        """`links` of all repetitions, those of the first seed first; each `stream` has its own luck."""
+        self._channel = channel.Channel(conditions.virtual(experiment, links, seeds, stream=stream))
+        self.instant = self._channel.instant
+        self._speaker = links.speaker
+        self._names = tuple(experiment.robots)
+        self._encoding: wire.Encoding = experiment.network.encoding
+
+    @property
+    def lost(self) -> Index:
+        """(E,) samples that did not get through; none before the common start."""
+        return self._channel.dropped
 
     def send(
-        self, t: float, rows: Index, seq: Index, position: Array, velocity: Array, *, surely: bool = False
+        self,
+        t: float,
+        rows: Index,
+        seq: Index,
+        position: Array,
+        velocity: Array,
+        *,
+        yaw: Array,
+        start: float,
+        extra: Array | None = None,
     ) -> None:
-        """Rows say where they are: `position`, `velocity` (N, 3) and `seq` (N,) of all rows, of which `rows` speak.
+        """Rows say where they are: pose, `seq` and what goes along of all rows (N, ...), of which `rows` speak.
 
-        Before the common start nothing is lost (`surely`): no run begins before everybody has heard his neighbours, and
-        the real network repeats a first pose until it arrives.
+        `start` is the common start [s]; NaN or infinity as long as it is not known: nothing is lost before.
         """
         spoke = np.zeros(len(position), dtype=bool)
         spoke[rows] = True
-        speaker = self._links.speaker
-        at = np.flatnonzero(spoke[speaker])
-        delay = np.full(len(at), self._delay)
-        if self._loss or self._jitter:
-            chance = np.zeros((2, len(speaker)))
-            for copy in np.unique(at // max(self._per_copy, 1)):  # only of those that speak: as if it were alone
-                mine = slice(copy * self._per_copy, (copy + 1) * self._per_copy)
-                chance[:, mine] = self._generators[copy].random((2, self._per_copy))
-            chance = chance[:, at]
-            delay -= self._jitter * np.log1p(-chance[1])
-            arrives = (chance[0] >= self._loss) | surely
-            self.lost[at[~arrives]] += 1
-            at, delay = at[arrives], delay[arrives]
-        if len(at):
-            who = speaker[at]
-            stamp = np.full(len(at), t)
-            self._flying.append(Samples(at, t + delay, stamp, seq[who], position[who], velocity[who]))
+        at = np.flatnonzero(spoke[self._speaker])
+        if not len(at):
+            return
+        who = self._speaker[at]
+        size = None
+        if self._channel.limited:
+            size = self._sizes(EPOCH + (t - start if t >= start else 0.0), rows, (seq, position, velocity, yaw))[who]
+        self._channel.send(
+            at,
+            seq[who],
+            np.full(len(at), t),
+            position[who],
+            velocity[who],
+            start=start,
+            size=size,
+            extra=None if extra is None else extra[who],
+        )
 
     def due(self, t: float) -> Samples | None:
         """What has arrived by `t` [s], in order of arrival."""
-        if not self._flying:
-            return None
-        if len(self._flying) == 1:
-            pool = self._flying[0]
-        else:
-            columns = ("link", "arrival", "stamp", "seq", "position", "velocity")
-            pool = Samples(*(np.concatenate([getattr(s, c) for s in self._flying]) for c in columns))
-        here = pool.arrival <= t + ROUNDING_S
-        if every(here):
-            self._flying = []
-            return pool if not self._jitter else pool.take(np.argsort(pool.arrival, kind="stable"))
-        self._flying = [pool.take(~here)]
-        if not some(here):
-            return None
-        arrived = pool.take(here)
-        return arrived.take(np.argsort(arrived.arrival, kind="stable"))
+        return self._channel.due(t)
+
+    def _sizes(self, stamp: float, rows: Index, said: tuple[Index, Array, Array, Array]) -> Index:
+        """(N,) bytes of the payloads of the rows that speak, as they would stand on the wire."""
+        found = np.zeros(len(said[0]), dtype=np.intp)
+        columns = zip(*(each[rows].tolist() for each in said), strict=True)
+        for row, (number, place, moves, turned) in zip(rows.tolist(), columns, strict=True):
+            pose = wire.pose(self._names[row % len(self._names)], number, stamp, place, moves, turned)
+            found[row] = len(wire.encode(pose, self._encoding))
+        return found

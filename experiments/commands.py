@@ -209,6 +209,8 @@ def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> No
             line += f", IAE {_figure(mean['iae'])}{spread['iae']}, RMSE {_figure(mean['rmse'])}{spread['rmse']} m"
             line += f", acquired {acquired} (mean)"
         line += f", lost {lost}"
+        if dropped := sum(r["dropped"] for r in case["robots"].values()):
+            line += f", {dropped} dropped by the modelled network"
         if name != next(iter(summary["cases"])):
             line += f"   (ratios: f {_figure(ratio['f_hz'])}, IAE {_figure(ratio['iae'])})"
         print(line)

@@ -16,6 +16,7 @@ from twins.scene import Obstacle
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
+AtLeastOne = Annotated[float, Meta(ge=1)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Planar = tuple[float, float]
 Vector = Annotated[list[float], Meta(min_length=2, max_length=3)]
@@ -210,12 +211,55 @@ class Leg(Part, frozen=True):
     plan: Annotated[Choice, Meta(description="a registered planner")]
 
 
-class Channel(Part, frozen=True):
-    """The network of a run in virtual time."""
+class LinkChannel(Part, frozen=True):
+    """What is otherwise on one link; what is left out is as on all others."""
 
-    delay_s: Annotated[NotNegative, Meta(description="from sender to listener [s]")] = 0.001
+    delay_s: Annotated[NotNegative | None, Meta(description="from speaker to listener [s]")] = None
+    jitter_s: Annotated[NotNegative | None, Meta(description="mean of an exponential addition [s]")] = None
+    loss: Annotated[Share | None, Meta(description="share of samples that never arrive")] = None
+    burst: Annotated[AtLeastOne | None, Meta(description="mean number of samples that are lost in a row")] = None
+    bandwidth: Annotated[Positive | None, Meta(description="[bit/s] of payload")] = None
+    queue_s: Annotated[NotNegative | None, Meta(description="longest wait for a link that is busy [s]")] = None
+
+
+class Outage(Part, frozen=True):
+    """A time in which nothing passes on some links."""
+
+    from_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
+    until_s: Annotated[Positive | None, Meta(description="[s] after it; left out: to the end")] = None
+    links: Annotated[
+        list[str], Meta(description='"A > B": what A says to B; "A - B": both ways; left out, and robots too: all')
+    ] = []
+    robots: Annotated[list[Name], Meta(description="all links to and from these")] = []
+
+    def __post_init__(self) -> None:
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError("`until_s` must be later than `from_s`; or leave it out")
+
+
+class Channel(Part, frozen=True):
+    """What the network does to poses between robots: modelled in virtual time, added at the listener in real time."""
+
+    delay_s: Annotated[
+        NotNegative,
+        Meta(description="from speaker to listener [s]; in real time what the network itself takes counts towards it"),
+    ] = 0.001
     jitter_s: Annotated[NotNegative, Meta(description="mean of an exponential addition [s]")] = 0.0
     loss: Annotated[Share, Meta(description="share of samples that never arrive")] = 0.0
+    burst: Annotated[
+        AtLeastOne | None,
+        Meta(description="mean number of samples that are lost in a row; left out: each is lost or not by itself"),
+    ] = None
+    bandwidth: Annotated[Positive | None, Meta(description="of each link [bit/s] of payload; left out: no limit")] = (
+        None
+    )
+    queue_s: Annotated[
+        NotNegative, Meta(description="a sample that would wait longer for its link to be free is dropped [s]")
+    ] = 0.5
+    outages: Annotated[list[Outage], Meta(description="times in which nothing passes")] = []
+    links: Annotated[
+        dict[str, LinkChannel], Meta(description='"A > B": what A says to B; "A - B": both ways; what is otherwise')
+    ] = {}
 
 
 class Network(Part, frozen=True):

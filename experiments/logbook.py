@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from itertools import repeat
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -15,13 +15,12 @@ from agents.graph import Links
 from agents.lifecycle import Phase
 from agents.rows import Array, Index, Mask
 from experiments import assign
+from experiments.channel import EPOCH
 from experiments.contacts import ROUNDING_S, WALL, finds_contacts, looked_for, within
 from experiments.experiment import Experiment
 from experiments.recording import Recording
 from experiments.trace import HeardPoses, Sent, Trace
 from experiments.virtual import Log
-
-EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
 
 
 class Logbook:
@@ -42,9 +41,7 @@ class Logbook:
         time, link, seq, stamp, position, velocity = log.heard
         own = (link >= copy * per_copy) & (link < (copy + 1) * per_copy)
         self._heard = (time[own], link[own] - copy * per_copy, seq[own], stamp[own], position[own], velocity[own])
-        lost = np.zeros(rows, dtype=np.intp)
-        np.add.at(lost, self._links.speaker, log.lost[copy * per_copy : (copy + 1) * per_copy])
-        self._lost = lost
+        self._dropped: Index = log.lost[copy * per_copy : (copy + 1) * per_copy]
 
     def trace(self) -> Trace:
         """The run from the common start on, as arrays."""
@@ -80,7 +77,7 @@ class Logbook:
                 heard_position[got],
                 heard_velocity[got],
             ),
-            lost=self._lost,
+            lost=np.zeros(rows, dtype=np.intp),
             missed_deadlines=np.zeros(rows, dtype=np.intp),
             ticks=np.full(rows, log.ticks, dtype=np.intp),
             decisions=log.updates[mine],
@@ -94,6 +91,7 @@ class Logbook:
             attitude=_part(log.attitude, run, mine),
             shadow_position=_part(log.shadow_position, run, mine),
             shadow_yaw=_part(log.shadow_yaw, run, mine),
+            dropped=self._dropped,
         )
 
     def record(self, path: Path, document: str) -> None:
@@ -205,9 +203,7 @@ class Logbook:
         for end, phase, done in ((self._experiment.duration_s, "landing", 0), (log.ended, "done", 1)):
             for row, name in enumerate(log.names):
                 mine = self._links.listener == row
-                speakers = self._links.speaker[mine]
-                copy = self._mine.start // len(log.names)
-                lost = log.lost[copy * len(self._links) :][: len(self._links)][mine]
+                each = zip(self._links.speaker[mine].tolist(), self._dropped[mine].tolist(), strict=True)
                 yield wire.Status(
                     robot=name,
                     stamp=EPOCH + end,
@@ -217,7 +213,8 @@ class Logbook:
                     battery=None,
                     sent=int(sent[done][row]),
                     heard=int(heard[done][row]),
-                    lost={log.names[s]: int(n) for s, n in zip(speakers, lost, strict=True)},
+                    lost={log.names[s]: 0 for s in self._links.speaker[mine].tolist()},
+                    dropped={log.names[s]: n for s, n in each if n},
                     malformed=0,
                     refused=0,
                     ticks=log.ticks,

@@ -6,7 +6,10 @@ from typing import Final
 
 import msgspec
 
-INDICES: Final = ("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_s", "lost", "missed_deadlines")
+INDICES: Final = (
+    *("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_s"),
+    *("lost", "dropped", "missed_deadlines"),
+)
 
 
 class Phase(msgspec.Struct, frozen=True):
@@ -89,7 +92,8 @@ class RobotMetrics(msgspec.Struct, frozen=True):
         rmse: √(mean e²) [m].
         acquired_s: From when on the one-second mean of |error| of each of its links stays within the tolerance until
             the next phase [s]; None if never.
-        lost: Samples that the sequence numbers prove were sent and that somebody never got.
+        lost: Samples that the sequence numbers prove were sent and that never came to somebody.
+        dropped: Samples of it that the modelled network dropped, over all its listeners.
         missed_deadlines: Ticks that began more than one period late.
         residual: Worst link, |error| averaged over the last second of the first phase [m].
         worst: Who is at the other end of that link.
@@ -128,6 +132,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     rmse: float | None
     acquired_s: float | None
     lost: int
+    dropped: int
     missed_deadlines: int
     residual: float | None
     worst: str
@@ -170,6 +175,26 @@ class Belief(msgspec.Struct, frozen=True):
     max: float | None  # [m]
 
 
+class Passage(msgspec.Struct, frozen=True):
+    """What became of the poses on one link.
+
+    Attributes:
+        listener: Who heard them.
+        speaker: Who said them.
+        heard: How many arrived.
+        dropped: How many the modelled network dropped.
+        delay_mean: From when a pose was taken to its arrival, of those heard [s], whatever caused it.
+        delay_max: The longest [s].
+    """
+
+    listener: str
+    speaker: str
+    heard: int
+    dropped: int
+    delay_mean: float | None
+    delay_max: float | None
+
+
 class CaseMetrics(msgspec.Struct, frozen=True):
     """One case of a run.
 
@@ -198,6 +223,9 @@ class CaseMetrics(msgspec.Struct, frozen=True):
         excursion: Farthest that a robot was outside the arena [m].
         excursion_robot: Which; empty if none was outside.
         lost: Sum over the robots.
+        dropped: Sum over the robots: what the modelled network dropped.
+        passages: What became of poses, per link.
+        modelled: Whether the file asks for network effects.
         missed_deadlines: Sum over the robots.
         missed_share: Missed deadlines over ticks, of all robots.
         collisions: What touched, in order of time.
@@ -234,6 +262,9 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     excursion: float
     excursion_robot: str
     lost: int
+    dropped: int
+    passages: tuple[Passage, ...]
+    modelled: bool
     missed_deadlines: int
     missed_share: float | None
     collisions: tuple[Collision, ...]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -16,8 +17,10 @@ import numpy as np
 
 from agents.graph import Links
 from agents.rows import norm
+from experiments import conditions
 from experiments.clearance import Clearance, collisions
-from experiments.measured import INDICES, Approach, Belief, CaseMetrics, Collision, Phase, RobotMetrics
+from experiments.measured import INDICES, Approach, Belief, CaseMetrics, Collision, Passage, Phase, RobotMetrics
+from experiments.passages import passages
 from experiments.shadows import agreement
 from experiments.signals import (
     LinkErrors,
@@ -67,7 +70,8 @@ def measure(trace: Trace) -> CaseMetrics:
     phases = _phases(trace, errors, bounds)
     clearance = Clearance.of(trace)
     touched = collisions(trace, clearance)
-    robots = _robots(trace, errors, phases, touched, clearance)
+    passed = passages(trace)
+    robots = _robots(trace, errors, phases, touched, clearance, passed=passed)
 
     leading = leaders(trace.experiment)
     died = tuple(robot.robot for robot in robots if robot.known < KNOWN and robot.robot not in leading)
@@ -115,6 +119,9 @@ def measure(trace: Trace) -> CaseMetrics:
         excursion=max(0.0, float(beyond[farthest])),
         excursion_robot=names[farthest] if beyond[farthest] > 0.0 else "",
         lost=int(trace.lost.sum()),
+        dropped=sum(each.dropped for each in passed),
+        passages=passed,
+        modelled=conditions.modelled(trace.experiment),
         missed_deadlines=int(trace.missed_deadlines.sum()),
         missed_share=_share(trace.missed_deadlines.sum(), ticks),
         collisions=touched,
@@ -152,6 +159,8 @@ def _robots(
     phases: Sequence[Sequence[Phase]],
     touched: Sequence[Collision],
     clearance: Clearance,
+    *,
+    passed: Sequence[Passage],
 ) -> tuple[RobotMetrics, ...]:
     rows, time, mine = len(trace.robots), trace.time, errors.own
     duration = float(time[-1] - time[0])
@@ -169,6 +178,9 @@ def _robots(
     waits = [(wait.min(), float(np.median(wait)), wait.max()) if len(wait) else (np.nan,) * 3 for wait in gaps(trace)]
     own = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
     agreements = agreement(trace)
+    dropped = Counter(dict.fromkeys(trace.robots, 0))
+    for link in passed:
+        dropped[link.speaker] += link.dropped
     return tuple(
         RobotMetrics(
             robot=name,
@@ -181,6 +193,7 @@ def _robots(
             rmse=_number(rmse[i]),
             acquired_s=phases[0][i].acquired_s,
             lost=int(trace.lost[i]),
+            dropped=dropped[name],
             missed_deadlines=int(trace.missed_deadlines[i]),
             residual=phases[0][i].residual,
             worst=phases[0][i].worst,

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from agents.lifecycle import Phase
 from agents.rows import Array, Index
 from agents.wire import Contact, Event, State, Status, WorldState
+from experiments import assign
 from experiments.cdr import Undecodable, codec
 from experiments.contacts import ROUNDING_S, looked_for, within
 from experiments.experiment import Experiment
@@ -66,7 +67,7 @@ def read(path: Path) -> Playback:
     number that goes back is a publisher that began anew at 1; (2) what its last status of the run counts as sent beyond
     the last pose recorded until then; (3) what the last status of each listener counts as lost from it, less what the
     same process counted before the common start. A pose that two listeners and the recorder missed counts three times:
-    each of them was owed it.
+    each of them was owed it. What the modelled network dropped is no loss: `dropped` is what the listeners counted.
 
     The trace of a run that did not last as long as its experiment ends with the run: where the conductor began to land
     everybody (interrupted by the user, or all robots had come down before), else, when the recorder or the conductor
@@ -220,6 +221,7 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         sent=_sent(poses, start, duration),
         heard=_heard(states, robots, start, duration),
         lost=_lost(robots, poses, statuses, (start, start + duration)),
+        dropped=_dropped(experiment, statuses, (start, start + duration)),
         missed_deadlines=_counted(last, "missed"),
         ticks=_counted(last, "ticks"),
         decisions=_counted(last, "decisions"),
@@ -359,7 +361,7 @@ def _lost(
     missed: Counter[str] = Counter()
     for robot, own, said in zip(robots, poses, statuses, strict=True):
         missed[robot] += _gaps(own, run) + _tail(own, said, run)
-        missed.update(_unheard(said, run))
+        missed.update(_by_speaker(said, run, "lost"))
     return np.array([missed[robot] for robot in robots], dtype=np.intp)
 
 
@@ -381,8 +383,16 @@ def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float
     return max(0, last.sent - max(recorded[-1:] + before[-1:], default=0))
 
 
-def _unheard(statuses: list[Status], run: tuple[float, float]) -> Counter[str]:
-    """What one listener's process, or several after each other, counted as lost in the run, by speaker."""
+def _dropped(experiment: Experiment, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
+    """(E,) what the modelled network dropped on each of `assign.heard_links`; `statuses` of each robot."""
+    links, robots = assign.heard_links(experiment), list(experiment.robots)
+    found = [_by_speaker(said, run, "dropped") for said in statuses]
+    ends = zip(links.listener.tolist(), links.speaker.tolist(), strict=True)
+    return np.array([found[i][robots[j]] for i, j in ends], dtype=np.intp)
+
+
+def _by_speaker(statuses: list[Status], run: tuple[float, float], what: Literal["lost", "dropped"]) -> Counter[str]:
+    """What one listener's process, or several after each other, counted in the run, by speaker."""
     total: Counter[str] = Counter()
     before: dict[str, int] = {}
     process = None
@@ -390,6 +400,7 @@ def _unheard(statuses: list[Status], run: tuple[float, float]) -> Counter[str]:
         if status.pid != process:
             before, process = {}, status.pid
         if run[0] < status.stamp <= run[1] + STATUS_S:
-            total.update({speaker: max(0, count - before.get(speaker, 0)) for speaker, count in status.lost.items()})
-        before = status.lost
+            now: dict[str, int] = getattr(status, what)
+            total.update({speaker: max(0, count - before.get(speaker, 0)) for speaker, count in now.items()})
+        before = getattr(status, what)
     return total

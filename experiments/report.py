@@ -18,6 +18,8 @@ from matplotlib.figure import Figure
 from experiments import figures, scenery, shadow_figures
 from experiments.measured import CaseMetrics
 from experiments.metrics import measure
+from experiments.report_network import PROSE as MODELLED
+from experiments.report_network import network_tables
 from experiments.report_tables import (
     DEFINITIONS,
     Table,
@@ -146,6 +148,7 @@ def write(
             (PROOF,),
             proof_tables(cases),
         ),
+        *_modelled(cases),
         Section(
             "Time between transmissions",
             prose=(
@@ -218,6 +221,7 @@ def compare(
         Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
         Section("Each robot", tables=robot_tables(cases), folded="Show all tables"),
         Section("Was anything lost?", tables=proof_tables(cases), folded="Show all tables"),
+        *_modelled(cases),
         Section("Definitions", terms=DEFINITIONS),
     ]
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -231,6 +235,14 @@ def compare(
         verdict=findings(cases),
         sections=sections,
     )
+
+
+def _modelled(cases: Sequence[CaseMetrics]) -> list[Section]:
+    """What the modelled network did, where there is one."""
+    tables = network_tables(cases)
+    many = any(len(table.rows) > MOST_LINKS for table in tables)
+    title, folded = "What the modelled network did", "Show all links" if many else ""
+    return [Section(title, (MODELLED,), tables, folded=folded)] if tables else []
 
 
 def date_of(at: float) -> str:

@@ -25,6 +25,7 @@ SUMMARY: Final = (
     ("rmse", "RMSE [m]"),
     ("acquired_s", "Acquired, mean over followers [s]"),
     ("lost", "Lost samples"),
+    ("dropped", "Dropped by the modelled network"),
     ("missed_deadlines", "Missed deadlines"),
 )
 DEFINITIONS: Final = (
@@ -111,6 +112,8 @@ def summary_table(cases: Sequence[CaseMetrics]) -> Table:
     first = next(iter(grouped.values()))
     rows = []
     for index, label in SUMMARY:
+        if index == "dropped" and not any(case.modelled for case in cases):
+            continue
         cells: list[Cell] = [label]
         for runs in grouped.values():
             found = spread([run.mean[index] for run in runs])
@@ -209,10 +212,11 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
 
 
 def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
-    """Per case: what was sent, recorded, heard and lost; several seeds are added up."""
+    """Per case: what was sent, recorded, heard, lost, and dropped by a modelled network; seeds are added up."""
     tables = []
     for name, runs in by_case(cases).items():
-        rows, total = [], [0, 0, 0, 0, 0]
+        columns = 6 if runs[0].modelled else 5
+        rows, total = [], [0] * columns
         for k, robot in enumerate(runs[0].robots):
             same = [run.robots[k] for run in runs]
             counts = [
@@ -221,12 +225,13 @@ def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
                 sum(each.messages * each.listeners for each in same),
                 sum(each.heard for each in same),
                 sum(each.lost for each in same),
-            ]
+                sum(each.dropped for each in same),
+            ][:columns]
             total = [a + b for a, b in zip(total, counts, strict=True)]
             rows.append(Row((robot.robot, str(robot.listeners), *(number(count) for count in counts))))
         rows.append(Row(("all", "", *(number(count) for count in total)), sum=True))
-        head = ("Robot", "Listeners", "Sent", "Recorded", "To be heard", "Heard", "Lost")
-        tables.append(Table(head, tuple(rows), title=name))
+        head = ("Robot", "Listeners", "Sent", "Recorded", "To be heard", "Heard", "Lost", "Dropped")
+        tables.append(Table(head[: 2 + columns], tuple(rows), title=name))
     return tuple(tables)
 
 

@@ -17,7 +17,7 @@ from agents.keys import Keys
 from agents.runtime import NameTaken, Ranging, Runtime, Setup
 from agents.session import DEFAULT_ENDPOINT, EndpointError, Unreachable
 from agents.shadow import shadowed
-from experiments import assign, document
+from experiments import assign, conditions, document
 from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
 
@@ -40,6 +40,7 @@ def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[
     endpoints = list(connect) or experiment.network.connect or [DEFAULT_ENDPOINT]
     request = assign.request(experiment, names, [experiment.seed], endpoints)
     body = shadowed(assemble(request), request, assign.shadows(experiment, names))
+    assignment = assign.assign(experiment, names)
     setup = Setup(
         keys=Keys(experiment.network.realm),
         endpoints=endpoints,
@@ -48,8 +49,9 @@ def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[
         lifeline=lifeline,
         located=[experiment.robots[name].position == "external" for name in names],
         ranging=[_ranging(experiment.robots[name]) for name in names],
+        conditions=conditions.at_listeners(experiment, assignment.links, names),
     )
-    return Runtime(assign.assign(experiment, names), body, setup).run()
+    return Runtime(assignment, body, setup).run()
 
 
 def _ranging(robot: Robot) -> Ranging:

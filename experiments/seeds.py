@@ -11,7 +11,15 @@ import msgspec
 
 from experiments.measured import INDICES, CaseMetrics
 
-SUMS: Final = ("messages", "bytes", "iae", "itae", "lost", "missed_deadlines")  # grow with the length of a run
+SUMS: Final = (
+    "messages",
+    "bytes",
+    "iae",
+    "itae",
+    "lost",
+    "dropped",
+    "missed_deadlines",
+)  # grow with the length of a run
 
 
 def ratio(value: float | None, reference: float | None) -> float | None:

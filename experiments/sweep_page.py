@@ -109,8 +109,8 @@ def table(rows: Sequence[Row]) -> Table:
         ratios = [with_interval(row.ratio[index]) for index in ("messages", "iae", "itae")]
         acquired = NONE if row.acquired is None else f"{100.0 * row.acquired:.0f} %"
         gap = NONE if row.gap_min_s is None else f"{1e3 * row.gap_min_s:.0f} ms"
-        f, lost = figure(row.mean["f_hz"].mean), figure(row.mean["lost"].mean)
-        lines.append(Line((row.case, *values, f, *ratios, acquired, gap, lost), sum=row.reference))
+        f, dropped = figure(row.mean["f_hz"].mean), figure(row.mean["dropped"].mean)
+        lines.append(Line((row.case, *values, f, *ratios, acquired, gap, dropped), sum=row.reference))
     reference = next((row.case for row in rows if row.reference), "the reference")
     return Table(head, tuple(lines), note=f"Messages, IAE and ITAE are relative to {reference} with the same seed.")
 

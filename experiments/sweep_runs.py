@@ -43,7 +43,7 @@ class Figures(msgspec.Struct, frozen=True):
         acquired_s: When its links were within the tolerance for good [s]; None if that is missing for any robot.
         gap_min_s: Shortest time between two transmissions of any robot [s]; None if none sent twice.
         updates: Times that a goal was computed anew; a mean as those above.
-        lost: Samples lost on all links.
+        dropped: Samples that the modelled network dropped on all links.
     """
 
     seed: int
@@ -55,7 +55,7 @@ class Figures(msgspec.Struct, frozen=True):
     acquired_s: float | None
     gap_min_s: float | None
     updates: float | None
-    lost: int
+    dropped: int
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -182,7 +182,7 @@ def _trace(log: Log, experiment: Experiment, copy: int) -> Trace:
     )
 
 
-def _figures(trace: Trace, lost: int) -> Figures:
+def _figures(trace: Trace, dropped: int) -> Figures:
     errors = LinkErrors.of(trace)
     _, begin, end = bounds_of(trace)[0]
     window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0])))
@@ -203,7 +203,7 @@ def _figures(trace: Trace, lost: int) -> Figures:
         acquired_s=None if None in arrived else _mean([when for when in arrived if when is not None]),
         gap_min_s=min(waits, default=None),
         updates=_mean(trace.decisions[kept].astype(float).tolist()),
-        lost=lost,
+        dropped=dropped,
     )
 
 

@@ -13,7 +13,7 @@ from experiments.seeds import Spread, ratio, spread
 from experiments.sweep_plan import Cell
 from experiments.sweep_runs import Figures
 
-MEANS: Final = ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s", "updates", "lost")
+MEANS: Final = ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s", "updates", "dropped")
 RATIOS: Final = ("messages", "iae", "itae", "rmse")
 NONE: Final = "-"
 
@@ -122,7 +122,7 @@ def text(rows: Sequence[Row]) -> list[str]:
         "ITAE ratio",
         "acquired",
         "gap [ms]",
-        "lost",
+        "dropped",
     )
     lines = [head, *(_cells(each) for each in rows)]
     width = [max(len(line[k]) for line in lines) for k in range(len(head))]
@@ -162,7 +162,7 @@ def _cells(each: Row) -> tuple[str, ...]:
         with_interval(each.ratio["itae"]),
         acquired,
         NONE if each.gap_min_s is None else f"{1e3 * each.gap_min_s:.0f}",
-        figure(each.mean["lost"].mean),
+        figure(each.mean["dropped"].mean),
     )
 
 

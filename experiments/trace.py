@@ -73,8 +73,8 @@ class Trace:
         setpoint: (T, N, 4) as sent to the body, see `agents.wire.State`.
         sent: Poses sent from the common start on.
         heard: Poses heard from the common start on.
-        lost: (N,) samples of each robot that the sequence numbers prove were sent and that a listener or the recorder
-            never got.
+        lost: (N,) samples of each robot that the sequence numbers prove were sent and that never came to a listener or
+            the recorder; those that the modelled network dropped are not among them.
         missed_deadlines: (N,) ticks that began more than one period late.
         ticks: (N,) ticks in all, from the common start on.
         decisions: (N,) how often it computed its goal, from the common start on.
@@ -87,6 +87,8 @@ class Trace:
         attitude: (T, N, 4) unit quaternions w, x, y, z from robot to room, NaN where unknown; None if none was told.
         shadow_position: (T, N, 3) of the twin beside each robot [m], NaN for robots without one; None if there is none.
         shadow_yaw: (T, N) of those twins [rad].
+        dropped: (E,) samples that the modelled network dropped on each of `assign.heard_links`, in their order; None
+            if that is not known.
     """
 
     case: str
@@ -114,3 +116,4 @@ class Trace:
     attitude: Array | None = None
     shadow_position: Array | None = None
     shadow_yaw: Array | None = None
+    dropped: Index | None = None

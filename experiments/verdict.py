@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from experiments.measured import CaseMetrics, Collision
+from experiments.report_network import sentences
 from experiments.report_tables import interval, number
 from experiments.report_worlds import shadowed
 from experiments.seeds import by_case, ratios, same_length, spread
@@ -30,6 +31,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     return [
         *interruptions(cases),
         *_nothing_lost(cases),
+        *(Finding("plain", text) for text in sentences(cases)),
         *_deadlines(cases),
         *_died(cases),
         *_formation(cases),

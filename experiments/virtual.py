@@ -139,7 +139,7 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
     request = replace(request, external=(False,) * len(request.names))  # nobody measures in virtual time
     twin = TwinBody(request, assign.world(experiment, names, len(seeds)))
     body = shadowed(twin, request, assign.shadows(experiment, names, len(seeds)))
-    channel = Channel(assignment.links, experiment.channel, seeds)
+    channel = Channel(experiment, assignment.links, seeds)
     rows = len(assignment.names)
     dt = 1.0 / assignment.body_hz
     log_every = round(assignment.body_hz / experiment.rates.state_hz)
@@ -189,7 +189,7 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
                 (nothing[speak],) * 3 if lean else (actions.position[speak], actions.velocity[speak], state.yaw[speak])
             )
             sent.add(np.full(len(speak), t), speak, seq[speak], *said)
-            channel.send(t, speak, seq, actions.position, actions.velocity, surely=agent.decisions == 0)
+            channel.send(t, speak, seq, actions.position, actions.velocity, yaw=state.yaw, start=conductor.start_at)
         conductor.look(t, dt)
         twin.begun_at = conductor.start_at
         tick += 1

@@ -48,8 +48,9 @@ def test_round_trip(encoding, message):
 def test_a_status_survives_both_encodings():
     status = Status(
         robot="CF01", stamp=1.5, phase="running", reason="", body="locked", battery=None, sent=1, heard=2,
-        lost={"KH01": 3}, malformed=0, refused=0, ticks=5, missed=1, decisions=2, interventions=0, avoided=0,
-        late_s=0.001, started=0.5, missing=["KH02"], pid=1, cpu_s=0.1, rss_mb=60.0,
+        lost={"KH01": 3}, dropped={"KH01": 2}, malformed=0, refused=0, ticks=5, missed=1,
+        decisions=2, interventions=0, avoided=0, late_s=0.001, started=0.5,
+        missing=["KH02"], pid=1, cpu_s=0.1, rss_mb=60.0,
     )  # fmt: skip
     for encoding in ENCODINGS:
         assert wire.decode(wire.encode(status, encoding), wire.MIME[encoding], Status) == status

@@ -184,6 +184,7 @@ def test_a_status_survives(battery):
         sent=3,
         heard=4,
         lost={"TB01": 2, "KH01": 0},
+        dropped={"TB01": 4},
         malformed=0,
         refused=1,
         ticks=10,

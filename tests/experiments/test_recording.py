@@ -18,7 +18,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from agents.wire import Contact, Event, Heard, Pose, Standing, State, Status, WorldState
-from experiments.experiment import Experiment, Rates, Robot
+from experiments.experiment import Experiment, Formation, Rates, Robot
 from experiments.playback import NotStarted, read
 from experiments.recording import Recording
 from experiments.records import RecordingError
@@ -54,7 +54,9 @@ def pose(robot="TB01", seq=1, at=0.0, x=0.0):
     return Pose(robot, seq, START + at, (x, 0.5, 0.0), (0.1, 0.2, 0.3), 0.4)
 
 
-def status(robot="TB01", at=1.0, *, sent=0, lost=None, started=START, pid=7, ticks=0, missed=0, decisions=0):
+def status(
+    robot="TB01", at=1.0, *, sent=0, lost=None, dropped=None, started=START, pid=7, ticks=0, missed=0, decisions=0
+):
     return Status(
         robot=robot,
         stamp=START + at,
@@ -65,6 +67,7 @@ def status(robot="TB01", at=1.0, *, sent=0, lost=None, started=START, pid=7, tic
         sent=sent,
         heard=0,
         lost=lost or {},
+        dropped=dropped or {},
         malformed=0,
         refused=0,
         ticks=ticks,
@@ -400,6 +403,17 @@ def test_numbers_that_nobody_knows(path):
 def test_lost(path, messages, lost):
     write(path, begun(), state(), *messages, landed())
     assert read(path).trace.lost.tolist() == [lost, 0]
+
+
+def test_what_the_modelled_network_dropped_is_no_loss(path):
+    said = [
+        status("CF01", at=at, dropped=dropped) for at, dropped in ((-0.5, {}), (0.4, {"TB01": 3}), (1.0, {"TB01": 7}))
+    ]
+    linked = msgspec.structs.replace(PAIR, formation=Formation(links={"TB01 - CF01": 0.5}))
+    write(path, begun(), state(), *said, landed(), experiment=linked)
+    trace = read(path).trace
+    assert trace.dropped.tolist() == [0, 7]  # TB01 listens to CF01; CF01 to TB01
+    assert trace.lost.tolist() == [0, 0]
 
 
 def test_only_poses_of_the_run_are_sent(path):

@@ -28,7 +28,7 @@ def test_a_lean_log_gives_the_figures_of_the_report_to_the_bit(park):
         for index in ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s"):
             assert getattr(figures, index) == measured.mean[index], index
         assert figures.gap_min_s == min(robot.gap_min_s for robot in measured.robots if robot.gap_min_s is not None)
-        assert figures.lost == measured.lost
+        assert figures.dropped == measured.dropped
         followers = [robot.updates for robot in measured.robots if robot.robot not in measured.leaders]
         assert figures.updates == np.mean(followers)
 
@@ -57,7 +57,7 @@ def test_a_run_comes_out_the_same_whoever_flies_beside_it(park):
     assert simulate(lossy, seeds, lean=True).waited.any()
     assert together.runs == [flown(lossy, [seed]).runs[0] for seed in seeds]
     assert flown(lossy, [5, 2]).runs == [together.runs[4], together.runs[1]]
-    assert sum(run.lost for run in together.runs) > 0
+    assert sum(run.dropped for run in together.runs) > 0
 
 
 def test_a_run_that_is_stuck_does_not_take_the_others_with_it(park, monkeypatch):

@@ -49,6 +49,7 @@ def test_a_run_forms_up_loses_nothing_and_reports(tmp_path: Path) -> None:
                 "rmse",
                 "acquired_s",
                 "lost",
+                "dropped",
                 "missed_deadlines",
             }
             assert robot["acquired_s"] is not None

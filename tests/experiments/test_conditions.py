@@ -1,0 +1,161 @@
+"""[channel] of a file: what it means for each link, by name; and everything that can be wrong with it."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents import chance
+from experiments import assign, checks, conditions
+from experiments.experiment import Channel, Experiment, Formation, LinkChannel, Outage, Robot
+
+NAMES = ("A", "B", "C")
+
+
+def experiment(channel=None, **parts):
+    """A and B hear each other, C hears both: links B > A, A > B, A > C, B > C."""
+    given = {
+        "title": "Three",
+        "duration_s": 10.0,
+        "robots": {name: Robot(kind="khepera4", start=[0.5 * k, 0.0]) for k, name in enumerate(NAMES)},
+        "formation": Formation(links={"A - B": 0.5, "A > C": 0.5, "B > C": 0.5}),
+        "channel": channel or Channel(),
+    }
+    return Experiment(**{**given, **parts})
+
+
+def virtual(channel, seeds=(1,)):
+    chosen = experiment(channel)
+    return conditions.virtual(chosen, assign.assign(chosen, NAMES, copies=len(seeds)).links, seeds)
+
+
+def at(channel, *names):
+    chosen = experiment(channel)
+    return conditions.at_listeners(chosen, assign.assign(chosen, names).links, names)
+
+
+def test_the_default_is_a_millisecond_and_nothing_at_a_real_listener():
+    assert virtual(Channel()).delay.tolist() == [0.001] * 4
+    assert at(Channel(), "A").delay.tolist() == [0.0]
+    assert at(Channel(delay_s=0.02), "A").delay.tolist() == [0.02]
+    assert not conditions.modelled(experiment())
+    assert conditions.modelled(experiment(Channel(loss=0.1)))
+
+
+def test_links_have_their_own():
+    own = {"A > C": LinkChannel(loss=0.3, burst=4.0), "A - B": LinkChannel(delay_s=0.1, bandwidth=1e4)}
+    made = virtual(Channel(loss=0.1, jitter_s=0.01, queue_s=0.2, links=own))
+    assert made.loss.tolist() == [0.1, 0.1, 0.3, 0.1]
+    np.testing.assert_array_equal(made.burst, [np.nan, np.nan, 4.0, np.nan])
+    assert made.delay.tolist() == [0.1, 0.1, 0.001, 0.001]
+    assert made.bandwidth.tolist() == [1e4, 1e4, np.inf, np.inf]
+    assert made.jitter.tolist() == [0.01] * 4
+    assert made.queue.tolist() == [0.2] * 4
+    assert made.duration == 10.0
+
+
+def test_outages_of_links_of_robots_and_of_all():
+    outages = [
+        Outage(from_s=1.0, until_s=2.0),
+        Outage(from_s=3.0, links=["A > B", "B > C"]),
+        Outage(from_s=4.0, until_s=5.0, robots=["B"]),
+    ]
+    made = virtual(Channel(outages=outages), seeds=(1, 2)).outages
+    assert [(each.begin, each.end) for each in made] == [(1.0, 2.0), (3.0, np.inf), (4.0, 5.0)]
+    assert [each.links[:4].tolist() for each in made] == [
+        [True] * 4,
+        [False, True, False, True],
+        [True, True, False, True],
+    ]
+    for each in made:
+        np.testing.assert_array_equal(each.links[4:], each.links[:4])
+
+
+def test_keys_come_from_the_seed_and_the_names_wherever_the_link_is():
+    channel = Channel(loss=0.2, links={"A > C": LinkChannel(loss=0.5)})
+    both = virtual(channel, seeds=(1, 7))
+    ends = [("B", "A"), ("A", "B"), ("A", "C"), ("B", "C")]
+    assert both.key.tolist() == [chance.key(seed, *names) for seed in (1, 7) for names in ends]
+    for names in (("A",), ("B",), ("C",), ("C", "A"), NAMES):  # processes with some of the robots
+        here = at(channel, *names)
+        links = assign.assign(experiment(channel), names).links
+        for k, (i, j) in enumerate(zip(links.listener, links.speaker, strict=True)):
+            k_all = ends.index((NAMES[j], names[i]))
+            assert here.key[k] == both.key[k_all]
+            assert here.loss[k] == both.loss[k_all]
+
+
+def test_another_robot_does_not_change_the_luck_of_the_others():
+    channel = Channel(loss=0.2)
+    bigger = experiment(channel)
+    robots = {"Z": Robot(kind="khepera4", start=[0.0, 1.0]), **bigger.robots}
+    bigger = msgspec.structs.replace(bigger, robots=robots)
+    made = conditions.virtual(bigger, assign.assign(bigger, tuple(robots)).links, [1])
+    assert made.key.tolist() == virtual(channel).key.tolist()
+
+
+def wrong(channel, **parts):
+    return [(".".join(map(str, f.path)), f.message, f.hint) for f in checks.faults(experiment(channel, **parts))]
+
+
+@pytest.mark.parametrize(
+    ("channel", "path", "message", "hint"),
+    [
+        (Channel(links={"A > D": LinkChannel()}), "channel.links.A > D", "no robot is called 'D'", "known: A, B, C"),
+        (
+            Channel(links={"A < B": LinkChannel()}),
+            "channel.links.A < B",
+            "'A < B' is no link",
+            '"A > B" is what A says',
+        ),
+        (Channel(links={"C > A": LinkChannel()}), "channel.links.C > A", "A does not listen to C", "let A listen to C"),
+        (
+            Channel(links={"A > B": LinkChannel(), "A - B": LinkChannel()}),
+            "channel.links.A - B",
+            "what A says to B has its settings by 'A > B' already",
+            "keep one",
+        ),
+        (Channel(burst=3.0), "channel.burst", "nothing is lost here", "give a loss too"),
+        (Channel(loss=0.5, burst=1.5), "channel.burst", "2 are lost in a row on average, not 1.5", "at least 2"),
+        (
+            Channel(loss=0.1, burst=2.0, links={"A > B": LinkChannel(loss=0.8)}),
+            "channel.links.A > B.loss",
+            "5 are lost in a row on average, not 2",
+            "at least 5",
+        ),
+        (Channel(outages=[Outage(from_s=10.0)]), "channel.outages.0.from_s", "begins at 10 s", "a longer duration_s"),
+        (Channel(outages=[Outage(from_s=1.0, robots=["D"])]), "channel.outages.0.robots.0", "'D'", "known: A, B, C"),
+        (
+            Channel(outages=[Outage(from_s=1.0, links=["C > B"])]),
+            "channel.outages.0.links.0",
+            "B does not",
+            "leave it out",
+        ),
+    ],
+)
+def test_what_contradicts_is_named_with_its_remedy(channel, path, message, hint):
+    ((where, said, remedy),) = wrong(channel)
+    assert where == path
+    assert message in said
+    assert hint in remedy
+
+
+def test_what_is_fine_is_fine():
+    good = Channel(loss=0.5, burst=2.0, links={"A > B": LinkChannel(loss=0.1)}, outages=[Outage(from_s=0.0)])
+    assert wrong(good) == []
+    assert wrong(Channel(loss=1.0, burst=3.0)) == []
+
+
+def test_an_outage_must_end_after_it_began():
+    with pytest.raises(ValueError, match="later than `from_s`"):
+        Outage(from_s=2.0, until_s=2.0)
+
+
+def test_links_that_only_avoidance_hears_are_links():
+    channel = Channel(links={"C > A": LinkChannel(loss=0.5)})
+    everybody = {"kind": "potential", "hears": "all"}
+    assert wrong(channel, avoidance=everybody) == []
+    chosen = experiment(channel, avoidance=everybody)
+    links = assign.assign(chosen, NAMES).links
+    made = conditions.virtual(chosen, links, [1])
+    ((k),) = np.flatnonzero(made.loss)
+    assert (NAMES[links.listener[k]], NAMES[links.speaker[k]]) == ("A", "C")

@@ -1,0 +1,96 @@
+"""What a report says of a modelled network: how much it dropped, how long the rest took, link by link."""
+
+import dataclasses
+
+import msgspec
+import numpy as np
+import pytest
+
+from experiments import playback, report
+from experiments.experiment import Channel, LinkChannel
+from experiments.logbook import Logbook
+from experiments.metrics import measure
+from experiments.report_network import network_tables
+from experiments.report_tables import proof_tables, summary_table
+from experiments.run import load
+from experiments.verdict import findings
+from experiments.virtual import simulate
+from tests.experiments.traces import pair
+
+BAD = Channel(delay_s=0.05, loss=0.2, links={"TB01 > KH01": LinkChannel(loss=0.0, delay_s=0.03)})
+
+
+@pytest.fixture(scope="module")
+def run():
+    park = load("robotic-park").cases()["periodic"]
+    park = msgspec.structs.replace(park, duration_s=4.0, timeline=[], channel=BAD)
+    return Logbook(simulate(park, [1]), park, "bad", 0)
+
+
+def test_what_was_dropped_is_told_apart_from_what_was_lost(run):
+    measured = measure(run.trace())
+    assert measured.modelled
+    assert measured.lost == 0
+    links = {(each.speaker, each.listener): each for each in measured.passages}
+    assert len(links) == 21
+    spared = links["TB01", "KH01"]
+    assert (spared.dropped, spared.heard) == (0, 200)  # that of the end is under way; one from before the start came
+    assert (spared.delay_mean, spared.delay_max) == (pytest.approx(0.03), pytest.approx(0.03))
+    for ends, each in links.items():
+        if ends != ("TB01", "KH01"):
+            assert each.dropped == pytest.approx(40, abs=24)
+            assert each.heard + each.dropped == pytest.approx(200, abs=4)
+            assert each.delay_mean == pytest.approx(0.05)
+    assert measured.dropped == sum(each.dropped for each in measured.passages)
+    of = {robot.robot: robot.dropped for robot in measured.robots}
+    assert of["TB01"] == sum(each.dropped for ends, each in links.items() if ends[0] == "TB01")
+    assert sum(of.values()) == measured.dropped
+
+
+def test_the_verdict_and_the_tables_say_so(run):
+    measured = measure(run.trace())
+    said = [each.text for each in findings([measured])]
+    assert any(text.startswith("Nothing was lost") for text in said)
+    (text,) = [text for text in said if text.startswith("The modelled network dropped")]
+    assert f"dropped {measured.dropped} of 4" in text
+    assert text.endswith("at most 50.0 ms.")
+    (table,) = network_tables([measured])
+    assert table.rows[-1].cells[0] == "all"
+    spared = next(row.cells for row in table.rows if row.cells[0] == "TB01 > KH01")
+    assert spared == ("TB01 > KH01", "200", "0", "0", "30.0", "30.0")
+    assert proof_tables([measured])[0].head[-2:] == ("Lost", "Dropped")
+    assert "Dropped by the modelled network" in [row.cells[0] for row in summary_table([measured]).rows]
+
+
+def test_a_report_has_a_section_for_it(tmp_path, run):
+    text = report.write(tmp_path, [run.trace()]).read_text(encoding="utf-8")
+    assert "What the modelled network did" in text
+    assert "TB01 &gt; KH01" in text
+
+
+def test_without_a_modelled_network_nothing_is_said_of_it():
+    measured = measure(pair(np.ones(100)))
+    assert not measured.modelled
+    assert measured.dropped == 0
+    assert network_tables([measured]) == ()
+    assert proof_tables([measured])[0].head[-1] == "Lost"
+    assert not any("modelled" in each.text for each in findings([measured]))
+
+
+def test_what_was_heard_on_no_link_of_the_file_counts_nowhere():
+    known = pair(np.ones(100), sent={"L": [0.1, 0.2], "F": [0.3]}, delay=0.01)
+    odd = dataclasses.replace(known.heard, listener=1 - known.heard.listener, speaker=1 - known.heard.speaker)
+    assert [each.heard for each in measure(known).passages] == [2]
+    assert [each.heard for each in measure(dataclasses.replace(known, heard=odd)).passages] == [0]
+
+
+def test_a_recording_keeps_it(tmp_path, run):
+    run.record(tmp_path / "bad.mcap", "")
+    read, trace = playback.read(tmp_path / "bad.mcap").trace, run.trace()
+    assert trace.dropped.sum() > 500
+    np.testing.assert_array_equal(read.dropped, trace.dropped)
+    np.testing.assert_array_equal(read.lost, 0)
+    one, other = measure(read).passages, measure(trace).passages
+    for a, b in zip(one, other, strict=True):
+        assert (a.heard, a.dropped) == (b.heard, b.dropped)
+        assert a.delay_mean == pytest.approx(b.delay_mean, abs=1e-5)

@@ -1,0 +1,65 @@
+"""A bad network in real time: the listeners lose and delay what the same file loses and delays in virtual time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents.rows import Index
+from experiments import playback
+from experiments.experiment import Experiment
+from experiments.logbook import Logbook
+from experiments.run import load
+from experiments.trace import Trace
+from experiments.virtual import simulate
+from tests.system.lab import Flight
+
+pytestmark = pytest.mark.system
+
+BAD = ("channel.loss=0.3", "channel.delay_s=0.05")
+MARGIN_S = 0.2  # what was said so shortly before the end may still be under way
+
+
+def sent_and_heard(trace: Trace, listener: int, speaker: int, end: float) -> tuple[Index, Index]:
+    """Running numbers of the run that a robot said, and those of them that another one heard."""
+    said = trace.sent.seq[(trace.sent.robot == speaker) & (trace.sent.time < end - MARGIN_S)]
+    mine = (trace.heard.listener == listener) & (trace.heard.speaker == speaker)
+    return said, np.intersect1d(said, trace.heard.seq[mine])
+
+
+def virtual(duration_s: float) -> Trace:
+    """The same in virtual time, longer: robots start sooner there, and their numbers must overlap."""
+    experiment: Experiment = load("triangle", *BAD, f"duration_s={duration_s}").cases()["periodic"]
+    return Logbook(simulate(experiment, [experiment.seed]), experiment, "periodic").trace()
+
+
+def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    changes = [part for change in (*BAD, "duration_s=3") for part in ("--set", change)]
+    flight = Flight(folder, "triangle", "--case", "periodic", "--json", "--no-report", *changes)
+    code, out = flight.finish(60.0)
+    assert code == 0, flight.said
+    robots = json.loads(out)["cases"]["periodic"]["robots"]
+    assert [robot["lost"] for robot in robots.values()] == [0, 0, 0], "of the real network nothing is lost"
+
+    real, other = playback.read(folder / "periodic.mcap").trace, virtual(15.0)
+    shares = []
+    pairs = sorted({*zip(real.heard.listener.tolist(), real.heard.speaker.tolist(), strict=True)})
+    assert len(pairs) == len(real.dropped if real.dropped is not None else ())
+    for listener, speaker in pairs:
+        said, heard = sent_and_heard(real, listener, speaker, 3.0)
+        said_there, heard_there = sent_and_heard(other, listener, speaker, 15.0)
+        both = np.intersect1d(said, said_there)
+        assert len(both) > 100
+        np.testing.assert_array_equal(np.intersect1d(heard, both), np.intersect1d(heard_there, both))
+        shares.append(1.0 - len(heard) / len(said))
+    assert np.mean(shares) == pytest.approx(0.3, abs=0.06)
+
+    delay = real.heard.time - real.heard.stamp
+    assert delay.min() >= 0.05 - 1e-5
+    assert np.median(delay) < 0.07  # the next tick after those 50 ms, and what a busy machine adds
+    assert real.dropped is not None
+    assert real.dropped.sum() == pytest.approx(0.3 * 150 * len(pairs), rel=0.15)
