@@ -68,6 +68,7 @@ class Agent:
         offset: (N, 3) decided last, before it was clamped [m].
         decisions: Coordination decisions since the common start.
         updates: (N,) how often each row computed its goal anew at one of them; of guided rows, how often it was told.
+        begun: Whether the first row has begun to run.
         decides: Whether goals are decided on this tick; known from its first half on.
         deciding: Computes the goals of rows that are not guided.
         guidance: What the others were told; None if there are none, and `all_guided` if there are only such.
@@ -95,7 +96,7 @@ class Agent:
         self.life = Lifecycle(flies, assignment.hover, assignment.duration)
         self._voice = Voice(assignment.trigger, rows, assignment.predictor)
         self.offline_since = np.inf
-        self._begun = False
+        self.begun = False
         self._decided = self._asked = -1
         self._duties: Duties | None = None
         self._ordered = np.zeros(rows, dtype=bool)
@@ -183,10 +184,10 @@ class Agent:
         life = self.life
         self._duties = life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
         assignment = self.assignment
-        if life.moved and not self._begun and (life.phase == RUNNING).any():
+        if life.moved and not self.begun and (life.phase == RUNNING).any():
             since = t - float(life.start_at[life.phase == RUNNING].min())
             self._decided = self._asked = -1
-            self._begun, self.tick = True, round(since * assignment.body_hz)  # 0, unless it joins a run under way
+            self.begun, self.tick = True, round(since * assignment.body_hz)  # 0, unless it joins a run under way
         # by number, not by remainder: a tick that was skipped because the process was late is made up for
         decision, question = self.tick // assignment.decide_every, self.tick // assignment.pose_every
         self.decides, self._decided = decision != self._decided, decision

@@ -12,11 +12,15 @@ from agents.rows import Array, Index, Mask, every, some
 from experiments.experiment import Channel as Parameters
 
 ROUNDING_S = 1e-9  # sums of binary fractions miss the ticks by less than this
+BETWEEN_ROBOTS, TO_CENTRE, FROM_CENTRE = 0x636861, 0x746F63, 0x66726F  # streams of chances
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Poses on their way (M): link, arrival time, sample time [s], number, position and velocity (M, 3)."""
+    """Poses on their way (M): link, arrival time, sample time [s], number, position and velocity (M, 3).
+
+    `extra` (M, k) is what else is told with them, for those who need it.
+    """
 
     link: Index
     arrival: Array
@@ -24,6 +28,7 @@ class Samples:
     seq: Index
     position: Array
     velocity: Array
+    extra: Array | None = None
 
     def take(self, which: Index | Mask) -> Samples:
         """Some of them."""
@@ -34,25 +39,44 @@ class Samples:
             self.seq[which],
             self.position[which],
             self.velocity[which],
+            None if self.extra is None else self.extra[which],
         )
 
 
 class Channel:
-    """Carries what rows say to whoever listens; each repetition has a random stream of its own."""
+    """Carries what rows say to whoever listens; each repetition has a random stream of its own.
 
-    def __init__(self, links: Links, parameters: Parameters, seeds: Sequence[int]) -> None:
-        """`links` of all repetitions, those of the first seed first."""
+    Attributes:
+        ideal: Without any delay: what is said on a tick is known to all before they decide on it.
+        lost: (E,) samples lost on each link.
+    """
+
+    def __init__(
+        self, links: Links, parameters: Parameters, seeds: Sequence[int], *, stream: int = BETWEEN_ROBOTS
+    ) -> None:
+        """`links` of all repetitions, those of the first seed first; each `stream` has chances of its own."""
         self._links = links
+        self.ideal = parameters.delay_s == parameters.jitter_s == 0.0
         self._delay, self._jitter, self._loss = parameters.delay_s, parameters.jitter_s, parameters.loss
-        self._generators = [np.random.default_rng([seed, 0x636861]) for seed in seeds]
+        self._generators = [np.random.default_rng([seed, stream]) for seed in seeds]
         self._per_copy = len(links) // len(seeds)
         self._flying: list[Samples] = []
         self.lost = np.zeros(len(links), dtype=np.intp)
 
     def send(
-        self, t: float, rows: Index, seq: Index, position: Array, velocity: Array, *, surely: bool = False
+        self,
+        t: float,
+        rows: Index,
+        seq: Index,
+        position: Array,
+        velocity: Array,
+        *,
+        surely: bool = False,
+        extra: Array | None = None,
     ) -> None:
         """Rows say where they are: `position`, `velocity` (N, 3) and `seq` (N,) of all rows, of which `rows` speak.
+
+        `extra` (N, k) goes along.
 
         Before the common start nothing is lost (`surely`): no run begins before everybody has heard his neighbours, and
         the real network repeats a first pose until it arrives.
@@ -75,7 +99,8 @@ class Channel:
         if len(at):
             who = speaker[at]
             stamp = np.full(len(at), t)
-            self._flying.append(Samples(at, t + delay, stamp, seq[who], position[who], velocity[who]))
+            more = None if extra is None else extra[who]
+            self._flying.append(Samples(at, t + delay, stamp, seq[who], position[who], velocity[who], more))
 
     def due(self, t: float) -> Samples | None:
         """What has arrived by `t` [s], in order of arrival."""
@@ -85,7 +110,9 @@ class Channel:
             pool = self._flying[0]
         else:
             columns = ("link", "arrival", "stamp", "seq", "position", "velocity")
-            pool = Samples(*(np.concatenate([getattr(s, c) for s in self._flying]) for c in columns))
+            told = [s.extra for s in self._flying if s.extra is not None]
+            pool = Samples(*(np.concatenate([getattr(s, c) for s in self._flying]) for c in columns),
+                           np.concatenate(told) if told else None)  # fmt: skip
         here = pool.arrival <= t + ROUNDING_S
         if every(here):
             self._flying = []

@@ -7,7 +7,7 @@ a lossy network makes one so much later ready that the others get their orders a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +21,7 @@ from agents.shadow import shadowed
 from experiments import assign
 from experiments.channel import Channel
 from experiments.experiment import Experiment
+from experiments.steering import Steering, SteeringLog
 from twins.body import TwinBody
 from twins.engine import Touch
 
@@ -135,6 +136,7 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
     twin = TwinBody(request, assign.world(experiment, names, len(seeds)))
     body = shadowed(twin, request, assign.shadows(experiment, names, len(seeds)))
     channel = Channel(assignment.links, experiment.channel, seeds)
+    steering = Steering(experiment, seeds) if assignment.guided is not None else None
     rows = len(assignment.names)
     dt = 1.0 / assignment.body_hz
     log_every = round(assignment.body_hz / experiment.rates.state_hz)
@@ -142,25 +144,46 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
     interventions, avoided = np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
     touches: list[Touch] = []
     states, seen, sent, heard = _Samples(), _Samples(), _Samples(), _Samples()
-    lost_before = lost_after = channel.lost
+    losses = _Losses([lambda: channel.lost] + ([] if steering is None else [lambda: steering.lost[0], lambda: steering.lost[1]]))
     conductor = _Conductor(agent, names)
     nothing = np.zeros((rows, 0))
     blank = (nothing,) * 4
     tick = 0
-    while not conductor.over:
-        t = tick * dt
-        state = body.read(t)
+
+    def hear(t: float) -> None:
         arrived = channel.due(t)
         if arrived is not None:
             agent.hear(arrived.link, arrived.position, arrived.velocity, arrived.stamp, arrived.arrival)
             if not lean:
                 heard.add(arrived.arrival, arrived.link, arrived.seq, arrived.stamp, arrived.position, arrived.velocity)
-        actions = agent.step(t, state)
-        if agent.life.moved:
-            if lost_before is channel.lost and agent.decisions:
-                lost_before = channel.lost.copy()
-            if lost_after is channel.lost and agent.decisions and (agent.life.phase >= LANDING).all():
-                lost_after = channel.lost.copy()
+
+    while not conductor.over:
+        t = tick * dt
+        state = body.read(t)
+        hear(t)
+        if steering is not None:
+            steering.deliver(t, agent)
+        said = agent.speak(t, state)
+        if agent.life.moved and agent.begun:
+            losses.look(over=bool((agent.life.phase >= LANDING).all()))
+        if len(speak := said.rows):
+            seq[speak] += 1
+            told = (nothing[speak],) * 3 if lean else (said.position[speak], said.velocity[speak], state.yaw[speak])
+            sent.add(np.full(len(speak), t), speak, seq[speak], *told)
+            surely = not agent.begun
+            channel.send(t, speak, seq, said.position, said.velocity, surely=surely)
+            if channel.ideal:
+                hear(t)
+            if steering is not None:
+                steering.say(t, speak, seq, said.position, said.velocity, state.yaw, surely=surely)
+        if steering is not None:
+            if channel.ideal:
+                steering.deliver(t, agent)
+            if agent.decides:
+                steering.decide(t, agent)
+                if channel.ideal:
+                    steering.deliver(t, agent)
+        actions = agent.act(t, state, said)
         if actions.duties is not None:
             body.takeoff(actions.duties.takeoff, assignment.hover[actions.duties.takeoff])
             body.land(actions.duties.land)
@@ -177,13 +200,6 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
             states.add(t, *((*blank, state.true_position, *blank) if lean else whole))
             more = () if lean else tuple(value for value in _extra(state) if value is not None)
             seen.add(nothing if lean else np.array(twin.engine.obstacles), *more)
-        if len(speak := actions.speak):
-            seq[speak] += 1
-            said = (
-                (nothing[speak],) * 3 if lean else (actions.position[speak], actions.velocity[speak], state.yaw[speak])
-            )
-            sent.add(np.full(len(speak), t), speak, seq[speak], *said)
-            channel.send(t, speak, seq, actions.position, actions.velocity, surely=agent.decisions == 0)
         conductor.look(t, dt)
         twin.begun_at = conductor.start_at
         tick += 1
@@ -208,7 +224,7 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
         error=error,
         sent=(at - begin, row.astype(np.intp), number.astype(np.intp), pose[0], pose[1], pose[2]),
         heard=(arrival - begin, link.astype(np.intp), told.astype(np.intp), stamp - begin, *heard_pose),
-        lost=lost_after - lost_before,
+        lost=losses.counted()[0],
         decisions=agent.decisions,
         updates=agent.updates,
         interventions=interventions,
@@ -232,6 +248,28 @@ def _measured(state: BodyState) -> tuple[Array, ...]:
 def _extra(state: BodyState) -> tuple[Array | None, ...]:
     """What there is of in all samples or in none."""
     return state.attitude, state.shadow_position, state.shadow_yaw
+
+
+class _Losses:
+    """What was lost from the common start to the landing."""
+
+    def __init__(self, counts: Sequence[Callable[[], Index]]) -> None:
+        """Counts that only grow."""
+        self._counts = counts
+        self._before: list[Index] | None = None
+        self._after: list[Index] | None = None
+
+    def look(self, *, over: bool) -> None:
+        """When phases have moved, before anybody speaks: the first time, all begin; `over`: all have ended."""
+        if self._before is None:
+            self._before = [count().copy() for count in self._counts]
+        if over and self._after is None:
+            self._after = [count().copy() for count in self._counts]
+
+    def counted(self) -> list[Index]:
+        """Of each of the counts."""
+        after = [count() for count in self._counts] if self._after is None else self._after
+        return [b - a for a, b in zip(self._before or after, after, strict=True)]
 
 
 class _Conductor:
