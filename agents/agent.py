@@ -146,8 +146,8 @@ class Agent:
 
     def hear_goal(self, rows: Index, goal: Array, toward: Array, stamp: Array) -> Mask:
         """See `Guidance.hear`; rows that nobody guides take no goals."""
-        return np.zeros(len(rows), dtype=bool) if self.guidance is None else self.guidance.hear(
-            rows, goal, toward, stamp
+        return (
+            np.zeros(len(rows), dtype=bool) if self.guidance is None else self.guidance.hear(rows, goal, toward, stamp)
         )
 
     def hold(self, row: int) -> str:

@@ -13,10 +13,10 @@ import numpy as np
 from agents.assignment import Assignment
 from agents.deciding import Deciding, Holding
 from agents.hearing import Heard
-from agents.lifecycle import READY, RUNNING
+from agents.lifecycle import AIRBORNE, RUNNING
 from agents.rows import Array, Index, Mask
 
-WAITING = READY + 1  # up to this phase a row waits for the start (airborne)
+ROUNDING_S = 1e-6  # instants of decisions are multiples of a period that binary fractions miss by less than this
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,9 @@ class Centre:
         speaks[assignment.links.speaker] = True
         self.listens: Index = np.flatnonzero(self.guided | speaks)
 
-    def hear(self, rows: Index, position: Array, velocity: Array, yaw: Array, stamp: Array, arrived: Array) -> None:
+    def hear(  # noqa: PLR0917 - as `Hearing.hear`
+        self, rows: Index, position: Array, velocity: Array, yaw: Array, stamp: Array, arrived: Array
+    ) -> None:
         """Poses of `rows` (H,) that arrived, in order of arrival; older samples than known are left out."""
         poses = self.poses
         order = np.argsort(stamp, kind="stable")  # of several of one robot the newest stays, whichever came last
@@ -106,8 +108,10 @@ class Centre:
         """
         deciding, poses, limits = self.deciding, self.poses, self.assignment.limits
         deciding.settle(t)
+        # a status that says so may still be on its way, but the start was known before
+        phase = np.where((phase == AIRBORNE) & (t >= start - ROUNDING_S), RUNNING, phase)
         known = self.guided & np.isfinite(poses.stamp) & np.isinf(poses.gone)
-        running, waiting = known & (phase == RUNNING), known & (phase <= WAITING) & self._complete(t)
+        running, waiting = known & (phase == RUNNING), known & (phase <= AIRBORNE) & self._complete(t)
         position = np.full((len(known), 3), np.nan)
         position[known] = poses.believed(self.assignment.predictor, t, np.flatnonzero(known))
         held = anew = (running & deciding.alone()) | waiting

@@ -99,9 +99,7 @@ class Deciding:
         if self._updating is not None:
             self._updating.forget(rows)
 
-    def decide(
-        self, t: float, position: Array, velocity: Array, yaw: Array, *, start: Array, running: Mask
-    ) -> Decided:
+    def decide(self, t: float, position: Array, velocity: Array, yaw: Array, *, start: Array, running: Mask) -> Decided:
         """New goals of rows that are under way.
 
         Args:

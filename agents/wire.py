@@ -55,6 +55,16 @@ class Heard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     velocity: Vector
 
 
+class Followed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A goal that reached its robot: when it was sent, when the pose was taken on which it rests, and when it was acted
+    on (UTC [s])."""
+
+    seq: int
+    stamp: float
+    pose: float
+    acted: float
+
+
 class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Telemetry of a body and its decision, for recorder and viewers.
 
@@ -81,6 +91,7 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     attitude: Setpoint | None = None
     shadow_position: Vector | None = None
     shadow_yaw: float | None = None
+    followed: list[Followed] = []
 
 
 class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -124,6 +135,46 @@ class Position(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stamp: float
     position: Vector
     yaw: float | None = None
+
+
+class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where a guided robot must go: position [m], yaw [rad] if one is wanted, when it was decided (UTC `stamp` [s]).
+
+    `pose` is when that robot's own pose was taken on which the goal rests (UTC [s]). The running `seq` grows for ever:
+    whoever decides begins at a number that nobody before him had reached, such as the time in milliseconds.
+    """
+
+    robot: str
+    seq: int
+    stamp: float
+    position: Vector
+    yaw: float | None
+    pose: float
+
+
+class CentreState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the centre says of itself, at 1 Hz.
+
+    `robots` are guided; `missing` are those that it needs and never heard, or that are gone. `load` is the share of a
+    core that it took in the last second, `late_s` the largest lateness of a decision in it. The others count since its
+    process began: `decisions`, and `missed` ones that were too late to be made; `goals` sent, poses `heard` and those
+    `lost` by their numbers, per robot.
+    """
+
+    stamp: float
+    robots: list[str]
+    missing: list[str]
+    load: float
+    late_s: float
+    decisions: int
+    missed: int
+    goals: int
+    heard: dict[str, int]
+    lost: dict[str, int]
+    malformed: int
+    pid: int
+    cpu_s: float
+    rss_mb: float
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -248,6 +299,8 @@ Message = (
     | State
     | Status
     | Position
+    | Goal
+    | CentreState
     | Command
     | Ranges
     | Order
@@ -265,6 +318,8 @@ M = TypeVar(
     State,
     Status,
     Position,
+    Goal,
+    CentreState,
     Command,
     Ranges,
     Order,
@@ -338,6 +393,32 @@ def check_position(measured: Position, *, robot: str, now: float, reach: Vector)
         raise Malformed(f"position {measured.position} is outside the arena")
     if measured.yaw is not None and not abs(measured.yaw) <= 1e3:
         raise Malformed(f"yaw {measured.yaw} is impossible")
+
+
+def check_goal(goal: Goal, *, robot: str, now: float, reach: Vector, oldest_s: float) -> None:
+    """Refuses a goal that no robot can follow, or that is too old to be followed.
+
+    Args:
+        goal: What arrived.
+        robot: Whose key it arrived on.
+        now: UTC time of arrival [s].
+        reach: See `check_pose`.
+        oldest_s: A goal that was decided longer ago is none [s].
+
+    Raises:
+        Malformed: If the name is another's, a number is not finite, the stamp is old or lies in the future, the pose is
+            younger than the goal that rests on it, or the position is out of reach.
+    """
+    if goal.robot != robot:
+        raise Malformed(f"goal of '{goal.robot}' on the key of '{robot}'")
+    if not (0 < goal.seq < 2**53 and math.isfinite(goal.stamp) and now - oldest_s <= goal.stamp < now + FUTURE_S):
+        raise Malformed(f"sequence number {goal.seq} or stamp {goal.stamp} is impossible, or the goal is old")
+    if not 0.0 < goal.pose <= goal.stamp + FUTURE_S:  # the robot's clock may be ahead
+        raise Malformed(f"a goal of {goal.stamp} cannot rest on a pose of {goal.pose}")
+    if not all(abs(value) <= limit for value, limit in zip(goal.position, reach, strict=True)):  # NaN fails too
+        raise Malformed(f"position {goal.position} is outside the arena")
+    if goal.yaw is not None and not abs(goal.yaw) <= 1e3:
+        raise Malformed(f"yaw {goal.yaw} is impossible")
 
 
 def check_ranges(ranges: Ranges, *, robot: str, now: float) -> None:

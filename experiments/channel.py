@@ -111,8 +111,11 @@ class Channel:
         else:
             columns = ("link", "arrival", "stamp", "seq", "position", "velocity")
             told = [s.extra for s in self._flying if s.extra is not None]
-            pool = Samples(*(np.concatenate([getattr(s, c) for s in self._flying]) for c in columns),
-                           np.concatenate(told) if told else None)  # fmt: skip
+            link, arrival, stamp, seq, position, velocity = (
+                np.concatenate([getattr(s, c) for s in self._flying]) for c in columns
+            )
+            extra = np.concatenate(told) if told else None
+            pool = Samples(link, arrival, stamp, seq, position, velocity, extra)
         here = pool.arrival <= t + ROUNDING_S
         if every(here):
             self._flying = []

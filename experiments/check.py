@@ -181,7 +181,14 @@ def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
     found = {}
     for name, case in cases.items():
         bare = msgspec.structs.replace(
-            case, trigger="periodic", prediction=None, architecture="distributed", channel=Channel(), network=Network(), disturbance={}, cases={}
+            case,
+            trigger="periodic",
+            prediction=None,
+            architecture="distributed",
+            channel=Channel(),
+            network=Network(),
+            disturbance={},
+            cases={},
         )
         key = msgspec.json.encode(bare)
         if key not in known:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,19 +17,23 @@ from experiments.channel import FROM_CENTRE, TO_CENTRE, Channel
 from experiments.experiment import Experiment
 
 
-@dataclass
-class SteeringLog:
-    """What went between robots and centre, columns that grow; times on the clock of the run [s].
+@dataclass(frozen=True)
+class Steered:
+    """What went between robots and centre in all repetitions, in the time of the experiment [s].
 
     Attributes:
         sent: Goals: time, row, number, goal (K, 3), yaw, time of the pose on which it rests.
-        followed: Goals that reached a robot which runs: time, row, number, time sent, time of the pose.
+        followed: Goals that reached their robots: time, row, number, time sent, time of the pose.
         heard: Poses that the centre heard: time, row.
+        lost_poses: (R,) of each row, that did not reach the centre, from the common start to the landing.
+        lost_goals: (R,) goals that did not reach their rows.
     """
 
-    sent: list[tuple[Array | Index, ...]] = field(default_factory=list)
-    followed: list[tuple[Array | Index, ...]] = field(default_factory=list)
-    heard: list[tuple[Array | Index, ...]] = field(default_factory=list)
+    sent: tuple[Array, Index, Index, Array, Array, Array]
+    followed: tuple[Array, Index, Index, Array, Array]
+    heard: tuple[Array, Index]
+    lost_poses: Index
+    lost_goals: Index
 
 
 class Steering:
@@ -38,15 +43,17 @@ class Steering:
     Phases and the common start are the conductor's, and known to everybody at once, as they are to the robots.
 
     Attributes:
-        log: See `SteeringLog`.
         centre: The decision.
     """
 
     def __init__(self, experiment: Experiment, seeds: Sequence[int]) -> None:
         self.centre = Centre(assign.assign_centre(experiment, len(seeds)))
-        self.log = SteeringLog()
+        self._sent: list[tuple[Any, ...]] = []
+        self._followed: list[tuple[Any, ...]] = []
+        self._heard: list[tuple[Any, ...]] = []
         rows = len(self.centre.guided)
-        ends = [(row, row) for row in self.centre.listens.tolist()], [(row, row) for row in np.flatnonzero(self.centre.guided).tolist()]
+        told = np.flatnonzero(self.centre.guided)
+        ends = [[(row, row) for row in group.tolist()] for group in (self.centre.listens, told)]
         self._poses, self._goals = (
             Channel(links(pairs, [1.0] * len(pairs), [1.0] * len(pairs)), experiment.channel, seeds, stream=stream)
             for pairs, stream in zip(ends, (TO_CENTRE, FROM_CENTRE), strict=True)
@@ -57,13 +64,18 @@ class Steering:
         self._extra = np.full((rows, 2), np.nan)
 
     @property
-    def lost(self) -> tuple[Index, Index]:
-        """(N,) poses that did not reach the centre, and goals that did not reach their robots."""
-        counts = np.zeros((2, len(self._seq)), dtype=np.intp)
-        counts[0, self._poses_of], counts[1, self._goals_of] = self._poses.lost, self._goals.lost
-        return counts[0], counts[1]
+    def losses(self) -> tuple[Callable[[], Index], Callable[[], Index]]:
+        """Tell (R,) poses that did not reach the centre so far, and goals that did not reach their rows."""
+        return lambda: self._counted(self._poses, self._poses_of), lambda: self._counted(self._goals, self._goals_of)
 
-    def say(self, t: float, rows: Index, seq: Index, position: Array, velocity: Array, yaw: Array, *, surely: bool) -> None:
+    def _counted(self, channel: Channel, rows: Index) -> Index:
+        counts = np.zeros(len(self._seq), dtype=np.intp)
+        counts[rows] = channel.lost
+        return counts
+
+    def say(  # noqa: PLR0917 - as `Channel.send`
+        self, t: float, rows: Index, seq: Index, position: Array, velocity: Array, yaw: Array, *, surely: bool
+    ) -> None:
         """Robots say where they are, to whoever listens; see `Channel.send`."""
         self._poses.send(t, rows, seq, position, velocity, surely=surely, extra=yaw[:, None])
 
@@ -75,7 +87,7 @@ class Steering:
             self.centre.hear(
                 rows, arrived.position, arrived.velocity, arrived.extra[:, 0], arrived.stamp, arrived.arrival
             )
-            self.log.heard.append((arrived.arrival, rows))
+            self._heard.append((arrived.arrival, rows))
         arrived = self._goals.due(t)
         if arrived is not None and arrived.extra is not None:
             # of several for one robot the newest counts
@@ -88,7 +100,7 @@ class Steering:
             news = agent.hear_goal(rows, arrived.position, toward, arrived.stamp)
             if news.any():
                 now = np.full(int(news.sum()), t)
-                self.log.followed.append((now, rows[news], arrived.seq[news], arrived.stamp[news], rests[news]))
+                self._followed.append((now, rows[news], arrived.seq[news], arrived.stamp[news], rests[news]))
 
     def decide(self, t: float, agent: Agent) -> None:
         """On a tick on which goals are decided: those of the robots that are guided."""
@@ -98,7 +110,25 @@ class Steering:
             return
         self._seq[rows] += 1
         self._goal[rows], self._extra[rows, 0], self._extra[rows, 1] = told.goal, told.toward, told.rests
-        self._goals.send(
-            t, rows, self._seq, self._goal, self._still, surely=not agent.begun, extra=self._extra
+        self._goals.send(t, rows, self._seq, self._goal, self._still, surely=not agent.begun, extra=self._extra)
+        self._sent.append((np.full(len(rows), t), rows, self._seq[rows], told.goal, told.toward, told.rests))
+
+    def logged(self, begin: float, lost_poses: Index, lost_goals: Index) -> Steered:
+        """All of it, when the common start was at `begin` [s]."""
+        time, row, seq, goal, toward, rests = joined(self._sent, (0,), (0,), (0,), (0, 3), (0,), (0,))
+        at, who, number, stamp, pose = joined(self._followed, (0,), (0,), (0,), (0,), (0,))
+        heard, speaker = joined(self._heard, (0,), (0,))
+        return Steered(
+            sent=(time - begin, row.astype(np.intp), seq.astype(np.intp), goal, toward, rests - begin),
+            followed=(at - begin, who.astype(np.intp), number.astype(np.intp), stamp - begin, pose - begin),
+            heard=(heard - begin, speaker.astype(np.intp)),
+            lost_poses=lost_poses,
+            lost_goals=lost_goals,
         )
-        self.log.sent.append((np.full(len(rows), t), rows, self._seq[rows], told.goal, told.toward, told.rests))
+
+
+def joined(columns: list[tuple[Any, ...]], *empty: tuple[int, ...]) -> tuple[Any, ...]:
+    """Concatenated; `empty` gives the shapes of columns when nothing was added."""
+    if not columns:
+        return tuple(np.zeros(shape) for shape in empty)
+    return tuple(np.concatenate(column) for column in zip(*columns, strict=True))

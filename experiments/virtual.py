@@ -1,13 +1,13 @@
 """The virtual clock: the whole experiment in one process, without sleeping, reproducible to the bit from its seed.
 
-The decision is `agents.Agent` with all rows, the bodies are the twins, the network is `experiments.channel`; this file
-is only the loop. Several seeds run side by side as more rows, each with the result that it would have alone (unless
+The decision is `agents.Agent` with all rows, the bodies are the twins, the network is `experiments.virtual_network`;
+this file is only the loop. Several seeds run side by side as more rows, each with the result that it would have alone (unless
 a lossy network makes one so much later ready that the others get their orders at another multiple of `ORDERS_S`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,13 +15,13 @@ import numpy as np
 
 from agents.agent import Agent
 from agents.body import BodyState
-from agents.lifecycle import LANDING, Phase
+from agents.lifecycle import Phase
 from agents.rows import Array, Index, Mask, some
 from agents.shadow import shadowed
 from experiments import assign
-from experiments.channel import Channel
 from experiments.experiment import Experiment
-from experiments.steering import Steering, SteeringLog
+from experiments.steering import Steered
+from experiments.virtual_network import VirtualNetwork
 from twins.body import TwinBody
 from twins.engine import Touch
 
@@ -62,6 +62,7 @@ class Log:
         shadow_position: (K, R, 3) of the twins beside the robots, NaN for rows without one; None if there is none.
         shadow_yaw: (K, R) of those twins.
         waited: (repetitions,) that got an order later than they would have got it alone, because another one was late.
+        steered: What went between the robots and the centre; None if every robot decides for itself.
     """
 
     names: tuple[str, ...]
@@ -92,6 +93,7 @@ class Log:
     shadow_position: Array | None
     shadow_yaw: Array | None
     waited: Mask
+    steered: Steered | None = None
 
 
 class _Samples:
@@ -107,16 +109,8 @@ class _Samples:
         """As arrays with the samples as first axis."""
         return tuple(np.array(column) for column in zip(*self._columns, strict=True))
 
-    def joined(self, *empty: tuple[int, ...]) -> tuple[Any, ...]:
-        """Concatenated; `empty` gives the shapes of columns when nothing was added."""
-        if not self._columns:
-            return tuple(np.zeros(shape) for shape in empty)
-        return tuple(np.concatenate(column) for column in zip(*self._columns, strict=True))
 
-
-def simulate(  # noqa: PLR0915 - one loop, told in order
-    experiment: Experiment, seeds: Sequence[int], *, lean: bool = False
-) -> Log:
+def simulate(experiment: Experiment, seeds: Sequence[int], *, lean: bool = False) -> Log:
     """Flies one case of an experiment once for each seed.
 
     Args:
@@ -135,54 +129,21 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
     request = replace(request, external=(False,) * len(request.names))  # nobody measures in virtual time
     twin = TwinBody(request, assign.world(experiment, names, len(seeds)))
     body = shadowed(twin, request, assign.shadows(experiment, names, len(seeds)))
-    channel = Channel(assignment.links, experiment.channel, seeds)
-    steering = Steering(experiment, seeds) if assignment.guided is not None else None
+    network = VirtualNetwork(experiment, agent, seeds, lean=lean)
     rows = len(assignment.names)
     dt = 1.0 / assignment.body_hz
     log_every = round(assignment.body_hz / experiment.rates.state_hz)
-    seq = np.zeros(rows, dtype=np.intp)
     interventions, avoided = np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
     touches: list[Touch] = []
-    states, seen, sent, heard = _Samples(), _Samples(), _Samples(), _Samples()
-    losses = _Losses([lambda: channel.lost] + ([] if steering is None else [lambda: steering.lost[0], lambda: steering.lost[1]]))
+    states, seen = _Samples(), _Samples()
     conductor = _Conductor(agent, names)
     nothing = np.zeros((rows, 0))
     blank = (nothing,) * 4
     tick = 0
-
-    def hear(t: float) -> None:
-        arrived = channel.due(t)
-        if arrived is not None:
-            agent.hear(arrived.link, arrived.position, arrived.velocity, arrived.stamp, arrived.arrival)
-            if not lean:
-                heard.add(arrived.arrival, arrived.link, arrived.seq, arrived.stamp, arrived.position, arrived.velocity)
-
     while not conductor.over:
         t = tick * dt
         state = body.read(t)
-        hear(t)
-        if steering is not None:
-            steering.deliver(t, agent)
-        said = agent.speak(t, state)
-        if agent.life.moved and agent.begun:
-            losses.look(over=bool((agent.life.phase >= LANDING).all()))
-        if len(speak := said.rows):
-            seq[speak] += 1
-            told = (nothing[speak],) * 3 if lean else (said.position[speak], said.velocity[speak], state.yaw[speak])
-            sent.add(np.full(len(speak), t), speak, seq[speak], *told)
-            surely = not agent.begun
-            channel.send(t, speak, seq, said.position, said.velocity, surely=surely)
-            if channel.ideal:
-                hear(t)
-            if steering is not None:
-                steering.say(t, speak, seq, said.position, said.velocity, state.yaw, surely=surely)
-        if steering is not None:
-            if channel.ideal:
-                steering.deliver(t, agent)
-            if agent.decides:
-                steering.decide(t, agent)
-                if channel.ideal:
-                    steering.deliver(t, agent)
+        said = network.carry(t, state)
         actions = agent.act(t, state, said)
         if actions.duties is not None:
             body.takeoff(actions.duties.takeoff, assignment.hover[actions.duties.takeoff])
@@ -207,8 +168,6 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
     time, phase, position, velocity, yaw, true_position, true_yaw, goal, setpoint, error = states.stacked()
     obstacles, *rest = seen.stacked()
     extra = [None if lean or value is None else rest.pop(0) for value in _extra(state)]
-    at, row, number, *pose = sent.joined((0,), (0,), (0,), (0, 3), (0, 3), (0,))
-    arrival, link, told, stamp, *heard_pose = heard.joined((0,), (0,), (0,), (0,), (0, 3), (0, 3))
     return Log(
         names=names,
         seeds=tuple(seeds),
@@ -222,9 +181,9 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
         goal=goal,
         setpoint=setpoint,
         error=error,
-        sent=(at - begin, row.astype(np.intp), number.astype(np.intp), pose[0], pose[1], pose[2]),
-        heard=(arrival - begin, link.astype(np.intp), told.astype(np.intp), stamp - begin, *heard_pose),
-        lost=losses.counted()[0],
+        sent=network.sent(begin),
+        heard=network.heard(begin),
+        lost=network.lost,
         decisions=agent.decisions,
         updates=agent.updates,
         interventions=interventions,
@@ -238,6 +197,7 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
         shadow_position=extra[1],
         shadow_yaw=extra[2],
         waited=conductor.waited,
+        steered=network.steered(begin),
     )
 
 
@@ -248,28 +208,6 @@ def _measured(state: BodyState) -> tuple[Array, ...]:
 def _extra(state: BodyState) -> tuple[Array | None, ...]:
     """What there is of in all samples or in none."""
     return state.attitude, state.shadow_position, state.shadow_yaw
-
-
-class _Losses:
-    """What was lost from the common start to the landing."""
-
-    def __init__(self, counts: Sequence[Callable[[], Index]]) -> None:
-        """Counts that only grow."""
-        self._counts = counts
-        self._before: list[Index] | None = None
-        self._after: list[Index] | None = None
-
-    def look(self, *, over: bool) -> None:
-        """When phases have moved, before anybody speaks: the first time, all begin; `over`: all have ended."""
-        if self._before is None:
-            self._before = [count().copy() for count in self._counts]
-        if over and self._after is None:
-            self._after = [count().copy() for count in self._counts]
-
-    def counted(self) -> list[Index]:
-        """Of each of the counts."""
-        after = [count() for count in self._counts] if self._after is None else self._after
-        return [b - a for a, b in zip(self._before or after, after, strict=True)]
 
 
 class _Conductor:
