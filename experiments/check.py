@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from experiments import assign, document, motion, surroundings, theory
+from experiments import architecture, assign, document, motion, surroundings, theory
 from experiments.analysis import Analysis, analyse
 from experiments.claim import FORGIVEN, Claim, Severity, few, listed
 from experiments.document import Document
@@ -32,6 +32,7 @@ SUBJECTS: Final = (
     *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
     *(motion.starts, motion.formation, motion.walls, motion.encounters, motion.speeds, motion.rates, motion.ends),
+    architecture.architecture,
 )
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
 ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")

@@ -17,7 +17,14 @@ from experiments.problem import Fault
 from twins.scene import Scene
 from twins.sensors import SENSORS
 
-_RESERVED: Final = ("all", "estop", "run", "world", "centre", *KINDS)  # they mean something in keys and in [disturbance]
+_RESERVED: Final = (
+    "all",
+    "estop",
+    "run",
+    "world",
+    "centre",
+    *KINDS,
+)  # they mean something in keys and in [disturbance]
 _WALL: Final = "wall"  # the border of the arena, where contacts are told
 
 

@@ -21,17 +21,15 @@ from experiments import orders
 from experiments import standins as standins_of
 from experiments.document import write_json
 from experiments.experiment import Experiment
-from experiments.launcher import LAND_S, ROUTER, Launcher, Process
+from experiments.launcher import LAND_S, Launcher, Process
+from experiments.servants import Servants
 
 POLL_S: Final = 0.05
 LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then
 CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
 ROUTER_S: Final = 10.0
 FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
-LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
-ROUTERS: Final = 5  # a router that dies more often is not helped by starting it again,
-WORLDS: Final = 5  # nor is a world
 
 M = TypeVar("M", wire.Status, wire.State)
 
@@ -136,7 +134,7 @@ class Conductor:
         for name, robot in experiment.robots.items():
             self._groups.setdefault(robot.process or name, []).append(name)
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
-        self._routers = self._worlds = 1
+        self._servants = Servants(experiment, case, file=file, endpoints=self._endpoints, launcher=launcher)
 
     def run(self) -> Result:
         """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
@@ -146,7 +144,6 @@ class Conductor:
         """
         began = time.monotonic()
         connect = [part for endpoint in self._endpoints for part in ("--connect", endpoint)]
-        self._connect = connect
         self._launcher.start(
             f"{self._case}-recorder",
             "experiments.recorder",
@@ -162,6 +159,7 @@ class Conductor:
         standins: tuple[str, ...] = ()
         try:
             addressed, standins = self._stand_in(connect)
+            standins += self._servants.start_centre()
             for group, names in self._groups.items():
                 process = self._process(group)
                 self._launcher.start(process, "experiments.robot", str(addressed), *names, *connect, "--lifeline")
@@ -342,23 +340,9 @@ class Conductor:
 
     def _mourn(self, process: Process) -> None:
         """A process has ended that should not have."""
-        if process.name == ROUTER:
-            self._routers += 1
-            if self._routers < ROUTERS:
-                start_router(self._launcher, self._endpoints)
-            what = "started again" if self._routers < ROUTERS else "given up: the robots hold, and land at the end"
-            self._say("router", "conductor", f"the router ended ({process.exit}); {what}")
-            return
-        if process.name == standins_of.world_name(self._case):
-            self._worlds += 1
-            last = process.tail().strip().splitlines()[-1:]
-            if self._worlds < WORLDS:
-                standins_of.start_world(
-                    self._experiment, self._file, prefix=self._case, launcher=self._launcher, connect=self._connect
-                )
-            what = "started again: robots hold until then" if self._worlds < WORLDS else "given up"
-            why = "".join(f": {line}" for line in last)
-            self._say("world", "conductor", f"the world ended ({process.exit}); {what}{why}")
+        said = self._servants.again(process, self._case)
+        if said is not None:
+            self._say(said[0], "conductor", said[1])
             return
         if process.name == f"{self._case}-recorder":
             self._say("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
@@ -409,9 +393,3 @@ class Conductor:
         remedy = "mend that" if ended else "give them more time with start.deadline_s"
         lines.append(f"  {remedy}, or go on without them with start.missing = 'go-on'")
         return "\n".join(lines)
-
-
-def start_router(launcher: Launcher, endpoints: Sequence[str]) -> None:
-    """A router of our own, which outlives a killed launcher by as long as robots take to land."""
-    listen = [part for endpoint in endpoints for part in ("--listen", endpoint)]
-    launcher.start(ROUTER, "agents.router", *listen, "--lifeline", "--linger", str(LINGER_S))

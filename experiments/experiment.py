@@ -265,7 +265,7 @@ class Start(Part, frozen=True):
 class Hybrid(Part, frozen=True):
     """Some robots are guided by the centre, the others decide for themselves."""
 
-    kind: Literal["hybrid"]
+    kind: Annotated[Literal["hybrid"], Meta(description='"hybrid"')]
     robots: Annotated[list[Name], Meta(min_length=1, description="those that the centre guides")]
 
 
