@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import repeat
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -14,14 +14,13 @@ from agents import plugins, wire
 from agents.graph import Links
 from agents.lifecycle import Phase
 from agents.rows import Array, Index, Mask
-from experiments import assign
+from experiments import assign, goals
 from experiments.contacts import ROUNDING_S, WALL, finds_contacts, looked_for, within
 from experiments.experiment import Experiment
+from experiments.goals import EPOCH, Goals
 from experiments.recording import Recording
 from experiments.trace import HeardPoses, Sent, Trace
 from experiments.virtual import Log
-
-EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
 
 
 class Logbook:
@@ -44,6 +43,11 @@ class Logbook:
         self._heard = (time[own], link[own] - copy * per_copy, seq[own], stamp[own], position[own], velocity[own])
         lost = np.zeros(rows, dtype=np.intp)
         np.add.at(lost, self._links.speaker, log.lost[copy * per_copy : (copy + 1) * per_copy])
+        self._goals: Goals | None = None
+        if log.steered is not None:
+            encoding = experiment.network.encoding
+            self._goals = goals.of_log(log.steered, log.names, copy * rows, experiment.duration_s, encoding)
+            lost += self._goals.lost
         self._lost = lost
 
     def trace(self) -> Trace:
@@ -94,6 +98,7 @@ class Logbook:
             attitude=_part(log.attitude, run, mine),
             shadow_position=_part(log.shadow_position, run, mine),
             shadow_yaw=_part(log.shadow_yaw, run, mine),
+            goals=self._goals,
         )
 
     def record(self, path: Path, document: str) -> None:
@@ -127,6 +132,11 @@ class Logbook:
                     pending = next(said, None)
                 for state in states:
                     recording.state(state)
+            for t, goal in self._told():
+                recording.goal(goal, EPOCH + t, len(wire.encode(goal, self._encoding)))
+            if self._log.steered is not None:
+                steered, end = self._log.steered, self._experiment.duration_s
+                recording.centre(goals.report(steered, self._log.names, self._mine.start, end))
             for status in self._statuses():
                 recording.status(status)
             for report in self._world():
@@ -148,6 +158,11 @@ class Logbook:
         for t, row, seq, position, velocity, yaw in zip(*columns, strict=True):
             yield wire.pose(names[row], seq, EPOCH + t, position, velocity, yaw)
 
+    def _told(self) -> Iterator[tuple[float, wire.Goal]]:
+        """What the centre told robots, and when."""
+        if self._log.steered is not None:
+            yield from goals.messages(self._log.steered, self._log.names, self._mine.start)
+
     def _states(self) -> Iterator[tuple[float, list[wire.State]]]:
         """Telemetry, sample by sample, with the poses that each robot heard since the sample before."""
         log, mine = self._log, self._mine
@@ -161,6 +176,9 @@ class Logbook:
             strict=True,
         )
         heard = self._heard_by_sample()
+        followed: dict[tuple[int, int], list[wire.Followed]] = {}
+        if log.steered is not None:
+            followed = goals.followed(log.steered, log.time, mine.start, len(log.names))
         for k, (t, phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw, *more) in enumerate(samples):
             yield (
                 t,
@@ -179,7 +197,8 @@ class Logbook:
                         tuple(truth[row]),
                         true_yaw[row],
                         heard.get((k, row), []),
-                        *(None if column is None else _known(column[row]) for column in more),
+                        *_three(more, row),
+                        followed.get((k, row), []),
                     )
                     for row, name in enumerate(log.names)
                 ],
@@ -296,3 +315,9 @@ def _known(value: Any) -> Any:  # noqa: ANN401 - a number or a list of them
     if isinstance(value, list):
         return None if math.isnan(value[0]) else tuple(value)
     return None if math.isnan(value) else value
+
+
+def _three(columns: Sequence[Any], row: int) -> tuple[Any, Any, Any]:
+    """Of a row: attitude, and where its shadow is and looks; None where it has none."""
+    attitude, position, yaw = (None if column is None else _known(column[row]) for column in columns)
+    return attitude, position, yaw

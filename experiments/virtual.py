@@ -1,8 +1,9 @@
 """The virtual clock: the whole experiment in one process, without sleeping, reproducible to the bit from its seed.
 
 The decision is `agents.Agent` with all rows, the bodies are the twins, the network is `experiments.virtual_network`;
-this file is only the loop. Several seeds run side by side as more rows, each with the result that it would have alone (unless
-a lossy network makes one so much later ready that the others get their orders at another multiple of `ORDERS_S`).
+this file is only the loop. Several seeds run side by side as more rows, each with the result that it would have alone
+(unless a lossy network makes one so much later ready that the others get their orders at another multiple of
+`ORDERS_S`).
 """
 
 from __future__ import annotations
