@@ -39,6 +39,7 @@ from experiments.robot import chosen_case
 
 REPORT_S: Final = 1.0
 DEPTH: Final = 64  # poses of a robot that may wait for the next decision
+ROUNDING_S: Final = 1e-5  # stamps are rounded
 PHASES: Final = {phase.word: int(phase) for phase in Phase}
 EXPLAINED: Final = (DocumentError, plugins.PluginError, network.EndpointError, network.Unreachable)
 
@@ -111,10 +112,14 @@ class CentreProcess:
             self._tell(self.centre.decide(t, self._phase, self._start), t)
             if t - self._reported >= REPORT_S - 1e-6:
                 self._report(t)
+        self._report(self._next)
         token.undeclare()  # type: ignore[no-untyped-call]
 
     def _listen(self, t: float) -> None:
         """Takes in what has arrived since the last decision."""
+        for row, statuses in self._statuses.items():
+            for sample in network.received(statuses.handler):
+                self._heed(row, sample)
         for robot in self._robots:
             for sample in network.received(robot.poses):
                 self._hear(robot, sample, t)
@@ -123,9 +128,6 @@ class CentreProcess:
                     self.centre.lose(np.array([robot.row]), t)
                 else:
                     self.centre.find(np.array([robot.row]))
-        for row, statuses in self._statuses.items():
-            for sample in network.received(statuses.handler):
-                self._heed(row, sample)
         begun = float(self._start[self._guided].min())
         if begun != self._begun and isfinite(begun):  # decisions fall on the same instants as those of the robots
             self._begun = begun
@@ -140,10 +142,11 @@ class CentreProcess:
             return
         if pose.stamp <= robot.stamp:
             return  # known already: told again after a reconnection
-        if 0 < robot.seq < pose.seq:
-            robot.lost += pose.seq - robot.seq - 1
+        start = float(self._start[self._guided].min())
+        if 0.0 <= pose.stamp - self._utc - start + ROUNDING_S < self.centre.assignment.duration:
+            robot.heard += 1
+            robot.lost += max(0, pose.seq - robot.seq - 1) if robot.seq else 0
         robot.seq, robot.stamp = pose.seq, pose.stamp
-        robot.heard += 1
         self.centre.hear(
             np.array([robot.row]),
             np.array([pose.position]),
@@ -187,7 +190,7 @@ class CentreProcess:
             stamp=self._utc + t,
             robots=[self._names[row] for row in self._guided],
             missing=[self._names[row] for row in self.centre.missing()],
-            load=round((cpu_s - self._cpu_s) / (t - self._reported), 4),
+            load=round((cpu_s - self._cpu_s) / max(t - self._reported, self._period), 4),
             late_s=round(self._late_s, 6),
             decisions=self.centre.decisions,
             missed=self._missed,

@@ -159,9 +159,10 @@ class Conductor:
         )
         start = ready = None
         standins: tuple[str, ...] = ()
+        centre: tuple[str, ...] = ()
         try:
             addressed, standins = self._stand_in(connect)
-            standins += self._servants.start_centre()
+            centre = self._servants.start_centre()
             for group, names in self._groups.items():
                 process = self._process(group)
                 self._launcher.start(process, "experiments.robot", str(addressed), *names, *connect, "--lifeline")
@@ -182,6 +183,7 @@ class Conductor:
             raise
         finally:
             self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
+            self._launcher.end(centre, grace_s=2.0)  # its last word is recorded
             self._launcher.end([f"{self._case}-recorder"], grace_s=5.0)
             self._launcher.end(standins, grace_s=2.0)
         gone = tuple(name for name, seen in self._robots.items() if seen.gone)

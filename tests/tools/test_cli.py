@@ -48,6 +48,7 @@ def test_commands():
                 "twin",
                 "order",
                 "bridge",
+                "centre",
                 "world",
                 "world-order",
             ]
