@@ -80,6 +80,11 @@ class Centre:
             links, poses.position[who], poses.velocity[who], poses.stamp[who], poses.arrived[who]
         )
 
+    def begin(self, row: int, origin: tuple[float, float, float, float]) -> None:
+        """A robot began at `origin`, x, y, z [m] and yaw [rad]: its plan does too, though this centre was not there."""
+        x, y, z, yaw = origin
+        self.deciding.begin(np.array([row]), np.array([[x, y, z]]), np.array([yaw]))
+
     def lose(self, rows: Index, t: float) -> None:
         """These robots are gone since `t` [s]; heard again, they are back."""
         self.poses.gone[rows] = np.minimum(self.poses.gone[rows], t)

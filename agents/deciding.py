@@ -94,6 +94,16 @@ class Deciding:
         hears[hearing.links.listener] = True
         return self._listens & ~hears
 
+    def begin(self, rows: Index, place: Array, yaw: Array) -> None:
+        """Plans of `rows` (K,) that have not begun do so where these were at the start: (K, 3) [m] and (K,) [rad]."""
+        count = len(self._listens)
+        elapsed, position, heading = np.full(count, -np.inf), np.full((count, 3), np.nan), np.zeros(count)
+        elapsed[rows], position[rows], heading[rows] = 0.0, place, yaw
+        position[:, 2] = self.ground
+        for itinerary in self._itineraries:
+            mine = itinerary.rows
+            itinerary.target(elapsed[mine], position[mine], heading[mine])
+
     def forget(self, rows: Index) -> None:
         """Rows whose goals are old compute the law at the next decision, whatever a trigger says."""
         if self._updating is not None:

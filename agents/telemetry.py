@@ -120,6 +120,7 @@ class Telemetry:
         self._followed: list[list[wire.Followed]] = [[] for _ in names] if followed is None else followed
         self._told = 0
         self._scanned = [-inf] * len(names)
+        self._origin: list[wire.Setpoint | None] = [None] * len(names)
         self._reported: list[tuple[object, ...]] = [()] * len(names)
 
     def tell(self, state: BodyState, actions: Actions, t: float) -> None:
@@ -186,6 +187,9 @@ class Telemetry:
             self._reported[row] = news
             mine = [speaker for speaker in self._speakers if (listener[speaker.links] == row).any()]
             battery = float(state.battery[row]) if state is not None else float("nan")
+            if self._origin[row] is None and state is not None and life.phase[row] == Phase.RUNNING:
+                x, y, z = state.position[row].tolist()
+                self._origin[row] = (x, y, z, float(state.yaw[row])) if isfinite(x + y + z) else None
             start = float(life.start_at[row])  # a plain float: msgspec does not encode those of numpy
             status = wire.Status(
                 robot=name,
@@ -210,6 +214,7 @@ class Telemetry:
                 pid=os.getpid(),
                 cpu_s=time.process_time(),
                 rss_mb=resident_mb(),
+                origin=self._origin[row],
             )
             self._statuses[row].put(wire.encode(status, self._encoding))
         if everything:

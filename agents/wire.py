@@ -100,8 +100,9 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `missing` names neighbours that were never heard or are gone; `lost` counts, per neighbour, samples that the
     sequence numbers prove were sent and never heard. `late_s` is the largest lateness of a tick since the last status.
     `started` is the UTC time at which the robot began to run the experiment (0 before). From there `ticks` count, and
-    `decisions`, at which it computed its goal. `interventions` are ticks on which safety changed what had been decided,
-    `avoided` those of them, and of changed goals, that kept clear of something.
+    `decisions`, at which it computed its goal (or was told one). `interventions` are ticks on which safety changed what
+    had been decided, `avoided` those of them, and of changed goals, that kept clear of something. `origin` is where it
+    began: x, y, z [m] and yaw [rad].
     """
 
     robot: str
@@ -126,6 +127,7 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pid: int
     cpu_s: float
     rss_mb: float
+    origin: Setpoint | None = None
 
 
 class Position(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -2,7 +2,7 @@
 
 It hears the poses of those robots, and of whom they listen to, as any neighbour would, and sends each its goal. What is
 decided is `agents.centre`; here are the clock and the network. It keeps nothing that it would miss after a death: it is
-started again, hears the last poses, learns from the robots' statuses when the run began, and goes on.
+started again, hears the last poses, learns from the robots' statuses when and where each began, and goes on.
 """
 
 from __future__ import annotations
@@ -165,6 +165,8 @@ class CentreProcess:
             self._malformed += 1
             return
         self._phase[row] = PHASES[status.phase]
+        if status.origin is not None and all(map(isfinite, status.origin)):
+            self.centre.begin(row, status.origin)
         self._start[row] = status.started - self._utc if status.started > 0.0 else np.inf
 
     def _tell(self, told: Told, t: float) -> None:

@@ -209,9 +209,11 @@ def test_in_a_hybrid_only_the_others_have_a_law_of_their_own():
     assert told.guided.tolist() == [False, True]
     assert told.links.listener.tolist() == [0]
     assert told.links.speaker.tolist() == [1]
-    assert not Agent(assign.assign(hybrid, ["A"])).hear_goal(
-        np.array([0]), np.zeros((1, 3)), np.zeros(1), np.zeros(1)
-    ).any()  # who decides for himself takes no goals
+    assert (
+        not Agent(assign.assign(hybrid, ["A"]))
+        .hear_goal(np.array([0]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+        .any()
+    )  # who decides for himself takes no goals
 
 
 def test_rows_are_guided_each_for_itself():

@@ -9,10 +9,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents import wire
-from agents.wire import JSON, MSGPACK, Event, Heard, Malformed, Order, Pose, Reply, State, Status, Stop
+from agents.wire import (
+    JSON,
+    MSGPACK,
+    CentreState,
+    Event,
+    Goal,
+    Heard,
+    Malformed,
+    Order,
+    Pose,
+    Reply,
+    State,
+    Status,
+    Stop,
+)
 
 FEW = settings(max_examples=60, deadline=None)
-KINDS = (Pose, State, Status, Order, Reply, Stop, Event)
+KINDS = (Pose, State, Status, Order, Reply, Stop, Event, Goal, CentreState)
 ENCODINGS = ("json", "msgpack")
 
 number = st.floats(allow_nan=False, allow_infinity=False)
@@ -27,6 +41,7 @@ messages = st.one_of(
         st.none() | st.tuples(number, number, number, number), number, st.none() | vector, st.none() | number,
         st.lists(heard, max_size=3),
     ),
+    st.builds(Goal, word, count, number, vector, st.none() | number, number),
     st.builds(Order, st.sampled_from(["takeoff", "start", "hold", "land", "stop", "get", "set"]), st.none() | number),
     st.builds(Reply, word, st.booleans(), word, word, st.none() | number),
     st.builds(Stop, word, word),
@@ -189,3 +204,40 @@ def test_a_pose_that_no_robot_can_have(change, says):
     pose = msgspec.structs.replace(POSE, **change)
     with pytest.raises(Malformed, match=says):
         wire.check_pose(pose, robot="KH01", now=1000.0, reach=REACH)
+
+
+GOAL = Goal("KH01", 7, 999.9, (0.5, -0.5, 0.0), 0.25, 999.85)
+
+
+def check_goal(**changes):
+    wire.check_goal(msgspec.structs.replace(GOAL, **changes), robot="KH01", now=1000.0, reach=REACH, oldest_s=1.0)
+
+
+def test_an_honest_goal_passes():
+    check_goal()
+    check_goal(yaw=None, stamp=1000.5, pose=1001.0)  # clocks that differ a little
+    check_goal(stamp=999.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"robot": "KH02"}, "on the key of"),
+        ({"seq": 0}, "sequence number"),
+        ({"seq": 2**60}, "sequence number"),
+        ({"stamp": 998.9}, "old"),
+        ({"stamp": math.nan}, "stamp"),
+        ({"stamp": 1006.0}, "stamp"),
+        ({"pose": math.inf}, "rest on a pose"),
+        ({"pose": math.nan}, "rest on a pose"),
+        ({"pose": 0.0}, "rest on a pose"),
+        ({"pose": 1005.5}, "rest on a pose"),
+        ({"position": (math.nan, 0.0, 0.0)}, "outside the arena"),
+        ({"position": (0.0, 1e9, 0.0)}, "outside the arena"),
+        ({"yaw": math.nan}, "yaw"),
+        ({"yaw": 1e9}, "yaw"),
+    ],
+)
+def test_a_goal_that_no_robot_can_follow(changes, says):
+    with pytest.raises(Malformed, match=says):
+        check_goal(**changes)
