@@ -380,8 +380,6 @@ def test_goals_come_in(router, bridge, eventually):
             raw = bytes(node.store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
             out.put(raw, attachment=struct.pack("<qqB16s", 1, time.time_ns(), 16, bytes(16)))
 
-        send("map", 7.0, (0.0, 1.0))  # where the robot is, nobody has said yet
-
         def known():
             realm.state("CF01", (0.0, 0.0, 0.5), (0.0, 0.0, 0.0), 0.0)
             return node.take(poses)
