@@ -42,6 +42,8 @@ class Assignment:
         anchors: Distances that the rows keep to what stands still; None: none.
         changes: What becomes of the links' targets, over all links.
         presence: When the links are there, over all links; None: always.
+        guided: (N,) rows for which a centre decides; None: none. Links of the law, anchors and legs are those of the
+            other rows; in the assignment of a centre, of these.
         body_hz: Rate of ticks.
         pose_every: The trigger is asked on every so many ticks.
         decide_every: A goal is decided on every so many ticks.
@@ -74,3 +76,4 @@ class Assignment:
     anchors: Anchors | None = None
     changes: tuple[Change, ...] = ()
     presence: Presence | None = None
+    guided: Mask | None = None

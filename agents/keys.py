@@ -36,7 +36,7 @@ class Keys:
         return f"{self.realm}/{robot}/position"
 
     def goal(self, robot: str) -> str:
-        """Where somebody outside wants this robot to go, as a `wire.Position`."""
+        """Where whoever decides for this robot wants it to go: the centre, or somebody outside."""
         return f"{self.realm}/{robot}/goal"
 
     def setpoint(self, robot: str) -> str:
@@ -70,6 +70,16 @@ class Keys:
     def world_alive(self) -> str:
         """Liveliness token of the world. Not `alive`: whoever counts robots asks for that of everybody."""
         return f"{self.realm}/world/here"
+
+    @property
+    def centre(self) -> str:
+        """What the centre says of itself: whom it guides, load, what it heard. Not `state`: only robots have one."""
+        return f"{self.realm}/centre/report"
+
+    @property
+    def centre_alive(self) -> str:
+        """Liveliness token of the centre. Not `alive`, as that of the world."""
+        return f"{self.realm}/centre/here"
 
     @property
     def estop(self) -> str:

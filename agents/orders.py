@@ -59,11 +59,13 @@ def _parameter(agent: Agent, order: Order) -> Answer:
     name = order.name or ""
     if name not in of_trigger and name not in OWN:
         return f"no parameter '{name}'; known: {', '.join(sorted([*of_trigger, *OWN]))}", None
+    if name in OWN and agent.all_guided:
+        return f"'{name}' is the centre's: change the experiment file, and start the centre again", None
     if order.order == "set":
         refusal = _set(agent, name, of_trigger.get(name), order.value)
         if refusal:
             return refusal, None
-    value = getattr(agent.trigger, of_trigger[name]) if name in of_trigger else getattr(agent, name)
+    value = getattr(agent.trigger, of_trigger[name]) if name in of_trigger else getattr(agent.deciding, name)
     return ("", float(value)) if isinstance(value, int | float) else (f"'{name}' is not set", None)
 
 
@@ -71,7 +73,7 @@ def _set(agent: Agent, name: str, of_trigger: str | None, value: float | None) -
     if value is None or not isfinite(value) or value < 0.0:
         return f"'{name}' needs a `value`, a number that is not negative"
     if of_trigger is None:
-        setattr(agent, name, value)
+        setattr(agent.deciding, name, value)
         return ""
     try:
         changed = {**msgspec.structs.asdict(agent.trigger), of_trigger: value}

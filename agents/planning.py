@@ -222,7 +222,7 @@ class Itinerary:
         target, toward = np.full((len(self.rows), 3), np.nan), _any_yaw(len(self.rows))
         for number, leg in enumerate(self.legs):
             begins = (t >= leg.at - 1e-9) & (self._leg < number)
-            if begins.any():
+            if begins.any() and (begins := begins & np.isfinite(position).all(axis=1)).any():  # or it begins later
                 self._begin(number, begins, position, yaw)
             mine = self._leg == number
             if mine.any():

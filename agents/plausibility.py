@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from agents.wire import Command, Malformed, Pose, Position, Ranges, State, Vector
+from agents.wire import Command, Goal, Malformed, Pose, Position, Ranges, State, Vector
 
 FUTURE_S: Final = 5.0  # a stamp further ahead is a broken clock or a forgery, and would silence honest samples
 MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
@@ -66,6 +66,31 @@ def check_position(measured: Position, *, robot: str, now: float, reach: Vector)
     _refuse_place(measured.position, reach)
     if measured.yaw is not None and not abs(measured.yaw) <= MAX_YAW:
         raise Malformed(f"yaw {measured.yaw} is impossible")
+
+
+def check_goal(goal: Goal, *, robot: str, now: float, reach: Vector, oldest_s: float) -> None:
+    """Refuses a goal that no robot can follow, or that is too old to be followed.
+
+    Args:
+        goal: What arrived.
+        robot: Whose key it arrived on.
+        now: UTC time of arrival [s].
+        reach: See `check_pose`.
+        oldest_s: A goal that was decided longer ago is none [s].
+
+    Raises:
+        Malformed: If the name is another's, a number is not finite, the stamp is old or lies in the future, the pose is
+            younger than the goal that rests on it, or the position is out of reach.
+    """
+    if goal.robot != robot:
+        raise Malformed(f"goal of '{goal.robot}' on the key of '{robot}'")
+    if not (_counted(goal.seq) and now - oldest_s <= goal.stamp and _past(goal.stamp, now)):
+        raise Malformed(f"sequence number {goal.seq} or stamp {goal.stamp} is impossible, or the goal is old")
+    if not 0.0 < goal.pose <= goal.stamp + FUTURE_S:  # the robot's clock may be ahead
+        raise Malformed(f"a goal of {goal.stamp} cannot rest on a pose of {goal.pose}")
+    _refuse_place(goal.position, reach)
+    if goal.yaw is not None and not abs(goal.yaw) <= MAX_YAW:
+        raise Malformed(f"yaw {goal.yaw} is impossible")
 
 
 def check_ranges(ranges: Ranges, *, robot: str, now: float) -> None:

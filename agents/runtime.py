@@ -24,18 +24,20 @@ from agents.agent import Actions, Agent, links_by_speaker
 from agents.assignment import Assignment
 from agents.body import Body
 from agents.channel import Channel, Conditions, Samples
+from agents.goals import HeardGoals
 from agents.keys import Keys
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
 from agents.orders import carry_out
 from agents.ranging import HeardRanges, instead
 from agents.rows import Index
+from agents.safety import Limits
+from agents.speaking import Said
 from agents.telemetry import Counts, Telemetry
 
 Ranging = Literal["body", "world", "far"]
 
 FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its launcher was lost has its motors cut
-GHOST_S: Final = 2.5  # so long may the token of a robot that hangs stand after its end
 REACH_M: Final = 1.0  # a neighbour said to be farther outside the arena than this is not believed
 
 
@@ -82,6 +84,12 @@ class NameTaken(RuntimeError):
     """A robot of the same name is on the network already."""
 
 
+def reach_of(limits: Limits) -> wire.Vector:
+    """Largest |x|, |y|, |z| [m] that a robot may say it has, and that anybody may tell it to go to."""
+    x, y, z = np.maximum(np.abs(limits.low), np.abs(limits.high)) + REACH_M
+    return float(x), float(y), float(z)
+
+
 class Runtime:
     """Drives the robots of one process through an experiment."""
 
@@ -97,9 +105,7 @@ class Runtime:
         self._state_slot = 0
         self._stopping: str | None = None
         self._utc = self._now = self._next = 0.0
-        limits = assignment.limits
-        x, y, z = np.maximum(np.abs(limits.low), np.abs(limits.high)) + REACH_M
-        self._reach = (float(x), float(y), float(z))
+        self._reach = reach_of(assignment.limits)
 
     def run(self) -> int:
         """Opens the body, joins the network, drives until all is done; returns the exit code of the process.
@@ -153,18 +159,12 @@ class Runtime:
         Raises:
             NameTaken: If one is on the network already. One that was killed is given the time until that is noticed.
         """
-        deadline = time.monotonic() + GHOST_S
-        while True:
-            replies = [session.liveliness().get(self._setup.keys.alive(name), timeout=1.0) for name in self._names]
-            taken = [name for name, there in zip(self._names, replies, strict=True) if list(there)]
-            if not taken:
-                return
-            if time.monotonic() > deadline:
-                raise NameTaken(
-                    f"{', '.join(taken)}: a robot of this name is on the network already; end it first "
-                    "(`zenpark keys` shows who is there), or choose another router with --connect"
-                )
-            time.sleep(0.1)
+        taken = [name for name in self._names if network.taken(session, self._setup.keys.alive(name))]
+        if taken:
+            raise NameTaken(
+                f"{', '.join(taken)}: a robot of this name is on the network already; end it first "
+                "(`zenpark keys` shows who is there), or choose another router with --connect"
+            )
 
     def _join(self, session: zenoh.Session) -> None:
         keys, names = self._setup.keys, self._names
@@ -185,6 +185,8 @@ class Runtime:
         by_speaker = links_by_speaker(self._assignment.links, self._assignment.speakers)
         self._subscribers = [network.pose_subscriber(session, keys.pose(name)) for name in by_speaker]
         self._watches = [network.alive_watch(session, keys.alive(name)) for name in by_speaker]
+        guidance = self.agent.guidance
+        self._goals = None if guidance is None else HeardGoals(session, keys, self.agent, guidance, self._reach)
         self._neighbours = [
             _Neighbour(name, links, poses.handler, watch.handler)
             for (name, links), poses, watch in zip(by_speaker.items(), self._subscribers, self._watches, strict=True)
@@ -198,6 +200,7 @@ class Runtime:
             dropped=self._channel.dropped,
             counts=self._counts,
             ranged=[source == "body" for source in ranging],
+            followed=None if self._goals is None else self._goals.news,
         )
         self._tokens = [network.alive_token(session, keys.alive(name)) for name in names]
 
@@ -205,6 +208,25 @@ class Runtime:
         """Takes in what has arrived since the last tick."""
         agent = self.agent
         agent.offline_since = np.inf if network.connected(self._session) else min(agent.offline_since, t)
+        self._listen_to_neighbours(t)
+        if self._goals is not None:
+            refused = self._goals.malformed
+            self._goals.take(t, self._utc)
+            self._counts.malformed += self._goals.malformed - refused
+        for sample in network.received(self._estop.handler):
+            self._stop(sample)
+        for row, positions in self._located:
+            for sample in network.received(positions.handler):
+                self._locate(row, sample, t)
+        for row, queryable in enumerate(self._orders):
+            for query in network.received(queryable.handler):
+                self._obey(row, query, t)
+        for last in self._last:
+            last.answer()
+
+    def _listen_to_neighbours(self, t: float) -> None:
+        """Poses, as the modelled network lets them through, and who is there."""
+        agent = self.agent
         for neighbour in self._neighbours:
             for sample in network.received(neighbour.poses):
                 self._hear(neighbour, sample, t)
@@ -216,16 +238,6 @@ class Runtime:
                     agent.find(neighbour.links)
         if (got := self._channel.due(t)) is not None:
             self._believe(got)
-        for sample in network.received(self._estop.handler):
-            self._stop(sample)
-        for row, positions in self._located:
-            for sample in network.received(positions.handler):
-                self._locate(row, sample, t)
-        for row, queryable in enumerate(self._orders):
-            for query in network.received(queryable.handler):
-                self._obey(row, query, t)
-        for last in self._last:
-            last.answer()
 
     def _locate(self, row: int, sample: zenoh.Sample, t: float) -> None:
         """Where a row is, as something outside of it says."""
@@ -308,6 +320,7 @@ class Runtime:
             self._counts.refused += bool(refusal)
             if order.order == "start" and order.at is not None and not refusal:
                 self._align(order.at - self._utc)
+                self._telemetry.due = t  # whoever decides for it must know in time when it begins
             phase = Phase(self.agent.life.phase[row]).word
             reply = wire.Reply(self._names[row], not refusal, phase, refusal, value)
             query.reply(key, wire.encode(reply, self._setup.encoding), encoding=self._mime)
@@ -355,7 +368,10 @@ class Runtime:
             refused = self._ranges.malformed
             state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))
             self._counts.malformed += self._ranges.malformed - refused
-        actions = self.agent.step(t, state)
+        said = self.agent.speak(t, state)
+        for row in said.rows:
+            self._say(int(row), said, float(state.yaw[row]), t)
+        actions = self.agent.act(t, state, said)
         self._act(actions)
         counts, telemetry = self._counts, self._telemetry
         if not begun and self.agent.decisions:
@@ -363,8 +379,6 @@ class Runtime:
         counts.ticks += 1
         counts.interventions += actions.changed
         counts.avoided += actions.avoided
-        for row in actions.speak:
-            self._say(int(row), actions, float(state.yaw[row]), t)
         slot = (self.agent.tick - 1) // self._state_every
         if slot != self._state_slot:
             self._state_slot = slot
@@ -384,15 +398,15 @@ class Runtime:
                 self._body.takeoff(duties.takeoff, self._assignment.hover[duties.takeoff])
         self._body.command(actions.setpoint)
 
-    def _say(self, row: int, actions: Actions, yaw: float, t: float) -> None:
+    def _say(self, row: int, said: Said, yaw: float, t: float) -> None:
         """Sends a row's pose to its neighbours."""
         self._counts.sent[row] += 1
         pose = wire.pose(
             self._names[row],
             self._counts.sent[row],
             self._utc + t,
-            actions.position[row].tolist(),
-            actions.velocity[row].tolist(),
+            said.position[row].tolist(),
+            said.velocity[row].tolist(),
             yaw,
         )
         payload = wire.encode(pose, self._setup.encoding)

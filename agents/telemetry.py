@@ -92,6 +92,7 @@ class Telemetry:
         dropped: Index,
         counts: Counts,
         ranged: Sequence[bool],
+        followed: list[list[wire.Followed]] | None = None,
     ) -> None:
         """Declares the publishers.
 
@@ -105,6 +106,7 @@ class Telemetry:
             counts: Kept by the runtime.
             ranged: (n) rows whose range readings are their own: the others' come from the network, where they need
                 not be said again.
+            followed: Goals that reached each row since the last telemetry; emptied here. None: nobody is guided.
         """
         self._agent, self._speakers, self._dropped, self._counts = agent, speakers, dropped, counts
         self._encoding = encoding
@@ -118,8 +120,10 @@ class Telemetry:
         ]
         self.utc = self.due = 0.0
         self.news: list[list[wire.Heard]] = [[] for _ in names]
+        self._followed: list[list[wire.Followed]] = [[] for _ in names] if followed is None else followed
         self._told = 0
         self._scanned = [-inf] * len(names)
+        self._origin: list[wire.Setpoint | None] = [None] * len(names)
         self._reported: list[tuple[object, ...]] = [()] * len(names)
 
     def tell(self, state: BodyState, actions: Actions, t: float) -> None:
@@ -149,9 +153,11 @@ class Telemetry:
                 _known_row(state.attitude, row),
                 _known_row(state.shadow_position, row),
                 _known_row(state.shadow_yaw, row),
+                self._followed[row],
             )
             self._states[row].put(wire.encode(message, self._encoding))
             self.news[row] = []
+            self._followed[row] = []
 
     def scan(self, state: BodyState) -> None:
         """Sends the range readings that are new and the rows' own."""
@@ -184,6 +190,9 @@ class Telemetry:
             self._reported[row] = news
             mine = [speaker for speaker in self._speakers if (listener[speaker.links] == row).any()]
             battery = float(state.battery[row]) if state is not None else float("nan")
+            if self._origin[row] is None and state is not None and life.phase[row] == Phase.RUNNING:
+                x, y, z = state.position[row].tolist()
+                self._origin[row] = (x, y, z, float(state.yaw[row])) if isfinite(x + y + z) else None
             start = float(life.start_at[row])  # a plain float: msgspec does not encode those of numpy
             status = wire.Status(
                 robot=name,
@@ -208,7 +217,8 @@ class Telemetry:
                 missing=missing,
                 pid=os.getpid(),
                 cpu_s=time.process_time(),
-                rss_mb=_resident_mb(),
+                rss_mb=resident_mb(),
+                origin=self._origin[row],
             )
             self._statuses[row].put(wire.encode(status, self._encoding))
         if everything:
@@ -230,7 +240,8 @@ def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a numbe
     return tuple(value) if isinstance(value, list) else value
 
 
-def _resident_mb() -> float:
+def resident_mb() -> float:
+    """Memory of this process [MB]."""
     try:
         with open("/proc/self/statm", "rb") as pages:  # noqa: PTH123 - a Path costs more than the read
             return int(pages.read().split()[1]) * resource.getpagesize() / 1e6

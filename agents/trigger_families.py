@@ -24,6 +24,8 @@ class Relative(Trigger, frozen=True):
     Who has no error, as a leader without links, speaks whenever noise moves it: `mixed` has a floor.
     """
 
+    judges_errors: ClassVar[bool] = True
+
     share: Annotated[Positive, Meta(description="σ [1]")] = 0.03
 
     def fires(self, view: View, memory: Array) -> Mask:
@@ -38,6 +40,8 @@ class Mixed(Trigger, frozen=True):
     and decentralized event-triggering", IEEE Transactions on Automatic Control 57(6), 2012, 1362–1376: the additional
     threshold is what keeps the time between two events from going to zero.
     """
+
+    judges_errors: ClassVar[bool] = True
 
     share: Annotated[NotNegative, Meta(description="σ [1]")] = 0.0004
     floor: Annotated[Positive, Meta(description="c [m]")] = 0.007
@@ -71,6 +75,8 @@ class Dynamic(Trigger, frozen=True):
     60(7), 2015, 1992–1997; the floor c is ours, and 0 is the publication's. Between two questions w counts as it is at
     the later one, and η, which never falls below zero in continuous time, is kept from it.
     """
+
+    judges_errors: ClassVar[bool] = True
 
     share: Annotated[NotNegative, Meta(description="σ [1]")] = 0.0003
     floor: Annotated[NotNegative, Meta(description="c [m]")] = 0.005
@@ -157,6 +163,8 @@ class Lyapunov(Trigger, frozen=True):
     floor c is for noise; δ is for robots that move without errors of their own: a leader has no links, and a whole
     formation can travel.
     """
+
+    judges_errors: ClassVar[bool] = True
 
     level: Annotated[float, Meta(gt=0, lt=1, description="η [1]")] = 0.7
     floor: Annotated[NotNegative, Meta(description="c [m]")] = 0.006

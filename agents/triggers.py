@@ -132,12 +132,14 @@ class View:
 class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Parameters that every trigger has, and the question that each answers in its own way.
 
-    Class attributes of a kind of trigger: `places` where it makes sense, and the `prediction` that it needs; an
-    experiment that names none gets it.
+    Class attributes of a kind of trigger: `places` where it makes sense, the `prediction` that it needs (an experiment
+    that names none gets it), and whether it `judges_errors` of the formation, which a robot that is guided by a centre
+    does not know: for it they are 0.
     """
 
     places: ClassVar[tuple[Place, ...]] = ("communication", "control")
     prediction: ClassVar[str] = "hold"
+    judges_errors: ClassVar[bool] = False
 
     minimum_interval_s: Annotated[NotNegative, Meta(description="never sooner after the last event [s]")] = 0.0
     maximum_silence_s: Annotated[Positive | None, Meta(description="at the latest so long after it [s]")] = None

@@ -49,6 +49,16 @@ class Heard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     velocity: Vector
 
 
+class Followed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A goal that reached its robot: when it was sent, when the pose was taken on which it rests, and when it was acted
+    on (UTC [s])."""
+
+    seq: int
+    stamp: float
+    pose: float
+    acted: float
+
+
 class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Telemetry of a body and its decision, for recorder and viewers.
 
@@ -75,6 +85,7 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     attitude: Setpoint | None = None
     shadow_position: Vector | None = None
     shadow_yaw: float | None = None
+    followed: list[Followed] = []
 
 
 class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -85,8 +96,9 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     (`agents.channel`; names without any are left out). `late_s` is the largest lateness of a tick since the last
     status.
     `started` is the UTC time at which the robot began to run the experiment (0 before). From there `ticks` count, and
-    `decisions`, at which it computed its goal. `interventions` are ticks on which safety changed what had been decided,
-    `avoided` those of them, and of changed goals, that kept clear of something.
+    `decisions`, at which it computed its goal (or was told one). `interventions` are ticks on which safety changed what
+    had been decided, `avoided` those of them, and of changed goals, that kept clear of something. `origin` is where it
+    began: x, y, z [m] and yaw [rad].
     """
 
     robot: str
@@ -112,6 +124,7 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pid: int
     cpu_s: float
     rss_mb: float
+    origin: Setpoint | None = None
 
 
 class Position(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -121,6 +134,46 @@ class Position(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stamp: float
     position: Vector
     yaw: float | None = None
+
+
+class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where a guided robot must go: position [m], yaw [rad] if one is wanted, when it was decided (UTC `stamp` [s]).
+
+    `pose` is when that robot's own pose was taken on which the goal rests (UTC [s]). The running `seq` grows for ever:
+    whoever decides begins at a number that nobody before him had reached, such as the time in milliseconds.
+    """
+
+    robot: str
+    seq: int
+    stamp: float
+    position: Vector
+    yaw: float | None
+    pose: float
+
+
+class CentreState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the centre says of itself, at 1 Hz.
+
+    `robots` are guided; `missing` are those that it needs and never heard, or that are gone. `load` is the share of a
+    core that it took in the last second, `late_s` the largest lateness of a decision in it. The others count since its
+    process began: `decisions`, and `missed` ones that were too late to be made, and `goals` sent. Of poses only those
+    count that were taken in the run: `heard`, and `lost` by their numbers, per robot.
+    """
+
+    stamp: float
+    robots: list[str]
+    missing: list[str]
+    load: float
+    late_s: float
+    decisions: int
+    missed: int
+    goals: int
+    heard: dict[str, int]
+    lost: dict[str, int]
+    malformed: int
+    pid: int
+    cpu_s: float
+    rss_mb: float
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -251,6 +304,8 @@ Message = (
     | State
     | Status
     | Position
+    | Goal
+    | CentreState
     | Command
     | Ranges
     | Order
@@ -268,6 +323,8 @@ M = TypeVar(
     State,
     Status,
     Position,
+    Goal,
+    CentreState,
     Command,
     Ranges,
     Order,

@@ -42,6 +42,7 @@ class _Robot:
     velocity: Publisher
     goal: Subscriber
     out: zenoh.Publisher
+    stamp: float = 0.0  # when its last pose was taken that ROS was told, UTC [s]
 
     def close(self) -> None:
         self.pose.close()
@@ -56,7 +57,8 @@ class Graph:
     Attributes:
         robots: Those in the graph now.
         malformed: Samples of the realm that were not what their key promises.
-        refused: Goals that were not finite, or not in the frame "map".
+        refused: Goals that were not finite, not in the frame "map", for a robot whose pose ROS never got, or that came
+            while a centre decides.
     """
 
     def __init__(self, session: zenoh.Session, participant: Participant, keys: Keys) -> None:
@@ -69,6 +71,9 @@ class Graph:
         self._states = network.subscriber(session, keys.state("*"), 1024)
         self._statuses = network.pose_subscriber(session, keys.status("*"), 256)
         self._alive = network.alive_watch(session, keys.alive("*"))
+        self._centres = network.alive_watch(session, keys.centre_alive)
+        self._guided = False
+        self._seq = round(time.time() * 1e3)  # beyond whatever somebody else who decided had reached
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -82,6 +87,8 @@ class Graph:
             header = self._types.header(time.time(), "")
             self._diagnostics.put(self._types.make(ros2.DIAGNOSTIC_ARRAY, header=header, status=statuses))
         self._moves()
+        for sample in network.received(self._centres.handler):
+            self._guided = sample.kind == zenoh.SampleKind.PUT
         for name, robot in self._robots.items():
             for message in robot.goal.received():
                 self._order(name, robot, message)
@@ -119,6 +126,7 @@ class Graph:
             except wire.Malformed:
                 self.malformed += 1
                 continue
+            robot.stamp = state.stamp
             robot.pose.put(pose(self._types, state))
             robot.velocity.put(velocity(self._types, state))
 
@@ -136,15 +144,17 @@ class Graph:
         return found
 
     def _order(self, name: str, robot: _Robot, message: Message) -> None:
-        """A goal from ROS, passed on into the realm."""
+        """A goal from ROS, passed on into the realm: a robot that is guided obeys, but two cannot guide it."""
         place, q = message.pose.position, message.pose.orientation
         numbers = (place.x, place.y, place.z, q.x, q.y, q.z, q.w)
-        if message.header.frame_id not in ("", FRAME) or not all(isfinite(number) for number in numbers):
+        known = robot.stamp > 0.0 and message.header.frame_id in ("", FRAME)
+        if self._guided or not known or not all(isfinite(number) for number in numbers):
             self.refused += 1
             return
         turned = q.x or q.y or q.z or q.w  # a quaternion of zeros: whoever asks does not care
         yaw = atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z)) if turned else None
-        goal = wire.Position(name, time.time(), (place.x, place.y, place.z), yaw)
+        self._seq += 1
+        goal = wire.Goal(name, self._seq, time.time(), (place.x, place.y, place.z), yaw, robot.stamp)
         robot.out.put(wire.encode(goal))
 
 

@@ -164,7 +164,8 @@ class Analysis:
 def analyse(experiment: Experiment) -> Analysis:
     """All the numbers of one case."""
     names = tuple(experiment.robots)
-    assignment = assign.assign(msgspec.structs.replace(experiment, avoidance=None), names)
+    bare = msgspec.structs.replace(experiment, avoidance=None, architecture="distributed")
+    assignment = assign.assign(bare, names)
     pattern = Pattern.of(experiment, names)
     links, rows, hz = assignment.links, len(names), experiment.rates.coordination_hz
     start, yaw = assign.start(experiment, names)

@@ -20,7 +20,7 @@ from agents.prediction import HOLD, Predictor
 from agents.rows import Array, Index
 from agents.safety import Limits
 from experiments import outlines
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, Hybrid
 from experiments.formation import Pattern, anchors_of
 from experiments.links import parse_links
 from twins.scene import Scene
@@ -42,22 +42,45 @@ def all_links(experiment: Experiment) -> Links:
     return Pattern.of(experiment, tuple(experiment.robots)).links
 
 
+def guided(experiment: Experiment) -> tuple[str, ...]:
+    """The robots for which a centre decides, in the order of the file."""
+    if isinstance(experiment.architecture, Hybrid):
+        return tuple(name for name in experiment.robots if name in experiment.architecture.robots)
+    return tuple(experiment.robots) if experiment.architecture == "centralised" else ()
+
+
 def heard_links(experiment: Experiment) -> Links:
-    """Every link on which something is heard: those of the formation, then those that only avoidance needs."""
-    return all_links(experiment).and_then(watch_links(experiment))
+    """Every link on which robots hear each other: those for the formation, then those that only avoidance needs."""
+    names = tuple(experiment.robots)
+    pattern = Pattern.of(experiment, names).without_listeners(_rows(experiment, guided(experiment)))
+    return pattern.links.and_then(watch_links(experiment))
 
 
 def watch_links(experiment: Experiment) -> Links:
-    """Links that only avoidance needs: between all robots that the formation does not link, if it hears all."""
+    """Links that only avoidance needs: between all robots that no law links, if it hears all; else between neighbours.
+
+    Robots that the centre guides have no law of their own.
+    """
     avoidance = _avoidance(experiment)
-    nobody = links([], [], [])
-    if avoidance is None or avoidance.hears != "all":
+    nobody, centrally = links([], [], []), set(guided(experiment))
+    if avoidance is None or not (avoidance.hears == "all" or centrally):
         return nobody
-    there = {(listener, speaker) for listener, speaker, _, _ in parse_links(experiment)}
+    linked = {(listener, speaker) for listener, speaker, _, _ in parse_links(experiment)}
+    there = {(listener, speaker) for listener, speaker in linked if listener not in centrally}
     robots = list(enumerate(experiment.robots))
     listening = [(i, a) for i, a in robots if experiment.robots[a].avoids]
-    pairs = [(i, j) for i, a in listening for j, b in robots if i != j and (a, b) not in there]
+    pairs = [
+        (i, j)
+        for i, a in listening
+        for j, b in robots
+        if i != j and (a, b) not in there and (avoidance.hears == "all" or (a, b) in linked)
+    ]
     return links(pairs, [1.0] * len(pairs), [1.0] * len(pairs)) if pairs else nobody
+
+
+def _rows(experiment: Experiment, names: Sequence[str]) -> Index:
+    everyone = list(experiment.robots)
+    return np.array([everyone.index(name) for name in names], dtype=np.intp)
 
 
 def _avoidance(experiment: Experiment) -> Avoidance | None:
@@ -194,10 +217,14 @@ def limits(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Lim
     )
 
 
-def _legs(experiment: Experiment, names: Sequence[str]) -> tuple[tuple[Index, tuple[Leg, ...]], ...]:
-    """Plans of these robots, each with its row."""
+def _legs(
+    experiment: Experiment, names: Sequence[str], only: Sequence[str]
+) -> tuple[tuple[Index, tuple[Leg, ...]], ...]:
+    """Plans of some of the robots `names`, each with its row."""
     plans = []
     for row, name in enumerate(names):
+        if name not in only:
+            continue
         legs = tuple(
             Leg(leg.at_s, plugins.build("zenpark.planners", leg.plan))
             for leg in experiment.timeline
@@ -214,14 +241,27 @@ def assign(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Ass
     Raises:
         ValueError: If copies are asked for but not of all robots: their links would point nowhere.
     """
+    return _assign(experiment, names, copies, centrally=False)
+
+
+def assign_centre(experiment: Experiment, copies: int = 1) -> Assignment:
+    """What the centre is told: of all robots, with links, anchors and plans of those that it guides."""
+    return _assign(experiment, tuple(experiment.robots), copies, centrally=True)
+
+
+def _assign(experiment: Experiment, names: Sequence[str], copies: int, *, centrally: bool) -> Assignment:
+    """For robots, or for the centre."""
     everyone = tuple(experiment.robots)
     if copies > 1 and tuple(names) != everyone:
         raise ValueError("only the whole experiment can be repeated")
-    rows = np.array([everyone.index(name) for name in names], dtype=np.intp)
-    pattern, watched = Pattern.of(experiment, everyone).heard_by(rows), watch_links(experiment).of(rows)
-    anchors = anchors_of(experiment, names)
+    rows, steered = _rows(experiment, names), guided(experiment)
+    others = [name for name in everyone if (name in steered) != centrally]
+    mine = [name for name in names if name not in others]
+    pattern = Pattern.of(experiment, everyone).without_listeners(_rows(experiment, others)).heard_by(rows)
+    watched = links([], [], []) if centrally else watch_links(experiment).of(rows)
+    anchors = anchors_of(experiment, names, only=mine)
     only_watched = np.repeat([False, True], [len(pattern.links), len(watched)])
-    legs = _legs(experiment, names)
+    legs = _legs(experiment, names, only=mine)
     if len(watched):
         pattern = pattern.and_then(watched)
     if copies > 1:
@@ -250,7 +290,7 @@ def assign(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Ass
         tracking_gain=experiment.formation.tracking_gain,
         legs=legs,
         limits=limits(experiment, names, copies),
-        avoidance=_avoidance(experiment),
+        avoidance=None if centrally else _avoidance(experiment),
         speaker_kinds=kinds(experiment, everyone) * copies,
         watched=np.tile(only_watched, copies) if len(watched) else None,
         avoids=np.array([experiment.robots[name].avoids for name in names] * copies),
@@ -259,6 +299,7 @@ def assign(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Ass
         decide_every=round(rates.body_hz / rates.coordination_hz),
         duration=experiment.duration_s,
         patience_s=experiment.start.deadline_s if experiment.start.missing == "go-on" else None,
+        guided=np.array([name in steered for name in names] * copies) if steered else None,
     )
 
 

@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from experiments import assign, document, motion, surroundings, theory
+from experiments import architecture, assign, document, motion, surroundings, theory
 from experiments.analysis import Analysis, analyse
 from experiments.claim import FORGIVEN, Claim, Severity, few, listed
 from experiments.document import Document
@@ -32,6 +32,7 @@ SUBJECTS: Final = (
     *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
     *(motion.starts, motion.formation, motion.walls, motion.encounters, motion.speeds, motion.rates, motion.ends),
+    architecture.architecture,
 )
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
 ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")
@@ -185,7 +186,14 @@ def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
     found = {}
     for name, case in cases.items():
         bare = msgspec.structs.replace(
-            case, trigger="periodic", prediction=None, channel=Channel(), network=Network(), disturbance={}, cases={}
+            case,
+            trigger="periodic",
+            prediction=None,
+            architecture="distributed",
+            channel=Channel(),
+            network=Network(),
+            disturbance={},
+            cases={},
         )
         key = msgspec.json.encode(bare)
         if key not in known:

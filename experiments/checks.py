@@ -12,12 +12,19 @@ from agents import plugins
 from agents.kinds import KINDS
 from agents.plugins import did_you_mean
 from experiments import channel_checks, formation_checks, outlines
-from experiments.experiment import Arena, Experiment, Robot
+from experiments.experiment import Arena, Experiment, Hybrid, Robot
 from experiments.problem import Fault
 from twins.scene import Scene
 from twins.sensors import SENSORS
 
-_RESERVED: Final = ("all", "estop", "run", "world", *KINDS)  # they mean something in keys and in [disturbance]
+_RESERVED: Final = (
+    "all",
+    "estop",
+    "run",
+    "world",
+    "centre",
+    *KINDS,
+)  # they mean something in keys and in [disturbance]
 _WALL: Final = "wall"  # the border of the arena, where contacts are told
 
 
@@ -31,6 +38,7 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
     yield from formation_checks.faults(experiment)
     yield from channel_checks.faults(experiment)
     yield from _timeline(experiment)
+    yield from _architecture(experiment)
     yield from _triggers(experiment)
     for name in experiment.disturbance:
         known = ("all", *KINDS, *experiment.robots)
@@ -185,6 +193,21 @@ def _triggers(experiment: Experiment) -> Iterator[Fault]:
     if given_too.get("smoothing_s"):
         message = "smoothing_s is for what is said; nothing is said where the law is computed"
         yield Fault(("formation", "update", "smoothing_s"), message, "leave it out", on_key=True)
+
+
+def _architecture(experiment: Experiment) -> Iterator[Fault]:
+    """Does a hybrid architecture name some of the robots, and not all."""
+    hybrid, path = experiment.architecture, ("architecture", "robots")
+    if not isinstance(hybrid, Hybrid):
+        return
+    for number, name in enumerate(hybrid.robots):
+        if name not in experiment.robots:
+            yield Fault((*path, number), f"no robot is called '{name}'", did_you_mean(name, experiment.robots))
+        elif name in hybrid.robots[:number]:
+            yield Fault((*path, number), f"'{name}' is named twice", "name it once")
+    if set(experiment.robots) <= set(hybrid.robots):
+        message = "a hybrid architecture in which the centre guides every robot is a centralised one"
+        yield Fault(path, message, 'write architecture = "centralised", or leave some robots out')
 
 
 def _timeline(experiment: Experiment) -> Iterator[Fault]:

@@ -18,6 +18,7 @@ from agents import session as network
 from agents import wire
 from agents.keys import Keys
 from experiments import orders
+from experiments.assign import guided
 from experiments.crew import Crew
 from experiments.experiment import Experiment
 from experiments.launcher import LAND_S, Launcher
@@ -44,14 +45,14 @@ class Seen:
 
     Attributes:
         status: Its last status.
-        error: Formation error as the robot itself sees it [m].
+        error: Formation error as the robot itself sees it [m]; None of one that is guided, and sees none.
         sent: Poses that it sent, and `rate` of them over the last second [1/s].
         alive: Whether its liveliness token stands.
         gone: Whether its process has ended or its token has vanished in mid-run.
     """
 
     status: wire.Status | None = None
-    error: float = 0.0
+    error: float | None = 0.0
     rate: float = 0.0
     alive: bool = False
     gone: bool = False
@@ -127,7 +128,8 @@ class Conductor:
         self._endpoints = list(endpoints)
         self._show, self._interrupted = show, interrupted
         self._keys = Keys(experiment.network.realm)
-        self._robots = {name: Seen() for name in experiment.robots}
+        steered = guided(experiment)
+        self._robots = {name: Seen(error=None if name in steered else 0.0) for name in experiment.robots}
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
         self._crew = Crew(
             experiment,
@@ -272,7 +274,8 @@ class Conductor:
         for status in self._messages(self._statuses.handler, wire.Status):
             self._heed(status)
         for state in self._messages(self._states.handler, wire.State):
-            self._robots[state.robot].error = state.error
+            if self._robots[state.robot].error is not None:
+                self._robots[state.robot].error = state.error
         for sample in network.received(self._watch.handler):
             seen = self._robots.get(self._keys.robot(str(sample.key_expr)))
             if seen is not None:

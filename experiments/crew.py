@@ -5,23 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
 
 from experiments import standins
 from experiments.document import write_json
 from experiments.experiment import Experiment
-from experiments.launcher import LAND_S, ROUTER, Launcher, Process
-
-LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
-ROUTERS: Final = 5  # a router that dies more often is not helped by starting it again,
-WORLDS: Final = 5  # nor is a world
+from experiments.launcher import LAND_S, Launcher, Process
+from experiments.servants import Servants
 
 
 @dataclass(frozen=True)
 class Death:
-    """A process has ended that should not have: what it was (`lost`: a robot's), whom it concerns, what is done."""
+    """A process has ended that should not have: what it was, whom it concerns, what is done.
 
-    kind: Literal["router", "world", "recorder", "lost"]
+    `kind` is "recorder", "lost" (a robot's process), or the name of one that was started again.
+    """
+
+    kind: str
     source: str
     text: str
 
@@ -60,7 +59,8 @@ class Crew:
             self._groups.setdefault(robot.process or name, []).append(name)
         self._recorder = f"{case}-recorder"
         self._standins: tuple[str, ...] = ()
-        self._routers = self._worlds = 1
+        self._centre: tuple[str, ...] = ()
+        self._servants = Servants(experiment, case, file=file, endpoints=endpoints, launcher=launcher)
 
     def start(self, interrupted: Callable[[], bool]) -> None:
         """Starts all but the router: the recorder, then what robots need, then the robots.
@@ -75,6 +75,7 @@ class Crew:
         file = str(self._file)
         self._launcher.start(self._recorder, "experiments.recorder", file, str(self._recording), *case, *self._connect)
         addressed = self._stand_in(interrupted)
+        self._centre = self._servants.start_centre()
         for group, names in self._groups.items():
             arguments = [str(addressed), *names, *self._connect, "--lifeline"]
             self._launcher.start(self._process(group), "experiments.robot", *arguments)
@@ -82,16 +83,16 @@ class Crew:
     def end(self) -> None:
         """Ends all but the router: robots land first, and the recorder sees it."""
         self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
+        self._launcher.end(self._centre, grace_s=2.0)  # its last word is recorded
         self._launcher.end([self._recorder], grace_s=5.0)
         self._launcher.end(self._standins, grace_s=2.0)
 
     def deaths(self) -> Iterator[Death]:
-        """What has died since the last call; router and world are started again, a few times."""
+        """What has died since the last call; router, world and centre are started again, a few times."""
         for process in self._launcher.died():
-            if process.name == ROUTER:
-                yield self._router_died(process)
-            elif process.name == standins.world_name(self._case):
-                yield self._world_died(process)
+            again = self._servants.again(process, self._case)
+            if again is not None:
+                yield Death(again[0], "conductor", again[1])
             elif process.name == self._recorder:
                 yield Death("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
             else:
@@ -122,30 +123,6 @@ class Crew:
         file = self._file.with_name(f"{self._case}-addressed.json")
         file.write_bytes(write_json(experiment))
         return file
-
-    def _router_died(self, process: Process) -> Death:
-        self._routers += 1
-        again = self._routers < ROUTERS
-        if again:
-            start_router(self._launcher, self._endpoints)
-        what = "started again" if again else "given up: the robots hold, and land at the end"
-        return Death("router", "conductor", f"the router ended ({process.exit}); {what}")
-
-    def _world_died(self, process: Process) -> Death:
-        self._worlds += 1
-        again, why = self._worlds < WORLDS, _because(process)
-        if again:
-            standins.start_world(
-                self._experiment, self._file, prefix=self._case, launcher=self._launcher, connect=self._connect
-            )
-        what = "started again: robots hold until then" if again else "given up"
-        return Death("world", "conductor", f"the world ended ({process.exit}); {what}{why}")
-
-
-def start_router(launcher: Launcher, endpoints: Sequence[str]) -> None:
-    """A router of our own, which outlives a killed launcher by as long as robots take to land."""
-    listen = [part for endpoint in endpoints for part in ("--listen", endpoint)]
-    launcher.start(ROUTER, "agents.router", *listen, "--lifeline", "--linger", str(LINGER_S))
 
 
 def _because(process: Process) -> str:

@@ -306,6 +306,13 @@ class Start(Part, frozen=True):
     scatter_yaw: Annotated[NotNegative, Meta(description="and turned by up to this, by the seed [rad]")] = 0.0
 
 
+class Hybrid(Part, frozen=True):
+    """Some robots are guided by the centre, the others decide for themselves."""
+
+    kind: Annotated[Literal["hybrid"], Meta(description='"hybrid"')]
+    robots: Annotated[list[Name], Meta(min_length=1, description="those that the centre guides")]
+
+
 class Experiment(Part, frozen=True):
     """One experiment, or one case of it after `document.cases`."""
 
@@ -319,6 +326,10 @@ class Experiment(Part, frozen=True):
     rates: Rates = Rates()
     formation: Formation = Formation()
     timeline: list[Leg] = []
+    architecture: Annotated[
+        Literal["distributed", "centralised"] | Hybrid,
+        Meta(description="who decides: every robot for itself, or one process for all or some of them"),
+    ] = "distributed"
     trigger: Annotated[Choice, Meta(description="a registered trigger: when a robot speaks")] = "periodic"
     prediction: Annotated[
         Choice | None,

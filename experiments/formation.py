@@ -65,6 +65,10 @@ class Pattern:
         mine = self.take(at)
         return replace(mine, links=replace(mine.links, listener=listener))
 
+    def without_listeners(self, rows: Index) -> Pattern:
+        """The links on which others than these rows listen."""
+        return self.take(np.flatnonzero(~np.isin(self.links.listener, rows))) if len(rows) else self
+
     def and_then(self, others: Links) -> Pattern:
         """With other links behind them, which do not change and are always there."""
         changes = tuple(change.padded(len(others)) for change in self.changes)
@@ -126,10 +130,11 @@ def _errors(law: Law, pattern: Pattern, time: Array, position: Array) -> Array:
     return law.error(flat, flat[many.speaker], many).reshape(count, len(links))
 
 
-def anchors_of(experiment: Experiment, names: Sequence[str]) -> Anchors | None:
-    """The anchors of these robots, each once; None if there are none."""
+def anchors_of(experiment: Experiment, names: Sequence[str], only: Sequence[str] | None = None) -> Anchors | None:
+    """The anchors of these robots, or of some `only`, each once; None if there are none."""
     formation = experiment.formation
-    there = [(row, formation.anchors[name]) for row, name in enumerate(names) if name in formation.anchors]
+    anchored = formation.anchors if only is None else [name for name in formation.anchors if name in only]
+    there = [(row, formation.anchors[name]) for row, name in enumerate(names) if name in anchored]
     if not there:
         return None
     anchors = [each if isinstance(each, Anchor) else Anchor(distance=each) for _, each in there]

@@ -100,6 +100,7 @@ def _written(  # noqa: PLR0917 - everything that was found out
         f'title = "{_plain(name)}: {len(park.robots)} robots, {park.mode}"',
         f'source = "an experiment file of Robotic-Park-Lab, {_plain(Path(label).name)}"',
         f"duration_s = {duration_s:g}",
+        *(['architecture = "centralised"'] if park.architecture == "centralized" else []),
         f"trigger = {trigger}",
         *(['positioning = "vicon-twin"'] if any(robot.external for robot in park.robots) else []),
         "",
@@ -173,7 +174,7 @@ def _tools(park: Park, notes: Notes) -> None:
         notes.say(f"Operation: the simulator and its world ({park.tool}); twins are zenpark's own, in an empty arena")
     if park.kind != "formation":
         notes.say(f"Experience: type {park.kind}; only formations are known")
-    if park.architecture != "distributed":
+    if park.architecture not in {"distributed", "centralized"}:
         notes.say(f"Architecture: {park.architecture}; every robot decides for itself here")
     if park.others:
         notes.say(f"{', '.join(park.others)}: zenpark records, watches and reports by itself")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ from agents import plugins, wire
 from agents.graph import Links
 from agents.lifecycle import Phase
 from agents.rows import Array, Index, Mask
-from experiments import assign
+from experiments import assign, goals
 from experiments.channel import EPOCH
 from experiments.contacts import ROUNDING_S, WALL, finds_contacts, looked_for, within
 from experiments.experiment import Experiment
+from experiments.goals import Goals
 from experiments.recording import Recording
 from experiments.trace import HeardPoses, Sent, Trace
 from experiments.virtual import Log
@@ -42,6 +43,10 @@ class Logbook:
         own = (link >= copy * per_copy) & (link < (copy + 1) * per_copy)
         self._heard = (time[own], link[own] - copy * per_copy, seq[own], stamp[own], position[own], velocity[own])
         self._dropped: Index = log.lost[copy * per_copy : (copy + 1) * per_copy]
+        self._goals: Goals | None = None
+        if log.steered is not None:
+            encoding = experiment.network.encoding
+            self._goals = goals.of_log(log.steered, log.names, copy * rows, experiment.duration_s, encoding)
 
     def trace(self) -> Trace:
         """The run from the common start on, as arrays."""
@@ -92,6 +97,7 @@ class Logbook:
             shadow_position=_part(log.shadow_position, run, mine),
             shadow_yaw=_part(log.shadow_yaw, run, mine),
             dropped=self._dropped,
+            goals=self._goals,
         )
 
     def record(self, path: Path, document: str) -> None:
@@ -125,6 +131,11 @@ class Logbook:
                     pending = next(said, None)
                 for state in states:
                     recording.state(state)
+            for t, goal in self._told():
+                recording.goal(goal, EPOCH + t, len(wire.encode(goal, self._encoding)))
+            if self._log.steered is not None:
+                steered, end = self._log.steered, self._experiment.duration_s
+                recording.centre(goals.report(steered, self._log.names, self._mine.start, end))
             for status in self._statuses():
                 recording.status(status)
             for report in self._world():
@@ -146,6 +157,11 @@ class Logbook:
         for t, row, seq, position, velocity, yaw in zip(*columns, strict=True):
             yield wire.pose(names[row], seq, EPOCH + t, position, velocity, yaw)
 
+    def _told(self) -> Iterator[tuple[float, wire.Goal]]:
+        """What the centre told robots, and when."""
+        if self._log.steered is not None:
+            yield from goals.messages(self._log.steered, self._log.names, self._mine.start)
+
     def _states(self) -> Iterator[tuple[float, list[wire.State]]]:
         """Telemetry, sample by sample, with the poses that each robot heard since the sample before."""
         log, mine = self._log, self._mine
@@ -159,6 +175,9 @@ class Logbook:
             strict=True,
         )
         heard = self._heard_by_sample()
+        followed: dict[tuple[int, int], list[wire.Followed]] = {}
+        if log.steered is not None:
+            followed = goals.followed(log.steered, log.time, mine.start, len(log.names))
         for k, (t, phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw, *more) in enumerate(samples):
             yield (
                 t,
@@ -177,7 +196,8 @@ class Logbook:
                         tuple(truth[row]),
                         true_yaw[row],
                         heard.get((k, row), []),
-                        *(None if column is None else _known(column[row]) for column in more),
+                        *_three(more, row),
+                        followed.get((k, row), []),
                     )
                     for row, name in enumerate(log.names)
                 ],
@@ -295,3 +315,9 @@ def _known(value: Any) -> Any:  # noqa: ANN401 - a number or a list of them
     if isinstance(value, list):
         return None if math.isnan(value[0]) else tuple(value)
     return None if math.isnan(value) else value
+
+
+def _three(columns: Sequence[Any], row: int) -> tuple[Any, Any, Any]:
+    """Of a row: attitude, and where its shadow is and looks; None where it has none."""
+    attitude, position, yaw = (None if column is None else _known(column[row]) for column in columns)
+    return attitude, position, yaw

@@ -78,6 +78,41 @@ class ShadowMetrics(msgspec.Struct, frozen=True):
     known: float
 
 
+class Guidance(msgspec.Struct, frozen=True):
+    """What deciding in one process came to.
+
+    Attributes:
+        guided: Robots for which it decided.
+        goals: That it sent, and `goals_hz` of them per second.
+        goals_hz: See `goals`.
+        goal_bytes: Their payload [bytes].
+        goals_lost: That did not reach their robots; those of the last instant may still have been under way.
+        heard: Poses that it heard.
+        poses_lost: And those that it never got, by their running numbers.
+        delay_mean_s: From the measurement of a robot's pose to its acting on the first goal that rests on it [s];
+            None if no pose was answered.
+        delay_p95_s: 95 % of these delays are shorter [s].
+        delay_max_s: The longest [s].
+        load: Share of a core that its process took; None in virtual time.
+        load_max: That of the busiest second.
+        missed: Decisions that were too late to be made.
+    """
+
+    guided: tuple[str, ...]
+    goals: int
+    goals_hz: float
+    goal_bytes: int
+    goals_lost: int
+    heard: int
+    poses_lost: int
+    delay_mean_s: float | None
+    delay_p95_s: float | None
+    delay_max_s: float | None
+    load: float | None
+    load_max: float | None
+    missed: int
+
+
 class RobotMetrics(msgspec.Struct, frozen=True):
     """One robot in one case. What cannot be known is None.
 
@@ -120,6 +155,11 @@ class RobotMetrics(msgspec.Struct, frozen=True):
         avoided: Ticks on which avoidance did.
         avoided_share: Those over ticks.
         shadow: How far the twin beside it agrees with it; None without one.
+        goals: That a centre sent to it, and `goal_bytes` their payload [bytes].
+        goal_bytes: See `goals`.
+        delay_mean_s: See `Guidance`; None for robots that decide for themselves.
+        delay_p95_s: Likewise [s].
+        delay_max_s: Likewise [s].
     """
 
     robot: str
@@ -159,6 +199,11 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     avoided: int
     avoided_share: float | None
     shadow: ShadowMetrics | None
+    goals: int = 0
+    goal_bytes: int = 0
+    delay_mean_s: float | None = None
+    delay_p95_s: float | None = None
+    delay_max_s: float | None = None
 
     @property
     def by_the_end(self) -> tuple[float | None, str]:
@@ -236,6 +281,10 @@ class CaseMetrics(msgspec.Struct, frozen=True):
         avoided_share: Ticks on which avoidance did over ticks, of all robots.
         world_factor: Lowest simulated over real time that the world reported while it was not paused; None without a
             world in real time.
+        network_messages: Of the whole network: poses of all robots, leaders too, and goals of the centre.
+        network_bytes: Their payload [bytes].
+        deliveries: The same messages, counted once for everybody who listens to them.
+        guidance: What deciding in one process came to; None if every robot decides for itself.
     """
 
     case: str
@@ -274,3 +323,7 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     intervened_share: float | None
     avoided_share: float | None
     world_factor: float | None
+    network_messages: int = 0
+    network_bytes: int = 0
+    deliveries: int = 0
+    guidance: Guidance | None = None

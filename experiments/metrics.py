@@ -17,7 +17,7 @@ import numpy as np
 
 from agents.graph import Links
 from agents.rows import norm
-from experiments import conditions
+from experiments import conditions, guiding
 from experiments.clearance import Clearance, collisions
 from experiments.measured import INDICES, Approach, Belief, CaseMetrics, Collision, Passage, Phase, RobotMetrics
 from experiments.passages import passages
@@ -131,6 +131,10 @@ def measure(trace: Trace) -> CaseMetrics:
         intervened_share=_share(trace.interventions.sum(), ticks),
         avoided_share=_share(trace.avoided.sum(), ticks),
         world_factor=_slowest(trace),
+        network_messages=sum(robot.messages + robot.goals for robot in robots),
+        network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
+        deliveries=guiding.deliveries(trace, np.array([robot.messages for robot in robots], dtype=np.intp)),
+        guidance=guiding.guidance(trace),
     )
 
 
@@ -171,10 +175,14 @@ def _robots(
     sent, recorded = transmissions(trace)
     size = np.bincount(trace.sent.robot, weights=trace.sent.bytes, minlength=rows)
     linked = np.zeros((rows, rows), dtype=bool)  # what only avoidance listens to does not belong to the formation
-    linked[errors.net.listener, errors.net.speaker] = True
+    told = guiding.guided_rows(trace)[errors.net.listener]  # what they would listen to, the centre hears
+    linked[errors.net.listener[~told], errors.net.speaker[~told]] = True
     by_listeners = linked[trace.heard.listener, trace.heard.speaker]
     heard = np.bincount(trace.heard.speaker[by_listeners], minlength=rows)
-    listeners = np.bincount(errors.net.speaker, minlength=rows)
+    listeners = np.bincount(errors.net.speaker[~told], minlength=rows) + guiding.centre_hears(trace)
+    if trace.goals is not None:
+        heard += trace.goals.heard
+    goals, goal_bytes, late = *guiding.goals_to(trace), guiding.delays(trace)
     waits = [(wait.min(), float(np.median(wait)), wait.max()) if len(wait) else (np.nan,) * 3 for wait in gaps(trace)]
     own = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
     agreements = agreement(trace)
@@ -220,6 +228,11 @@ def _robots(
             avoided=int(trace.avoided[i]),
             avoided_share=_share(trace.avoided[i], trace.ticks[i]),
             shadow=agreements[i],
+            goals=int(goals[i]),
+            goal_bytes=int(goal_bytes[i]),
+            delay_mean_s=late[i].mean,
+            delay_p95_s=late[i].p95,
+            delay_max_s=late[i].largest,
         )
         for i, name in enumerate(trace.robots)
     )

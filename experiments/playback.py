@@ -14,12 +14,14 @@ import numpy as np
 
 from agents.lifecycle import Phase
 from agents.rows import Array, Index
-from agents.wire import Contact, Event, State, Status, WorldState
+from agents.wire import CentreState, Contact, Event, State, Status, WorldState
 from experiments import assign
+from experiments.assign import guided
 from experiments.cdr import Undecodable, codec
 from experiments.contacts import ROUNDING_S, looked_for, within
 from experiments.experiment import Experiment
-from experiments.recording import JSON, METADATA, SentPose
+from experiments.goals import of_recording
+from experiments.recording import JSON, METADATA, SentGoal, SentPose
 from experiments.records import RecordingError, Records
 from experiments.resample import HOLE_S, attitude, line, step, turn
 from experiments.trace import HeardPoses, Sent, Trace
@@ -109,6 +111,8 @@ class _Content:
     events: list[Event] = field(default_factory=list)
     contacts: list[Contact] = field(default_factory=list)
     world: list[WorldState] = field(default_factory=list)
+    goals: list[SentGoal] = field(default_factory=list)
+    reports: list[CentreState] = field(default_factory=list)
 
     def fill(self) -> int:
         """Reads all messages and counts them; those of other types are passed over."""
@@ -120,6 +124,8 @@ class _Content:
                 _reader(Event, self.events),
                 _reader(Contact, self.contacts),
                 _reader(WorldState, self.world),
+                _reader(SentGoal, self.goals),
+                _reader(CentreState, self.reports),
             ]
         )
         readers: dict[int, Callable[[bytes], None] | None] = {}
@@ -203,9 +209,13 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
     def column(what: str) -> Array:
         return np.stack([getattr(own, what) for own in sampled], axis=1)
 
-    told = any(state.attitude is not None for state in content.states)
+    turned = any(state.attitude is not None for state in content.states)
     shadowed = any(state.shadow_position is not None for state in content.states)
     contacts, world = within(content.contacts, start, duration), within(content.world, start, duration)
+    goals = None
+    if guided(experiment):
+        told = dict(zip(robots, states, strict=True))
+        goals = of_recording(content.goals, told, content.reports, start, duration)
     return Trace(
         case=about[0],
         experiment=experiment,
@@ -220,7 +230,7 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         setpoint=column("setpoint"),
         sent=_sent(poses, start, duration),
         heard=_heard(states, robots, start, duration),
-        lost=_lost(robots, poses, statuses, (start, start + duration)),
+        lost=_lost(robots, poses, statuses, (start, start + duration)) + (0 if goals is None else goals.lost),
         dropped=_dropped(experiment, statuses, (start, start + duration)),
         missed_deadlines=_counted(last, "missed"),
         ticks=_counted(last, "ticks"),
@@ -233,9 +243,10 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         avoided=_counted(last, "avoided"),
         contacts=contacts if looked_for(contacts, world) else None,
         world=world,
-        attitude=column("attitude") if told else None,
+        attitude=column("attitude") if turned else None,
         shadow_position=column("shadow_position") if shadowed else None,
         shadow_yaw=column("shadow_yaw")[:, :, 0] if shadowed else None,
+        goals=goals,
     )
 
 

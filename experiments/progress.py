@@ -52,7 +52,7 @@ class Lines:
         now = time.monotonic()
         if now >= self._next and progress.elapsed is not None:
             self._next = now + LINE_S
-            errors = ", ".join(f"{name} {seen.error:.3f}" for name, seen in progress.robots.items())
+            errors = ", ".join(f"{name} {_metres(seen.error)}" for name, seen in progress.robots.items())
             print(f"{progress.case}: {progress.elapsed:5.1f} s, {progress.phase}; error [m] {errors}", file=sys.stderr)
 
 
@@ -114,7 +114,7 @@ def _cells(seen: Seen, now: float) -> tuple[str, ...]:
         note += f" {status.malformed} malformed"
     return (
         phase,
-        f"{seen.error:.3f}",
+        _metres(seen.error),
         str(status.sent),
         f"{seen.rate:.1f}",
         str(sum(status.lost.values())),
@@ -123,3 +123,7 @@ def _cells(seen: Seen, now: float) -> tuple[str, ...]:
         "" if status.battery is None else f"{100 * status.battery:.0f} %",
         note,
     )
+
+
+def _metres(error: float | None) -> str:
+    return "–" if error is None else f"{error:.3f}"

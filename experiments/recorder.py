@@ -49,6 +49,8 @@ class Recorder:
         self._events = network.subscriber(session, keys.event, DEPTH)
         self._contacts = network.subscriber(session, keys.contact, DEPTH)
         self._world = network.subscriber(session, keys.world, DEPTH)
+        self._goals = network.subscriber(session, keys.goal("*"), DEPTH)
+        self._centre = network.subscriber(session, keys.centre, DEPTH)
         self._truths = network.subscriber(session, keys.truth("*"), DEPTH)
         self._truth: dict[str, wire.Position] = {}
         self._watch = network.alive_watch(session, keys.alive("*"))
@@ -76,6 +78,8 @@ class Recorder:
             (self._events.handler, self._event),
             (self._contacts.handler, self._contact),
             (self._world.handler, self._said_by_world),
+            (self._goals.handler, self._goal),
+            (self._centre.handler, self._said_by_centre),
         ):
             for sample in network.received(handler):
                 try:
@@ -122,6 +126,18 @@ class Recorder:
         for standing in said.obstacles:
             self._finite(sample, *standing.pose)
         self._recording.world(said)
+
+    def _goal(self, sample: zenoh.Sample) -> None:
+        payload = sample.payload.to_bytes()
+        goal = wire.decode(payload, str(sample.encoding), wire.Goal)
+        self._own(sample, goal.robot)
+        self._finite(sample, goal.stamp, goal.pose)
+        self._recording.goal(goal, time.time(), len(payload))
+
+    def _said_by_centre(self, sample: zenoh.Sample) -> None:
+        said = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.CentreState)
+        self._finite(sample, said.stamp, said.load, said.late_s, said.cpu_s, said.rss_mb)
+        self._recording.centre(said)
 
     @staticmethod
     def _finite(sample: zenoh.Sample, *numbers: float) -> None:

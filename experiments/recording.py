@@ -4,6 +4,8 @@
     /<robot>/state      zenpark_msgs/State            telemetry, with the poses heard since the one before
     /<robot>/true_pose  geometry_msgs/PoseStamped     the same place in a type that every viewer draws
     /<robot>/status     zenpark_msgs/Status
+    /<robot>/goal       zenpark_msgs/SentGoal         what the centre told a robot that it guides
+    /centre/report      zenpark_msgs/CentreState      what the centre says of itself
     /world/contact      zenpark_msgs/Contact          what touched in the world, when it began
     /world/state        zenpark_msgs/WorldState       what the world says of itself
     /events             zenpark_msgs/Event
@@ -24,7 +26,7 @@ from typing import IO, Any, Final, Literal, Self, cast
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from agents.wire import Contact, Event, Pose, State, Status, Vector, WorldState
+from agents.wire import CentreState, Contact, Event, Goal, Pose, State, Status, Vector, WorldState
 from experiments.cdr import POSE_STAMPED, POSE_STAMPED_SCHEMA, Unencodable, codec, pose_stamped
 from experiments.experiment import Experiment
 from experiments.records import RecordingError
@@ -33,7 +35,8 @@ FRAME: Final = "park"
 TOML: Final = "experiment.toml"
 JSON: Final = "experiment.json"
 METADATA: Final = "zenpark"
-WORLD: Final = "world"  # stands where a robot's name would; no robot may be called so
+WORLD: Final = "world"  # stands where a robot's name would; no robot may be called so,
+CENTRE: Final = "centre"  # nor so
 CHUNK_BYTES: Final = 32 * 1024  # what a kill can cost: a third of a second of seven robots
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 
@@ -47,6 +50,19 @@ class SentPose(msgspec.Struct, frozen=True):
     position: Vector
     velocity: Vector
     yaw: float
+    received: float
+    size: int
+
+
+class SentGoal(msgspec.Struct, frozen=True):
+    """A goal as it was sent, see `agents.wire.Goal`, when the recorder got it (UTC [s]) and its size [bytes]."""
+
+    robot: str
+    seq: int
+    stamp: float
+    position: Vector
+    yaw: float | None
+    pose: float
     received: float
     size: int
 
@@ -94,6 +110,7 @@ class Recording:
         self._status = _topic("status", Status)
         self._event = _topic("events", Event)
         self._contact, self._world = _topic("contact", Contact), _topic("state", WorldState)
+        self._goal, self._centre = _topic("goal", SentGoal), _topic("report", CentreState)
         self._drawn = _Topic("true_pose", POSE_STAMPED, POSE_STAMPED_SCHEMA, _drawing())
         self._over = ""  # why nothing more can be written
         try:
@@ -142,6 +159,23 @@ class Recording:
             RecordingError: If it cannot be written; what was written before stays.
         """
         self._record(self._status, status.robot, status, status.stamp, status.stamp)
+
+    def goal(self, goal: Goal, received: float, size: int) -> None:
+        """Records a goal that was sent to a robot; see `pose`.
+
+        Raises:
+            RecordingError: If it cannot be written; what was written before stays.
+        """
+        sent = SentGoal(goal.robot, goal.seq, goal.stamp, goal.position, goal.yaw, goal.pose, received, size)
+        self._record(self._goal, goal.robot, sent, received, goal.stamp, seq=goal.seq)
+
+    def centre(self, said: CentreState) -> None:
+        """Records what the centre says of itself.
+
+        Raises:
+            RecordingError: If it cannot be written; what was written before stays.
+        """
+        self._record(self._centre, CENTRE, said, said.stamp, said.stamp)
 
     def contact(self, contact: Contact) -> None:
         """Records the beginning of a contact in the world.

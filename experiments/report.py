@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from experiments import figures, scenery, shadow_figures
 from experiments.measured import CaseMetrics
 from experiments.metrics import measure
+from experiments.report_architecture import EXPLAINED, architecture_table
 from experiments.report_network import PROSE as MODELLED
 from experiments.report_network import network_tables
 from experiments.report_tables import (
@@ -141,6 +142,7 @@ def write(
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
         Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
+        *_of_architecture(cases),
         Section("Figures", pictures=drawn),
         Section("Each robot", tables=robot_tables(cases)),
         Section(
@@ -218,6 +220,7 @@ def compare(
     experiments = dict.fromkeys(trace.experiment.title for _, traces in runs for trace in traces)
     sections = [
         Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
+        *_of_architecture(cases),
         Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
         Section("Each robot", tables=robot_tables(cases), folded="Show all tables"),
         Section("Was anything lost?", tables=proof_tables(cases), folded="Show all tables"),
@@ -305,6 +308,12 @@ def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Pi
     }
     drawn = figures.every(cases, traces)
     return numbered((figure, captions[name]) for name, figure in drawn.items())
+
+
+def _of_architecture(cases: Sequence[CaseMetrics]) -> list[Section]:
+    """Who decides, if not every robot for itself."""
+    table = architecture_table(cases)
+    return [] if table is None else [Section("Architecture", (EXPLAINED,), (table,))]
 
 
 def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_before: int) -> list[Section]:

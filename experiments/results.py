@@ -24,6 +24,12 @@ def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[s
                 "mean": dict(case.mean),
                 "ratio": {index: next(iter(ratios([case], cases[:1], index))) for index in INDICES},
                 "collisions": len(case.collisions),
+                "network": {
+                    "messages": case.network_messages,
+                    "bytes": case.network_bytes,
+                    "deliveries": case.deliveries,
+                },
+                **({} if case.guidance is None else {"guidance": msgspec.to_builtins(case.guidance)}),
                 "near_m": None if case.near is None else case.near.gap,
                 **({"duration_s": case.duration_s, "interrupted": True} if case.interrupted else {}),
             }

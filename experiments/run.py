@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any, Final
 from agents.session import free_endpoint
 from experiments import document, metrics, playback, results, virtual
 from experiments.conductor import Conductor, Result
-from experiments.crew import start_router
 from experiments.document import Document
 from experiments.experiment import Experiment
 from experiments.launcher import Launcher
@@ -35,6 +34,7 @@ from experiments.logbook import Logbook
 from experiments.measured import CaseMetrics
 from experiments.problem import DocumentError, Problem
 from experiments.progress import Shown
+from experiments.servants import start_router
 from experiments.standins import choose_bodies
 from experiments.trace import Trace
 

@@ -218,6 +218,9 @@ def _in_words(text: str, value: object, annotation: object, path: Path, note: st
     plain, _ = _plain(annotation, note)
     if get_origin(plain) is Literal:
         return Fault(path, f"'{name}' cannot be {shown(value)}", did_you_mean(str(value), map(str, get_args(plain))))
+    words = [word for part in get_args(plain) if get_origin(part) is Literal for word in get_args(part)]
+    if get_origin(plain) in (Union, types.UnionType) and words and isinstance(value, str):
+        return Fault(path, f"'{name}' cannot be {shown(value)}", did_you_mean(value, words))
     match = re.fullmatch(r"Expected `([^`]+)`(.*?)(?:, got `.*`)?", text)
     if match is None:
         return Fault(path, f"'{name}': {text}", note)

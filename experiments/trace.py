@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from agents.rows import Array, Index
 from agents.wire import Contact, Event, WorldState
 from experiments.experiment import Experiment
+from experiments.goals import Goals
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ class Trace:
         shadow_yaw: (T, N) of those twins [rad].
         dropped: (E,) samples that the modelled network dropped on each of `assign.heard_links`, in their order; None
             if that is not known.
+        goals: What the centre told robots, and heard of them; None if every robot decides for itself.
     """
 
     case: str
@@ -117,3 +119,4 @@ class Trace:
     shadow_position: Array | None = None
     shadow_yaw: Array | None = None
     dropped: Index | None = None
+    goals: Goals | None = None

@@ -34,6 +34,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *(Finding("plain", text) for text in sentences(cases)),
         *_deadlines(cases),
         *_died(cases),
+        *_guided(cases),
         *_formation(cases),
         *contacts(cases),
         *_avoided(cases),
@@ -46,7 +47,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 def _formation(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """What became of the formation, where there is one."""
-    if not any(robot.listeners for case in cases for robot in case.robots):
+    if not any(case.belief for case in cases):
         return []
     return [*_acquired(cases), _worst_link(cases), *_against_the_first(cases)]
 
@@ -108,6 +109,25 @@ def _died(cases: Sequence[CaseMetrics]) -> list[Finding]:
         gone = list(dict.fromkeys(robot for run in runs for robot in run.died))
         if gone:
             found.append(Finding("bad", f"In {name}, {_list(gone)} dropped out; the means leave {_them(gone)} out."))
+    return found
+
+
+def _guided(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """What deciding in one process took."""
+    found = []
+    for name, runs in by_case(cases).items():
+        centres = [run.guidance for run in runs if run.guidance is not None]
+        if not centres:
+            continue
+        delay = spread([centre.delay_mean_s for centre in centres])
+        busy = spread([centre.load for centre in centres])
+        text = f"In {name} a centre decides for {_list(centres[0].guided)}"
+        text += f": {interval(spread([centre.goals_hz for centre in centres]))} goals per second"
+        if delay.mean is not None:
+            text += f", acted on {interval(delay, 1000.0)} ms after the pose on which they rest"
+        if busy.mean is not None:
+            text += f"; its process took {interval(busy, 100.0)} % of a core"
+        found.append(Finding("plain", f"{text}."))
     return found
 
 

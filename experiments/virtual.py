@@ -1,8 +1,9 @@
 """The virtual clock: the whole experiment in one process, without sleeping, reproducible to the bit from its seed.
 
-The decision is `agents.Agent` with all rows, the bodies are the twins, the network is `experiments.channel`; this file
-is only the loop. Several seeds run side by side as more rows, each with the result that it would have alone (unless
-a lossy network makes one so much later ready that the others get their orders at another multiple of `ORDERS_S`).
+The decision is `agents.Agent` with all rows, the bodies are the twins, the network is `experiments.virtual_network`;
+this file is only the loop. Several seeds run side by side as more rows, each with the result that it would have alone
+(unless a lossy network makes one so much later ready that the others get their orders at another multiple of
+`ORDERS_S`).
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ import numpy as np
 
 from agents.agent import Agent
 from agents.body import BodyState
-from agents.lifecycle import LANDING, Phase
+from agents.lifecycle import Phase
 from agents.rows import Array, Index, Mask, some
 from agents.shadow import shadowed
 from experiments import assign
-from experiments.channel import Channel
 from experiments.experiment import Experiment
+from experiments.steering import Steered
+from experiments.virtual_network import VirtualNetwork
 from twins.body import TwinBody
 from twins.engine import Touch
 
@@ -61,6 +63,7 @@ class Log:
         shadow_position: (K, R, 3) of the twins beside the robots, NaN for rows without one; None if there is none.
         shadow_yaw: (K, R) of those twins.
         waited: (repetitions,) that got an order later than they would have got it alone, because another one was late.
+        steered: What went between the robots and the centre; None if every robot decides for itself.
     """
 
     names: tuple[str, ...]
@@ -91,6 +94,7 @@ class Log:
     shadow_position: Array | None
     shadow_yaw: Array | None
     waited: Mask
+    steered: Steered | None = None
 
 
 class _Samples:
@@ -106,14 +110,8 @@ class _Samples:
         """As arrays with the samples as first axis."""
         return tuple(np.array(column) for column in zip(*self._columns, strict=True))
 
-    def joined(self, *empty: tuple[int, ...]) -> tuple[Any, ...]:
-        """Concatenated; `empty` gives the shapes of columns when nothing was added."""
-        if not self._columns:
-            return tuple(np.zeros(shape) for shape in empty)
-        return tuple(np.concatenate(column) for column in zip(*self._columns, strict=True))
 
-
-def simulate(  # noqa: PLR0915 - one loop, told in order
+def simulate(
     experiment: Experiment,
     seeds: Sequence[int],
     *,
@@ -139,15 +137,13 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
     request = replace(request, external=(False,) * len(request.names))  # nobody measures in virtual time
     twin = TwinBody(request, assign.world(experiment, names, len(seeds)))
     body = shadowed(twin, request, assign.shadows(experiment, names, len(seeds)))
-    channel = Channel(experiment, assignment.links, seeds)
+    network = VirtualNetwork(experiment, agent, seeds, lean=lean)
     rows = len(assignment.names)
     dt = 1.0 / assignment.body_hz
     log_every = round(assignment.body_hz / experiment.rates.state_hz)
-    seq = np.zeros(rows, dtype=np.intp)
     interventions, avoided = np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
     touches: list[Touch] = []
-    states, seen, sent, heard = _Samples(), _Samples(), _Samples(), _Samples()
-    lost_before = lost_after = channel.lost
+    states, seen = _Samples(), _Samples()
     conductor = _Conductor(agent, names)
     nothing = np.zeros((rows, 0))
     blank = (nothing,) * 4
@@ -155,17 +151,8 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
     while not conductor.over:
         t = tick * dt
         state = body.read(t)
-        arrived = channel.due(t)
-        if arrived is not None:
-            agent.hear(arrived.link, arrived.position, arrived.velocity, arrived.stamp, arrived.arrival)
-            if not lean:
-                heard.add(arrived.arrival, arrived.link, arrived.seq, arrived.stamp, arrived.position, arrived.velocity)
-        actions = agent.step(t, state)
-        if agent.life.moved:
-            if lost_before is channel.lost and agent.decisions:
-                lost_before = channel.lost.copy()
-            if lost_after is channel.lost and agent.decisions and (agent.life.phase >= LANDING).all():
-                lost_after = channel.lost.copy()
+        said = network.carry(t, state)
+        actions = agent.act(t, state, said)
         if actions.duties is not None:
             body.takeoff(actions.duties.takeoff, assignment.hover[actions.duties.takeoff])
             body.land(actions.duties.land)
@@ -183,13 +170,6 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
             states.add(t, *((*blank, state.true_position, *blank) if lean else whole))
             more = () if lean else tuple(value for value in _extra(state) if value is not None)
             seen.add(nothing if lean else np.array(twin.engine.obstacles), *more)
-        if len(speak := actions.speak):
-            seq[speak] += 1
-            said = (
-                (nothing[speak],) * 3 if lean else (actions.position[speak], actions.velocity[speak], state.yaw[speak])
-            )
-            sent.add(np.full(len(speak), t), speak, seq[speak], *said)
-            channel.send(t, speak, seq, actions.position, actions.velocity, yaw=state.yaw, start=conductor.start_at)
         conductor.look(t, dt)
         twin.begun_at = conductor.start_at
         tick += 1
@@ -197,8 +177,6 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
     time, phase, position, velocity, yaw, true_position, true_yaw, goal, setpoint, error = states.stacked()
     obstacles, *rest = seen.stacked()
     extra = [None if lean or value is None else rest.pop(0) for value in _extra(state)]
-    at, row, number, *pose = sent.joined((0,), (0,), (0,), (0, 3), (0, 3), (0,))
-    arrival, link, told, stamp, *heard_pose = heard.joined((0,), (0,), (0,), (0,), (0, 3), (0, 3))
     return Log(
         names=names,
         seeds=tuple(seeds),
@@ -212,9 +190,9 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
         goal=goal,
         setpoint=setpoint,
         error=error,
-        sent=(at - begin, row.astype(np.intp), number.astype(np.intp), pose[0], pose[1], pose[2]),
-        heard=(arrival - begin, link.astype(np.intp), told.astype(np.intp), stamp - begin, *heard_pose),
-        lost=lost_after - lost_before,
+        sent=network.sent(begin),
+        heard=network.heard(begin),
+        lost=network.lost,
         decisions=agent.decisions,
         updates=agent.updates,
         interventions=interventions,
@@ -228,6 +206,7 @@ def simulate(  # noqa: PLR0915 - one loop, told in order
         shadow_position=extra[1],
         shadow_yaw=extra[2],
         waited=conductor.waited,
+        steered=network.steered(begin),
     )
 
 

@@ -35,7 +35,6 @@ from experiments.robot import chosen_case
 
 REPORT_S: Final = 1.0
 SLIP_S: Final = 0.05  # what it makes up for when it was late; the rest of the time is lost, and the factor says so
-GHOST_S: Final = 2.5  # so long may the token of a world that hangs stand after its end
 MOST_STEPS: Final = 1_000_000
 EXPLAINED: Final = (DocumentError, BodyError, plugins.PluginError, network.EndpointError, network.Unreachable)
 
@@ -238,7 +237,11 @@ def serve(
         population = Population(experiment)
         with network.open_session(endpoints, name="world", stop=lost) as session:
             keys = Keys(experiment.network.realm)
-            _refuse_doubles(session, keys)
+            if network.taken(session, keys.world_alive):
+                raise WorldTaken(
+                    f"a world runs in the realm '{keys.realm}' already: end it first, choose another router with "
+                    "--connect, or another network.realm in the experiment file"
+                )
             # before anything watches those tokens: a session that has begun to watch answers from what it has heard
             there = _alive(session, keys)
             world = WorldProcess(experiment, population, session, lost)
@@ -264,22 +267,6 @@ def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
     """Robots that are on the network already: another world may have carried them."""
     replies = session.liveliness().get(keys.alive("*"), timeout=1.0)
     return {keys.robot(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
-
-
-def _refuse_doubles(session: zenoh.Session, keys: Keys) -> None:
-    """Two worlds would both answer for a robot.
-
-    Raises:
-        WorldTaken: If one is on the network already. One that was killed is given the time until that is noticed.
-    """
-    deadline = time.monotonic() + GHOST_S
-    while list(session.liveliness().get(keys.world_alive, timeout=1.0)):
-        if time.monotonic() > deadline:
-            raise WorldTaken(
-                f"a world runs in the realm '{keys.realm}' already: end it first, choose another router with "
-                "--connect, or another network.realm in the experiment file"
-            )
-        time.sleep(0.1)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

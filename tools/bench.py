@@ -89,9 +89,9 @@ def process() -> Iterator[Figure]:
     from agents.session import free_endpoint  # noqa: PLC0415
     from experiments import document  # noqa: PLC0415
     from experiments.conductor import Conductor, Progress  # noqa: PLC0415
-    from experiments.crew import start_router  # noqa: PLC0415
     from experiments.launcher import Launcher  # noqa: PLC0415
     from experiments.run import SOURCE, load  # noqa: PLC0415
+    from experiments.servants import start_router  # noqa: PLC0415
 
     read = load("robotic-park", f"duration_s={FLIGHT_S}", "timeline=[]", "trigger.period_s=0.02")
     first: dict[str, wire.Status] = {}

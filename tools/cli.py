@@ -32,6 +32,7 @@ EXPLAINED: Final = (
     ("experiments.sweep_workers", "SweepError"),
     ("experiments.standins", "StandInError"),
     ("experiments.world", "WorldTaken"),
+    ("experiments.centre", "CentreTaken"),
     ("tools.world", "WorldOrderError"),
     ("tools.network", "KeyExpressionError"),
 )
@@ -194,6 +195,20 @@ def router(
     from agents.session import DEFAULT_ENDPOINT  # noqa: PLC0415
 
     raise typer.Exit(serve(listen or [DEFAULT_ENDPOINT], lifeline=lifeline))
+
+
+@app.command()
+def centre(
+    file: File,
+    *,
+    case: Annotated[str | None, typer.Option(metavar="NAME", help="A case of the file. [the first]")] = None,
+    connect: Connect = None,
+    lifeline: Annotated[bool, typer.Option("--lifeline", help="End when standard input ends or falls silent.")] = False,
+) -> None:
+    """Be the centre of an experiment: decide for the robots that it guides."""
+    from experiments.centre import serve  # noqa: PLC0415
+
+    raise typer.Exit(serve(file, case=case, connect=connect or [], lifeline=lifeline))
 
 
 @app.command()

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from agents import plausibility
-from agents.wire import Command, Malformed, Pose, State
+from agents.wire import Command, Goal, Malformed, Pose, State
 
 POSE = Pose("KH01", 3, 1000.0, (0.1, -0.2, 0.0), (0.01, 0.0, 0.0), 1.5)
 REACH = (2.0, 2.0, 3.5)
@@ -82,3 +82,42 @@ def test_states_of_mirrored_robots_that_cannot_be(changes: dict[str, object]) ->
         plausibility.check_state(
             msgspec.structs.replace(state, **changes), robot="KH01", now=1000.0, reach=(2.0, 2.0, 2.0)
         )
+
+
+GOAL = Goal("KH01", 7, 999.9, (0.5, -0.5, 0.0), 0.25, 999.85)
+
+
+def check_goal(**changes):
+    plausibility.check_goal(
+        msgspec.structs.replace(GOAL, **changes), robot="KH01", now=1000.0, reach=REACH, oldest_s=1.0
+    )
+
+
+def test_an_honest_goal_passes():
+    check_goal()
+    check_goal(yaw=None, stamp=1000.5, pose=1001.0)  # clocks that differ a little
+    check_goal(stamp=999.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"robot": "KH02"}, "on the key of"),
+        ({"seq": 0}, "sequence number"),
+        ({"seq": 2**60}, "sequence number"),
+        ({"stamp": 998.9}, "old"),
+        ({"stamp": math.nan}, "stamp"),
+        ({"stamp": 1006.0}, "stamp"),
+        ({"pose": math.inf}, "rest on a pose"),
+        ({"pose": math.nan}, "rest on a pose"),
+        ({"pose": 0.0}, "rest on a pose"),
+        ({"pose": 1005.5}, "rest on a pose"),
+        ({"position": (math.nan, 0.0, 0.0)}, "outside the arena"),
+        ({"position": (0.0, 1e9, 0.0)}, "outside the arena"),
+        ({"yaw": math.nan}, "yaw"),
+        ({"yaw": 1e9}, "yaw"),
+    ],
+)
+def test_a_goal_that_no_robot_can_follow(changes, says):
+    with pytest.raises(Malformed, match=says):
+        check_goal(**changes)

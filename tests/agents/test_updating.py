@@ -96,14 +96,14 @@ def test_what_moved_is_the_largest_change_on_a_link(trigger):
     swarm = Swarm(triangle({key: value for key, value in chosen.items() if value is not None})).running().run(0.5)
     (group,) = swarm.groups
     agent, state = group.agent, group.state
-    view = agent._input(agent._updating, swarm.t, state)
+    view = agent.deciding.input(swarm.t, state.position, state.velocity, agent.life.start_at)
     links = assign.all_links(swarm.experiment)
     apart = state.position[links.listener] - agent.heard.position
-    moved = np.linalg.norm(apart - agent._updating._apart, axis=1)
+    moved = np.linalg.norm(apart - agent.deciding._updating._apart, axis=1)
     for row in range(2):
         assert view.gap[row] == pytest.approx(moved[links.listener == row].max(), abs=1e-15)
     assert view.gap[2] == 0.0
-    np.testing.assert_array_equal(view.offset, agent._law_offset(swarm.t, state.position))
-    error, energy = agent._see_errors(swarm.t, state.position)
+    np.testing.assert_array_equal(view.offset, agent.deciding.law_offset(swarm.t, state.position))
+    error, energy = agent.deciding.errors(swarm.t, state.position)
     np.testing.assert_array_equal(view.error, error)
     np.testing.assert_array_equal(view.energy, energy)

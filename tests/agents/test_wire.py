@@ -9,10 +9,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents import plausibility, wire
-from agents.wire import JSON, MSGPACK, Event, Heard, Malformed, Order, Pose, Reply, State, Status, Stop
+from agents.wire import (
+    JSON,
+    MSGPACK,
+    CentreState,
+    Event,
+    Goal,
+    Heard,
+    Malformed,
+    Order,
+    Pose,
+    Reply,
+    State,
+    Status,
+    Stop,
+)
 
 FEW = settings(max_examples=60, deadline=None)
-KINDS = (Pose, State, Status, Order, Reply, Stop, Event)
+KINDS = (Pose, State, Status, Order, Reply, Stop, Event, Goal, CentreState)
 ENCODINGS = ("json", "msgpack")
 
 number = st.floats(allow_nan=False, allow_infinity=False)
@@ -27,6 +41,7 @@ messages = st.one_of(
         st.none() | st.tuples(number, number, number, number), number, st.none() | vector, st.none() | number,
         st.lists(heard, max_size=3),
     ),
+    st.builds(Goal, word, count, number, vector, st.none() | number, number),
     st.builds(Order, st.sampled_from(["takeoff", "start", "hold", "land", "stop", "get", "set"]), st.none() | number),
     st.builds(Reply, word, st.booleans(), word, word, st.none() | number),
     st.builds(Stop, word, word),

@@ -6,6 +6,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from zenoh.ext import Int64, z_serialize
 from zenoh.handlers import RingChannel
 
-from agents import wire
+from agents import plausibility, wire
 from agents.keys import Keys
 from agents.protocols import ros2
 from agents.session import alive_token, open_session, pose_publisher, publisher, received
@@ -361,6 +362,7 @@ def test_goals_come_in(router, bridge, eventually):
         node, realm = RosNode(outside, 7), Realm(inside)
         goals = inside.declare_subscriber("park/CF01/goal", RingChannel(16))
         realm.enter("CF01")
+        poses = node.subscribe("CF01/pose", "geometry_msgs/msg/PoseStamped")
         eventually(lambda: ("MS", "/CF01/goal", "geometry_msgs::msg::dds_::PoseStamped_") in node.topics())
         key = f"7/CF01/goal/geometry_msgs::msg::dds_::PoseStamped_/RIHS01_{HASHES['geometry_msgs/msg/PoseStamped']}"
         kinds = node.store.types
@@ -379,6 +381,11 @@ def test_goals_come_in(router, bridge, eventually):
             raw = bytes(node.store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
             out.put(raw, attachment=struct.pack("<qqB16s", 1, time.time_ns(), 16, bytes(16)))
 
+        def known():
+            realm.state("CF01", (0.0, 0.0, 0.5), (0.0, 0.0, 0.0), 0.0)
+            return node.take(poses)
+
+        eventually(known)
         out.put(b"\0\1\0\0garbage", attachment=struct.pack("<qqB16s", 1, time.time_ns(), 16, bytes(16)))
         send("odom", 3.0, (0.0, 1.0))  # another frame
         send("map", math.nan, (0.0, 1.0))
@@ -386,11 +393,24 @@ def test_goals_come_in(router, bridge, eventually):
         send("", 2.5, (0.0, 0.0))
         samples = []
         eventually(lambda: samples.extend(received(goals)) or len(samples) >= 2)
-        first, second = (wire.decode(s.payload.to_bytes(), str(s.encoding), wire.Position) for s in samples)
+        first, second = (wire.decode(s.payload.to_bytes(), str(s.encoding), wire.Goal) for s in samples)
+        for goal in (first, second):
+            plausibility.check_goal(goal, robot="CF01", now=time.time(), reach=(3.0, 3.0, 3.0), oldest_s=1.0)
+        assert (second.seq - first.seq, first.pose) == (1, 1700000000.5)
         assert (first.robot, first.position) == ("CF01", (1.5, 0.25, 0.5))
         assert first.yaw == pytest.approx(0.5)
         assert (second.position, second.yaw) == ((2.5, 0.25, 0.5), None)
         assert str(samples[0].encoding) == JSON
+
+        def passed_on():
+            send("map", 1.0, (0.0, 1.0))
+            threading.Event().wait(0.2)
+            return list(received(goals))
+
+        token = alive_token(inside, "park/centre/here")  # two cannot guide one robot
+        eventually(lambda: not passed_on())
+        token.undeclare()
+        eventually(passed_on)
 
 
 @pytest.mark.system

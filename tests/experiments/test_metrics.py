@@ -217,7 +217,7 @@ def test_document_has_the_shape_for_scripts():
     found = results.document("runs/7", 4, [first, second])
     assert (found["run"], found["seed"], list(found["cases"])) == ("runs/7", 4, ["a", "b"])
     b = found["cases"]["b"]
-    assert set(b) == {"robots", "mean", "ratio", "collisions", "near_m"}
+    assert set(b) == {"robots", "mean", "ratio", "collisions", "network", "near_m"}
     assert b["collisions"] == 0
     short = results.document("runs/7", 4, [metrics.measure(cut(park("a", seed=4), 8.0))])["cases"]["a"]
     assert (short["duration_s"], short["interrupted"]) == (8.0, True)

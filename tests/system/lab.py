@@ -157,7 +157,7 @@ class Flight:
         )
 
     def children(self) -> dict[str, psutil.Process]:
-        """The processes that it started, by robot name, "router", "recorder" and "world"."""
+        """The processes that it started, by robot name, "router", "recorder", "world", "centre"."""
         found = {}
         for child in psutil.Process(self.process.pid).children(recursive=True):
             try:
@@ -173,6 +173,8 @@ class Flight:
                 found["recorder"] = child
             elif "experiments.world" in line:
                 found["world"] = child
+            elif "experiments.centre" in line:
+                found["centre"] = child
         return found
 
     def endpoint(self) -> str:

@@ -49,6 +49,7 @@ def test_commands():
                 "twin",
                 "order",
                 "bridge",
+                "centre",
                 "world",
                 "world-order",
             ]

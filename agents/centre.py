@@ -1,0 +1,151 @@
+"""The centre of a centralised experiment: one decision for many robots, from what they said of themselves. Pure.
+
+It asks `agents.deciding` as each robot would for itself, with one difference: it knows where a robot is only from the
+last pose that it heard of it, carried on by the prediction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.assignment import Assignment
+from agents.deciding import Deciding, Holding
+from agents.hearing import Heard
+from agents.lifecycle import AIRBORNE, RUNNING
+from agents.rows import Array, Index, Mask
+
+ROUNDING_S = 1e-6  # instants of decisions are multiples of a period that binary fractions miss by less than this
+
+
+@dataclass(frozen=True)
+class Told:
+    """Goals to be sent (K).
+
+    Attributes:
+        rows: Whose.
+        goal: (K, 3) [m].
+        toward: (K,) yaw wanted there [rad], NaN for any.
+        rests: (K,) when the pose of that robot was taken on which its goal rests [s].
+    """
+
+    rows: Index
+    goal: Array
+    toward: Array
+    rests: Array
+
+
+class Centre:
+    """Decides for the rows `assignment.guided` of all robots of an experiment.
+
+    Attributes:
+        poses: What was last heard of each robot (N).
+        yaw: (N,) and where it looked [rad].
+        listens: Rows whose poses it needs: those that it guides, and those to whom they listen.
+        deciding: Computes the goals.
+        decisions: Since the first robot that it guides began.
+        updates: (N,) of these, those at which each row's goal was computed anew.
+    """
+
+    def __init__(self, assignment: Assignment) -> None:
+        """`assignment` of all robots, with links, anchors and plans of those that are guided."""
+        assert assignment.guided is not None
+        rows = len(assignment.names)
+        self.assignment, self.guided = assignment, assignment.guided
+        self.deciding = Deciding(assignment, self.guided)
+        self.poses, self.yaw = Heard.nothing(rows), np.zeros(rows)
+        self._holding = Holding(self.deciding.ground)
+        self.goal, self.toward = np.full((rows, 3), np.nan), np.full(rows, np.nan)
+        self._rests, self._sent = np.full(rows, -np.inf), np.full(rows, -np.inf)
+        self.decisions = 0
+        self.updates: Index = np.zeros(rows, dtype=np.intp)
+        speaks = np.zeros(rows, dtype=bool)
+        speaks[assignment.links.speaker] = True
+        self.listens: Index = np.flatnonzero(self.guided | speaks)
+
+    def hear(  # noqa: PLR0917 - as `Hearing.hear`
+        self, rows: Index, position: Array, velocity: Array, yaw: Array, stamp: Array, arrived: Array
+    ) -> None:
+        """Poses of `rows` (H,) that arrived, in order of arrival; older samples than known are left out."""
+        poses = self.poses
+        order = np.argsort(stamp, kind="stable")  # of several of one robot the newest stays, whichever came last
+        order = order[stamp[order] > poses.stamp[rows[order]]]
+        mine = rows[order]
+        poses.position[mine], poses.velocity[mine], self.yaw[mine] = position[order], velocity[order], yaw[order]
+        poses.stamp[mine], poses.arrived[mine], poses.gone[mine] = stamp[order], arrived[order], np.inf
+        links = self._links(mine)
+        who = self.assignment.links.speaker[links]
+        self.deciding.hearing.hear(
+            links, poses.position[who], poses.velocity[who], poses.stamp[who], poses.arrived[who]
+        )
+
+    def begin(self, row: int, origin: tuple[float, float, float, float]) -> None:
+        """A robot began at `origin`, x, y, z [m] and yaw [rad]: its plan does too, though this centre was not there."""
+        x, y, z, yaw = origin
+        self.deciding.begin(np.array([row]), np.array([[x, y, z]]), np.array([yaw]))
+
+    def lose(self, rows: Index, t: float) -> None:
+        """These robots are gone since `t` [s]; heard again, they are back."""
+        self.poses.gone[rows] = np.minimum(self.poses.gone[rows], t)
+        self.deciding.hearing.lose(self._links(rows), t)
+
+    def find(self, rows: Index) -> None:
+        """These robots are back, whether or not they have something new to say."""
+        self.poses.gone[rows] = np.inf
+        self.deciding.hearing.find(self._links(rows))
+
+    def missing(self) -> Index:
+        """Rows that it needs and never heard, or that are gone."""
+        poses, rows = self.poses, self.listens
+        return rows[~np.isfinite(poses.stamp[rows]) | np.isfinite(poses.gone[rows])]
+
+    def decide(self, t: float, phase: Index, start: Array) -> Told:
+        """Goals at `t` [s].
+
+        Who runs gets one whenever it was decided anew, and again when the last one would soon be too old. Who still
+        waits is told to stay: a robot that heard this, and whose neighbours were all heard, can begin.
+
+        Args:
+            t: Now [s].
+            phase: (N,) of the robots, as far as is known.
+            start: (N,) when each began [s].
+        """
+        deciding, poses, limits = self.deciding, self.poses, self.assignment.limits
+        deciding.settle(t)
+        # a status that says so may still be on its way, but the start was known before
+        phase = np.where((phase == AIRBORNE) & (t >= start - ROUNDING_S), RUNNING, phase)
+        known = self.guided & np.isfinite(poses.stamp) & np.isinf(poses.gone)
+        running, waiting = known & (phase == RUNNING), known & (phase <= AIRBORNE) & self._complete(t)
+        position = np.full((len(known), 3), np.nan)
+        position[known] = poses.believed(self.assignment.predictor, t, np.flatnonzero(known))
+        held = anew = (running & deciding.alone()) | waiting
+        if running.any():
+            self.decisions += 1
+            new = deciding.decide(t, position, poses.velocity, self.yaw, start=start, running=running)
+            self.goal = np.where(new.due[:, None], new.goal, self.goal)
+            self.toward = np.where(new.due, new.toward, self.toward)
+            self.updates += new.due
+            held = (running & deciding.alone()) | waiting  # links may have come or gone by the decision
+            anew = held | new.due
+        self.goal, self.toward = self._holding.stay(held, position, self.goal, self.toward)
+        self._rests = np.where(anew, poses.stamp, self._rests)
+        deciding.forget(np.flatnonzero(~running | held))
+        again = running & (t - self._sent >= 0.5 * limits.link_silence_s)
+        rows = np.flatnonzero((anew | again) & np.isfinite(self.goal).all(axis=1))
+        self._sent[rows] = t
+        return Told(rows, self.goal[rows], self.toward[rows], self._rests[rows])
+
+    def _complete(self, t: float) -> Mask:
+        """Rows (N,) whose neighbours were all heard once, or waited for long enough."""
+        complete = np.ones(len(self.guided), dtype=bool)
+        patience, stamp = self.assignment.patience_s, self.deciding.hearing.heard.stamp
+        if patience is None or t <= patience:
+            complete[self.assignment.links.listener[~np.isfinite(stamp)]] = False
+        return complete
+
+    def _links(self, rows: Index) -> Index:
+        """All links on which `rows` are heard."""
+        spoke = np.zeros(len(self.guided), dtype=bool)
+        spoke[rows] = True
+        return np.flatnonzero(spoke[self.assignment.links.speaker])

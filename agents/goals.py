@@ -1,0 +1,65 @@
+"""Goals as they come over the network to robots that are guided, and whether the centre is there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import nan
+
+import numpy as np
+import zenoh
+
+from agents import plausibility, wire
+from agents import session as network
+from agents.agent import Agent
+from agents.guidance import Guidance
+from agents.keys import Keys
+
+
+class HeardGoals:
+    """The goals of the rows of one process; polled.
+
+    Attributes:
+        malformed: Goals that were refused.
+        news: Per row, goals that it got since somebody emptied this; for telemetry.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, keys: Keys, agent: Agent, guidance: Guidance, reach: wire.Vector
+    ) -> None:
+        """Listens for the guided rows of `agent`; no goal beyond `reach` [m] is believed."""
+        self._session, self._agent, self._guidance, self._reach = session, agent, guidance, reach
+        self._names: Sequence[str] = agent.assignment.names
+        rows = np.flatnonzero(guidance.guided).tolist()
+        self._goals = [(row, network.subscriber(session, keys.goal(self._names[row]), 8)) for row in rows]
+        self._watch = network.alive_watch(session, keys.centre_alive)
+        self._seq = dict.fromkeys(rows, 0)
+        self.malformed = 0
+        self.news: list[list[wire.Followed]] = [[] for _ in self._names]
+
+    def take(self, t: float, utc: float) -> None:
+        """Takes in what has come by `t` [s] of a clock that was 0 at `utc`."""
+        for row, goals in self._goals:
+            for sample in network.received(goals.handler):
+                self._hear(row, sample, t, utc)
+        for sample in network.received(self._watch.handler):
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._guidance.find()
+            elif network.connected(self._session):  # without a router every token is gone, and that is another matter
+                self._guidance.lose(t)
+
+    def _hear(self, row: int, sample: zenoh.Sample, t: float, utc: float) -> None:
+        oldest_s = self._agent.assignment.limits.link_silence_s
+        try:
+            goal = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Goal)
+            plausibility.check_goal(goal, robot=self._names[row], now=utc + t, reach=self._reach, oldest_s=oldest_s)
+            if goal.seq <= self._seq[row]:
+                raise wire.Malformed(f"goal {goal.seq} after {self._seq[row]}")
+        except wire.Malformed:
+            self.malformed += 1
+            return
+        self._seq[row] = goal.seq
+        toward = np.array([nan if goal.yaw is None else goal.yaw])
+        # a clock that is ahead must not keep a goal fresh for longer than it is
+        stamp = np.array([min(goal.stamp - utc, t)])
+        if self._agent.hear_goal(np.array([row]), np.array([goal.position]), toward, stamp).any():
+            self.news[row].append(wire.Followed(goal.seq, goal.stamp, goal.pose, utc + t))

@@ -1,0 +1,87 @@
+"""The table of architectures.md: who decides, on networks of different delay, in virtual time.
+
+python docs/architecture_table.py               seeds 1 to 20
+python docs/architecture_table.py --seeds 5     fewer, for a quick look
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from statistics import fmean
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from experiments import assign, goals, virtual
+from experiments.experiment import Channel, Experiment
+from experiments.run import load
+from experiments.sweep_runs import Figures, figures_of
+
+SEEDS: Final = 20
+BATCH: Final = 10  # seeds side by side: more take more memory, not less time
+DELAYS_S: Final = (0.0, 0.02, 0.05, 0.1)
+TRIGGERS: Final[dict[str, dict[str, Any]]] = {
+    "periodic, 50 Hz": {"kind": "periodic", "period_s": 0.02},
+    "send-on-delta, 1 cm": {"kind": "send-on-delta", "threshold": 0.01},
+}
+
+
+def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[Figures], float, float, float]:
+    """Figures of each seed; of a run, on average: messages of the network, deliveries, and the delay of goals [s]."""
+    listeners = np.bincount(assign.heard_links(experiment).speaker, minlength=len(experiment.robots))
+    found: list[Figures] = []
+    messages, deliveries, delay = [], [], []
+    for begin in range(0, len(seeds), BATCH):
+        log = virtual.simulate(experiment, seeds[begin : begin + BATCH], lean=True)
+        found += figures_of(log, experiment)
+        rows, (time, row, *_) = len(log.names), log.sent
+        within = (time >= -1e-9) & (time < experiment.duration_s - 1e-9)
+        poses = np.bincount(row[within], minlength=rows * len(log.seeds)).reshape(-1, rows)
+        for copy, sent in enumerate(poses):
+            told, heard = 0, 0
+            if log.steered is not None:
+                seen = goals.of_log(log.steered, log.names, copy * rows, experiment.duration_s, "json")
+                told, heard = len(seen.time), int(seen.heard.sum())
+                delay.append(float(seen.delay.mean()))
+            messages.append(int(sent.sum()) + told)
+            deliveries.append(int(sent @ listeners) + heard + told)
+    return found, fmean(messages), fmean(deliveries), fmean(delay) if delay else 0.0
+
+
+def mean(runs: Sequence[Figures], what: str) -> float:
+    """Over the seeds for which it is known."""
+    known = [value for run in runs if (value := getattr(run, what)) is not None]
+    return fmean(known) if known else float("nan")
+
+
+def main() -> None:
+    """Prints a table for each trigger."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", type=int, default=SEEDS)
+    seeds = tuple(range(1, parser.parse_args().seeds + 1))
+    cases = load("architectures").cases()
+    for name, trigger in TRIGGERS.items():
+        print(f"\n{name}, seeds 1 to {len(seeds)}\n")
+        print("| one way | decides | messages | deliveries | goals late by | IAE | ITAE | acquired | formed |")
+        print("|---|---|---|---|---|---|---|---|---|")
+        first: list[Figures] | None = None
+        for delay_s in DELAYS_S:
+            for who, case in cases.items():
+                experiment = msgspec.structs.replace(case, trigger=trigger, channel=Channel(delay_s=delay_s))
+                runs, messages, deliveries, late = flown(experiment, seeds)
+                first = first or runs
+                ratio = {what: mean(runs, what) / mean(first, what) for what in ("iae", "itae")}
+                formed = sum(run.acquired_s is not None for run in runs)
+                late_ms = "–" if who == "distributed" else f"{1e3 * late:.0f} ms"
+                print(
+                    f"| {1e3 * delay_s:g} ms | {who} | {messages:.0f} | {deliveries:.0f} | {late_ms} | "
+                    f"{ratio['iae']:.3f} | {ratio['itae']:.3f} | {mean(runs, 'acquired_s'):.1f} s | "
+                    f"{formed}/{len(runs)} |",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()

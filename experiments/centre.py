@@ -1,0 +1,270 @@
+"""The centre as a process: `python -m experiments.centre FILE`. It decides for the robots that the file says.
+
+It hears the poses of those robots, and of whom they listen to, as any neighbour would, and sends each its goal. What is
+decided is `agents.centre`; here are the clock and the network. It keeps nothing that it would miss after a death: it is
+started again, hears the last poses, learns from the robots' statuses when and where each began, and goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import floor, isfinite
+from types import FrameType
+from typing import Final
+
+import numpy as np
+import zenoh
+
+from agents import plausibility, plugins, wire
+from agents import session as network
+from agents.centre import Centre, Told
+from agents.keys import Keys
+from agents.lifecycle import IDLE, Phase
+from agents.lifeline import Lifeline
+from agents.runtime import reach_of
+from agents.telemetry import resident_mb
+from experiments import document
+from experiments.assign import assign_centre, guided
+from experiments.experiment import Experiment
+from experiments.problem import DocumentError, Problem
+from experiments.robot import chosen_case
+
+REPORT_S: Final = 1.0
+DEPTH: Final = 64  # poses of a robot that may wait for the next decision
+ROUNDING_S: Final = 1e-5  # stamps are rounded
+PHASES: Final = {phase.word: int(phase) for phase in Phase}
+EXPLAINED: Final = (DocumentError, plugins.PluginError, network.EndpointError, network.Unreachable)
+
+
+class CentreTaken(RuntimeError):
+    """A centre is on the network already."""
+
+
+@dataclass
+class _Robot:
+    """Somebody who is listened to, and the count of its samples."""
+
+    name: str
+    row: int
+    poses: network.Polled[zenoh.Sample]
+    alive: network.Polled[zenoh.Sample]
+    seq: int = 0
+    stamp: float = 0.0
+    heard: int = 0
+    lost: int = 0
+
+
+class CentreProcess:
+    """Paces a centre, and carries its words."""
+
+    def __init__(self, experiment: Experiment, session: zenoh.Session, keys: Keys) -> None:
+        """Declares everything but the token: whoever sees that is listened to."""
+        assignment = assign_centre(experiment)
+        self.centre = centre = Centre(assignment)
+        self._names, self._session, self._keys = assignment.names, session, keys
+        self._encoding: wire.Encoding = experiment.network.encoding
+        self._reach = reach_of(assignment.limits)
+        self._period = assignment.decide_every / assignment.body_hz
+        # what robots say on the tick of a decision is on its way then: half a tick more, and it counts
+        self._patience = 0.5 / assignment.body_hz
+        names, rows = self._names, centre.listens.tolist()
+        self._subscribers = [network.pose_subscriber(session, keys.pose(names[row]), DEPTH) for row in rows]
+        self._watches = [network.alive_watch(session, keys.alive(names[row])) for row in rows]
+        self._robots = [
+            _Robot(names[row], row, poses.handler, watch.handler)
+            for row, poses, watch in zip(rows, self._subscribers, self._watches, strict=True)
+        ]
+        self._guided = [row for row in rows if centre.guided[row]]
+        self._statuses = {row: network.pose_subscriber(session, keys.status(names[row])) for row in self._guided}
+        mime = wire.MIME[self._encoding]
+        self._goals = {row: network.publisher(session, keys.goal(names[row]), mime) for row in self._guided}
+        self._reports = network.pose_publisher(session, keys.centre, wire.JSON)
+        self._phase, self._start = np.full(len(names), IDLE), np.full(len(names), np.inf)
+        self._begun = np.inf
+        self._next = self._utc = 0.0
+        self._seq = round(time.time() * 1e3)  # beyond whatever a centre before this one had reached
+        self._sent = self._missed = self._malformed = 0
+        self._late_s, self._reported, self._cpu_s = 0.0, 0.0, time.process_time()
+
+    def run(self, over: threading.Event) -> None:
+        """Until told to end."""
+        gc.collect()
+        gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
+        zero = time.monotonic()
+        self._utc = time.time()
+        token = network.alive_token(self._session, self._keys.centre_alive)
+        while not over.wait(max(0.0, zero + self._next + self._patience - time.monotonic())):
+            now = time.monotonic() - zero - self._patience
+            behind = int((now - self._next) / self._period)
+            self._missed += behind
+            t = self._next + behind * self._period
+            self._late_s = max(self._late_s, now - self._next)
+            self._next = t + self._period
+            self._listen(t)
+            self._tell(self.centre.decide(t, self._phase, self._start), t)
+            if t - self._reported >= REPORT_S - 1e-6:
+                self._report(t)
+        self._report(self._next)
+        token.undeclare()  # type: ignore[no-untyped-call]
+
+    def _listen(self, t: float) -> None:
+        """Takes in what has arrived since the last decision."""
+        for row, statuses in self._statuses.items():
+            for sample in network.received(statuses.handler):
+                self._heed(row, sample)
+        for robot in self._robots:
+            for sample in network.received(robot.poses):
+                self._hear(robot, sample, t)
+            for sample in network.received(robot.alive):
+                if sample.kind == zenoh.SampleKind.DELETE:
+                    self.centre.lose(np.array([robot.row]), t)
+                else:
+                    self.centre.find(np.array([robot.row]))
+        begun = float(self._start[self._guided].min())
+        if begun != self._begun and isfinite(begun):  # decisions fall on the same instants as those of the robots
+            self._begun = begun
+            self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
+
+    def _hear(self, robot: _Robot, sample: zenoh.Sample, t: float) -> None:
+        try:
+            pose = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Pose)
+            plausibility.check_pose(pose, robot=robot.name, now=self._utc + t, reach=self._reach)
+        except wire.Malformed:
+            self._malformed += 1
+            return
+        if pose.stamp <= robot.stamp:
+            return  # known already: told again after a reconnection
+        start = float(self._start[self._guided].min())
+        if 0.0 <= pose.stamp - self._utc - start + ROUNDING_S < self.centre.assignment.duration:
+            robot.heard += 1
+            robot.lost += max(0, pose.seq - robot.seq - 1) if robot.seq else 0
+        robot.seq, robot.stamp = pose.seq, pose.stamp
+        self.centre.hear(
+            np.array([robot.row]),
+            np.array([pose.position]),
+            np.array([pose.velocity]),
+            np.array([pose.yaw]),
+            np.array([pose.stamp - self._utc]),
+            np.array([t]),
+        )
+
+    def _heed(self, row: int, sample: zenoh.Sample) -> None:
+        try:
+            status = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Status)
+            if status.robot != self._names[row] or status.phase not in PHASES or not isfinite(status.started):
+                raise wire.Malformed(f"a status of '{status.robot}', {status.phase}")
+        except wire.Malformed:
+            self._malformed += 1
+            return
+        self._phase[row] = PHASES[status.phase]
+        if status.origin is not None and all(map(isfinite, status.origin)):
+            self.centre.begin(row, status.origin)
+        self._start[row] = status.started - self._utc if status.started > 0.0 else np.inf
+
+    def _tell(self, told: Told, t: float) -> None:
+        """Sends goals, rounded as poses are."""
+        self._seq += 1
+        for k, row in enumerate(told.rows.tolist()):
+            x, y, z = told.goal[k].tolist()
+            yaw = float(told.toward[k])
+            goal = wire.Goal(
+                self._names[row],
+                self._seq,
+                round(self._utc + t, 6),
+                (round(x, 6), round(y, 6), round(z, 6)),
+                round(yaw, 6) if isfinite(yaw) else None,
+                round(self._utc + float(told.rests[k]), 6),
+            )
+            self._goals[row].put(wire.encode(goal, self._encoding))
+        self._sent += len(told.rows)
+
+    def _report(self, t: float) -> None:
+        cpu_s = time.process_time()
+        report = wire.CentreState(
+            stamp=self._utc + t,
+            robots=[self._names[row] for row in self._guided],
+            missing=[self._names[row] for row in self.centre.missing()],
+            load=round((cpu_s - self._cpu_s) / max(t - self._reported, self._period), 4),
+            late_s=round(self._late_s, 6),
+            decisions=self.centre.decisions,
+            missed=self._missed,
+            goals=self._sent,
+            heard={robot.name: robot.heard for robot in self._robots},
+            lost={robot.name: robot.lost for robot in self._robots},
+            malformed=self._malformed,
+            pid=os.getpid(),
+            cpu_s=cpu_s,
+            rss_mb=resident_mb(),
+        )
+        self._cpu_s, self._reported, self._late_s = cpu_s, t, 0.0
+        self._reports.put(wire.encode(report))
+
+
+def serve(file: str, *, case: str | None, connect: Sequence[str], lifeline: bool = False) -> int:
+    """Runs the centre of an experiment until it is told to end; returns the exit code.
+
+    Raises:
+        DocumentError: If the file is wrong, has no such case, or no robot that is guided.
+        PluginError: If a law, planner, trigger or predictor cannot be had.
+        CentreTaken: If a centre is on the network already.
+        Unreachable: If no router answers.
+    """
+    experiment = chosen_case(document.read(file), case)
+    steered = guided(experiment)
+    if not steered:
+        hint = 'write architecture = "centralised" at the top of the file, or choose another case with --case'
+        raise DocumentError([Problem(file, 0, 0, "every robot of this experiment decides for itself", hint)])
+    endpoints = list(connect) or experiment.network.connect or [network.DEFAULT_ENDPOINT]
+    over = threading.Event()
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        over.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+    if lifeline:
+        Lifeline(over).start()
+    with network.open_session(endpoints, name="centre", stop=over) as session:
+        keys = Keys(experiment.network.realm)
+        if network.taken(session, keys.centre_alive):
+            raise CentreTaken(
+                f"a centre guides the robots of the realm '{keys.realm}' already: end it first, choose another router "
+                "with --connect, or another network.realm in the experiment file"
+            )
+        process = CentreProcess(experiment, session, keys)
+        heard = [name for name in experiment.robots if name not in steered]
+        print(
+            f"centre ready: guides {', '.join(steered)} at {experiment.rates.coordination_hz:g} Hz"
+            + (f"; {', '.join(heard)} decide for themselves" if heard else "")
+            + f"; realm {experiment.network.realm} at {', '.join(endpoints)}",
+            flush=True,
+        )
+        process.run(over)
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line of the process."""
+    parser = argparse.ArgumentParser(prog="zenpark centre", description="Decides for robots of an experiment.")
+    parser.add_argument("file", help="experiment file, or name in the catalogue")
+    parser.add_argument("--case", help="which case of the file; the first if left out")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent")
+    chosen = parser.parse_args(arguments)
+    try:
+        return serve(chosen.file, case=chosen.case, connect=chosen.connect, lifeline=chosen.lifeline)
+    except (*EXPLAINED, CentreTaken) as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

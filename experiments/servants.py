@@ -1,0 +1,76 @@
+"""Processes that serve a whole run, and are started again when they die: router, world, centre."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from experiments import standins
+from experiments.assign import guided
+from experiments.experiment import Experiment
+from experiments.launcher import ROUTER, Launcher, Process
+
+LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
+STARTS: Final = 4  # who dies more often is not helped by starting it again
+
+
+@dataclass
+class _Servant:
+    """What to start, and what becomes of the robots meanwhile, or when it is given up."""
+
+    start: Callable[[], object]
+    meanwhile: str = ": robots hold until then"
+    given_up: str = ""
+    starts: int = 1
+
+
+class Servants:
+    """Those of one case."""
+
+    def __init__(
+        self, experiment: Experiment, case: str, *, file: Path, endpoints: Sequence[str], launcher: Launcher
+    ) -> None:
+        """The router and the world are started by others, for the first time; the centre by `start_centre`."""
+        connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
+        self._centre = f"{case}-centre" if guided(experiment) else None
+        self._known = {
+            ROUTER: _Servant(lambda: start_router(launcher, endpoints), "", ": the robots hold, and land at the end"),
+            standins.world_name(case): _Servant(
+                lambda: standins.start_world(experiment, file, prefix=case, launcher=launcher, connect=connect)
+            ),
+        }
+        if self._centre is not None:
+            name = self._centre
+            self._known[name] = _Servant(
+                lambda: launcher.start(name, "experiments.centre", str(file), *connect, "--lifeline"),
+                given_up=": the robots that it guides hold, and land at the end",
+            )
+
+    def start_centre(self) -> tuple[str, ...]:
+        """Starts the centre, if robots are guided by one; the name of its process."""
+        if self._centre is None:
+            return ()
+        self._known[self._centre].start()
+        return (self._centre,)
+
+    def again(self, process: Process, case: str) -> tuple[str, str] | None:
+        """Starts one again that has died; what kind it is, and what is to be said. None if it is no servant."""
+        servant = self._known.get(process.name)
+        if servant is None:
+            return None
+        kind = process.name.removeprefix(f"{case}-")
+        more = servant.starts < STARTS
+        if more:
+            servant.starts += 1
+            servant.start()
+        what = f"started again{servant.meanwhile}" if more else f"given up{servant.given_up}"
+        last = process.tail().strip().splitlines()[-1:] if kind != ROUTER else []
+        return kind, f"the {kind} ended ({process.exit}); {what}" + "".join(f": {line}" for line in last)
+
+
+def start_router(launcher: Launcher, endpoints: Sequence[str]) -> None:
+    """A router of our own, which outlives a killed launcher by as long as robots take to land."""
+    listen = [part for endpoint in endpoints for part in ("--listen", endpoint)]
+    launcher.start(ROUTER, "agents.router", *listen, "--lifeline", "--linger", str(LINGER_S))

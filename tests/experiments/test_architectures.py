@@ -1,0 +1,290 @@
+"""Architectures in virtual time: the same decision wherever it is made, and what the way to it costs."""
+
+from dataclasses import fields
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.rows import norm
+from experiments import assign, check, document, metrics, playback, report, results, virtual
+from experiments.experiment import Channel, Experiment, Formation, Hybrid, Leg, Robot
+from experiments.logbook import Logbook
+from experiments.problem import DocumentError
+from experiments.report_architecture import architecture_table
+from experiments.verdict import findings
+
+HYBRID = Hybrid(kind="hybrid", robots=["KH02", "CF02", "CF03"])
+LINE = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.15}
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return document.read("robotic-park").cases()
+
+
+def short(experiment, **parts):
+    """Nine seconds of it, with a leader that drives."""
+    given = {"duration_s": 9.0, "timeline": [Leg(at_s=6.0, robot="TB01", plan=LINE)], **parts}
+    return msgspec.structs.replace(experiment, **given)
+
+
+def with_delay(experiment, delay_s, architecture="distributed", **more):
+    return msgspec.structs.replace(experiment, channel=Channel(delay_s=delay_s, **more), architecture=architecture)
+
+
+def measured(experiment, seed=1):
+    log = virtual.simulate(experiment, [seed])
+    return metrics.measure(Logbook(log, experiment, str(experiment.architecture)[:11]).trace())
+
+
+def assert_same_motion(first, second):
+    one, other = first.time > -1e-9, second.time > -1e-9
+    assert one.sum() == other.sum()
+    for what in ("true_position", "true_yaw", "goal"):
+        wanted, found = getattr(first, what)[one], getattr(second, what)[other]
+        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-9, err_msg=what)
+
+
+# ---------------------------------------------------------------- without delay, and with it
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("architecture", ["centralised", HYBRID])
+def test_without_delay_the_reference_experiment_moves_the_same_wherever_it_is_decided(cases, architecture):
+    park = cases["periodic"]
+    first = virtual.simulate(with_delay(park, 0.0), [1])
+    assert first.time[-1] > park.duration_s
+    assert_same_motion(first, virtual.simulate(with_delay(park, 0.0, architecture), [1]))
+
+
+@pytest.mark.parametrize("update", [None, "relative-control"])
+def test_so_it_does_when_the_law_is_computed_on_events_and_for_several_seeds(cases, update):
+    formation = msgspec.structs.replace(cases["periodic"].formation, update=update)
+    park = short(cases["periodic"], duration_s=4.0, timeline=[Leg(at_s=2.0, robot="TB01", plan=LINE)],
+                 formation=formation)  # fmt: skip
+    first = virtual.simulate(with_delay(park, 0.0), [1, 2])
+    for architecture in ("centralised", HYBRID):
+        second = virtual.simulate(with_delay(park, 0.0, architecture), [1, 2])
+        assert_same_motion(first, second)
+        np.testing.assert_array_equal(second.updates >= first.updates, True)  # goals are said again now and then
+
+
+def test_what_a_robot_believes_of_itself_is_all_that_differs_with_events(cases):
+    """Poses are said on events: the centre knows of a robot what its neighbours know."""
+    park = short(cases["event"])
+    first, second = (virtual.simulate(with_delay(park, 0.0, a), [1]) for a in ("distributed", "centralised"))
+    apart = norm(first.true_position - second.true_position).max()
+    assert 1e-4 < apart < 0.05
+
+
+def test_delay_makes_the_centre_worse_and_itself_known(cases):
+    park = cases["periodic"]
+    near, far = ({a: measured(with_delay(short(park), d, a)) for a in ("distributed", "centralised")}
+                 for d in (0.0, 0.1))  # fmt: skip
+    assert near["centralised"].mean["iae"] == pytest.approx(near["distributed"].mean["iae"], rel=1e-9)
+    assert far["centralised"].mean["iae"] > 1.03 * far["distributed"].mean["iae"]
+    assert near["centralised"].guidance.delay_max_s == pytest.approx(0.0, abs=1e-9)
+    late = far["centralised"].guidance
+    assert (late.delay_mean_s, late.delay_max_s) == pytest.approx((0.2, 0.2), abs=1e-9)  # both ways, on the grid
+    assert late.load is None
+    assert far["distributed"].guidance is None
+
+
+def test_goals_come_as_late_as_the_network_and_the_grid_of_decisions_make_them(cases):
+    park = with_delay(short(cases["periodic"]), 0.031, "centralised")
+    log = virtual.simulate(park, [1])
+    delay = Logbook(log, park, "").trace().goals.delay
+    # said at 0, 20, 40, 60 ms before a decision: the newest that is there is 40 ms old; the goal acts on the next tick
+    np.testing.assert_allclose(delay, 0.04 + 0.04, atol=1e-9)
+
+
+def test_the_default_network_is_one_tick(cases):
+    late = measured(msgspec.structs.replace(short(cases["periodic"]), architecture="centralised")).guidance
+    assert late.delay_mean_s == pytest.approx(0.02 + 0.01, abs=1e-9)
+
+
+# ---------------------------------------------------------------- rows, losses
+
+
+def test_seeds_side_by_side_are_as_alone(cases):
+    park = with_delay(short(cases["event"], duration_s=3.0, timeline=[]), 0.03, HYBRID, jitter_s=0.01, loss=0.1)
+    many, alone = virtual.simulate(park, [4, 5]), virtual.simulate(park, [5])
+    np.testing.assert_array_equal(many.true_position[:, 7:], alone.true_position)
+    both, one = Logbook(many, park, "", 1).trace().goals, Logbook(alone, park, "").trace().goals
+    for field in fields(one):
+        np.testing.assert_array_equal(getattr(both, field.name), getattr(one, field.name))
+    assert one.lost.sum() > 0
+
+
+def test_robots_that_decide_for_themselves_do_not_feel_that_others_are_guided(cases):
+    """Who is guided moves as before where it hears at once; what it says is heard as ever."""
+    park = short(cases["periodic"], duration_s=3.0, timeline=[])
+    first = virtual.simulate(with_delay(park, 0.0), [1])
+    second = virtual.simulate(with_delay(park, 0.0, HYBRID), [1])
+    np.testing.assert_array_equal(first.sent[1], second.sent[1])
+    names = np.array(first.names)
+    links = assign.heard_links(with_delay(park, 0.0, HYBRID))
+    assert not set(names[links.listener]) & set(HYBRID.robots)
+    assert len(second.heard[0]) == len(first.heard[0]) * len(links) / len(assign.heard_links(park))
+
+
+def test_lost_poses_and_goals_are_counted(cases):
+    park = with_delay(short(cases["periodic"]), 0.01, "centralised", loss=0.2)
+    case = measured(park)
+    late = case.guidance
+    assert late.goals == pytest.approx(7 * 90, abs=7)
+    assert late.goals_lost / late.goals == pytest.approx(0.2, abs=0.06)
+    sent = sum(robot.messages for robot in case.robots)
+    assert late.poses_lost / sent == pytest.approx(0.2, abs=0.02)
+    assert case.lost == 0, "the real network lost nothing"
+    assert late.heard + late.poses_lost == pytest.approx(sent, abs=7)  # the last ones are under way
+    assert case.acquired_s == (None, None)
+    assert max(robot.worst is None for robot in case.robots) is False
+
+
+def test_links_of_avoidance_stay_with_the_robots(cases):
+    park = with_delay(short(cases["periodic"], duration_s=2.0, timeline=[], avoidance={"kind": "barrier"}), 0.0)
+    first = virtual.simulate(park, [1])
+    second = virtual.simulate(msgspec.structs.replace(park, architecture="centralised"), [1])
+    assert_same_motion(first, second)
+    np.testing.assert_array_equal(first.setpoint, second.setpoint)
+
+
+# ---------------------------------------------------------------- what is recorded, measured and said
+
+
+def test_a_recording_tells_the_same(tmp_path, cases):
+    park = with_delay(short(cases["event"], duration_s=4.0, timeline=[]), 0.03, HYBRID, loss=0.05)
+    log = virtual.simulate(park, [3])
+    book = Logbook(log, park, "hybrid")
+    book.record(tmp_path / "hybrid.mcap", "")
+    first, second = book.trace().goals, playback.read(tmp_path / "hybrid.mcap").trace.goals
+    for what in ("time", "acted", "delay"):
+        np.testing.assert_allclose(getattr(second, what), getattr(first, what), rtol=0.0, atol=3e-6)
+    for what in ("robot", "bytes", "reached", "follower", "heard", "lost"):
+        np.testing.assert_array_equal(getattr(second, what), getattr(first, what))
+    assert len(first.time) == 3 * 40
+    assert playback.read(tmp_path / "hybrid.mcap").trace.lost.sum() >= first.lost.sum() > 0
+
+
+def test_messages_of_the_whole_network_are_counted_alike(cases):
+    park = short(cases["periodic"], duration_s=4.0, timeline=[])
+    distributed, centralised, hybrid = (
+        measured(with_delay(park, 0.0, a)) for a in ("distributed", "centralised", HYBRID)
+    )
+    poses = sum(robot.messages for robot in distributed.robots)
+    assert poses == sum(robot.messages for robot in centralised.robots) == 7 * 200
+    assert distributed.network_messages == poses
+    assert distributed.deliveries == 21 * 200
+    assert centralised.network_messages == centralised.deliveries == poses + 7 * 40
+    # of 21 links 10 are those of KH02, CF02, CF03; the centre hears all but the leader
+    listened = {robot.robot: robot.listeners for robot in hybrid.robots}
+    links = assign.heard_links(with_delay(park, 0.0, HYBRID))
+    assert hybrid.deliveries == (len(links) + 6) * 200 + 3 * 40
+    assert sum(listened.values()) == len(links) + 6
+    assert centralised.guidance.goals_hz == pytest.approx(70.0)
+    assert centralised.network_bytes > distributed.network_bytes
+    assert {robot.heard for robot in centralised.robots} == {200}
+    assert [robot.goals for robot in hybrid.robots] == [0, 0, 40, 0, 0, 40, 40]
+    assert hybrid.guidance.guided == ("KH02", "CF02", "CF03")
+
+
+def test_the_report_compares_them(tmp_path, cases):
+    park = short(cases["periodic"], duration_s=4.0, timeline=[])
+    traces = []
+    for name, architecture in (("apart", "distributed"), ("together", "centralised")):
+        experiment = with_delay(park, 0.05, architecture)
+        traces.append(Logbook(virtual.simulate(experiment, [1]), experiment, name).trace())
+    found = [metrics.measure(trace) for trace in traces]
+    table = architecture_table(found)
+    cells = {row.cells[0]: row.cells[1:] for row in table.rows}
+    assert cells["Decides"] == ("every robot", "the centre")
+    assert cells["Delay, mean [ms]"] == ("–", "110")
+    assert cells["Goals per second"] == ("–", "70.0")
+    assert cells["IAE relative to apart"][0] == "1.00"
+    assert float(cells["IAE relative to apart"][1]) > 1.0
+    assert any("a centre decides for TB01" in finding.text for finding in findings(found))
+    page = report.write(tmp_path, traces, measured=found).read_text()
+    assert "Architecture</h2>" in page
+    alone = report.write(tmp_path, traces[:1], measured=found[:1], name="one.html").read_text()
+    assert "Architecture</h2>" not in alone
+    results.write_csv(tmp_path / "metrics.csv", found)
+    header, *rows = (tmp_path / "metrics.csv").read_text().splitlines()
+    columns = dict(zip(header.split(","), rows[9].split(","), strict=True))
+    assert (columns["case"], columns["goals"]) == ("together", "40")
+    assert float(columns["delay_p95_s"]) == pytest.approx(0.11)
+    together = results.document("", 1, found)["cases"]["together"]
+    assert together["guidance"]["goals"] == 280
+    assert together["network"]["messages"] == found[1].network_messages
+
+
+# ---------------------------------------------------------------- the file
+
+TWO = """
+title = "two"
+duration_s = 5.0
+[robots]
+A = { kind = "khepera4", start = [-0.5, 0.0] }
+B = { kind = "khepera4", start = [0.5, 0.0] }
+[formation.links]
+"A - B" = 0.6
+"""
+
+
+@pytest.mark.parametrize(
+    ("architecture", "says"),
+    [
+        ('"centralized"', "did you mean 'centralised'"),
+        ('{ kind = "hybrid", robots = [] }', "length >= 1"),
+        ('{ kind = "hybrid", robots = ["A", "C"] }', "no robot is called 'C'"),
+        ('{ kind = "hybrid", robots = ["A", "A"] }', "named twice"),
+        ('{ kind = "hybrid", robots = ["B", "A"] }', 'write architecture = "centralised"'),
+        ('{ kind = "hybrid" }', "'robots' is missing"),
+        ("3", "must be text or a table"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(tmp_path, architecture, says):
+    file = tmp_path / "two.toml"
+    file.write_text(TWO + f"[cases.odd]\narchitecture = {architecture}\n")
+    with pytest.raises(DocumentError) as caught:
+        document.read(file)
+    (problem,) = caught.value.problems
+    assert says in f"{problem.message}; {problem.hint}"
+    assert problem.line == 10
+
+
+def test_no_robot_is_called_as_the_centre(tmp_path):
+    file = tmp_path / "two.toml"
+    file.write_text(TWO.replace("B =", "centre =").replace("A - B", "A - centre"))
+    with pytest.raises(DocumentError, match="a robot cannot be called 'centre'"):
+        document.read(file)
+
+
+def test_check_says_what_it_means(tmp_path):
+    file = tmp_path / "two.toml"
+    file.write_text(TWO + '[cases.a]\narchitecture = "centralised"\n[cases.b]\n'
+                    'architecture = { kind = "hybrid", robots = ["A"] }\ntrigger = "lyapunov"\n')  # fmt: skip
+    found = {finding.code: finding for finding in check.check(document.read(file))}
+    assert "decides for all 2 robots 10 times a second" in found["centralised"].message
+    assert "decides for A 10 times" in found["hybrid"].message
+    assert found["error-unknown"].where.endswith(":13:11")
+    late = check.check(document.read(file, ["safety.link_silence_s=0.1"]))
+    assert [each.code for each in late if each.severity == "error"] == ["goals-too-old"]
+    assert not {"centralised", "hybrid"} & {each.code for each in check.check(document.read("robotic-park"))}
+
+
+def test_who_is_guided(cases):
+    park = cases["periodic"]
+    assert assign.guided(park) == ()
+    assert assign.guided(with_delay(park, 0.0, "centralised")) == tuple(park.robots)
+    assert assign.guided(with_delay(park, 0.0, HYBRID)) == ("KH02", "CF02", "CF03")
+
+
+def test_robots_without_a_formation_are_guided_too():
+    robots = {"A": Robot(kind="khepera4", start=[0.0, 0.0])}
+    plan = Leg(at_s=0.0, robot="A", plan={"kind": "waypoints", "points": [[0.3, 0.0]], "speed": 0.1})
+    one = Experiment(title="one", duration_s=5.0, robots=robots, timeline=[plan], formation=Formation())
+    first, second = (virtual.simulate(with_delay(one, 0.0, a), [1]) for a in ("distributed", "centralised"))
+    assert_same_motion(first, second)
+    assert second.true_position[-1, 0, 0] > 0.25

@@ -1,0 +1,156 @@
+"""The centre in real processes: a run that it decides, its death, and goals that nobody should believe."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from experiments import playback
+from experiments.run import reopen
+from tests.conftest import RouterProcess
+from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher, gone, until
+
+pytestmark = pytest.mark.system
+
+KEYS = Keys()
+FAST = """
+title = "three, two of them guided"
+duration_s = {duration}
+trigger = {{ kind = "periodic", period_s = 0.02 }}
+architecture = {architecture}
+[robots]
+TB01 = {{ kind = "turtlebot3", start = [-0.4, 0.0] }}
+KH01 = {{ kind = "khepera4", start = [0.4, 0.6] }}
+KH02 = {{ kind = "khepera4", start = [0.4, -0.6] }}
+[formation.links]
+"TB01 > KH01" = 0.5
+"TB01 > KH02" = 0.5
+"KH01 - KH02" = 0.5
+[[timeline]]
+at_s = 0.5
+robot = "TB01"
+plan = {{ kind = "line", move_by = [-0.9, 0.0], speed = 0.1 }}
+"""
+HYBRID = '{ kind = "hybrid", robots = ["TB01", "KH01"] }'
+
+
+@pytest.mark.timeout(120)
+def test_robots_hold_while_the_centre_is_dead_and_go_on_when_it_is_back(tmp_path: Path) -> None:
+    file, folder = tmp_path / "three.toml", tmp_path / "run"
+    file.write_text(FAST.format(duration=6.5, architecture=HYBRID))
+    flight = Flight(folder, str(file), "--json", "--no-report")
+    flight.until_said(r"phase conductor: TB01 under way", 40.0)
+    everyone = list(flight.children().values())
+    watcher = Watcher(flight.endpoint())
+    names = ("TB01", "KH01")
+    watcher.until(lambda: all(name in watcher.state for name in names), "telemetry")
+    watcher.until(lambda: watcher.state["TB01"].position[0] < -0.45, "the leader drives")
+    killed = time.time()
+    flight.children()["centre"].kill()
+    flight.until_said(r"centre conductor: the centre ended \(killed by SIGKILL\); started again")
+    watcher.until(lambda: watcher.state["TB01"].position[0] < -0.7, "the leader goes on")
+    everyone += list(flight.children().values())
+    watcher.close()
+    code, out = flight.finish(60.0)
+    assert code == 0
+    until(lambda: gone(everyone), "nothing is left")
+
+    trace = playback.read(folder / "default.mcap").trace
+    run = reopen(folder)
+    case = run.metrics["default"]
+    died = killed - playback.read(folder / "default.mcap").started
+    back = trace.goals.time[trace.goals.time > died + 0.15].min()  # of the centre that was started again
+    assert 0.2 < back - died < 4.0
+    quiet = (trace.time > died + 0.35) & (trace.time < back - 0.05)
+    assert quiet.any()
+    for row, name in enumerate(trace.robots):
+        held = np.ptp(trace.goal[quiet, row], axis=0).max()
+        if name in names:
+            assert held < 1e-6, name  # they stay where they were when it died
+    leader = trace.position[:, 0, 0]
+    assert np.ptp(leader[quiet]) < 0.05
+    # its plan is what it was: 0.1 m/s from 0.5 s on, from where it had begun, however long nobody said so
+    wanted = leader[0] - 0.1 * (trace.time - 0.5)
+    for moment in (trace.time < died - 0.2) & (trace.time > 1.0), trace.time > back + 0.2:
+        np.testing.assert_allclose(trace.goal[moment, 0, 0], wanted[moment], rtol=0.0, atol=0.02)
+    guidance = case.guidance
+    assert guidance.guided == names
+    assert 0.0 < guidance.delay_mean_s < 0.1
+    assert 0.0 < guidance.load < 0.5
+    assert len({report.pid for report in trace.goals.reports}) == 2
+    assert json.loads(out)["cases"]["default"]["guidance"]["goals"] == guidance.goals > 60
+    assert case.lost == 0
+
+
+def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path: Path) -> None:
+    file = tmp_path / "three.toml"
+    file.write_text(FAST.format(duration=60.0, architecture='"centralised"'))
+    robots = [RobotProcess(router.endpoint, file, name) for name in ("TB01", "KH01", "KH02")]
+    watcher = Watcher(router.endpoint)
+    watcher.until(lambda: len(watcher.status) == 3, "they are there")
+    watcher.until(lambda: "never heard centre" in watcher.status["KH01"].reason, "they wait for the centre")
+    assert watcher.status["KH01"].missing == ["centre"]
+    command = [sys.executable, "-m", "experiments.centre", str(file), "--connect", router.endpoint]
+    centre = subprocess.Popen(
+        command, cwd=ROOT, env=ENVIRONMENT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
+    )
+    assert centre.stdout is not None
+    assert centre.stdout.readline().startswith("centre ready: guides TB01, KH01, KH02 at 10 Hz; realm park at")
+    watcher.until(lambda: all(watcher.phase(name) == "ready" for name in watcher.status), "they are ready")
+    second = subprocess.run(command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=20)
+    assert second.returncode == 2
+    assert "a centre guides the robots of the realm 'park' already" in second.stderr
+
+    for name in watcher.status:
+        assert watcher.order(name, wire.Order("takeoff")).ok
+    watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in watcher.status), "airborne")
+    at = time.time() + 0.3
+    for name in watcher.status:
+        assert watcher.order(name, wire.Order("start", at=at)).ok
+    watcher.until(lambda: watcher.state["KH01"].phase == "running" and watcher.state["KH01"].followed, "it is guided")
+
+    refused = watcher.status["KH01"].malformed
+    late = watcher.state["KH01"].followed[-1]
+    assert 0.0 < late.acted - late.pose < 0.5
+    now = time.time()
+    nonsense = (
+        b"no goal at all",
+        wire.encode(wire.Goal("KH02", 2**52, now, (0.0, 0.0, 0.0), None, now)),
+        wire.encode(wire.Goal("KH01", 2**52, now, (1e3, 0.0, 0.0), None, now)),
+        wire.encode(wire.Goal("KH01", 2**52, now - 5.0, (0.0, 0.0, 0.0), None, now - 5.0)),
+        wire.encode(wire.Goal("KH01", 1, now, (0.0, 0.0, 0.0), None, now)),  # of a centre that came before
+    )
+    for payload in nonsense:
+        watcher.session.put(KEYS.goal("KH01"), payload, encoding=wire.JSON)
+    watcher.until(lambda: watcher.status["KH01"].malformed >= refused + 5, "all are refused")
+    assert watcher.state["KH01"].phase == "running"
+    assert abs(watcher.state["KH01"].goal[0]) < 3.0
+
+    subscriber = network.pose_subscriber(watcher.session, KEYS.centre)
+    reports: list[wire.CentreState] = []
+
+    def reported() -> bool:
+        came = network.received(subscriber.handler)
+        reports.extend(wire.decode(each.payload.to_bytes(), str(each.encoding), wire.CentreState) for each in came)
+        return bool(reports)
+
+    watcher.until(reported, "the centre says how it is")
+    assert (reports[-1].robots, reports[-1].missing) == (["TB01", "KH01", "KH02"], [])
+    assert reports[-1].heard["KH01"] > 0
+    centre.terminate()
+    assert centre.wait(10.0) == 0
+    centre.stdout.close()
+    watcher.until(lambda: watcher.status["KH02"].missing == ["centre"], "its end is noticed")
+    for robot in robots:
+        robot.process.terminate()
+    assert [robot.wait() for robot in robots] == [0, 0, 0]
+    watcher.close()
