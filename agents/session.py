@@ -105,13 +105,18 @@ def config(
         settings["metadata"] = {"name": name}
     made = zenoh.Config()
     for key, value in settings.items():
-        made.insert_json5(key, json.dumps(value))
+        try:
+            made.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise EndpointError(
+                f"{', '.join((*connect, *listen))}: {_reason(error)}; write endpoints like {DEFAULT_ENDPOINT}"
+            ) from None
     return made
 
 
 def _check_form(endpoint: str) -> None:
     protocol, slash, address = endpoint.partition("/")
-    if not (protocol and slash and address):
+    if not (protocol and slash and address and endpoint.isprintable()):
         raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
 
 

@@ -61,7 +61,9 @@ class Tree:
             hint = "check the indentation, the colons and the quotes there"
             raise DocumentError([at_offset(self.label, self.text, mark.index if mark else 0, words, hint)]) from None
         except yaml.reader.ReaderError as error:
-            message = f"the character U+{ord(str(error.character)):04X} cannot stand in YAML"
+            found = error.character  # of text a character, of what it could not decode a number
+            code = found if isinstance(found, int) else ord(str(found)[:1] or "?")
+            message = f"the character U+{code:04X} cannot stand in YAML"
             raise DocumentError([at_offset(self.label, self.text, error.position, message, "remove it")]) from None
         except RecursionError:
             raise DocumentError([Problem(self.label, 0, 0, "is nested too deeply", "flatten it")]) from None
