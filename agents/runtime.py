@@ -208,6 +208,8 @@ class Runtime:
             for sample in network.received(neighbour.poses):
                 self._hear(neighbour, sample, t)
             for sample in network.received(neighbour.alive):
+                if str(sample.key_expr) != self._setup.keys.alive(neighbour.name):
+                    continue  # a token on many keys at once (`park/**`) is nobody's life
                 self._news = True
                 if sample.kind == zenoh.SampleKind.DELETE:
                     agent.lose(neighbour.links, t)

@@ -122,4 +122,3 @@ def replay(place: Place, data: bytes) -> str:
         except target.refusals as error:
             return f"refused: {type(error).__name__}: {error}"
     return "read"
-

@@ -29,7 +29,8 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
     return {
         "pose": [wire.Pose(robot, seq + k, now + 0.01 * k, place, rest, 0.1) for k in range(2)],
         "state": [
-            wire.State(robot, seq, now, "running", place, rest, 0.1, place, (0.1, 0.2, 0.0, 0.0), 0.1, place, 0.1, [heard]),
+            wire.State(robot, seq, now, "running", place, rest, 0.1, place, (0.1, 0.2, 0.0, 0.0), 0.1, place,
+            0.1, [heard]),
             wire.State(robot, seq, now, "idle", place, rest, 0.1, None, None, 0.1, attitude=(1.0, 0.0, 0.0, 0.0)),
         ],
         "status": [status],

@@ -14,19 +14,26 @@ LARGEST = 64 * 1024  # [bytes] what is grown grows to this
 NUMBERS = [
     b"0", b"-0", b"1", b"-1", b"1e308", b"-1e308", b"1e400", b"1e-320", b"9" * 25, b"-" + b"9" * 25, b"9" * 5000,
     b"NaN", b"nan", b"Infinity", b"-Infinity", b"inf", b"-inf", b"9007199254740993", b"18446744073709551615",
-    b"-9223372036854775808", b"4294967296", b"2147483648", b"65536", b"0x7fffffff", b"1_000", b"1.5", b"00", b"1979-05-27",
+    b"-9223372036854775808", b"4294967296", b"2147483648", b"65536", b"0x7fffffff", b"1_000", b"1.5", b"00",
+    b"1979-05-27",
 ]  # fmt: skip
 TOKENS = [
     *NUMBERS, b"null", b"true", b"false", b'""', b"[]", b"{}", b"[[]]", b'{"":1}', b"[{}]", b'"\\ud800"', b'"\\u0000"',
-    b"\xff\xfe", b"\xed\xa0\x80", b"\xc0\x80", b"\xf0\x9f\xa4\x96", b"\0", b"\n", b"\r\n", b",", b":", b"=", b"*", b"**",
-    b"$*", b"/", b"//", b"@", b"#", b"?", b"..", b"'", b'"', b"\\", b"{", b"}", b"[", b"]", b"(", b")", b"%", b"-", b" ",
-    b"\t", b"\x1b[2J", b"\xe2\x80\xa8", b"\xef\xbb\xbf", b"<<", b"&a", b"*a", b"!!python/object", b"kind", b"%s%n", b">",
+    b"\xff\xfe", b"\xed\xa0\x80", b"\xc0\x80", b"\xf0\x9f\xa4\x96", b"\0", b"\n", b"\r\n", b",", b":", b"=",
+    b"*", b"**",
+    b"$*", b"/", b"//", b"@", b"#", b"?", b"..", b"'", b'"', b"\\", b"{", b"}", b"[", b"]", b"(", b")", b"%",
+    b"-", b" ",
+    b"\t", b"\x1b[2J", b"\xe2\x80\xa8", b"\xef\xbb\xbf", b"<<", b"&a", b"*a", b"!!python/object", b"kind",
+    b"%s%n", b">",
 ]  # fmt: skip
-LONG = [b"[", b"{", b'{"a":', b"(", b"\x91", b"\xdd\xff\xff\xff\xff", b"a.", b"A", b"9", b"- ", b"  ", b"\0", b"\xff", b"\xc3\xa9", b"/", b"a,"]  # fmt: skip
+LONG = [b"[", b"{", b'{"a":', b"(", b"\x91", b"\xdd\xff\xff\xff\xff", b"a.", b"A", b"9", b"- ", b"  ", b"\0",
+    b"\xff", b"\xc3\xa9", b"/", b"a,"]  # fmt: skip
 VALUES: list[Any] = [
     None, True, False, 0, 1, -1, 2**31, 2**53, 2**53 + 1, 2**63 - 1, -(2**63), 2**64 - 1, 0.0, -0.0, 0.5, 1e-320, 1e6,
-    1e16, 1e300, -1e300, float("nan"), float("inf"), float("-inf"), "", "x", "\0", "KH01", "KH02", "/", "*", "é", "a" * 300,
-    "\x1b[31m", [], [[]], {}, {"": None}, [0.0, 0.0], [0.0, 0.0, 0.0], [1e300] * 3, [float("nan")] * 3, [0] * 4, [[0, 0]] * 3,
+    1e16, 1e300, -1e300, float("nan"), float("inf"), float("-inf"), "", "x", "\0", "KH01", "KH02", "/", "*",
+    "é", "a" * 300,
+    "\x1b[31m", [], [[]], {}, {"": None}, [0.0, 0.0], [0.0, 0.0, 0.0], [1e300] * 3, [float("nan")] * 3,
+    [0] * 4, [[0, 0]] * 3,
 ]  # fmt: skip
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _WORD = re.compile(rb"[A-Za-z_][A-Za-z0-9_]*")
@@ -48,7 +55,7 @@ class Dice:
             self._drawn = self._generator.integers(0, 1 << 62, 4096).tolist()
         return self._drawn.pop() % limit
 
-    def one(self, among: Sequence[Any]) -> Any:  # noqa: ANN401 - whatever they are
+    def one(self, among: Sequence[Any]) -> Any:
         """One of them."""
         return among[self.below(len(among))]
 
@@ -135,7 +142,7 @@ def _json(tree: object) -> bytes:
     return json.dumps(tree, ensure_ascii=False, default=str).encode("utf-8", "surrogatepass")
 
 
-def _changed(tree: Any, dice: Dice) -> Any:  # noqa: ANN401 - whatever stands in a message
+def _changed(tree: Any, dice: Dice) -> Any:  # noqa: PLR0911
     """The tree with one value changed, somewhere in it."""
     if isinstance(tree, dict) and tree and dice.below(12):
         keys = list(tree)

@@ -39,7 +39,11 @@ def run(name: str, inputs: int, seed: int, slot_file: str, told: Queue[Tally | s
     with contextlib.suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_AS, (ROOM, resource.RLIM_INFINITY))
     try:
-        with open(slot_file, "r+b") as file, mmap.mmap(file.fileno(), LARGEST + 8) as slot, PLACES[name].open() as target:  # noqa: PTH123
+        with (
+            Path(slot_file).open("r+b") as file,
+            mmap.mmap(file.fileno(), LARGEST + 8) as slot,
+            PLACES[name].open() as target,
+        ):
             done = 0
             while done < inputs:
                 tally = Tally()

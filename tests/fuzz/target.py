@@ -36,7 +36,7 @@ class Place:
     inputs: int
     quick: int = 200
 
-    def open(self):  # noqa: ANN201 - a context manager of a Target
+    def open(self):
         """The target, ready, in a `with`."""
         return contextmanager(self.make)()
 

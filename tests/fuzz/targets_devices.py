@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import struct
+import sys
+import types
 from collections import deque
 from collections.abc import Iterator
 from typing import Any
@@ -80,19 +83,21 @@ def crazyflie_twin() -> Iterator[Target]:
         packet(Port.MEMORY, 0, b"\1"), packet(Port.MEMORY, 0, b"\2\1"),
         *(packet(Port.MEMORY, 1, crtp.MEMORY.pack(k, 0) + b"\x10") for k in range(4)),
         *(packet(Port.MEMORY, 2, crtp.MEMORY.pack(k, 0) + bytes(16)) for k in range(4)),
-        up, up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.GO_TO, 0)) + crtp.GO_TO.pack(True, False, 0.1, 0.2, 0.3, 1.0, 1.0)),
+        up, up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.GO_TO, 0)) + crtp.GO_TO.pack(True, False, 0.1,
+        0.2, 0.3, 1.0, 1.0)),
         up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.LAND, 0)) + climb), packet(Port.HIGH_LEVEL, 0, b"\3\0"),
         arm + packet(Port.SETPOINT, 0, bytes((Setpoint.POSITION,)) + crtp.FOUR.pack(0.1, 0.2, 0.5, 90.0)),
         *(arm + packet(Port.SETPOINT, 0, bytes((kind,)) + crtp.FOUR.pack(0.1, 0.1, 0.1, 0.5)) for kind in Setpoint),
         arm + packet(Port.SETPOINT, 0, bytes((Setpoint.FULL_STATE,)) + full), packet(Port.SETPOINT, 1, b"\0\0\0\0\0"),
         arm + packet(Port.COMMANDER, 0, crtp.THRUST.pack(0.0, 0.0, 10.0, 40000)),
         packet(Port.LOCATION, 0, crtp.VECTOR.pack(0.1, 0.2, 0.3)), packet(Port.LOCATION, 1, b"\x08" + pose),
-        packet(Port.LOCATION, 1, b"\2\1\1" + crtp.VECTOR.pack(0.1, 0.2, 0.3)), packet(Port.LOCATION, 1, b"\x0b\3\0\3\0"),
+        packet(Port.LOCATION, 1, b"\2\1\1" + crtp.VECTOR.pack(0.1, 0.2, 0.3)), packet(Port.LOCATION, 1,
+        b"\x0b\3\0\3\0"),
         packet(Port.LOCATION, 1, b"\3"), packet(Port.LOCATION, 1, b"\4"),
         *(packet(Port.SUPERVISOR, 1, bytes((kind, 1))) for kind in Safety), packet(Port.SUPERVISOR, 0, b"\x0c"),
     ]  # fmt: skip
 
-    def make():  # noqa: ANN202
+    def make():
         nonlocal device
         if device is not None:
             device.close()
@@ -138,7 +143,7 @@ def tello_twin() -> Iterator[Target]:
     ]  # fmt: skip
     examples = [b"command", *(f"command\0takeoff\0\0{word}".encode() for word in words)]
 
-    def make():  # noqa: ANN202
+    def make():
         nonlocal device
         if device is not None:
             device.close()
@@ -192,10 +197,10 @@ def tello_pilot() -> Iterator[Target]:
     """A drone's state lines and answers: state and answer with a zero byte between them."""
     from agents.kinds import KINDS  # noqa: PLC0415
     from agents.protocols.tello import Settings  # noqa: PLC0415
-    from bridges.tello import _library  # noqa: PLC0415
     from bridges.tello_pilot import Pilot  # noqa: PLC0415
 
-    _library()
+    if importlib.util.find_spec("av") is None:
+        sys.modules.setdefault("av", types.ModuleType("av"))  # only its video would need it, see `bridges.tello`
     import djitellopy.tello  # noqa: PLC0415
 
     djitellopy.tello.Tello.LOGGER.setLevel("CRITICAL")  # it says every line that it cannot read
@@ -204,9 +209,12 @@ def tello_pilot() -> Iterator[Target]:
         b"mid:-1;x:-100;y:-100;z:-100;mpry:0,0,0;pitch:0;roll:0;yaw:12;vgx:0;vgy:0;vgz:0;templ:63;temph:66;tof:50;"
         b"h:40;bat:80;baro:170.80;time:12;agx:-6.00;agy:1.00;agz:-999.00;\r\n"
     )
-    examples = [line + b"\0" + answer for answer in (b"ok", b"error", b"out of range", b"unknown command: x", b"error Auto land")]
+    examples = [
+        line + b"\0" + answer
+        for answer in (b"ok", b"error", b"out of range", b"unknown command: x", b"error Auto land")
+    ]
 
-    def make():  # noqa: ANN202
+    def make():
         drone = Drone()
         pilot = Pilot(drone, KINDS["tello"], Settings())
         pilot.position = (0.0, 0.0, 0.5)
@@ -243,7 +251,7 @@ def khepera_twin() -> Iterator[Target]:
     kteam = ["B", "D,100,-100", "R", "G", "N", "O", "V,5", "U,31", "I", "E", "S", "T", "M,1,2", "K", "H", "J"]
     examples = [b"p" + word.encode() for word in park] + [b"k" + "\r".join([word, "R", ""]).encode() for word in kteam]
 
-    def make():  # noqa: ANN202
+    def make():
         nonlocal devices
         for device in devices.values():
             device.close()
@@ -294,7 +302,8 @@ def khepera_bridge() -> Iterator[Target]:
             return self.parts.popleft()[:1024]
 
     park = [b"0.1,0.2,0.3", b"1000,1000,50,1000,1000"]
-    kteam = [b"b,C,4\r\n", b"u\r\n", b"d\r\n", b"r,100,-100\r\n", b"g,1000,1000,50,1000,2000\r\n", b"n,40,40,40,40,40,40,40,900,1,1,1,1\r\n", b"v,80\r\n"]  # fmt: skip
+    kteam = [b"b,C,4\r\n", b"u\r\n", b"d\r\n", b"r,100,-100\r\n", b"g,1000,1000,50,1000,2000\r\n",
+        b"n,40,40,40,40,40,40,40,900,1,1,1,1\r\n", b"v,80\r\n"]  # fmt: skip
     examples = [b"p\0" + b"\0".join(park), b"s\0" + park[0][:7], b"k\0" + b"\0".join(kteam)]
 
     def take(data: bytes) -> None:
@@ -334,7 +343,8 @@ def _vicon_stream() -> list[bytes]:
         frames.append(b"".join(parts))
     return [
         datastream.packet(names, frames[0]), datastream.packet(names, frames[0]) + datastream.packet(frames[1]),
-        datastream.packet(frames[1]), datastream.packet(names), datastream.packet(names, datastream.pack_axes(1), frames[2]),
+        datastream.packet(frames[1]), datastream.packet(names), datastream.packet(names,
+        datastream.pack_axes(1), frames[2]),
         datastream.pack_kinds(datastream.POSES),
     ]  # fmt: skip
 
@@ -344,7 +354,7 @@ def vicon_bridge() -> Iterator[Target]:
     from bridges.datastream import Decoder  # noqa: PLC0415
     from bridges.vicon import Sieve  # noqa: PLC0415
 
-    def make():  # noqa: ANN202
+    def make():
         decoder, sieve, t = Decoder(), Sieve({"CF01": "cf1", "KH01": "kh1"}, lambda _: None), 0.0
 
         def take(data: bytes) -> None:
@@ -398,7 +408,10 @@ def ros_messages() -> dict[str, bytes]:
     types = ros2.types("jazzy")
     make = types.make
     header = types.header(1.7e9, "map")
-    point, turn = make("geometry_msgs/msg/Point", x=0.1, y=0.2, z=0.0), make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.1, w=1.0)
+    point, turn = (
+        make("geometry_msgs/msg/Point", x=0.1, y=0.2, z=0.0),
+        make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.1, w=1.0),
+    )
     pose = make("geometry_msgs/msg/Pose", position=point, orientation=turn)
     twist = types.twist((0.1, 0.0, 0.0), (0.0, 0.0, 0.2))
     sides = np.zeros(36)
@@ -431,7 +444,8 @@ def ros() -> Iterator[Target]:
     types = ros2.types("jazzy")
     good = ros_messages()
     tokens = [
-        ros2.endpoint_token(0, "f00d", 0, 1, "MP", "tb3_0", "node", ros2.endpoint_topic("/tb3_0/odom", ros2.ODOMETRY, ros2.RELIABLE, types)),
+        ros2.endpoint_token(0, "f00d", 0, 1, "MP", "tb3_0", "node", ros2.endpoint_topic("/tb3_0/odom",
+        ros2.ODOMETRY, ros2.RELIABLE, types)),
         ros2.dds_token("f00d", "MS", "/tb3_0/cmd_vel", ros2.TWIST),
     ]  # fmt: skip
     examples = [kind.encode() + b"\0" + payload for kind, payload in good.items()]
@@ -460,7 +474,7 @@ def turtlebot_bridge() -> Iterator[Target]:
     examples = [f"tb3_0/{topic}\0\0".encode() + good[kind] for topic, kind in topics.items()]
     examples += [ros2.dds_token("f00d", "MS", "/tb3_0/cmd_vel", ros2.TWIST_STAMPED).encode() + b"\0\0"]
 
-    def make():  # noqa: ANN202
+    def make():
         net.forget()
         net.first["tb3_0/odom"] = Sample("tb3_0/odom", "", good[ros2.ODOMETRY])
         body = TurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))
@@ -487,7 +501,7 @@ def turtlebot_twin() -> Iterator[Target]:
 
     good = ros_messages()
 
-    def make():  # noqa: ANN202
+    def make():
         net.forget()
         device = open_device(DeviceRequest(request("turtlebot3", "turtlebot3-twin"), Faults()))
         t = 0.0
@@ -514,7 +528,7 @@ def ros_graph() -> Iterator[Target]:
     good = ros_messages()
     examples = everything("KH01", "KH02", only=("state", "status"))
 
-    def make():  # noqa: ANN202
+    def make():
         net.forget()
         participant = Participant(net.session, ros2.types("jazzy"), style="rmw")  # type: ignore[arg-type]
         graph = Graph(net.session, participant, Keys())  # type: ignore[arg-type]

@@ -64,7 +64,9 @@ def experiment(suffix: str, examples: list[bytes]) -> Iterator[Target]:
 def toml() -> Iterator[Target]:
     """The catalogue, and every malformed file of the tests."""
     files = [*sorted(catalogue.FOLDER.glob("*.toml")), *sorted(MALFORMED.glob("*.toml"))]
-    small = b'title = "x"\nduration_s = 1.0\n[robots.K]\nkind = "khepera4"\nstart = [0, 0]\n[formation.links]\n[cases.a]\n'
+    small = (
+        b'title = "x"\nduration_s = 1.0\n[robots.K]\nkind = "khepera4"\nstart = [0, 0]\n[formation.links]\n[cases.a]\n'
+    )
     yield from experiment(".toml", [small, *(file.read_bytes() for file in files)])
 
 
@@ -164,7 +166,9 @@ def recording_bytes(*, plain: bool) -> list[bytes]:
             writer.event(wire.Event(began, "start", "conductor", "go"))
             writer.contact(wire.Contact(began + 0.5, "KH01", "CF01", 0.1, 0.01))
             writer.world(
-                wire.WorldState(began, "pymunk", 0.0, 1.0, 0.1, False, ["KH01"], [], {"b": (0.0, 0.0, 0.0)}, 1, 0, 0, "")
+                wire.WorldState(
+                    began, "pymunk", 0.0, 1.0, 0.1, False, ["KH01"], [], {"b": (0.0, 0.0, 0.0)}, 1, 0, 0, ""
+                )
             )
             writer.event(wire.Event(began + 1.0, "phase", "conductor", "landing"))
         made.append(path.read_bytes())
@@ -246,7 +250,8 @@ def cdr() -> Iterator[Target]:
     made: list[Any] = [
         said["state"][0], said["state"][1], said["status"][0], SentPose(*fields, 1.0, 150),
         wire.Event(1.0, "start", "conductor", "go"), wire.Contact(1.0, "KH01", "wall", 0.1, 0.01),
-        World.of(wire.WorldState(1.0, "pymunk", 0.0, 1.0, 0.1, False, ["KH01"], ["a"], {"b": (0.0, 0.0, 0.0)}, 1, 0, 0, "")),
+        World.of(wire.WorldState(1.0, "pymunk", 0.0, 1.0, 0.1, False, ["KH01"], ["a"], {"b": (0.0, 0.0, 0.0)},
+            1, 0, 0, "")),
     ]  # fmt: skip
     codecs = {type(each).__name__: codec(type(each)) for each in made}
     examples = [type(each).__name__.encode() + b"\0" + codecs[type(each).__name__].encode(each) for each in made]
@@ -368,7 +373,8 @@ def words() -> Iterator[Target]:
             "vicon": ["10.0.0.2:801", "host"], "listen": ["127.0.0.1:801"],
             "faults": ['{"occluded_from_s": 5, "loss": 0.1}'],
             "device": ['{"odometry":"pose","poll_hz":10}', '{"positioning":{"system":"loco","anchors":[[0,0,1]]}}',
-                       '{"control":"position","log_hz":50,"parameters":{"a.b":1}}', '{"distro":"humble","watchdog_s":1}'],
+                       '{"control":"position","log_hz":50,"parameters":{"a.b":1}}',
+                           '{"distro":"humble","watchdog_s":1}'],
             "key": ["park/*/pose", "park/**"], "plugin": ["periodic", "mixed"], "link": ["A > B", "A - B"],
             "park": ["0.1,0.2,0.3", "d 10.0 0.5"],
             "stations": [

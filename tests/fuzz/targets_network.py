@@ -54,7 +54,7 @@ def robot() -> Iterator[Target]:
 
     experiment = document.read("triangle", ["robots.KH01.position=external", "avoidance=barrier"]).experiment
 
-    def make():  # noqa: ANN202
+    def make():
         net.forget()
         body = assemble(assign.request(experiment, ["KH01"], [1], ["tcp/127.0.0.1:1"]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True], ranging=["world"])
@@ -111,7 +111,7 @@ def world() -> Iterator[Target]:
     changes = ["robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk"]
     experiment = document.read("triangle", changes).experiment
 
-    def make():  # noqa: ANN202
+    def make():
         net.forget()
         process = WorldProcess(experiment, Population(experiment), net.session, Event())  # type: ignore[arg-type]
         process._exchange.utc = time.time()
@@ -140,7 +140,7 @@ def recorder() -> Iterator[Target]:
 
     experiment = document.read("triangle").experiment
 
-    def make():  # noqa: ANN202
+    def make():
         nonlocal recording
         net.forget()
         if recording is not None:
@@ -173,7 +173,7 @@ def conductor() -> Iterator[Target]:
         def died(self) -> list[object]:
             return []
 
-    def make():  # noqa: ANN202
+    def make():
         net.forget()
         file = Path(folder) / "case.json"
         file.write_bytes(document.write_json(experiment))
@@ -207,7 +207,7 @@ def external_body() -> Iterator[Target]:
     """A body elsewhere says where it is and what it sees."""
     from bridges.external import ExternalBody  # noqa: PLC0415
 
-    def make():  # noqa: ANN202
+    def make():
         net.forget()
         for name in ("KH01", "KH02"):
             key = KEYS.position(name)
