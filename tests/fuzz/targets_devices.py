@@ -199,8 +199,8 @@ def tello_pilot() -> Iterator[Target]:
     from agents.protocols.tello import Settings  # noqa: PLC0415
     from bridges.tello_pilot import Pilot  # noqa: PLC0415
 
-    if importlib.util.find_spec("av") is None:
-        sys.modules.setdefault("av", types.ModuleType("av"))  # only its video would need it, see `bridges.tello`
+    if "av" not in sys.modules and importlib.util.find_spec("av") is None:
+        sys.modules["av"] = types.ModuleType("av")  # only its video would need it, see `bridges.tello`
     import djitellopy.tello  # noqa: PLC0415
 
     djitellopy.tello.Tello.LOGGER.setLevel("CRITICAL")  # it says every line that it cannot read
