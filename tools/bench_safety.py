@@ -52,14 +52,14 @@ def safety() -> Iterator[Figure]:
     stops: list[tuple[float, float]] = []
     killed: list[float] = []
     frozen: list[float] = []
-    missed = 0
+    missed = wrong = 0
     for run in range(STOPS + DEATHS):
         with _Park(ROBOTS) as park:
             pings += park.pings()
             if run < STOPS:
                 ways, lost = park.stop()
                 stops += ways
-                missed += lost
+                missed, wrong = missed + lost, wrong + park.wrong()
                 continue
             # every second robot at most, so that each who dies leaves both of its neighbours to notice
             for number, row in enumerate(range(0, 2 * (KILLED + FROZEN), 2)):
@@ -67,6 +67,7 @@ def safety() -> Iterator[Figure]:
                 found, lost = park.lose(row, cause)
                 (killed if cause == signal.SIGKILL else frozen).extend(found)
                 missed += lost
+            wrong += park.wrong()
     empty = statistics.median(pings)
     yield from _figures("an empty way over the router", pings, empty, empty, "yardstick")
     yield from _figures("emergency stop until motors off", [whole for whole, _ in stops], empty, STOP_S, "of 20 ms")
@@ -74,6 +75,7 @@ def safety() -> Iterator[Figure]:
     yield from _figures("neighbour killed until known", killed, empty, KILL_S, "of 0.1 s")
     yield from _figures("neighbour frozen until known", frozen, empty, FREEZE_S, "of 1.5 s")
     yield Figure("safety", "reactions that did not come", float(missed), "", float(missed), "wanted: 0")
+    yield Figure("safety", "robots held for dead that were not", float(wrong), "", float(wrong), "wanted: 0")
     load = os.getloadavg()[0]
     yield Figure("safety", "load of the machine", load, "", load / (os.cpu_count() or 1), "× its cores")
 
@@ -172,6 +174,7 @@ class _Park:
         self._ears = _Ears()
         self._over = threading.Event()
         self._stack = ExitStack()
+        self._ended: set[str] = set()
 
     def __enter__(self) -> _Park:
         try:
@@ -182,6 +185,7 @@ class _Park:
             self._order("start", at=time.time() + 0.5)
             self._until(lambda: self._all("running"), "running")
             self._over.wait(SETTLE_S)
+            self._ears.missing.clear()  # when the run began nobody had been heard
         except BaseException:
             self._over.set()
             self._stack.close()
@@ -215,7 +219,7 @@ class _Park:
         payload = wire.encode(wire.Stop("bench", "to see how long it takes"))
         self._ears.stopped.clear()
         began, utc = time.monotonic(), time.time()
-        self._session.put(self._keys.estop, payload, encoding=wire.JSON, priority=self._urgent)
+        self._session.put(self._keys.estop, payload, encoding=wire.JSON, priority=self._urgent, express=True)
         self._wait(lambda: len(self._ears.stopped) == len(self._names))
         heard = list(self._ears.stopped.values())
         return [(at - began, max(0.0, sent - utc)) for at, sent in heard], len(self._names) - len(heard)
@@ -224,14 +228,17 @@ class _Park:
         """From the end of a robot until each of its two neighbours knows [s], and how many never did."""
         name = self._names[row]
         around = [(self._names[(row + step) % len(self._names)], name) for step in (-1, 1)]
-        for pair in around:
-            self._ears.missing.pop(pair, None)  # nobody had been heard when the run began
+        self._ended.add(name)
         began = time.monotonic()
         os.kill(self._launcher.get(name).handle.pid, cause)
         self._wait(lambda: all(pair in self._ears.missing for pair in around))
         self._over.wait(0.3)  # the next one begins in peace
         known = [self._ears.missing[pair] - began for pair in around if pair in self._ears.missing]
         return known, len(around) - len(known)
+
+    def wrong(self) -> int:
+        """How often somebody was said to be missing who was there."""
+        return sum(name not in self._ended for _, name in self._ears.missing)
 
     # ------------------------------------------------------------------ how it comes about
 

@@ -109,7 +109,7 @@ def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[
         if sample is not None and str(sample.encoding) == JSON:
             try:
                 yield str(sample.key_expr), json.loads(sample.payload.to_bytes())
-            except ValueError:
+            except (ValueError, RecursionError):
                 continue  # somebody else's idea of JSON
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
+import zenoh
 
 from agents import wire
 from tests.conftest import RouterProcess
@@ -14,6 +15,7 @@ from tests.system.lab import RobotProcess, Watcher
 
 pytestmark = pytest.mark.system
 
+BLOCK = zenoh.CongestionControl.BLOCK  # a stop must not be dropped where a hundred kilobytes go before it
 TRIANGLE = ("KH01", "KH02", "CF01")
 
 
@@ -37,6 +39,11 @@ def robots(router: RouterProcess, watcher: Watcher) -> Iterator[dict[str, RobotP
 
 
 def test_a_killed_and_a_frozen_neighbour_are_noticed(robots: dict[str, RobotProcess], watcher: Watcher) -> None:
+    with watcher.session.liveliness().declare_token("park/**"):  # somebody who says that everybody lives ...
+        watcher.until(lambda: watcher.state["KH01"].seq > 0, "they go on")
+    told = watcher.state["KH01"].seq  # ... and then that everybody is dead
+    watcher.until(lambda: watcher.state["KH01"].seq > told + 10, "they still go on")
+    assert not any(watcher.status[name].missing for name in TRIANGLE)
     hanging = robots["KH02"].process
     hanging.send_signal(signal.SIGSTOP)
     try:
@@ -52,9 +59,9 @@ def test_a_killed_and_a_frozen_neighbour_are_noticed(robots: dict[str, RobotProc
 def test_an_emergency_stop_reaches_every_process(robots: dict[str, RobotProcess], watcher: Watcher) -> None:
     key, said = watcher.keys.estop, wire.encode(wire.Stop("a test", "all of you"))
     for nonsense in (b"", b"{", b"\x00" * 100_000):
-        watcher.session.put(key, nonsense, encoding=wire.JSON)
+        watcher.session.put(key, nonsense, encoding=wire.JSON, congestion_control=BLOCK)
     watcher.session.delete(key)
-    watcher.session.put(key, said, encoding=wire.JSON)
+    watcher.session.put(key, said, encoding=wire.JSON, congestion_control=BLOCK)
     watcher.until(lambda: all(watcher.phase(name) == "done" for name in TRIANGLE), "all motors are off")
     assert {watcher.status[name].reason for name in TRIANGLE} == {"emergency stop by a test: all of you"}
     assert all(watcher.status[name].malformed == 4 for name in TRIANGLE)
