@@ -179,11 +179,11 @@ def command(kind: str, count: int, *, faults: str, device: str, connect: Sequenc
     """`zenpark twin`: as `by_hand`, with faults and settings as JSON."""
     try:
         wrong = msgspec.json.decode(faults, type=Faults)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise DocumentError([Problem(f"--faults {faults}", 0, 0, str(error), "see twins/device.py")]) from None
     try:
         settings = msgspec.json.decode(device, type=dict[str, object])
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, RecursionError) as error:
         hint = "write a JSON object"
         raise DocumentError([Problem(f"--device {device}", 0, 0, str(error), hint)]) from None
     return by_hand(kind, count, faults=wrong, device=settings, connect=connect)
@@ -201,7 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         faults = msgspec.json.decode(chosen.faults, type=Faults)
         return stand_in(chosen.file, chosen.names, faults=faults, connect=chosen.connect, lifeline=chosen.lifeline)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, RecursionError) as error:
         print(f"zenpark: --faults {chosen.faults}: {error}", file=sys.stderr)
     except EXPLAINED as error:
         print(f"zenpark: {error}", file=sys.stderr)

@@ -17,6 +17,7 @@ from experiments.links import pairs
 from experiments.locate import Path
 from experiments.shape import group_of, parameters
 
+DEEPEST: Final = 20  # names of a path; no value of an experiment lies deeper
 _PART: Final = re.compile(r"\s*(?:\"([^\"]*)\"|'([^']*)'|([^.\"']+))\s*(?:\.|$)")
 _SHAPES: Final = frozenset({"box", "radius", "wall"})
 _DEFAULT: Final[dict[Path, Any]] = {
@@ -64,6 +65,8 @@ def parse(flag: str, document: Mapping[str, Any]) -> Override:
     """
     key, equals, text = flag.partition("=")
     path = _path(key)
+    if len(path) > DEEPEST:
+        raise OverrideError(f"nothing lies {len(path)} tables deep", "leave out what is too much")
     if not equals or not path:
         raise OverrideError("this is not of the form path=value", "write, for example, --set formation.gain=2.5")
     if not flag.isprintable():

@@ -85,7 +85,7 @@ def read(path: Path) -> Playback:
         case, seed, clock = about["case"], int(about["seed"]), about["clock"]
         announced = float(about["started"]) if "started" in about else None
         experiment = msgspec.json.decode(attached, type=Experiment)
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: holds no experiment that this version of zenpark can read ({error})") from None
     start = content.start(announced)
     if start is None:

@@ -47,7 +47,7 @@ def command(
     if obstacle is not None:
         try:
             given = msgspec.json.decode(obstacle, type=dict[str, object])
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, RecursionError) as error:
             raise WorldOrderError(f"--obstacle {obstacle}: {error}; write a JSON object, as in the file") from None
         if at is not None:
             given["at"] = at

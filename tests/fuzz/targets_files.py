@@ -337,7 +337,7 @@ def words() -> Iterator[Target]:
     kinds = (crazyflie.Settings, khepera4.Settings, tello.Settings, turtlebot3.Settings)
 
     def device(text: str) -> None:
-        table = msgspec.json.decode(text)
+        table = msgspec.json.decode(text) if text.count("[") + text.count("{") < 500 else {}
         for kind in kinds:
             with suppress(BodyError):
                 settings(kind, "R1", table if isinstance(table, dict) else {})
