@@ -16,6 +16,7 @@ from experiments.experiment import Experiment, Formation, World
 from experiments.links import pairs
 from experiments.locate import Path
 from experiments.shape import group_of, parameters
+from experiments.syntax import endless
 
 DEEPEST: Final = 20  # names of a path; no value of an experiment lies deeper
 _PART: Final = re.compile(r"\s*(?:\"([^\"]*)\"|'([^']*)'|([^.\"']+))\s*(?:\.|$)")
@@ -219,6 +220,8 @@ def _path(key: str) -> Path:
 
 def _typed(text: str) -> object:
     """What TOML makes of a value; the bare text if it makes nothing of it."""
+    if endless(text):
+        return text
     try:
         values = tomllib.loads(f"value = {text}")
     except ValueError:

@@ -108,8 +108,8 @@ def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[
         sample = reply.ok
         if sample is not None and str(sample.encoding) == JSON:
             try:
-                yield str(sample.key_expr), json.loads(sample.payload.to_bytes())
-            except (ValueError, RecursionError):
+                yield str(sample.key_expr), msgspec.json.decode(sample.payload.to_bytes())
+            except (msgspec.MsgspecError, ValueError, RecursionError):
                 continue  # somebody else's idea of JSON
 
 

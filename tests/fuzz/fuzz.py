@@ -108,7 +108,7 @@ def save(folder: Path, name: str, kept: tuple[bytes, str]) -> Path:
     """Keeps an input, and what it ended in beside it."""
     data, text = kept
     folder.mkdir(parents=True, exist_ok=True)
-    file = folder / f"{name}--{hashlib.sha256(data).hexdigest()[:12]}.bin"
+    file = folder / f"{name}--{hashlib.sha256(data + text.encode('utf-8', 'replace')[-200:]).hexdigest()[:12]}.bin"
     file.write_bytes(data)
     file.with_suffix(".txt").write_text(text, encoding="utf-8", errors="backslashreplace")
     return file
