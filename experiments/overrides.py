@@ -19,7 +19,7 @@ from experiments.shape import group_of, parameters
 from experiments.syntax import endless
 
 DEEPEST: Final = 20  # names of a path; no value of an experiment lies deeper
-_PART: Final = re.compile(r"\s*(?:\"([^\"]*)\"|'([^']*)'|([^.\"']+))\s*(?:\.|$)")
+_PART: Final = re.compile(r"\s*+(?:\"([^\"]*)\"|'([^']*)'|([^.\"']++))\s*+(?:\.|$)")
 _SHAPES: Final = frozenset({"box", "radius", "wall"})
 _DEFAULT: Final[dict[Path, Any]] = {
     ("trigger",): msgspec.structs.fields(Experiment)[Experiment.__struct_fields__.index("trigger")].default,
