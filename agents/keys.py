@@ -112,3 +112,10 @@ class Keys:
         if realm != self.realm or not robot or not what:
             raise ValueError(f"'{key}' is not a key of a robot in '{self.realm}'")
         return robot
+
+    def whose(self, key: str) -> str | None:
+        """The robot that a key belongs to; None of any other, as when somebody puts on many keys at once (`**`)."""
+        try:
+            return self.robot(key)
+        except ValueError:
+            return None

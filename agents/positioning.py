@@ -11,6 +11,7 @@ from agents.rows import Array, Index
 
 SMOOTHING_S: Final = 0.1  # time constant of the velocity estimate
 FASTEST: Final = 5.0  # [m/s] a jump that would need more is a mistaken marker, not a motion
+FARTHEST: Final = 1e6  # [m] nothing is measured beyond
 PATIENCE_S: Final = 0.5  # after this silence any position is believed again
 
 
@@ -35,7 +36,7 @@ class External:
     def update(self, row: int, t: float, position: Array, yaw: float) -> bool:
         """Takes a pose in; False if it is old, or jumps farther than any robot moves."""
         since = t - self.time[row]
-        if not (since > 0.0 and np.isfinite(position).all()):
+        if not (since > 0.0 and (np.abs(position) <= FARTHEST).all()):  # NaN is not nearer either
             return False
         if since < PATIENCE_S:
             moved = position - self.position[row]

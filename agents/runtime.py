@@ -104,6 +104,7 @@ class Runtime:
         self._channel = Channel(setup.conditions or Conditions.ideal(len(assignment.links)))
         self._state_slot = 0
         self._stopping: str | None = None
+        self._news = False  # somebody came or went since the last report
         self._utc = self._now = self._next = 0.0
         self._reach = reach_of(assignment.limits)
 
@@ -128,7 +129,9 @@ class Runtime:
             self._body.open()
             try:
                 name = "+".join(self._names)
-                with network.open_session(self._setup.endpoints, name=name, stop=asked) as session:
+                with network.open_session(
+                    self._setup.endpoints, name=name, stop=asked, lease_s=network.ROBOT_LEASE_S
+                ) as session:
                     self._refuse_doubles(session)
                     self._join(session)
                     self._loop(lambda: rope.reason if lost.is_set() else ("told to end" if asked.is_set() else None))
@@ -172,7 +175,7 @@ class Runtime:
         self._poses = [network.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]
-        self._estop = network.subscriber(session, keys.estop)
+        self._estop = network.Alarm(session, keys.estop)
         self._located = [
             (row, network.subscriber(session, keys.position(name), 32))
             for row, name in enumerate(names)
@@ -213,8 +216,7 @@ class Runtime:
             refused = self._goals.malformed
             self._goals.take(t, self._utc)
             self._counts.malformed += self._goals.malformed - refused
-        for sample in network.received(self._estop.handler):
-            self._stop(sample)
+        self._heed_stops()
         for row, positions in self._located:
             for sample in network.received(positions.handler):
                 self._locate(row, sample, t)
@@ -231,6 +233,9 @@ class Runtime:
             for sample in network.received(neighbour.poses):
                 self._hear(neighbour, sample, t)
             for sample in network.received(neighbour.alive):
+                if str(sample.key_expr) != self._setup.keys.alive(neighbour.name):
+                    continue  # a token on many keys at once (`park/**`) is nobody's life
+                self._news = True
                 if sample.kind == zenoh.SampleKind.DELETE:
                     self._channel.forget(neighbour.links)
                     agent.lose(neighbour.links, t)
@@ -250,15 +255,20 @@ class Runtime:
         yaw = nan if measured.yaw is None else measured.yaw
         self._body.locate(row, measured.stamp - self._utc, np.array(measured.position), yaw)
 
-    def _stop(self, sample: zenoh.Sample) -> None:
-        """The emergency stop of everybody."""
-        try:
-            stop = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
-        except wire.Malformed:
-            self._counts.malformed += 1
-            return
-        for row in range(len(self._names)):
-            self.agent.life.stop(row, f"emergency stop by {stop.who}: {stop.reason}")
+    def _heed_stops(self) -> bool:
+        """Emergency stops of everybody; whether there was one."""
+        self._estop.rung.clear()
+        stopped = False
+        for sample in network.received(self._estop):
+            try:
+                stop = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
+            except wire.Malformed:
+                self._counts.malformed += 1
+                continue
+            stopped = True
+            for row in range(len(self._names)):
+                self.agent.life.stop(row, f"emergency stop by {stop.who}: {stop.reason}")
+        return stopped
 
     def _hear(self, neighbour: _Neighbour, sample: zenoh.Sample, t: float) -> None:
         """One pose of a neighbour has come: checked, counted, and given to the modelled network."""
@@ -341,7 +351,7 @@ class Runtime:
         while True:
             wait = zero + self._next - time.monotonic()
             if wait > 0.0:
-                time.sleep(wait)
+                self._sleep(zero + self._next)
             else:
                 behind = int(-wait / self._dt)
                 self._counts.missed += behind
@@ -359,6 +369,15 @@ class Runtime:
             if self._stopping is not None and (t > farewell or (self.agent.life.phase == Phase.DONE).all()):
                 self._telemetry.report(t, everything=True)
                 return
+
+    def _sleep(self, until: float) -> None:
+        """Until the next tick [s, monotonic]; motors are cut on an emergency stop without waiting for it.
+
+        Once only: whoever floods the key with nonsense must not keep the loop awake.
+        """
+        if self._estop.rung.wait(max(0.0, until - time.monotonic())) and self._heed_stops():
+            self._body.stop(np.arange(len(self._names)))
+        time.sleep(max(0.0, until - time.monotonic()))
 
     def _tick(self, t: float) -> None:
         begun = self.agent.decisions > 0
@@ -384,7 +403,8 @@ class Runtime:
             self._state_slot = slot
             telemetry.tell(state, actions, t)
             telemetry.scan(state)
-        telemetry.report(t, everything=t >= telemetry.due, state=state)
+        telemetry.report(t, everything=t >= telemetry.due, state=state, changed=self._news)
+        self._news = False
 
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""

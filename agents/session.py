@@ -2,7 +2,8 @@
 
 Everything that is received waits in a ring channel and is polled from the control loop. A callback would cost a thread
 each, a slow one stops all reception of its session, and one that is left open keeps the interpreter from exiting.
-A ring channel does none of this: it keeps the newest items and never blocks.
+A ring channel does none of this: it keeps the newest items and never blocks. The emergency stop alone cannot wait for
+the next tick (`Alarm`).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, Literal, Protocol, Self, TypeVar
 
@@ -27,7 +29,7 @@ from zenoh.ext import (
     declare_advanced_publisher,
     declare_advanced_subscriber,
 )
-from zenoh.handlers import Handler, RingChannel
+from zenoh.handlers import Callback, Handler, RingChannel
 
 Mode = Literal["client", "peer", "router"]
 T_co = TypeVar("T_co", covariant=True)
@@ -37,6 +39,8 @@ DEFAULT_ENDPOINT: Final = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 
 RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
 GHOST_S: Final = 2.5  # so long may the token of somebody who hangs stand after his end
+LEASE_S: Final = 2.0  # whoever is silent for so long is held for dead
+ROBOT_LEASE_S: Final = 1.2  # the same for robots: neighbours of one that hangs must know within 1.5 s
 HEARTBEAT_S: Final = 0.5  # how long the loss of the last pose before a silence goes unnoticed
 
 # 4 threads instead of 7 in each client and a sixth less CPU at 50 Hz. Zenoh reads it once, at the first open.
@@ -65,7 +69,7 @@ def config(
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
     name: str | None = None,
-    lease_s: float = 2.0,
+    lease_s: float = LEASE_S,
 ) -> zenoh.Config:
     """The configuration of every session: no multicast, no gossip, no shared memory, listening on loopback only.
 
@@ -102,13 +106,18 @@ def config(
         settings["metadata"] = {"name": name}
     made = zenoh.Config()
     for key, value in settings.items():
-        made.insert_json5(key, json.dumps(value))
+        try:
+            made.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise EndpointError(
+                f"{', '.join((*connect, *listen))}: {_reason(error)}; write endpoints like {DEFAULT_ENDPOINT}"
+            ) from None
     return made
 
 
 def _check_form(endpoint: str) -> None:
     protocol, slash, address = endpoint.partition("/")
-    if not (protocol and slash and address):
+    if not (protocol and slash and address and endpoint.isprintable()):
         raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
 
 
@@ -130,7 +139,12 @@ def _check_loopback(endpoint: str) -> None:
 
 
 def open_session(
-    endpoints: Sequence[str], *, name: str, wait_s: float = 10.0, stop: threading.Event | None = None
+    endpoints: Sequence[str],
+    *,
+    name: str,
+    wait_s: float = 10.0,
+    stop: threading.Event | None = None,
+    lease_s: float = LEASE_S,
 ) -> zenoh.Session:
     """A client session on the first router that answers; use it in a `with`.
 
@@ -139,12 +153,13 @@ def open_session(
         name: Who this is, as `zenpark keys` shows it.
         wait_s: How long to try [s].
         stop: Ends the wait when it is set.
+        lease_s: See `config`.
 
     Raises:
         EndpointError: If an endpoint is malformed.
         Unreachable: If no router answered in time, or `stop` was set before one did.
     """
-    settings = config("client", connect=endpoints, name=name)
+    settings = config("client", connect=endpoints, name=name, lease_s=lease_s)
     gone = stop or threading.Event()
     deadline = time.monotonic() + wait_s
     while True:
@@ -238,6 +253,30 @@ def publisher(session: zenoh.Session, key: str, mime: str) -> zenoh.Publisher:
 def subscriber(session: zenoh.Session, key: str, depth: int = 256) -> zenoh.Subscriber[Handler[zenoh.Sample]]:
     """The other end of `publisher`: the newest `depth` samples wait in `.handler`."""
     return session.declare_subscriber(key, RingChannel(depth))
+
+
+class Alarm:
+    """Samples for which a control loop interrupts its sleep; polled like those of any other handler.
+
+    The callback runs in the thread that receives, without one of its own, and does no more than fill a slot.
+
+    Attributes:
+        rung: Set when something has arrived; whoever looks clears it.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, depth: int = 256) -> None:
+        """Listens on a key; the newest `depth` samples wait."""
+        self.rung = threading.Event()
+        self._waiting: deque[zenoh.Sample] = deque(maxlen=depth)
+        self._subscriber = session.declare_subscriber(key, Callback(self._take, indirect=False))
+
+    def try_recv(self) -> zenoh.Sample | None:
+        """See `Polled`."""
+        return self._waiting.popleft() if self._waiting else None
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        self._waiting.append(sample)
+        self.rung.set()
 
 
 class LastValue:

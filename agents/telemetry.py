@@ -171,10 +171,13 @@ class Telemetry:
                 ranges = ranging.message(self._names[row], self.utc, scan)
                 publisher.put(wire.encode(ranges, self._encoding))
 
-    def report(self, t: float, *, everything: bool, state: BodyState | None = None) -> None:
-        """Sends statuses: of all rows when asked for everything, else of those whose phase or reason changed."""
+    def report(self, t: float, *, everything: bool, state: BodyState | None = None, changed: bool = False) -> None:
+        """Sends statuses: of all rows when asked for everything, else of those whose phase, reason or missing changed.
+
+        `changed` says that neighbours came or went: what the phases alone would not tell.
+        """
         agent, counts = self._agent, self._counts
-        if not (everything or agent.life.moved):
+        if not (everything or changed or agent.life.moved):
             return
         if everything:
             self.due = t + STATUS_S

@@ -220,7 +220,7 @@ class KTeam:
 
     def move(self, odometer: Odometer) -> None:
         """See `Driver`."""
-        left, right = self._ask("R", 2)
+        left, right = self._ask("R", 2)[:2]
         odometer.wheels(left, right, time.monotonic())
 
     def ranges(self) -> tuple[Array, Array]:

@@ -18,8 +18,8 @@ from typing import Final, get_args
 
 import zenoh
 
+from agents import plausibility, wire
 from agents import session as network
-from agents import wire
 from agents.body import BodyError
 from agents.keys import Keys
 from agents.lifeline import Lifeline
@@ -31,6 +31,7 @@ from agents.rosnode import Participant, Publisher, Subscriber
 NODE: Final = "zenpark"
 FRAME: Final = "map"  # the arena, as rviz and nav2 name the fixed frame; goals must be in it
 POLL_S: Final = 0.01
+REACH: Final = (1e3, 1e3, 1e3)  # [m] any room
 OK, WARN, ERROR = 0, 1, 2  # levels of a DiagnosticStatus
 
 
@@ -97,7 +98,9 @@ class Graph:
         """Who comes and goes; says so to the graph."""
         gone = []
         for sample in network.received(self._alive.handler):
-            name = self._keys.robot(str(sample.key_expr))
+            name = self._keys.whose(str(sample.key_expr))
+            if name is None:
+                continue
             if sample.kind == zenoh.SampleKind.DELETE:
                 if (robot := self._robots.pop(name, None)) is not None:
                     robot.close()
@@ -118,11 +121,13 @@ class Graph:
     def _moves(self) -> None:
         """Telemetry as pose and velocity."""
         for sample in network.received(self._states.handler):
-            robot = self._robots.get(self._keys.robot(str(sample.key_expr)))
-            if robot is None:
+            name = self._keys.whose(str(sample.key_expr))
+            robot = self._robots.get(name or "")
+            if name is None or robot is None:
                 continue
             try:
                 state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
+                plausibility.check_state(state, robot=name, now=time.time(), reach=REACH)
             except wire.Malformed:
                 self.malformed += 1
                 continue

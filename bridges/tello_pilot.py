@@ -215,9 +215,9 @@ class Pilot:
 
     def _learn(self, state: Mapping[str, Any], now: float) -> None:
         charge, yaw, height, motors = (state.get(key) for key in ("bat", "yaw", "h", "time"))
-        if isinstance(charge, int):
+        if isinstance(charge, int) and 0 <= charge <= 100:  # text over UDP can be anything
             self.battery = 0.01 * charge
-        if isinstance(yaw, int):
+        if isinstance(yaw, int) and abs(yaw) <= 360:
             self._zero_yaw = yaw if self._zero_yaw is None else self._zero_yaw
             self.turned = -math.radians(yaw - self._zero_yaw)
         if isinstance(height, int):

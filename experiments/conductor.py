@@ -277,7 +277,7 @@ class Conductor:
             if self._robots[state.robot].error is not None:
                 self._robots[state.robot].error = state.error
         for sample in network.received(self._watch.handler):
-            seen = self._robots.get(self._keys.robot(str(sample.key_expr)))
+            seen = self._robots.get(self._keys.whose(str(sample.key_expr)) or "")
             if seen is not None:
                 seen.alive = sample.kind == zenoh.SampleKind.PUT
         for death in self._crew.deaths():
@@ -298,7 +298,7 @@ class Conductor:
                 message = wire.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
             except wire.Malformed:
                 continue
-            if message.robot in self._robots and str(sample.key_expr).split("/")[-2] == message.robot:
+            if message.robot in self._robots and self._keys.whose(str(sample.key_expr)) == message.robot:
                 yield message
 
     def _heed(self, status: wire.Status) -> None:

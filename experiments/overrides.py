@@ -16,8 +16,10 @@ from experiments.experiment import Experiment, Formation, World
 from experiments.links import pairs
 from experiments.locate import Path
 from experiments.shape import group_of, parameters
+from experiments.syntax import endless
 
-_PART: Final = re.compile(r"\s*(?:\"([^\"]*)\"|'([^']*)'|([^.\"']+))\s*(?:\.|$)")
+DEEPEST: Final = 20  # names of a path; no value of an experiment lies deeper
+_PART: Final = re.compile(r"\s*+(?:\"([^\"]*)\"|'([^']*)'|([^.\"']++))\s*+(?:\.|$)")
 _SHAPES: Final = frozenset({"box", "radius", "wall"})
 _DEFAULT: Final[dict[Path, Any]] = {
     ("trigger",): msgspec.structs.fields(Experiment)[Experiment.__struct_fields__.index("trigger")].default,
@@ -64,6 +66,8 @@ def parse(flag: str, document: Mapping[str, Any]) -> Override:
     """
     key, equals, text = flag.partition("=")
     path = _path(key)
+    if len(path) > DEEPEST:
+        raise OverrideError(f"nothing lies {len(path)} tables deep", "leave out what is too much")
     if not equals or not path:
         raise OverrideError("this is not of the form path=value", "write, for example, --set formation.gain=2.5")
     if not flag.isprintable():
@@ -216,6 +220,8 @@ def _path(key: str) -> Path:
 
 def _typed(text: str) -> object:
     """What TOML makes of a value; the bare text if it makes nothing of it."""
+    if endless(text):
+        return text
     try:
         values = tomllib.loads(f"value = {text}")
     except ValueError:

@@ -84,8 +84,9 @@ def _fitted(wanted: Wanted, guess: Array, climbs: Mask) -> Placed:
         normal = jacobian.T @ jacobian + damping * np.eye(int(free.sum()))
         tried = position.copy()
         tried[free] -= np.linalg.solve(normal, jacobian.T @ value)
-        then, steeper = _residuals(wanted, tried)
-        before, after = float(value @ value), float(then @ then)
+        with np.errstate(over="ignore", invalid="ignore"):  # too far a step is no better, whatever it comes to
+            then, steeper = _residuals(wanted, tried)
+            before, after = float(value @ value), float(then @ then)
         if after < before:
             position, value, slope, damping = tried, then, steeper, max(damping / 10.0, 1e-10)
         else:

@@ -88,7 +88,7 @@ def read(path: Path) -> Playback:
         case, seed, clock = about["case"], int(about["seed"]), about["clock"]
         announced = float(about["started"]) if "started" in about else None
         experiment = msgspec.json.decode(attached, type=Experiment)
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: holds no experiment that this version of zenpark can read ({error})") from None
     start = content.start(announced)
     if start is None:
@@ -96,7 +96,8 @@ def read(path: Path) -> Playback:
     length = content.length(start, experiment.duration_s)
     if length * experiment.rates.state_hz < 1.0 - ROUNDING_S:
         raise NotStarted(f"{path}: the run ended before the common start; there is nothing to show")
-    trace = _trace(content, experiment, (start, length), (case, seed, clock))
+    with np.errstate(all="ignore"):  # numbers that no robot can have are in the file, not of our making
+        trace = _trace(content, experiment, (start, length), (case, seed, clock))
     return Playback(trace, start, records.complete, messages)
 
 

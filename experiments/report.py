@@ -262,7 +262,7 @@ def _origin(folder: Path, now: Origin) -> Origin:
         if now.command:
             file.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
         return now
-    except ValueError:  # another file of this name: a case may be called "run"
+    except (ValueError, RecursionError):  # another file of this name: a case may be called "run"
         return now
 
 

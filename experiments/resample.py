@@ -36,7 +36,8 @@ def turn(t: Array, angle: Array, time: Array, hold: float) -> Array:
 
 def attitude(t: Array, quaternion: Array, time: Array, hold: float) -> Array:
     """Like `line` for unit quaternions (K, 4), of which q and −q are the same: the short way, and of length one."""
-    whole = np.isfinite(quaternion).all(axis=1)
+    size = np.abs(quaternion).max(axis=1, initial=0.0)
+    whole = (size > 0.1) & (size < 2.0)  # a recording can hold anything; NaN is neither
     t, quaternion = t[whole], quaternion[whole]
     with_the_last = np.vecdot(quaternion[1:], quaternion[:-1])
     sign = np.cumprod(np.concatenate([np.ones(min(1, len(t))), np.where(with_the_last < 0.0, -1.0, 1.0)]))

@@ -20,6 +20,7 @@ from experiments.experiment import Experiment
 from experiments.locate import Path
 from experiments.problem import Fault, shown
 
+LARGEST: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
 _REMEDY: Final = {  # of what is missing
     "title": 'add title = "what this experiment shows"',
     "duration_s": "add duration_s = 30.0",
@@ -46,6 +47,8 @@ def storable(value: object, path: Path = ()) -> Iterator[Fault]:
             yield from storable(each, (*path, number))
     elif isinstance(value, float) and not math.isfinite(value):
         yield Fault(path, f"'{_name(path)}' is {value}, which is no quantity", "give a finite number")
+    elif isinstance(value, float) and abs(value) > LARGEST:
+        yield Fault(path, f"'{_name(path)}' is {value:g}, larger than anything here can be", "give a smaller number")
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
         yield Fault(path, f"'{_name(path)}' has more digits than a 64-bit integer holds", "give a smaller number")
 

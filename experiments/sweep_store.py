@@ -80,7 +80,7 @@ class Store:
         path = self._folder / ORIGIN
         try:
             before = msgspec.json.decode(path.read_bytes(), type=Origin)
-        except (FileNotFoundError, msgspec.DecodeError):
+        except (FileNotFoundError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             before = now
         path.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
         found = []
@@ -129,7 +129,7 @@ class Store:
             if text:
                 try:
                     self._keep(msgspec.json.decode(text, type=_Line))
-                except msgspec.DecodeError:
+                except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
                     self.damaged += 1
 
     def _keep(self, line: _Line) -> None:

@@ -12,6 +12,8 @@ import msgspec
 from experiments.problem import DocumentError, Problem, at_offset
 
 LARGEST: Final = 4_000_000  # bytes; a hundred robots take ten thousand
+DEEPEST: Final = 50  # parts of a dotted key
+_PART: Final = re.compile(r"""["']?[\w-]+["']?""")
 _AT: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _REMEDIES: Final = (
     ("Invalid value", 'text stands in quotes, as in kind = "crazyflie"; numbers have a point, not a comma'),
@@ -88,6 +90,9 @@ def parsed(text: str, label: str, *, json: bool) -> dict[str, Any]:
 
 
 def _toml(text: str, label: str) -> dict[str, Any]:
+    if endless(text):
+        hint = "no value of an experiment lies so deep; leave out what is too much"
+        raise DocumentError([Problem(label, 0, 0, f"a key has more than {DEEPEST} parts", hint)])
     try:
         document = tomllib.loads(text)
     except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits
@@ -96,6 +101,16 @@ def _toml(text: str, label: str) -> dict[str, Any]:
         hint = "zenpark new copies an experiment to begin with"
         raise DocumentError([Problem(label, 0, 0, "holds nothing but comments", hint)])
     return document
+
+
+def endless(text: str) -> bool:
+    """Whether a TOML text holds a key of very many parts, for which `tomllib` takes seconds and gigabytes."""
+    run = 0
+    for part in text.split("."):
+        run = run + 1 if _PART.fullmatch(part.strip(" \t")) else 0
+        if run > DEEPEST:
+            return True
+    return False
 
 
 def _toml_problem(text: str, label: str, message: str) -> Problem:

@@ -266,7 +266,8 @@ def _ready(experiment: Experiment, population: Population, endpoints: Sequence[s
 def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
     """Robots that are on the network already: another world may have carried them."""
     replies = session.liveliness().get(keys.alive("*"), timeout=1.0)
-    return {keys.robot(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
+    found = {keys.whose(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
+    return {name for name in found if name is not None}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,6 +15,7 @@ from typing import Final
 import yaml
 
 from experiments.problem import DocumentError, Problem, at_offset
+from experiments.shape import LARGEST
 
 CORE: Final = "tag:yaml.org,2002:"
 PLAIN: Final = frozenset(CORE + kind for kind in ("str", "int", "float", "bool", "null", "map", "seq", "timestamp"))
@@ -61,7 +62,9 @@ class Tree:
             hint = "check the indentation, the colons and the quotes there"
             raise DocumentError([at_offset(self.label, self.text, mark.index if mark else 0, words, hint)]) from None
         except yaml.reader.ReaderError as error:
-            message = f"the character U+{ord(str(error.character)):04X} cannot stand in YAML"
+            found = error.character  # of text a character, of what it could not decode a number
+            code = found if isinstance(found, int) else ord(str(found)[:1] or "?")
+            message = f"the character U+{code:04X} cannot stand in YAML"
             raise DocumentError([at_offset(self.label, self.text, error.position, message, "remove it")]) from None
         except RecursionError:
             raise DocumentError([Problem(self.label, 0, 0, "is nested too deeply", "flatten it")]) from None
@@ -124,7 +127,7 @@ class Tree:
             value = float(self._written(item))
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
+        if not abs(value) <= LARGEST:  # NaN is not smaller either
             self.fault(item, f"'{item.name}' must be a number, not {self._shown(item)}")
             return default
         return value
@@ -140,7 +143,7 @@ class Tree:
             found = [float(part) for part in parts]
         except ValueError:
             found = [math.nan]
-        if not all(map(math.isfinite, found)):
+        if not all(abs(value) <= LARGEST for value in found):
             self.fault(item, f"'{item.name}' must be numbers, not {self._shown(item)}", "such as 1.2, -0.5, 0.7")
             return []
         return found

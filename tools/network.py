@@ -66,15 +66,15 @@ def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[Member]:
     """
     held: dict[str, dict[str, list[str]]] = {}
     for place, value in _admin(session, "@/*/router/**", timeout_s):
-        _, _, _, kind, key = (*place.split("/", 4), "", "")[:5]
+        _, _, _, kind, key = (*place.split("/", 4), *[""] * 4)[:5]
         if kind not in _KINDS or not isinstance(value, dict):
             continue
-        for owner in {*value.get("clients", []), *value.get("peers", [])}:
+        for owner in {*_words(value.get("clients")), *_words(value.get("peers"))}:
             held.setdefault(owner, {}).setdefault(_KINDS[kind], []).append(key)
     names = {
-        place.split("/")[1]: (value.get("metadata") or {}).get("name")
+        place.split("/")[1]: _name(value)
         for place, value in _admin(session, "@/*/*", timeout_s)
-        if isinstance(value, dict)
+        if isinstance(value, dict) and "/" in place
     }
     mine = str(session.zid())
     everyone = (held.keys() | names.keys()) - {mine}
@@ -85,14 +85,31 @@ def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[Member]:
     return sorted(found, key=lambda member: (member.name, member.id))
 
 
+def _words(value: object) -> list[str]:
+    """The words of a list, if it is one: what stands in the admin space is another program's."""
+    return [word for word in value if isinstance(word, str)] if isinstance(value, list) else []
+
+
+def _name(value: dict[str, object]) -> str | None:
+    """The name that a session gave itself."""
+    about = value.get("metadata")
+    name = about.get("name") if isinstance(about, dict) else None
+    return name if isinstance(name, str) else None
+
+
+def printable(text: str) -> str:
+    """Text of others, without what could steer the terminal."""
+    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
+
+
 def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[tuple[str, object]]:
     """Keys and JSON values in the admin space."""
     for reply in session.get(selector, timeout=timeout_s):
         sample = reply.ok
         if sample is not None and str(sample.encoding) == JSON:
             try:
-                yield str(sample.key_expr), json.loads(sample.payload.to_bytes())
-            except ValueError:
+                yield str(sample.key_expr), msgspec.json.decode(sample.payload.to_bytes())
+            except (msgspec.MsgspecError, ValueError, RecursionError):
                 continue  # somebody else's idea of JSON
 
 
@@ -108,7 +125,7 @@ def keys(connect: Sequence[str] = (), *, as_json: bool = False, out: Printer = a
         out(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
         return
     for member in found:
-        out(f"{member.name}  ({member.id})")
+        out(f"{printable(member.name)}  ({member.id})")
         for title, held in (
             ("alive", member.alive),
             ("publishes", member.publishers),
@@ -116,7 +133,7 @@ def keys(connect: Sequence[str] = (), *, as_json: bool = False, out: Printer = a
             ("listens to", member.subscribers),
         ):
             for place, key in enumerate(held):
-                out(f"  {'' if place else title:10}  {key}")
+                out(f"  {'' if place else title:10}  {printable(key)}")
 
 
 def readable(payload: bytes, mime: str) -> str:
@@ -133,7 +150,7 @@ def readable(payload: bytes, mime: str) -> str:
             value = payload.decode()
         return json.dumps(value, ensure_ascii=True, separators=(",", ":"))
     except (msgspec.MsgspecError, ValueError, TypeError, RecursionError):
-        return f"<{len(payload)} bytes, {mime}>"
+        return f"<{len(payload)} bytes, {printable(mime)}>"
 
 
 def echo(
@@ -168,7 +185,7 @@ def echo(
             for sample in received(samples.handler):
                 deleted = sample.kind == zenoh.SampleKind.DELETE
                 text = "(deleted)" if deleted else readable(sample.payload.to_bytes(), str(sample.encoding))
-                out(f"{sample.key_expr} {text}")
+                out(f"{printable(str(sample.key_expr))} {text}")
                 left -= 1
                 if left <= 0:
                     return
@@ -266,6 +283,6 @@ def hz(
                 cadence.add(str(sample.key_expr), at, len(sample.payload))
             if now - printed >= window_s or now >= end:
                 for rate in cadence.window(now - printed):
-                    out(str(rate))
+                    out(printable(str(rate)))
                 printed = now
             time.sleep(POLL_S)

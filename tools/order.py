@@ -31,9 +31,9 @@ def command(what: str, robots: Sequence[str], *, connect: Sequence[str], realm: 
     keys = Keys(realm)
     with network.open_session(list(connect) or [network.DEFAULT_ENDPOINT], name="order", wait_s=2.0) as session:
         there = [
-            keys.robot(str(reply.ok.key_expr))
+            robot
             for reply in session.liveliness().get(keys.alive("*"), timeout=2.0)
-            if reply.ok is not None
+            if reply.ok is not None and (robot := keys.whose(str(reply.ok.key_expr))) is not None
         ]
         if not there:
             print(f"zenpark: no robot is there in the realm '{realm}'; `zenpark keys` shows who is", file=sys.stderr)

@@ -269,7 +269,7 @@ def _address(text: str) -> tuple[str, int]:
 def _faults(text: str) -> Faults:
     try:
         return msgspec.json.decode(text, type=Faults)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise argparse.ArgumentTypeError(f"{error}; write it like '{{\"occluded_from_s\": 5}}'") from None
 
 

@@ -8,6 +8,7 @@ import pytest
 import zenoh
 
 from agents.session import (
+    Alarm,
     EndpointError,
     Unreachable,
     alive_token,
@@ -54,6 +55,12 @@ def test_refuses_to_listen_beyond_loopback(endpoint):
 @pytest.mark.parametrize("endpoint", ["127.0.0.1:7447", "tcp/", "/127.0.0.1:7447", ""])
 def test_refuses_what_is_no_endpoint(endpoint):
     with pytest.raises(EndpointError, match=r"write it like tcp/127\.0\.0\.1:7447"):
+        config("client", connect=[endpoint])
+
+
+@pytest.mark.parametrize("endpoint", ["t#tcp/localhost:1", "tcp/127.0.0.1:7447\n", "tcp?/x/y"])
+def test_what_zenoh_would_not_understand_is_refused_by_name(endpoint):
+    with pytest.raises(EndpointError, match=r"write .*tcp/127\.0\.0\.1:7447"):
         config("client", connect=[endpoint])
 
 
@@ -234,3 +241,18 @@ def test_a_killed_robot_is_noticed(router, eventually):
         assert seen[0].kind == zenoh.SampleKind.DELETE
         assert connected(session)
         own.undeclare()
+
+
+@pytest.mark.system
+def test_an_alarm_rings_and_keeps_what_came(router, eventually):
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
+        alarm = Alarm(robot, "park/estop", depth=2)
+        assert not alarm.rung.is_set()
+        speaker = publisher(ui, "park/estop", JSON)
+        eventually(lambda: speaker.matching_status.matching)
+        for payload in (b"1", b"2", b"3"):
+            speaker.put(payload)
+        assert alarm.rung.wait(10.0)
+        heard = []
+        eventually(lambda: heard.extend(payloads(alarm)) or heard[-1:] == [b"3"])
+        assert alarm.try_recv() is None

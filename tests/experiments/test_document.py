@@ -504,3 +504,10 @@ def test_the_schema_is_draft_7_and_knows_the_plugins():
     case = schema["properties"]["cases"]["additionalProperties"]["$ref"].rpartition("/")[2]
     assert "required" not in schema["definitions"][case]
     assert "cases" not in schema["definitions"][case]["properties"]
+
+
+def test_a_key_of_thousands_of_parts_is_refused_at_once(tmp_path):
+    file = tmp_path / "deep.toml"
+    file.write_text(f'title = "x"\nduration_s = 1.0\n{"a." * 20_000}a = 1\n')
+    with pytest.raises(DocumentError, match="a key has more than 50 parts"):
+        read(file)

@@ -6,7 +6,7 @@ import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from twins.crazyflie.tables import (
 
 Send = Callable[[Port, int, bytes], None]
 HOVER_THRUST: Final = 36000.0  # about what a Crazyflie hovers with
+LARGEST: Final = 2.0**32  # as large as whole parameters get; no length, angle or speed comes near it
 CLIMB_THRUST: Final = 24000.0  # that much more is a metre per second up, about
 
 
@@ -35,7 +36,8 @@ CLIMB_THRUST: Final = 24000.0  # that much more is a metre per second up, about
 class Drone:
     """Row `row` of a flock, at the far end of `send`.
 
-    A packet that is too short for what it claims to be raises `struct.error` or `IndexError`; the link drops it.
+    A packet that is too short for what it claims to be raises `struct.error` or `IndexError`, one with numbers that are
+    none `ValueError`; the link drops it.
     """
 
     flock: Flock
@@ -139,7 +141,7 @@ class Drone:
         elif channel == 1:
             self.send(Port.PARAM, 1, data[:2] + b"\0" + PARAMETERS[number].packing.pack(self._stored_as(number)))
         elif not PARAMETERS[number].flags & READ_ONLY:  # a write to a constant is never answered
-            (value,) = PARAMETERS[number].packing.unpack_from(data, 2)
+            (value,) = _numbers(PARAMETERS[number].packing, data[2:])
             self.send(Port.PARAM, 2, data)
             self._set(number, value)
 
@@ -150,7 +152,7 @@ class Drone:
             status = Status.UNKNOWN
             if number is not None and PARAMETER_TYPES[PARAMETERS[number].type][0] == rest[0]:
                 status = Status.OK
-                self._set(number, PARAMETERS[number].packing.unpack_from(rest, 1)[0])
+                self._set(number, _numbers(PARAMETERS[number].packing, rest[1:])[0])
             self.send(Port.PARAM, 3, data[: len(group) + len(name) + 3] + bytes((status,)))
             return
         command, number = crtp.ITEM.unpack_from(data)
@@ -229,7 +231,7 @@ class Drone:
         self.flock.commander.command(self.row, self.flock.t, **setpoint)  # type: ignore[arg-type]
 
     def _thrust(self, _channel: int, data: bytes) -> None:
-        _, _, turn, thrust = crtp.THRUST.unpack(data)
+        _, _, turn, thrust = _numbers(crtp.THRUST, data)
         climb = (thrust - HOVER_THRUST) / CLIMB_THRUST
         self._command(on=thrust > 0, velocity=(math.nan, math.nan, climb), turn=math.radians(turn))
 
@@ -242,16 +244,16 @@ class Drone:
         if kind == Setpoint.STOP:
             self._command(on=False)
         elif kind == Setpoint.POSITION:
-            x, y, z, yaw = crtp.FOUR.unpack_from(rest)
+            x, y, z, yaw = _numbers(crtp.FOUR, rest)
             self._command(target=(x, y, z), heading=math.radians(yaw))
         elif kind == Setpoint.VELOCITY:
-            vx, vy, vz, turn = crtp.FOUR.unpack_from(rest)
+            vx, vy, vz, turn = _numbers(crtp.FOUR, rest)
             self._command(velocity=(vx, vy, vz), turn=math.radians(turn))
         elif kind == Setpoint.HOVER:
-            vx, vy, turn, z = crtp.FOUR.unpack_from(rest)
+            vx, vy, turn, z = _numbers(crtp.FOUR, rest)
             self._command(velocity=(vx, vy, free), target=(free, free, z), turn=math.radians(turn), body=True)
         elif kind == Setpoint.HEIGHT:
-            _, _, turn, z = crtp.FOUR.unpack_from(rest)
+            _, _, turn, z = _numbers(crtp.FOUR, rest)
             self._command(target=(free, free, z), turn=math.radians(turn))
         elif kind == Setpoint.FULL_STATE:
             values = crtp.FULL_STATE.unpack_from(rest)
@@ -274,12 +276,12 @@ class Drone:
             return Status.BUSY
         pose = flock.pose(row)
         if command in (HighLevel.TAKEOFF, HighLevel.LAND):
-            height, yaw, keep, span = crtp.CLIMB.unpack_from(data)
+            height, yaw, keep, span = _numbers(crtp.CLIMB, data)
             yaw = float(pose[3]) if keep else yaw
             climb = flock.planner.takeoff if command == HighLevel.TAKEOFF else flock.planner.land
             return climb(row, t, pose, height=height, yaw=yaw, span=span)
         if command == HighLevel.GO_TO:
-            relative, linear, x, y, z, yaw, span = crtp.GO_TO.unpack_from(data)
+            relative, linear, x, y, z, yaw, span = _numbers(crtp.GO_TO, data)
             goal, velocity = np.array([x, y, z, yaw]), flock.quadrotor.velocity[row]
             return flock.planner.go_to(row, t, pose, velocity, goal=goal, span=span, relative=relative, linear=linear)
         return Status.NO_COMMAND
@@ -289,15 +291,15 @@ class Drone:
     def _location(self, channel: int, data: bytes) -> None:
         flock, row = self.flock, self.row
         if channel == 0:
-            flock.estimator.hear(row, flock.t, crtp.VECTOR.unpack(data))
+            flock.estimator.hear(row, flock.t, _numbers(crtp.VECTOR, data))
             return
         kind, rest = data[0], data[1:]
         if kind == Location.POSE:
-            x, y, z, *_ = crtp.POSE.unpack_from(rest)
+            x, y, z, *_ = _numbers(crtp.POSE, rest)
             flock.estimator.hear(row, flock.t, (x, y, z))
         elif kind == Location.LPP and flock.loco[row]:
             if rest[1] == crtp.ANCHOR_POSITION and rest[0] < ANCHORS:
-                flock.memories[row].place(rest[0], *crtp.VECTOR.unpack_from(rest, 2))
+                flock.memories[row].place(rest[0], *_numbers(crtp.VECTOR, rest[2:]))
         elif kind == Location.STORE_LIGHTHOUSE:
             flock.memories[row].stored = struct.unpack_from("<HH", rest)
             self.send(Port.LOCATION, 1, bytes((Location.STORE_LIGHTHOUSE, 1)))
@@ -315,3 +317,16 @@ class Drone:
 def _typed(kind: str, value: float) -> float:
     """A value as its type wants it for packing."""
     return value if kind == "float" else int(value)
+
+
+def _numbers(packing: struct.Struct, data: bytes) -> tuple[Any, ...]:
+    """What is packed at the beginning of `data`.
+
+    Raises:
+        struct.error: If it is too short.
+        ValueError: If a number is not finite, or absurdly large.
+    """
+    values = packing.unpack_from(data)
+    if not all(abs(value) <= LARGEST for value in values):  # NaN fails too
+        raise ValueError(f"{values} are no numbers for a robot")
+    return values

@@ -1,0 +1,17 @@
+"""Whose a key is."""
+
+import pytest
+
+from agents.keys import Keys
+
+
+@pytest.mark.parametrize("key", ["**", "park/**", "lab/KH01/pose", "park", "park/", "park//pose", ""])
+def test_a_key_on_which_many_hear_is_nobodys(key):
+    assert Keys("park").whose(key) is None
+    with pytest.raises(ValueError, match="is not a key of a robot"):
+        Keys("park").robot(key)
+
+
+def test_a_robots_key_is_its_own():
+    keys = Keys("park")
+    assert keys.whose(keys.pose("KH01")) == keys.robot(keys.alive("KH01")) == "KH01"

@@ -1,0 +1,99 @@
+"""Good messages of every kind, in both encodings, for the mutator to spoil."""
+
+from __future__ import annotations
+
+import time
+
+from agents import wire
+from agents.keys import Keys
+
+KEYS = Keys()
+
+
+def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]]:
+    """By the name of its key what a robot says, with stamps so far ahead of now [s]."""
+    now = time.time() + ahead
+    place, rest = (-0.5, -0.4, 0.0), (0.0, 0.0, 0.0)
+    heard = wire.Heard("KH02", seq, now, now, place, rest)
+    status = wire.Status(
+        robot=robot, stamp=now, phase="running", reason="", body="", battery=0.5, sent=seq, heard=2, lost={"KH01": 1},
+        malformed=0, refused=0, ticks=5, missed=1, decisions=2, interventions=0, avoided=0, late_s=0.001,
+        started=now - 1.0, missing=["KH02"], pid=1, cpu_s=0.1, rss_mb=60.0,
+    )  # fmt: skip
+    commands = [
+        wire.Command(robot, seq + 10, now, "drive", (0.1, 0.2, 0.0, 0.0)),
+        wire.Command(robot, seq + 20, now, "takeoff", height=0.5),
+        wire.Command(robot, seq + 30, now, "land"),
+        wire.Command(robot, seq + 40, now, "stop"),
+    ]
+    return {
+        "pose": [wire.Pose(robot, seq + k, now + 0.01 * k, place, rest, 0.1) for k in range(2)],
+        "state": [
+            wire.State(robot, seq, now, "running", place, rest, 0.1, place, (0.1, 0.2, 0.0, 0.0), 0.1, place,
+            0.1, [heard]),
+            wire.State(robot, seq, now, "idle", place, rest, 0.1, None, None, 0.1, attitude=(1.0, 0.0, 0.0, 0.0)),
+        ],
+        "status": [status],
+        "position": [wire.Position(robot, now, place, 0.1), wire.Position(robot, now, place)],
+        "truth": [wire.Position(robot, now, place, 0.1)],
+        "setpoint": list(commands),
+        "ranges": [wire.Ranges(robot, now, [0.0, 0.1], [0.0, 0.0], [1.0, None])],
+        "order": [
+            wire.Order("takeoff"), wire.Order("start", at=now + 0.5), wire.Order("hold"), wire.Order("land"),
+            wire.Order("stop"), wire.Order("get", name="clamp"), wire.Order("set", name="clamp", value=0.2),
+            wire.Order("set", name="trigger.period_s", value=0.05),
+        ],
+        "goal": [wire.Position(robot, now, place, 0.1)],
+    }  # fmt: skip
+
+
+def of_all() -> dict[str, list[object]]:
+    """By key what is nobody's."""
+    now = time.time()
+    world = wire.WorldState(
+        now, "pymunk", 1.0, 1.0, 0.1, False, ["KH01"], ["CF01"], {"box": (0.1, 0.2, 0.3)}, 1, 0, 0, ""
+    )  # fmt: skip
+    orders = [
+        wire.WorldOrder("pause"), wire.WorldOrder("resume"), wire.WorldOrder("step", steps=3),
+        wire.WorldOrder("reset"), wire.WorldOrder("reset", name="KH01"), wire.WorldOrder("remove", name="KH02"),
+        wire.WorldOrder("spawn", name="KH02", kind="khepera4", at=(0.5, 0.5), yaw=1.0),
+        wire.WorldOrder("spawn", name="CF02", kind="crazyflie", at=(0.2, -0.5)),
+        wire.WorldOrder("spawn", name="box", obstacle={"at": [0.1, 0.2], "radius": 0.1, "height": 0.5}),
+        wire.WorldOrder("spawn", name="moving", obstacle={
+            "at": [0.1, 0.2], "box": [0.1, 0.2],
+            "plan": {"kind": "circle", "radius": 0.1}}),
+        wire.WorldOrder("spawn", name="pushed", obstacle={"at": [-0.1, 0.6], "box": [0.1, 0.2], "mass": 1.0}),
+    ]  # fmt: skip
+    return {
+        KEYS.estop: [wire.Stop("a test", "to see")],
+        KEYS.event: [wire.Event(now, "phase", "conductor", "landing")],
+        KEYS.contact: [wire.Contact(now, "KH01", "wall", 0.1, 0.001)],
+        KEYS.world: [world],
+        KEYS.world_order: list(orders),
+    }
+
+
+def sent(key: str, message: object) -> list[bytes]:
+    """A message as `loopnet.Net.deliver` takes it, in both encodings."""
+    return [
+        b"\0".join([key.encode(), wire.MIME[encoding].encode(), wire.encode(message, encoding)])  # type: ignore[arg-type]
+        for encoding in ("json", "msgpack")
+    ]
+
+
+def everything(*robots: str, only: tuple[str, ...] = ()) -> list[bytes]:
+    """All messages of these robots, and those that are nobody's; or only those of some kinds."""
+    found = []
+    for number, robot in enumerate(robots):
+        for what, said in good(robot, 1 + 100 * number).items():
+            if not only or what in only:
+                found += [part for message in said for part in sent(f"park/{robot}/{what}", message)]
+        found.append(b"park/" + robot.encode() + b"/alive\0text/plain\0")
+    many = {key: said[0] for what, said in good(robots[0], 900).items() for key in (f"park/*/{what}", "park/**", "**")}
+    for key, message in many.items():  # whoever puts on a wildcard reaches everybody
+        if not only or key.rpartition("/")[2] in (*only, "**"):
+            found += sent(key, message)
+    for key, said in of_all().items():
+        if not only or key.rpartition("/")[2] in only:
+            found += [part for message in said for part in sent(key, message)]
+    return found

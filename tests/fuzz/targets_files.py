@@ -1,0 +1,412 @@
+"""Files and what stands on command lines: experiments, their changes, imports, recordings, sweeps, addresses."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import struct
+import tempfile
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from agents import plugins, wire
+from agents.body import BodyError
+from agents.session import EndpointError
+from experiments import catalogue, document
+from experiments.document import DocumentError, write_json
+from experiments.records import RecordingError
+from tests.fuzz.messages import good
+from tests.fuzz.target import Place, Target
+
+MALFORMED = Path(__file__).parents[1] / "experiments" / "malformed"
+
+
+@contextmanager
+def place_for(name: str) -> Iterator[Path]:
+    """A file of that name in a folder of its own, in memory where there is such a place."""
+    memory = Path("/dev/shm")
+    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
+        yield Path(folder) / name
+
+
+def refused_well(error: DocumentError) -> None:
+    """What is refused is said, and can be printed."""
+    assert error.problems
+    assert all(problem.message for problem in error.problems)
+    str(error).encode("utf-8")
+
+
+def experiment(suffix: str, examples: list[bytes]) -> Iterator[Target]:
+    """An experiment file; what is read can be written and read again."""
+    with place_for(f"some{suffix}") as file:
+        for arena in catalogue.FOLDER.glob("*.arena.toml"):
+            (file.parent / arena.name).write_bytes(arena.read_bytes())
+
+        def take(data: bytes) -> None:
+            file.write_bytes(data)
+            try:
+                cases = document.read(file).cases()
+            except DocumentError as error:
+                refused_well(error)
+                raise
+            assert all(write_json(case) for case in cases.values())
+
+        yield Target(examples, take, (DocumentError,))
+
+
+def toml() -> Iterator[Target]:
+    """The catalogue, and every malformed file of the tests."""
+    files = [*sorted(catalogue.FOLDER.glob("*.toml")), *sorted(MALFORMED.glob("*.toml"))]
+    small = (
+        b'title = "x"\nduration_s = 1.0\n[robots.K]\nkind = "khepera4"\nstart = [0, 0]\n[formation.links]\n[cases.a]\n'
+    )
+    yield from experiment(".toml", [small, *(file.read_bytes() for file in files)])
+
+
+def resolved() -> Iterator[Target]:
+    """Cases as the processes are told them."""
+    names = ("triangle", "convoy", "obstacle-course")
+    yield from experiment(".json", [write_json(document.read(name).experiment) for name in names])
+
+
+def arena() -> Iterator[Target]:
+    """An arena file beside an experiment."""
+    text = '[robots.K]\nkind = "khepera4"\nstart = [0, 0]\n[arena]\nfile = "a.arena.toml"\n'
+    with place_for("some.toml") as file:
+        file.write_text(f'title = "x"\nduration_s = 1.0\n{text}')
+
+        def take(data: bytes) -> None:
+            (file.parent / "a.arena.toml").write_bytes(data)
+            try:
+                document.read(file)
+            except DocumentError as error:
+                refused_well(error)
+                raise
+
+        examples = [each.read_bytes() for each in sorted(catalogue.FOLDER.glob("*.arena.toml"))]
+        yield Target([*examples, b"[arena]\nsize = [4, 4, 2]\n"], take, (DocumentError,))
+
+
+def overrides() -> Iterator[Target]:
+    """What stands behind `--set`, one a line."""
+    flags = [
+        "robots.KH01.start=[0.1, 0.2]", "formation.gain=2.5", "trigger.threshold=0.02", "trigger.kind=mixed",
+        "cases.event.trigger=periodic", "timeline.0.at_s=3", 'formation.links."KH01 - KH02"=0.5', "seed=7",
+        "arena.obstacles.box={ at = [0, 0.5], radius = 0.1 }", "formation.changes=[{ at_s = 1, scale = 2 }]",
+        "disturbance.all.hover_jitter={}", "rates.body_hz=100", "avoidance=barrier", "network.connect=[]",
+    ]  # fmt: skip
+    examples = [flag.encode() for flag in flags] + ["\n".join(flags[k : k + 3]).encode() for k in range(10)]
+
+    def take(data: bytes) -> None:
+        try:
+            name = "robotic-park" if len(data) % 4 == 0 else "triangle"
+            read = document.read(name, data.decode("utf-8", "surrogateescape").split("\n")[:8])
+        except DocumentError as error:
+            refused_well(error)
+            raise
+        assert read.cases()
+
+    yield Target(examples, take, (DocumentError,))
+
+
+def park_yaml() -> Iterator[Target]:
+    """Files of Robotic Park's authors; what becomes of them is read."""
+    from experiments.importing import imported  # noqa: PLC0415
+    from experiments.syntax import decoded  # noqa: PLC0415
+    from tests.experiments import robotic_park_files as theirs  # noqa: PLC0415
+
+    examples = [theirs.dome(4).encode(), theirs.column(3, 1).encode(), theirs.dome(5, origin=True, real=(0,)).encode()]
+    with place_for("some.toml") as file:
+
+        def take(data: bytes) -> None:
+            try:
+                text, _ = imported(decoded(data, "some.yaml"), "some.yaml", 20.0)
+                file.write_text(text, encoding="utf-8")
+            except DocumentError as error:
+                refused_well(error)
+                raise
+            with suppress(DocumentError):  # robots that stand in each other are for its user to see
+                document.read(file)
+
+        yield Target(examples, take, (DocumentError,))
+
+
+# ---------------------------------------------------------------------- recordings
+
+
+def recording_bytes(*, plain: bool) -> list[bytes]:
+    """Recordings of a second: as they are made, or neither compressed nor guarded by checksums."""
+    from mcap.writer import CompressionType, Writer  # noqa: PLC0415
+
+    from experiments import recording  # noqa: PLC0415
+    from experiments.records import Records  # noqa: PLC0415
+
+    what = document.read("triangle", ["duration_s=1.0", "timeline=[]"]).experiment
+    made = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "good.mcap"
+        began = time.time()
+        with recording.Recording(path, what, "x", case="only", seed=1, clock="real", started=began) as writer:
+            for k in range(12):
+                for name in ("KH01", "CF01"):
+                    said = good(name, k + 1)
+                    at = began + 0.1 * k
+                    writer.state(msgspec.structs.replace(said["state"][0], stamp=at))  # type: ignore[type-var]
+                    writer.pose(msgspec.structs.replace(said["pose"][0], stamp=at), at, 150)  # type: ignore[type-var]
+                    if k % 5 == 0:
+                        status = msgspec.structs.replace(said["status"][0], stamp=at, started=began)  # type: ignore[type-var]
+                        writer.status(status)
+            writer.event(wire.Event(began, "start", "conductor", "go"))
+            writer.contact(wire.Contact(began + 0.5, "KH01", "CF01", 0.1, 0.01))
+            writer.world(
+                wire.WorldState(
+                    began, "pymunk", 0.0, 1.0, 0.1, False, ["KH01"], [], {"b": (0.0, 0.0, 0.0)}, 1, 0, 0, ""
+                )
+            )
+            writer.event(wire.Event(began + 1.0, "phase", "conductor", "landing"))
+        made.append(path.read_bytes())
+        if not plain:
+            return [made[0], made[0][: len(made[0]) // 2]]
+        records = Records(path)
+        messages = list(records.messages())
+        target = Path(folder) / "plain.mcap"
+        with target.open("wb") as file:
+            copy = Writer(file, compression=CompressionType.NONE, use_chunking=False, enable_crcs=False)
+            copy.start("ros2", "zenpark")
+            for attached in records.attachments:
+                copy.add_attachment(0, 0, attached.name, attached.media_type, attached.data)
+            for about in records.metadata:
+                copy.add_metadata(about.name, about.metadata)
+            schemas = {k: copy.register_schema(s.name, s.encoding, s.data) for k, s in records.schemas.items()}
+            channels = {
+                k: copy.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
+                for k, c in records.channels.items()
+            }
+            for message in messages:
+                copy.add_message(channels[message.channel], message.logged, message.data, message.published)
+            copy.finish()
+        return [target.read_bytes()]
+
+
+def resealed(data: bytes) -> bytes:
+    """The checksums of attachments made good again, so that what was changed in them is looked at."""
+    made, at = bytearray(data), 8
+    while at + 9 <= len(made):
+        opcode, length = struct.unpack_from("<BQ", made, at)
+        end = at + 9 + length
+        if end > len(made) or length < 4:
+            break
+        if opcode == 0x09:
+            made[end - 4 : end] = zlib.crc32(made[at + 9 : end - 4]).to_bytes(4, "little")
+        at = end
+    return bytes(made)
+
+
+def recording_of(*, plain: bool) -> Iterator[Target]:
+    """A recording is read, analysed as `zenpark report` begins, and recovered."""
+    from experiments import playback  # noqa: PLC0415
+    from experiments.recover import recover  # noqa: PLC0415
+
+    with place_for("some.mcap") as file:
+        target = file.with_name("other.mcap")
+
+        def take(data: bytes) -> None:
+            file.write_bytes(resealed(data) if plain else data)
+            if len(data) % 4 == 0:
+                target.unlink(missing_ok=True)
+                with suppress(RecordingError):
+                    recover(file, target)
+            trace = playback.read(file).trace
+            assert len(trace.time) <= 100_000
+
+        yield Target(recording_bytes(plain=plain), take, (RecordingError,))
+
+
+def damaged() -> Iterator[Target]:
+    """Recordings as the disk may leave them."""
+    yield from recording_of(plain=False)
+
+
+def forged() -> Iterator[Target]:
+    """Recordings whose checksums fit, and whose content somebody made up."""
+    yield from recording_of(plain=True)
+
+
+def cdr() -> Iterator[Target]:
+    """Every recorded struct: name and CDR with a zero byte between them; what is decoded can be encoded."""
+    from experiments.cdr import Undecodable, Unencodable, codec  # noqa: PLC0415
+    from experiments.recording import SentPose, World  # noqa: PLC0415
+
+    said = good("KH01")
+    pose: Any = said["pose"][0]
+    fields = [getattr(pose, name) for name in ("robot", "seq", "stamp", "position", "velocity", "yaw")]
+    made: list[Any] = [
+        said["state"][0], said["state"][1], said["status"][0], SentPose(*fields, 1.0, 150),
+        wire.Event(1.0, "start", "conductor", "go"), wire.Contact(1.0, "KH01", "wall", 0.1, 0.01),
+        World.of(wire.WorldState(1.0, "pymunk", 0.0, 1.0, 0.1, False, ["KH01"], ["a"], {"b": (0.0, 0.0, 0.0)},
+            1, 0, 0, "")),
+    ]  # fmt: skip
+    codecs = {type(each).__name__: codec(type(each)) for each in made}
+    examples = [type(each).__name__.encode() + b"\0" + codecs[type(each).__name__].encode(each) for each in made]
+    names = list(codecs)
+
+    def take(data: bytes) -> None:
+        head, _, payload = data.partition(b"\0")
+        chosen = codecs.get(head.decode("utf-8", "replace")) or codecs[names[len(data) % len(names)]]
+        chosen.encode(chosen.decode(payload))
+
+    yield Target(examples, take, (Undecodable, Unencodable))
+
+
+# ---------------------------------------------------------------------- sweeps
+
+
+def sweep_runs() -> Iterator[Target]:
+    """`runs.jsonl` and `origin.json` of a sweep: lines that cannot be read are counted, not fatal."""
+    from experiments.sweep_runs import Figures  # noqa: PLC0415
+    from experiments.sweep_store import ORIGIN, RUNS, Origin, Store  # noqa: PLC0415
+
+    kinds = {int: 1, float: 0.5, bool: True, str: "x"}
+    blank = {
+        field.name: next((value for kind, value in kinds.items() if field.type is kind), None)
+        for field in msgspec.structs.fields(Figures)
+    }
+    line = json.dumps({"cell": "c", "code": "d", "runs": [blank], "failed": {"3": "why"}}).encode() + b"\n"
+    with place_for(RUNS) as file:
+
+        def take(data: bytes) -> None:
+            runs, _, origin = data.partition(b"\0")
+            file.write_bytes(runs)
+            (file.parent / ORIGIN).write_bytes(origin)
+            with Store(file.parent) as store:
+                store.runs("c", "d")
+                store.missing("c", "d", [1, 2, 3])
+                store.changed_since(Origin("1", "2", "3"))
+
+        yield Target([line * 2 + b'\0{"version":"1","code":"2","file":"3"}', line + line[:30]], take, (DocumentError,))
+
+
+def sweep_arguments() -> Iterator[Target]:
+    """Axes and seeds, one a line."""
+    from experiments.sweep_plan import arguments, cells, seeds_of  # noqa: PLC0415
+
+    read = document.read("triangle")
+    lines = [
+        "trigger.threshold=0.002:0.05:log5", "formation.gain=2:4:lin3", "trigger.kind=mixed,relative", "seeds=5",
+        "seeds=101:150", "tuning=1001:1010", 'formation.links."KH01 - KH02"=0.4,0.5', "formation.gain=1,2,3",
+    ]  # fmt: skip
+    examples = [line.encode() for line in lines] + [b"\n".join([lines[1].encode(), lines[3].encode()])]
+
+    def take(data: bytes) -> None:
+        given = data.decode("utf-8", "surrogateescape").split("\n")[:4]
+        try:
+            axes, words = arguments(given)
+            seeds_of(words.get("seeds"), 1)
+            seeds_of(words.get("tuning"), 1001)
+            few = [replace(axis, values=axis.values[:2]) for axis in axes[:2]]
+            cells(read, "triangle", [], few, [])
+        except DocumentError as error:
+            refused_well(error)
+            raise
+
+    yield Target(examples, take, (DocumentError,))
+
+
+# ---------------------------------------------------------------------- words
+
+
+def words() -> Iterator[Target]:
+    """Addresses, endpoints, settings of devices, faults, key expressions: kind and text with a zero byte between."""
+    from agents import session  # noqa: PLC0415
+    from agents.protocols import crazyflie, khepera4, tello, turtlebot3  # noqa: PLC0415
+    from agents.protocols.settings import settings  # noqa: PLC0415
+    from bridges.crazyflie.positioning import stations  # noqa: PLC0415
+    from bridges.khepera4_link import Address  # noqa: PLC0415
+    from bridges.vicon import split  # noqa: PLC0415
+    from experiments.links import pairs  # noqa: PLC0415
+    from tools.network import KeyExpressionError, key_expression  # noqa: PLC0415
+    from twins import vicon  # noqa: PLC0415
+
+    kinds = (crazyflie.Settings, khepera4.Settings, tello.Settings, turtlebot3.Settings)
+
+    def device(text: str) -> None:
+        table = msgspec.json.decode(text) if text.count("[") + text.count("{") < 500 else {}
+        for kind in kinds:
+            with suppress(BodyError):
+                settings(kind, "R1", table if isinstance(table, dict) else {})
+
+    with place_for("stations.yaml") as file:
+
+        def lighthouse(text: str) -> None:
+            file.write_bytes(text.encode("utf-8", "surrogatepass"))
+            stations(str(file), 4)
+
+        read: dict[str, Callable[[str], object]] = {
+            "endpoint": lambda text: session.config("client", connect=[text], listen=[text]),
+            "crazyflie": lambda text: crazyflie.address("R1", text),
+            "khepera": lambda text: Address.of("R1", text),
+            "tello": lambda text: tello.endpoint("R1", text),
+            "turtlebot": lambda text: turtlebot3.address("R1", text, turtlebot3.Settings()),
+            "vicon": split,
+            "listen": vicon._address,
+            "faults": vicon._faults,
+            "device": device,
+            "key": key_expression,
+            "plugin": lambda text: plugins.struct(plugins.TRIGGERS, text),
+            "link": pairs,
+            "park": lambda text: khepera4.scanned(text) + khepera4.numbers(text),
+            "stations": lighthouse,
+        }
+        good_words = {
+            "endpoint": ["tcp/127.0.0.1:7447", "tls/[::1]:7447?a=b#c", "unixsock-stream//tmp/x", "udp/localhost:1"],
+            "crazyflie": ["radio://0/80/2M/E7E7E7E701", "udp://127.0.0.1:19850", "usb://0"],
+            "khepera": ["khepera4://10.0.0.1:50000", "kteam://host:9", "kteam:///dev/ttyS0"],
+            "tello": ["tello://192.168.10.1", "tello://127.0.0.2:8889"],
+            "turtlebot": ["ros2dds://tb3_0?distro=humble", "rmw://tb3_0?domain=0&distro=jazzy"],
+            "vicon": ["10.0.0.2:801", "host"], "listen": ["127.0.0.1:801"],
+            "faults": ['{"occluded_from_s": 5, "loss": 0.1}'],
+            "device": ['{"odometry":"pose","poll_hz":10}', '{"positioning":{"system":"loco","anchors":[[0,0,1]]}}',
+                       '{"control":"position","log_hz":50,"parameters":{"a.b":1}}',
+                           '{"distro":"humble","watchdog_s":1}'],
+            "key": ["park/*/pose", "park/**"], "plugin": ["periodic", "mixed"], "link": ["A > B", "A - B"],
+            "park": ["0.1,0.2,0.3", "d 10.0 0.5"],
+            "stations": [
+                "type: lighthouse_system_configuration\nversion: '1'\nsystemType: 2\ngeos:\n  0:\n"
+                "    origin: [0, 0, 1]\n    rotation: [[1,0,0],[0,1,0],[0,0,1]]\ncalibs: {}\n"],
+        }  # fmt: skip
+        examples = [f"{kind}\0{text}".encode() for kind, texts in good_words.items() for text in texts]
+        names = list(read)
+
+        def take(data: bytes) -> None:
+            head, _, rest = data.partition(b"\0")
+            name = head.decode("utf-8", "replace")
+            text = rest.decode("utf-8", "surrogateescape")
+            read[name if name in read else names[len(data) % len(names)]](text)
+
+        refusals = (
+            BodyError, EndpointError, KeyExpressionError, plugins.PluginError, argparse.ArgumentTypeError,
+            msgspec.MsgspecError, ValueError,
+        )  # fmt: skip
+        yield Target(examples, take, refusals)
+
+
+PLACES = {
+    "toml": Place(toml, 12_000, 60),
+    "resolved": Place(resolved, 8_000, 40),
+    "arena": Place(arena, 8_000, 40),
+    "overrides": Place(overrides, 12_000, 60),
+    "park-yaml": Place(park_yaml, 4_000, 25),
+    "damaged-recording": Place(damaged, 10_000, 60),
+    "forged-recording": Place(forged, 10_000, 60),
+    "cdr": Place(cdr, 50_000, 500),
+    "sweep-runs": Place(sweep_runs, 30_000),
+    "sweep-arguments": Place(sweep_arguments, 6_000, 30),
+    "words": Place(words, 60_000, 400),
+}

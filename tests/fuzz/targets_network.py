@@ -1,0 +1,296 @@
+"""Whatever arrives on the network: the messages themselves, and every process that polls it."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, redirect_stdout, suppress
+from pathlib import Path
+from threading import Event
+
+import msgspec
+import numpy as np
+
+from agents import wire
+from agents.body import BodyRequest, Disturbance
+from agents.kinds import KINDS
+from agents.runtime import Runtime, Setup
+from experiments import assign, document, orders
+from tests.fuzz.loopnet import Net, Reply, Sample
+from tests.fuzz.messages import KEYS, everything, good, of_all, sent
+from tests.fuzz.target import Place, Renewed, Target
+
+RUBBISH = io.StringIO()  # where processes say what they would say on a terminal
+
+
+def messages() -> Iterator[Target]:
+    """Every struct, both encodings: what is decoded can be encoded again."""
+    kinds = {kind.__name__: kind for kind in wire.M.__constraints__}
+    examples = []
+    for said in [*good("KH01").values(), *of_all().values()]:
+        for message in said:
+            examples += sent(type(message).__name__, message)
+    for kind in (wire.Reply("KH01", True, "ready", "", 0.1), wire.WorldReply(True, False, 0.1, "")):
+        examples += sent(type(kind).__name__, kind)
+    names = list(kinds.values())
+
+    def take(data: bytes) -> None:
+        name, _, rest = data.partition(b"\0")
+        mime, _, payload = rest.partition(b"\0")
+        kind = kinds.get(name.decode("utf-8", "replace")) or names[len(data) % len(names)]
+        message = wire.decode(payload, mime.decode("utf-8", "replace"), kind)
+        wire.encode(message)
+        with suppress(OverflowError):  # JSON holds whole numbers of any length
+            wire.encode(message, "msgpack")
+
+    yield Target(examples, take, (wire.Malformed,))
+
+
+def robot() -> Iterator[Target]:
+    """A robot's process: poses, tokens, orders, stops, positions, ranges; its body is never told nonsense."""
+    from agents.fleet import assemble  # noqa: PLC0415
+
+    experiment = document.read("triangle", ["robots.KH01.position=external", "avoidance=barrier"]).experiment
+
+    def make():
+        net.forget()
+        body = assemble(assign.request(experiment, ["KH01"], [1], ["tcp/127.0.0.1:1"]))
+        setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True], ranging=["world"])
+        runtime = Runtime(assign.assign(experiment, ["KH01"]), body, setup)
+        body.open()
+        runtime._join(net.session)
+        runtime._utc = runtime._telemetry.utc = time.time()
+        command = body.command
+
+        def told(setpoint: np.ndarray) -> None:
+            assert not np.isinf(setpoint).any()
+            assert (np.nan_to_num(np.abs(setpoint)) < 10.0).all(), setpoint
+            command(setpoint)
+
+        body.command = told  # type: ignore[method-assign]
+        t = 0.0
+
+        def tick() -> None:
+            nonlocal t
+            t += 0.01
+            if runtime._estop.rung.is_set():
+                runtime._heed_stops()
+            runtime._tick(t)
+
+        began = runtime._utc
+        for k in range(1, 6):
+            for name in ("KH01", "KH02", "CF01"):
+                for what in ("pose", "position"):
+                    message = msgspec.structs.replace(good(name)[what][0], stamp=began + 0.01 * k)
+                    if what == "pose":
+                        message = msgspec.structs.replace(message, seq=k)
+                    net.deliver(sent(f"park/{name}/{what}", message)[0])
+                net.deliver(f"park/{name}/alive\0\0".encode())
+            if k > 2:
+                order = wire.Order("takeoff") if k == 3 else wire.Order("start", at=began + 0.01 * k)
+                net.deliver(sent("park/KH01/order", order)[0])
+            tick()
+
+        def take(data: bytes) -> None:
+            net.deliver(data, gone=len(data) % 16 == 0)
+            tick()
+
+        return take
+
+    with Net().worn() as net, redirect_stdout(RUBBISH):
+        yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 200))
+
+
+def world() -> Iterator[Target]:
+    """The twin service: commands, states of those elsewhere, statuses, and orders to put things in and out."""
+    from experiments.population import Population  # noqa: PLC0415
+    from experiments.world import WorldProcess  # noqa: PLC0415
+
+    changes = ["robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk"]
+    experiment = document.read("triangle", changes).experiment
+
+    def make():
+        net.forget()
+        process = WorldProcess(experiment, Population(experiment), net.session, Event())  # type: ignore[arg-type]
+        process._exchange.utc = time.time()
+        t = 0.0
+
+        def take(data: bytes) -> None:
+            nonlocal t
+            t += 0.01
+            net.deliver(data)
+            process._tick(t)
+            if process._pace.look(t, 0.01):
+                process._report(t)
+            state = process._population.state
+            assert np.isfinite(state.position[process._population.carried]).all()
+
+        return take
+
+    with Net().worn() as net, redirect_stdout(RUBBISH):
+        yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 200))
+
+
+def recorder() -> Iterator[Target]:
+    """The recorder writes what is honest and counts the rest; what it wrote can be read."""
+    from experiments.recorder import Recorder  # noqa: PLC0415
+    from experiments.recording import Recording  # noqa: PLC0415
+
+    experiment = document.read("triangle").experiment
+
+    def make():
+        nonlocal recording
+        net.forget()
+        if recording is not None:
+            recording.close()
+            recording.path.unlink()
+        path = Path(folder) / f"{time.monotonic_ns()}.mcap"
+        recording = Recording(path, experiment, case="only", seed=1, clock="real")
+        made = Recorder(net.session, KEYS, recording)  # type: ignore[arg-type]
+
+        def take(data: bytes) -> None:
+            net.deliver(data)
+            made.take()
+
+        return take
+
+    recording: Recording | None = None
+    with tempfile.TemporaryDirectory() as folder, Net().worn() as net:
+        yield Target(everything("KH01", "KH02"), Renewed(make, 1000))
+        if recording is not None:
+            recording.close()
+
+
+def conductor() -> Iterator[Target]:
+    """The conductor follows the robots' statuses, states and tokens."""
+    from experiments.conductor import Conductor  # noqa: PLC0415
+
+    experiment = document.read("triangle").experiment
+
+    class Nobody:
+        def died(self) -> list[object]:
+            return []
+
+    def make():
+        net.forget()
+        file = Path(folder) / "case.json"
+        file.write_bytes(document.write_json(experiment))
+        made = Conductor(
+            experiment, "only", file=file, source=file, folder=Path(folder), endpoints=["tcp/127.0.0.1:1"],
+            launcher=Nobody(), show=lambda _: None, interrupted=lambda: False,  # type: ignore[arg-type]
+        )  # fmt: skip
+        made._join(ExitStack())
+
+        def take(data: bytes) -> None:
+            net.deliver(data, gone=len(data) % 16 == 0)
+            made._look()
+
+        return take
+
+    with tempfile.TemporaryDirectory() as folder, Net().worn() as net, redirect_stdout(RUBBISH):
+        yield Target(everything("KH01", "KH02", "CF01"), Renewed(make, 500))
+
+
+def request(kind: str, address: str, count: int = 1) -> BodyRequest:
+    """Robots of one kind."""
+    return BodyRequest(
+        names=tuple(f"KH{row + 1:02}" for row in range(count)), kinds=(KINDS[kind],) * count,
+        addresses=(address,) * count, start=np.zeros((count, 3)), yaw=np.zeros(count), rate_hz=100.0,
+        seeds=(1,) * count, disturbance=(Disturbance(),) * count, external=(False,) * count, device=({},) * count,
+        endpoints=("tcp/127.0.0.1:1",), keys=KEYS,
+    )  # fmt: skip
+
+
+def external_body() -> Iterator[Target]:
+    """A body elsewhere says where it is and what it sees."""
+    from bridges.external import ExternalBody  # noqa: PLC0415
+
+    def make():
+        net.forget()
+        for name in ("KH01", "KH02"):
+            key = KEYS.position(name)
+            place = wire.Position(name, time.time(), (0.0, 0.0, 0.0), 0.1)
+            net.first[key] = Sample(key, wire.JSON, wire.encode(place))
+        body = ExternalBody(request("khepera4", "external", 2))
+        body.open()
+        t = 0.0
+
+        def take(data: bytes) -> None:
+            nonlocal t
+            t += 0.01
+            net.deliver(data)
+            state = body.read(t)
+            assert np.isfinite(state.position).all()
+            body.command(np.zeros((2, 4)))
+
+        return take
+
+    with Net().worn() as net:
+        yield Target(everything("KH01", "KH02", only=("position", "ranges", "state")), Renewed(make, 200))
+
+
+def vicon_truths() -> Iterator[Target]:
+    """The simulated Vicon hears where twins are."""
+    from twins.vicon import Truths, ViconTwin  # noqa: PLC0415
+
+    with Net().worn() as net:
+        vicon = ViconTwin(["KH01", "KH02"])
+        truths = Truths(net.session, KEYS, ["KH01", "KH02"])  # type: ignore[arg-type]
+        t = 0.0
+
+        def take(data: bytes) -> None:
+            nonlocal t
+            t += 0.01
+            net.deliver(data)
+            truths.show(vicon, time.time())
+            vicon.advance(t)
+
+        try:
+            yield Target(everything("KH01", "KH02", only=("truth",)), take)
+        finally:
+            vicon.close()
+
+
+def answers() -> Iterator[Target]:
+    """Whoever gives orders reads the answers; whoever looks at the network the admin space."""
+    from tools.network import members, readable  # noqa: PLC0415
+
+    examples = []
+    for message in (wire.Reply("KH01", True, "ready", "", 0.1), wire.WorldReply(True, False, 1.0, "")):
+        examples += sent("park/KH01/order", message)
+    admin = {
+        "@/f00d/router/token/park/KH01/alive": b'{"clients":["aa","bb"],"peers":[]}',
+        "@/f00d/router/publisher/park/KH01/pose": b'{"clients":["aa"]}',
+        "@/aa/client": b'{"zid":"aa","metadata":{"name":"KH01"}}',
+        "@/f00d/router": b'{"zid":"f00d","metadata":null}',
+    }
+    examples += [b"\0".join([key.encode(), b"application/json", text]) for key, text in admin.items()]
+
+    def take(data: bytes) -> None:
+        key, _, rest = data.partition(b"\0")
+        mime, _, payload = rest.partition(b"\0")
+        kind = mime.decode("utf-8", "replace")
+        made = [Sample(key.decode("utf-8", "replace"), kind, payload)]
+        net.replies = [Reply(sample, good=len(data) % 8 > 0) for sample in made]
+        assert isinstance(orders.give(net.session, KEYS, "KH01", wire.Order("hold")), wire.Reply)  # type: ignore[arg-type]
+        assert isinstance(orders.give_world(net.session, KEYS, wire.WorldOrder("pause")), wire.WorldReply)  # type: ignore[arg-type]
+        assert readable(payload, kind).isprintable()
+        for member in members(net.session):  # type: ignore[arg-type]
+            msgspec.json.encode(member)
+
+    net = Net()
+    yield Target(examples, take)
+
+
+PLACES = {
+    "messages": Place(messages, 300_000, 1000),
+    "robot": Place(robot, 100_000, 600),
+    "world": Place(world, 50_000, 300),
+    "recorder": Place(recorder, 60_000),
+    "conductor": Place(conductor, 60_000),
+    "external-body": Place(external_body, 30_000),
+    "vicon-truths": Place(vicon_truths, 20_000),
+    "answers": Place(answers, 40_000),
+}

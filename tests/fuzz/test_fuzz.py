@@ -1,0 +1,63 @@
+"""Nothing that arrives from outside escapes as a traceback: a few hundred spoilt inputs each, and those that once did.
+
+`zenpark test --nightly` tries a million; what it finds is added to the folder `once`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.fuzz.fuzz import Tally, drive, generator, replay
+from tests.fuzz.mutate import LARGEST, Mutator
+from tests.fuzz.places import PLACES
+
+ONCE = sorted((Path(__file__).parent / "once").glob("*.bin"))
+HEAVY = {name for name, place in PLACES.items() if place.quick <= 60}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in HEAVY else name for name in PLACES]
+)
+def test_nothing_escapes(name: str) -> None:
+    place, tally = PLACES[name], Tally()
+    with place.open() as target:
+        drive(target, place.quick, generator(1, name, 0), tally, bombs=False)
+    assert not tally.escaped, "\n".join(text for _, text in tally.kept)
+    assert tally.refused < tally.inputs, "no good example is read"
+
+
+@pytest.mark.parametrize("file", ONCE, ids=lambda file: file.stem)
+def test_what_escaped_once_does_not_again(file: Path) -> None:
+    assert replay(PLACES[file.name.partition("--")[0]], file.read_bytes())
+
+
+def test_every_example_is_found_by_name() -> None:
+    assert {file.name.partition("--")[0] for file in ONCE} <= set(PLACES)
+    assert sum(place.inputs for place in PLACES.values()) >= 1_000_000
+
+
+def test_inputs_are_the_same_for_a_seed_and_not_too_long() -> None:
+    examples = [b'{"a":[1,2.5,"x"]}', b'{"b":null}']
+    first, second = (Mutator(examples, np.random.default_rng(3)) for _ in range(2))
+    made = [first.spoilt() for _ in range(500)]
+    assert made == [second.spoilt() for _ in range(500)]
+    assert len(set(made)) > 400
+    assert max(map(len, made)) <= LARGEST
+
+
+def test_what_escapes_is_told_with_its_place() -> None:
+    from tests.fuzz.target import Target  # noqa: PLC0415
+
+    def careless(data: bytes) -> int:
+        return data[3] if len(data) < 10 else int(data)
+
+    tally = Tally()
+    drive(Target([b"123456"], careless, (ValueError,)), 300, np.random.default_rng(1), tally, bombs=True)
+    assert tally.inputs == 300
+    assert tally.refused > 0
+    (way,) = tally.escaped
+    assert way.startswith("IndexError in test_fuzz.py")
+    assert len(tally.kept) == 1
