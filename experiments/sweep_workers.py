@@ -142,7 +142,7 @@ class Cluster:
         except ImportError:
             raise SweepError(
                 "--scheduler needs a library that is an extra: ./zenpark install distributed, or "
-                "uv pip install 'zenpark[cluster]'"
+                "pip install -e '.[cluster]'"
             ) from None
         if not ADDRESS.fullmatch(self._address):
             raise SweepError(f"--scheduler {self._address}: this is no address; write one as tcp://192.0.2.7:8786")
