@@ -11,6 +11,7 @@ import zenoh
 from agents import plausibility, wire
 from agents import session as network
 from agents.agent import Agent
+from agents.channel import Channel, Conditions
 from agents.guidance import Guidance
 from agents.keys import Keys
 
@@ -24,33 +25,53 @@ class HeardGoals:
     """
 
     def __init__(
-        self, session: zenoh.Session, keys: Keys, agent: Agent, guidance: Guidance, reach: wire.Vector
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        agent: Agent,
+        guidance: Guidance,
+        *,
+        reach: wire.Vector,
+        conditions: Conditions | None = None,
     ) -> None:
-        """Listens for the guided rows of `agent`; no goal beyond `reach` [m] is believed."""
+        """Listens for the guided rows of `agent`; no goal beyond `reach` [m] is believed.
+
+        `conditions` are what is done to the goals of each guided row on their way; None: nothing.
+        """
         self._session, self._agent, self._guidance, self._reach = session, agent, guidance, reach
         self._names: Sequence[str] = agent.assignment.names
         rows = np.flatnonzero(guidance.guided).tolist()
         self._goals = [(row, network.subscriber(session, keys.goal(self._names[row]), 8)) for row in rows]
         self._watch = network.alive_watch(session, keys.centre_alive)
         self._seq = dict.fromkeys(rows, 0)
+        self._rows = np.array(rows, dtype=np.intp)
+        self._channel = Channel(conditions or Conditions.ideal(len(rows)))
         self.malformed = 0
         self.news: list[list[wire.Followed]] = [[] for _ in self._names]
 
     def take(self, t: float, utc: float) -> None:
         """Takes in what has come by `t` [s] of a clock that was 0 at `utc`."""
-        for row, goals in self._goals:
+        for link, (row, goals) in enumerate(self._goals):
             for sample in network.received(goals.handler):
-                self._hear(row, sample, t, utc)
+                self._hear(link, row, sample, t, utc)
+        if (got := self._channel.due(t)) is not None and got.extra is not None:
+            said = (got.link.tolist(), got.seq.tolist(), got.stamp.tolist(), got.position, got.extra.tolist())
+            for link, seq, stamp, position, (toward, sent, pose) in zip(*said, strict=True):
+                which = self._rows[[link]]
+                news = self._agent.hear_goal(which, position[None], np.array([toward]), np.array([stamp]))
+                if news.any():
+                    self.news[which[0]].append(wire.Followed(seq, utc + sent, utc + pose, utc + t))
         for sample in network.received(self._watch.handler):
             if sample.kind == zenoh.SampleKind.PUT:
                 self._guidance.find()
             elif network.connected(self._session):  # without a router every token is gone, and that is another matter
                 self._guidance.lose(t)
 
-    def _hear(self, row: int, sample: zenoh.Sample, t: float, utc: float) -> None:
+    def _hear(self, link: int, row: int, sample: zenoh.Sample, t: float, utc: float) -> None:
         oldest_s = self._agent.assignment.limits.link_silence_s
+        payload = sample.payload.to_bytes()
         try:
-            goal = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Goal)
+            goal = wire.decode(payload, str(sample.encoding), wire.Goal)
             plausibility.check_goal(goal, robot=self._names[row], now=utc + t, reach=self._reach, oldest_s=oldest_s)
             if goal.seq <= self._seq[row]:
                 raise wire.Malformed(f"goal {goal.seq} after {self._seq[row]}")
@@ -58,8 +79,17 @@ class HeardGoals:
             self.malformed += 1
             return
         self._seq[row] = goal.seq
-        toward = np.array([nan if goal.yaw is None else goal.yaw])
         # a clock that is ahead must not keep a goal fresh for longer than it is
-        stamp = np.array([min(goal.stamp - utc, t)])
-        if self._agent.hear_goal(np.array([row]), np.array([goal.position]), toward, stamp).any():
-            self.news[row].append(wire.Followed(goal.seq, goal.stamp, goal.pose, utc + t))
+        stamp, sent = min(goal.stamp - utc, t), goal.stamp - utc
+        start = self._agent.life.start_at[[row]]
+        self._channel.send(
+            np.array([link]),
+            np.array([goal.seq]),
+            np.array([stamp]),
+            np.array([goal.position]),
+            np.zeros((1, 3)),
+            start=start,
+            size=np.array([len(payload)]),
+            now=t,
+            extra=np.array([[nan if goal.yaw is None else goal.yaw, sent, goal.pose - utc]]),
+        )

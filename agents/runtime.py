@@ -55,6 +55,7 @@ class Setup:
         ranging: Where each row's range readings come from: its body; the world, which says them on the row's key
             `ranges` ("world"); or that key too, but the body hears them by itself ("far"). Left out: the bodies.
         conditions: What is done to poses that have come from neighbours, on each link; None: nothing.
+        goal_conditions: The same for goals that have come from a centre, for each guided row.
     """
 
     keys: Keys
@@ -65,6 +66,7 @@ class Setup:
     located: Sequence[bool]
     ranging: Sequence[Ranging] = ()
     conditions: Conditions | None = None
+    goal_conditions: Conditions | None = None
 
 
 @dataclass
@@ -189,7 +191,10 @@ class Runtime:
         self._subscribers = [network.pose_subscriber(session, keys.pose(name)) for name in by_speaker]
         self._watches = [network.alive_watch(session, keys.alive(name)) for name in by_speaker]
         guidance = self.agent.guidance
-        self._goals = None if guidance is None else HeardGoals(session, keys, self.agent, guidance, self._reach)
+        self._goals = None
+        if guidance is not None:
+            of_goals = self._setup.goal_conditions
+            self._goals = HeardGoals(session, keys, self.agent, guidance, reach=self._reach, conditions=of_goals)
         self._neighbours = [
             _Neighbour(name, links, poses.handler, watch.handler)
             for (name, links), poses, watch in zip(by_speaker.items(), self._subscribers, self._watches, strict=True)

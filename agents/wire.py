@@ -157,7 +157,7 @@ class CentreState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `robots` are guided; `missing` are those that it needs and never heard, or that are gone. `load` is the share of a
     core that it took in the last second, `late_s` the largest lateness of a decision in it. The others count since its
     process began: `decisions`, and `missed` ones that were too late to be made, and `goals` sent. Of poses only those
-    count that were taken in the run: `heard`, and `lost` by their numbers, per robot.
+    count that were taken in the run, per robot: `heard`, `lost` by their numbers, `dropped` by the modelled network.
     """
 
     stamp: float
@@ -170,6 +170,7 @@ class CentreState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     goals: int
     heard: dict[str, int]
     lost: dict[str, int]
+    dropped: dict[str, int]
     malformed: int
     pid: int
     cpu_s: float

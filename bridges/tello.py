@@ -165,7 +165,7 @@ def _library() -> _Make:
     except ModuleNotFoundError as error:
         raise BodyError(
             f"flying a Tello needs djitellopy, which is not installed ({error.name} is missing): "
-            "uv pip install 'zenpark[tello]'"
+            "pip install -e '.[tello]'"
         ) from error
     library.Tello.LOGGER.setLevel(logging.ERROR)  # it says every command
     if not library.threads_initialized:

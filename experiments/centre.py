@@ -26,12 +26,13 @@ import zenoh
 from agents import plausibility, plugins, wire
 from agents import session as network
 from agents.centre import Centre, Told
+from agents.channel import Channel, Samples
 from agents.keys import Keys
 from agents.lifecycle import IDLE, Phase
 from agents.lifeline import Lifeline
 from agents.runtime import reach_of
 from agents.telemetry import resident_mb
-from experiments import document
+from experiments import conditions, document
 from experiments.assign import assign_centre, guided
 from experiments.experiment import Experiment
 from experiments.problem import DocumentError, Problem
@@ -78,6 +79,7 @@ class CentreProcess:
         names, rows = self._names, centre.listens.tolist()
         self._subscribers = [network.pose_subscriber(session, keys.pose(names[row]), DEPTH) for row in rows]
         self._watches = [network.alive_watch(session, keys.alive(names[row])) for row in rows]
+        self._channel = Channel(conditions.to_centre(experiment, centre.listens))
         self._robots = [
             _Robot(names[row], row, poses.handler, watch.handler)
             for row, poses, watch in zip(rows, self._subscribers, self._watches, strict=True)
@@ -120,22 +122,26 @@ class CentreProcess:
         for row, statuses in self._statuses.items():
             for sample in network.received(statuses.handler):
                 self._heed(row, sample)
-        for robot in self._robots:
+        for link, robot in enumerate(self._robots):
             for sample in network.received(robot.poses):
-                self._hear(robot, sample, t)
+                self._hear(link, robot, sample, t)
             for sample in network.received(robot.alive):
                 if sample.kind == zenoh.SampleKind.DELETE:
+                    self._channel.forget(np.array([link]))
                     self.centre.lose(np.array([robot.row]), t)
                 else:
                     self.centre.find(np.array([robot.row]))
+        if (got := self._channel.due(t)) is not None:
+            self._believe(got)
         begun = float(self._start[self._guided].min())
         if begun != self._begun and isfinite(begun):  # decisions fall on the same instants as those of the robots
             self._begun = begun
             self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
 
-    def _hear(self, robot: _Robot, sample: zenoh.Sample, t: float) -> None:
+    def _hear(self, link: int, robot: _Robot, sample: zenoh.Sample, t: float) -> None:
+        payload = sample.payload.to_bytes()
         try:
-            pose = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Pose)
+            pose = wire.decode(payload, str(sample.encoding), wire.Pose)
             plausibility.check_pose(pose, robot=robot.name, now=self._utc + t, reach=self._reach)
         except wire.Malformed:
             self._malformed += 1
@@ -143,18 +149,33 @@ class CentreProcess:
         if pose.stamp <= robot.stamp:
             return  # known already: told again after a reconnection
         start = float(self._start[self._guided].min())
-        if 0.0 <= pose.stamp - self._utc - start + ROUNDING_S < self.centre.assignment.duration:
-            robot.heard += 1
+        if self._within(pose.stamp - self._utc, start):
             robot.lost += max(0, pose.seq - robot.seq - 1) if robot.seq else 0
         robot.seq, robot.stamp = pose.seq, pose.stamp
-        self.centre.hear(
-            np.array([robot.row]),
+        self._channel.send(
+            np.array([link]),
+            np.array([pose.seq]),
+            np.array([pose.stamp - self._utc]),
             np.array([pose.position]),
             np.array([pose.velocity]),
-            np.array([pose.yaw]),
-            np.array([pose.stamp - self._utc]),
-            np.array([t]),
+            start=np.array([start]),
+            size=np.array([len(payload)]),
+            now=t,
+            extra=np.array([[pose.yaw]]),
         )
+
+    def _believe(self, got: Samples) -> None:
+        """Poses have got through."""
+        assert got.extra is not None  # all bring their yaw along
+        rows = self.centre.listens[got.link]
+        self.centre.hear(rows, got.position, got.velocity, got.extra[:, 0], got.stamp, got.arrival)
+        start = float(self._start[self._guided].min())
+        for link, stamp in zip(got.link.tolist(), got.stamp.tolist(), strict=True):
+            self._robots[link].heard += self._within(stamp, start)
+
+    def _within(self, taken: float, start: float) -> bool:
+        """Whether a pose was taken in the run that began at `start` [s]."""
+        return 0.0 <= taken - start + ROUNDING_S < self.centre.assignment.duration
 
     def _heed(self, row: int, sample: zenoh.Sample) -> None:
         try:
@@ -199,6 +220,7 @@ class CentreProcess:
             goals=self._sent,
             heard={robot.name: robot.heard for robot in self._robots},
             lost={robot.name: robot.lost for robot in self._robots},
+            dropped=dict(zip((robot.name for robot in self._robots), self._channel.dropped.tolist(), strict=True)),
             malformed=self._malformed,
             pid=os.getpid(),
             cpu_s=cpu_s,

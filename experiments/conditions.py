@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 
 from agents import chance
 from agents.channel import Conditions, Outage
-from agents.graph import Links
-from agents.rows import Array, Mask
+from agents.graph import Links, links
+from agents.rows import Array, Index, Mask
+from experiments.assign import guided
 from experiments.experiment import Channel, Experiment, LinkChannel
 from experiments.links import pairs
 
 OWN_S: Final = Channel().delay_s  # any real network takes as long: to wait for it would cost a tick in ten milliseconds
 _PLAIN: Final = LinkChannel()
+TO_CENTRE, FROM_CENTRE = "to centre", "from centre"  # streams
 
 
 def modelled(experiment: Experiment) -> bool:
@@ -32,24 +34,38 @@ def of_link(channel: Channel, own: LinkChannel = _PLAIN) -> LinkChannel:
     return LinkChannel(**{name: getattr(channel, name) if value is None else value for name, value in given.items()})
 
 
-def virtual(experiment: Experiment, links: Links, seeds: Sequence[int], *, stream: str = "") -> Conditions:
-    """Of all links of all repetitions, those of the first seed first; rows are the robots in the order of the file.
+def virtual(experiment: Experiment, over: Links, seeds: Sequence[int], *, stream: str = "") -> Conditions:
+    """Of all links `over` of all repetitions, those of the first seed first; rows are the robots as in the file.
 
     What else goes between the same robots has another `stream`, and its own luck.
     """
-    ends = _Ends.of(experiment, links.take(np.arange(len(links) // len(seeds))), tuple(experiment.robots))
+    ends = _Ends.of(experiment, over.take(np.arange(len(over) // len(seeds))), tuple(experiment.robots))
     return Conditions.side_by_side(_seeded(_of(experiment.channel, ends, experiment.duration_s), ends, seeds, stream))
 
 
-def at_listeners(experiment: Experiment, links: Links, listeners: Sequence[str], *, stream: str = "") -> Conditions:
+def at_listeners(experiment: Experiment, over: Links, listeners: Sequence[str], *, stream: str = "") -> Conditions:
     """Of the links on which robots of one process listen, on a real network, which has a delay of its own.
 
-    `links.listener` counts in `listeners`, `links.speaker` in the robots of the file.
+    `over.listener` counts in `listeners`, `over.speaker` in the robots of the file.
     """
-    ends = _Ends.of(experiment, links, listeners)
+    ends = _Ends.of(experiment, over, listeners)
     bare = _of(experiment.channel, ends, experiment.duration_s)
     bare = replace(bare, delay=np.where(bare.delay > OWN_S, bare.delay, 0.0))
     return _seeded(bare, ends, [experiment.seed], stream)[0]
+
+
+def to_centre(experiment: Experiment, speakers: Index) -> Conditions:
+    """Of poses that the centre hears from robots `speakers` (K,), rows of the file, on a real network."""
+    names = tuple(experiment.robots)
+    pairs = [(row, row) for row in speakers.tolist()]
+    return at_listeners(experiment, links(pairs), names, stream=TO_CENTRE)
+
+
+def from_centre(experiment: Experiment, listeners: Sequence[str]) -> Conditions:
+    """Of goals that those of the robots `listeners` hear which are guided, in their order, on a real network."""
+    names, told = tuple(experiment.robots), guided(experiment)
+    pairs = [(row, names.index(name)) for row, name in enumerate(listeners) if name in told]
+    return at_listeners(experiment, links(pairs), listeners, stream=FROM_CENTRE)
 
 
 @dataclass(frozen=True)

@@ -270,6 +270,6 @@ def _savemat() -> Any:  # noqa: ANN401 - scipy has no types
         return import_module("scipy.io").savemat  # an extra
     except ImportError:
         raise ExportError(
-            "MATLAB files need a library that is an extra: ./zenpark install scipy, or uv pip install "
-            "'zenpark[matlab]'; a table needs none: --csv"
+            "MATLAB files need a library that is an extra: ./zenpark install scipy, or pip install -e "
+            "'.[matlab]'; a table needs none: --csv"
         ) from None

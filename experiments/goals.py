@@ -38,7 +38,8 @@ class Goals:
         follower: (A,) row of its robot.
         delay: (A,) see above [s].
         heard: (N,) poses of each robot that the centre heard.
-        lost: (N,) and those that it never got.
+        lost: (N,) and those that never came, by their numbers.
+        dropped: (N,) and those that the modelled network dropped.
         reports: What the centre said of itself, stamps in seconds since the common start; of no meaning in virtual
             time, where it takes no time.
     """
@@ -52,6 +53,7 @@ class Goals:
     delay: Array
     heard: Index
     lost: Index
+    dropped: Index
     reports: tuple[wire.CentreState, ...] = ()
 
 
@@ -97,7 +99,8 @@ def report(steered: Steered, names: Sequence[str], first: int, duration: float) 
         missed=0,
         goals=len(goals.time),
         heard=dict(zip(names, goals.heard.tolist(), strict=True)),
-        lost=dict(zip(names, goals.lost.tolist(), strict=True)),
+        lost=dict.fromkeys(names, 0),
+        dropped=dict(zip(names, goals.dropped.tolist(), strict=True)),
         malformed=0,
         pid=0,
         cpu_s=0.0,
@@ -131,7 +134,8 @@ def of_log(steered: Steered, names: Sequence[str], first: int, duration: float, 
         follower=row[anew] - first,
         delay=(time - pose)[anew],
         heard=np.bincount(steered.heard[1][heard] - first, minlength=rows),
-        lost=steered.lost_poses[first : first + rows],
+        lost=np.zeros(rows, dtype=np.intp),
+        dropped=steered.lost_poses[first : first + rows],
     )
 
 
@@ -170,7 +174,7 @@ def of_recording(
     reached, anew = within(acted[0]), _first(acted[0], follower, acted[2])
     anew &= reached
     said = sorted(reports, key=lambda each: each.stamp)
-    heard, lost = (_grown(said, what, start, start + duration) for what in ("heard", "lost"))
+    heard, lost, dropped = (_grown(said, what, start, start + duration) for what in ("heard", "lost", "dropped"))
     return Goals(
         time=sent[0],
         robot=sent[1].astype(np.intp),
@@ -181,6 +185,7 @@ def of_recording(
         delay=(acted[0] - acted[2])[anew],
         heard=np.array([heard[name] for name in row], dtype=np.intp),
         lost=np.array([lost[name] for name in row], dtype=np.intp),
+        dropped=np.array([dropped[name] for name in row], dtype=np.intp),
         reports=tuple(
             msgspec.structs.replace(each, stamp=each.stamp - start)
             for each in said

@@ -85,7 +85,7 @@ def guidance(trace: Trace) -> Guidance | None:
         goal_bytes=int(goals.bytes.sum()),
         goals_lost=max(0, len(goals.time) - int(goals.reached.sum())),
         heard=int(goals.heard.sum()),
-        poses_lost=int(goals.lost.sum()),
+        poses_lost=int(goals.lost.sum() + goals.dropped.sum()),
         delay_mean_s=all_of_them.mean,
         delay_p95_s=all_of_them.p95,
         delay_max_s=all_of_them.largest,

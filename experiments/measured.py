@@ -88,7 +88,7 @@ class Guidance(msgspec.Struct, frozen=True):
         goal_bytes: Their payload [bytes].
         goals_lost: That did not reach their robots; those of the last instant may still have been under way.
         heard: Poses that it heard.
-        poses_lost: And those that it never got, by their running numbers.
+        poses_lost: And those that it never got, because they were lost or the modelled network dropped them.
         delay_mean_s: From the measurement of a robot's pose to its acting on the first goal that rests on it [s];
             None if no pose was answered.
         delay_p95_s: 95 % of these delays are shorter [s].

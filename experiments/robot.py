@@ -50,6 +50,7 @@ def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[
         located=[experiment.robots[name].position == "external" for name in names],
         ranging=[_ranging(experiment.robots[name]) for name in names],
         conditions=conditions.at_listeners(experiment, assignment.links, names),
+        goal_conditions=conditions.from_centre(experiment, names),
     )
     return Runtime(assignment, body, setup).run()
 

@@ -14,6 +14,7 @@ from agents.graph import links
 from agents.rows import Array, Index
 from experiments import assign
 from experiments.channel import Channel
+from experiments.conditions import FROM_CENTRE, TO_CENTRE
 from experiments.experiment import Experiment
 
 
@@ -56,7 +57,7 @@ class Steering:
         ends = [[(row, row) for row in group.tolist()] for group in (self.centre.listens, told)]
         self._poses, self._goals = (
             Channel(experiment, links(pairs), seeds, stream=stream)
-            for pairs, stream in zip(ends, ("to centre", "from centre"), strict=True)
+            for pairs, stream in zip(ends, (TO_CENTRE, FROM_CENTRE), strict=True)
         )
         self._poses_of, self._goals_of = (np.array([row for row, _ in pairs], dtype=np.intp) for pairs in ends)
         self._seq: Index = np.zeros(rows, dtype=np.intp)

@@ -90,11 +90,11 @@ class Processes:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
             for child in multiprocessing.active_children():
                 if child not in self._others:
                     child.terminate()
-            self._pool.shutdown()
+            # once, and waiting: a thread of the pool that still runs when the interpreter ends may print a traceback
+            self._pool.shutdown(cancel_futures=True)
 
     def done(self, works: Sequence[Work]) -> Iterator[tuple[Work, Outcome]]:
         """See `Workers.done`."""
@@ -142,7 +142,7 @@ class Cluster:
         except ImportError:
             raise SweepError(
                 "--scheduler needs a library that is an extra: ./zenpark install distributed, or "
-                "uv pip install 'zenpark[cluster]'"
+                "pip install -e '.[cluster]'"
             ) from None
         if not ADDRESS.fullmatch(self._address):
             raise SweepError(f"--scheduler {self._address}: this is no address; write one as tcp://192.0.2.7:8786")

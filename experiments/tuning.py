@@ -288,7 +288,7 @@ def _library() -> Any:  # noqa: ANN401 - it has no types
         return import_module("cma")
     except ImportError:
         raise SweepError(
-            "--optimize needs a library that is an extra: ./zenpark install cma, or uv pip install 'zenpark[optimize]'"
+            "--optimize needs a library that is an extra: ./zenpark install cma, or pip install -e '.[optimize]'"
         ) from None
 
 

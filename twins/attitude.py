@@ -114,7 +114,7 @@ class Drones(Piloted):
         except ImportError:
             raise BodyError(
                 "the engine mujoco needs a library that is an extra: ./zenpark install mujoco-core, or "
-                "uv pip install 'zenpark[mujoco]'"
+                "pip install -e '.[mujoco]'"
             ) from None
         super().__init__(kinds, start, yaw, dt)
         rows = len(kinds)

@@ -119,7 +119,7 @@ def types(distro: Distro) -> Types:
 
 
 def _missing() -> BodyError:
-    return BodyError("ROS 2 messages need rosbags and xxhash: uv pip install 'rosbags>=0.11.9' 'xxhash>=3.5'")
+    return BodyError("ROS 2 messages need rosbags and xxhash: ./zenpark hardware")
 
 
 # ---------------------------------------------------------------------- names

@@ -49,9 +49,7 @@ def prepare() -> None:
     try:
         import cflib.crtp  # noqa: PLC0415 - an optional extra, under another licence
     except ModuleNotFoundError:
-        raise BodyError(
-            "Crazyflies need cflib (GPL-3.0), which is an extra: uv pip install 'zenpark[crazyflie]'"
-        ) from None
+        raise BodyError("Crazyflies need cflib (GPL-3.0), which is an extra: pip install -e '.[crazyflie]'") from None
     if not cflib.crtp.CLASSES:  # a second call would register every driver twice
         cflib.crtp.init_drivers()
     logging.getLogger("cflib").setLevel(logging.CRITICAL)  # it logs tracebacks of what is reported here

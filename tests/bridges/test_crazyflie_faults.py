@@ -170,7 +170,7 @@ def test_wrong_settings(device, said):
 def test_library_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "cflib", None)
     monkeypatch.delitem(sys.modules, "cflib.crtp", raising=False)
-    with pytest.raises(BodyError, match=r"uv pip install 'zenpark\[crazyflie\]'"):
+    with pytest.raises(BodyError, match=r"pip install -e '\.\[crazyflie\]'"):
         open_crazyflie(request("crazyflie", [RADIO.format(1)])).open()
 
 

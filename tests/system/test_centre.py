@@ -70,7 +70,7 @@ def test_robots_hold_while_the_centre_is_dead_and_go_on_when_it_is_back(tmp_path
     died = killed - playback.read(folder / "default.mcap").started
     back = trace.goals.time[trace.goals.time > died + 0.15].min()  # of the centre that was started again
     assert 0.2 < back - died < 4.0
-    quiet = (trace.time > died + 0.35) & (trace.time < back - 0.05)
+    quiet = (trace.time > died + 0.16) & (trace.time < back)  # at the next decision they hold
     assert quiet.any()
     for row, name in enumerate(trace.robots):
         held = np.ptp(trace.goal[quiet, row], axis=0).max()
@@ -138,14 +138,13 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
     subscriber = network.pose_subscriber(watcher.session, KEYS.centre)
     reports: list[wire.CentreState] = []
 
-    def reported() -> bool:
+    def reported() -> object:
         came = network.received(subscriber.handler)
         reports.extend(wire.decode(each.payload.to_bytes(), str(each.encoding), wire.CentreState) for each in came)
-        return bool(reports)
+        return reports and reports[-1].heard["KH01"] > 0  # the first may be from before the start
 
     watcher.until(reported, "the centre says how it is")
     assert (reports[-1].robots, reports[-1].missing) == (["TB01", "KH01", "KH02"], [])
-    assert reports[-1].heard["KH01"] > 0
     centre.terminate()
     assert centre.wait(10.0) == 0
     centre.stdout.close()

@@ -12,7 +12,7 @@ from agents.rows import Index
 from experiments import playback
 from experiments.experiment import Experiment
 from experiments.logbook import Logbook
-from experiments.run import load
+from experiments.run import load, reopen
 from experiments.trace import Trace
 from experiments.virtual import simulate
 from tests.system.lab import Flight
@@ -63,3 +63,22 @@ def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Pat
     assert np.median(delay) < 0.07  # the next tick after those 50 ms, and what a busy machine adds
     assert real.dropped is not None
     assert real.dropped.sum() == pytest.approx(0.3 * 150 * len(pairs), rel=0.15)
+
+
+def test_a_centre_hears_and_is_heard_over_the_same_network(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    changes = [part for change in (*BAD, "duration_s=4") for part in ("--set", change)]
+    changes += ["--set", "architecture=centralised"]
+    flight = Flight(folder, "triangle", "--case", "periodic", "--json", "--no-report", *changes)
+    code, _ = flight.finish(60.0)
+    assert code == 0, flight.said
+    case = reopen(folder).metrics["periodic"]
+    centre = case.guidance
+    assert centre is not None
+    assert case.lost == 0, "of the real network nothing is lost"
+    sent = sum(robot.messages for robot in case.robots)
+    assert centre.poses_lost / sent == pytest.approx(0.3, abs=0.07)
+    assert centre.goals_lost / centre.goals == pytest.approx(0.3, abs=0.15)
+    goals = playback.read(folder / "periodic.mcap").trace.goals
+    assert goals is not None
+    assert goals.delay.min() >= 0.1 - 1e-5, "both ways"
