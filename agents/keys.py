@@ -87,6 +87,11 @@ class Keys:
         return f"{self.realm}/run/experiment"
 
     @property
+    def clock(self) -> str:
+        """How the clocks of other machines lie to the conductor's."""
+        return f"{self.realm}/run/clock"
+
+    @property
     def recorder(self) -> str:
         """Liveliness token of the recorder."""
         return f"{self.realm}/run/recorder"

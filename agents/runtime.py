@@ -23,6 +23,7 @@ from agents import wire
 from agents.agent import Actions, Agent, links_by_speaker
 from agents.assignment import Assignment
 from agents.body import Body
+from agents.clock import MACHINE, Clock
 from agents.keys import Keys
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
@@ -51,6 +52,8 @@ class Setup:
         located: Which rows get their position from outside.
         ranging: Where each row's range readings come from: its body; the world, which says them on the row's key
             `ranges` ("world"); or that key too, but the body hears them by itself ("far"). Left out: the bodies.
+        clock: Of the experiment.
+        once: Whether the process ends when its robots are down after an experiment.
     """
 
     keys: Keys
@@ -60,6 +63,8 @@ class Setup:
     lifeline: bool
     located: Sequence[bool]
     ranging: Sequence[Ranging] = ()
+    clock: Clock = MACHINE
+    once: bool = False
 
 
 @dataclass
@@ -299,7 +304,7 @@ class Runtime:
         gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
         zero = time.monotonic()
         # one reading: a step of the wall clock in mid-run does not move the experiment
-        self._utc = self._telemetry.utc = time.time()
+        self._utc = self._telemetry.utc = self._setup.clock.utc()
         farewell = np.inf
         while True:
             wait = zero + self._next - time.monotonic()
@@ -319,7 +324,9 @@ class Runtime:
                 self._stopping = reason
                 for row in range(len(self._names)):
                     self.agent.life.land(row, reason)
-            if self._stopping is not None and (t > farewell or (self.agent.life.phase == Phase.DONE).all()):
+            if (self._stopping is not None or self._setup.once) and (
+                t > farewell or (self.agent.life.phase == Phase.DONE).all()
+            ):
                 self._telemetry.report(t, everything=True)
                 return
 

@@ -17,10 +17,12 @@ import zenoh
 from agents import session as network
 from agents import wire
 from agents.keys import Keys
+from experiments import hosts as machines
 from experiments import orders
 from experiments import standins as standins_of
-from experiments.document import write_json
+from experiments.document import read, write_json
 from experiments.experiment import Experiment
+from experiments.hosts import STATION, Hosts
 from experiments.launcher import LAND_S, ROUTER, Launcher, Process
 
 POLL_S: Final = 0.05
@@ -32,6 +34,10 @@ LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the la
 GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
 ROUTERS: Final = 5  # a router that dies more often is not helped by starting it again,
 WORLDS: Final = 5  # nor is a world
+
+ADOPT_S: Final = 0.5
+LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
+OUTPUT: Final = "says"  # kind of the events that are a line of a process's output
 
 M = TypeVar("M", wire.Status, wire.State)
 
@@ -109,6 +115,7 @@ class Conductor:
         folder: Path,
         endpoints: Sequence[str],
         launcher: Launcher,
+        hosts: Hosts,
         show: Show,
         interrupted: Callable[[], bool],
     ) -> None:
@@ -122,6 +129,7 @@ class Conductor:
             folder: Where the recording goes.
             endpoints: Routers.
             launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
+            hosts: Other machines, on which robots may be started.
             show: Called with the progress, about ten times a second.
             interrupted: Asked whether the user wants to end it.
         """
@@ -129,7 +137,7 @@ class Conductor:
         self._file, self._source = file, source
         self._recording = folder / f"{case}.mcap"
         self._endpoints, self._launcher = list(endpoints), launcher
-        self._show, self._interrupted = show, interrupted
+        self._hosts, self._show, self._interrupted = hosts, show, interrupted
         self._keys = Keys(experiment.network.realm)
         self._robots = {name: Seen() for name in experiment.robots}
         self._groups: dict[str, list[str]] = {}
@@ -137,6 +145,8 @@ class Conductor:
             self._groups.setdefault(robot.process or name, []).append(name)
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
         self._routers = self._worlds = 1
+        self._abroad: dict[str, Process] = {}  # by host and process, as output is shown
+        self._adopted: set[str] = set()
 
     def run(self) -> Result:
         """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
@@ -147,6 +157,8 @@ class Conductor:
         began = time.monotonic()
         connect = [part for endpoint in self._endpoints for part in ("--connect", endpoint)]
         self._connect = connect
+        self._progress.phase = "connecting the hosts" if self._experiment.hosts else "starting"
+        clocks = self._hosts.join(self._experiment)
         self._launcher.start(
             f"{self._case}-recorder",
             "experiments.recorder",
@@ -162,19 +174,24 @@ class Conductor:
         standins: tuple[str, ...] = ()
         try:
             addressed, standins = self._stand_in(connect)
-            for group, names in self._groups.items():
-                process = self._process(group)
-                self._launcher.start(process, "experiments.robot", str(addressed), *names, *connect, "--lifeline")
             with ExitStack() as stack:
                 self._join(stack)
+                self._adopt()
+                self._start_robots(addressed)
                 if self._until("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
+                    self._tell_clocks(clocks)
                     self._say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
                     self._order(wire.Order("takeoff"))
                     if self._until("airborne", CLIMB_S):
                         start = self._start()
                         self._walk(start)
                 self._land()
+                if start is not None:
+                    clocks, trouble = self._hosts.clocks()
+                    self._tell_clocks(clocks)
+                    for each in trouble:
+                        self._say("clock", "conductor", each)
         except RunFailed as failure:
             self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: say it now
             self._progress.events.append(wire.Event(time.time(), "failed", "conductor", self._progress.phase))
@@ -186,6 +203,53 @@ class Conductor:
             self._launcher.end(standins, grace_s=2.0)
         gone = tuple(name for name, seen in self._robots.items() if seen.gone)
         return Result(self._recording, self._interrupted(), start, ready, gone)
+
+    def _adopt(self) -> None:
+        """Finds robots that were started by hand or at boot, which nobody needs to start.
+
+        Raises:
+            RunFailed: If one of them has flown already.
+        """
+        away = machines.absent(self._experiment)
+        if self._experiment.network.connect is not None or away:  # a router of our own has nobody else
+            self._progress.phase = "looking who is there"
+            began = time.monotonic()
+            while (past := time.monotonic() - began) < ADOPT_S or (self._flown() and past < LEAVE_S):
+                self._look()
+                time.sleep(POLL_S)
+        if flown := self._flown():
+            raise RunFailed(
+                f"{', '.join(flown)}: on the network already, and {self._robots[flown[0]].phase}; a robot that was "
+                "started by hand flies once: end its process and start it again, next time with --once"
+            )
+        there = {name for name, seen in self._robots.items() if seen.alive}
+        self._adopted = there | set(away)
+        for name in sorted(self._adopted):
+            said = f"is there already, {self._robots[name].phase}" if name in there else f"is started on {away[name]}"
+            self._say("adopted", name, f"{said}; not started from here")
+
+    def _flown(self) -> list[str]:
+        """Robots that are there and have flown, or do."""
+        return [name for name, seen in self._robots.items() if seen.alive and seen.reached("airborne")]
+
+    def _start_robots(self, addressed: Path) -> None:
+        """Starts every robot that is not there, on its host or here."""
+        document = machines.document(read(addressed).experiment) if self._experiment.hosts else b""
+        for group, names in self._groups.items():
+            missing = [name for name in names if name not in self._adopted]
+            station = self._hosts.of(names[0])
+            process = self._process(group)
+            if station is not None and missing:
+                self._abroad[f"{station.name}/{group}"] = station.start(process, missing, document, self._launcher)
+            elif missing:
+                robot = ("experiments.robot", str(addressed), *missing)
+                self._launcher.start(process, *robot, *self._connect, "--lifeline")
+
+    def _tell_clocks(self, clocks: Sequence[wire.HostClock]) -> None:
+        """Says how the hosts' clocks lie, for the recording."""
+        for each in clocks:
+            self._clock.put(wire.encode(each))
+            self._say("clock", each.host, f"{each.offset * 1e3:+.2f} ms ± {each.uncertainty * 1e3:.2f} ms against ours")
 
     def _stand_in(self, connect: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
         """Starts world, protocol twins and positioning; the case as a file with addresses, and the processes' names."""
@@ -290,6 +354,7 @@ class Conductor:
         if self._endpoints != [network.DEFAULT_ENDPOINT]:
             there = self._endpoints[0]
             self._say("router", "conductor", f"{there}: look with `zenpark keys --connect {there}`")
+        self._clock = network.publisher(self._session, keys.clock, wire.JSON)
         self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
         self._told.put(self._file.read_bytes())
         self._statuses = network.pose_subscriber(self._session, keys.status("*"), 4096)
@@ -311,8 +376,11 @@ class Conductor:
             seen = self._robots.get(self._keys.robot(str(sample.key_expr)))
             if seen is not None:
                 seen.alive = sample.kind == zenoh.SampleKind.PUT
+                self._miss(sample, seen)
         for process in self._launcher.died():
             self._mourn(process)
+        for place, process in self._abroad.items():
+            self._progress.events += [wire.Event(now, OUTPUT, place, line) for line in process.news()]
         for name, seen in self._robots.items():
             if seen.gone and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
                 seen.gone = False  # somebody started it again
@@ -340,6 +408,13 @@ class Conductor:
             seen.counted = (status.stamp, status.sent)
         seen.status = status
 
+    def _miss(self, sample: zenoh.Sample, seen: Seen) -> None:
+        """The token of an adopted robot has vanished: all that is known of its end. Without a router all vanish."""
+        name = self._keys.robot(str(sample.key_expr))
+        if name in self._adopted and not seen.alive and network.connected(self._session):
+            seen.gone = True
+            self._say("lost", name, "is not on the network any more")
+
     def _mourn(self, process: Process) -> None:
         """A process has ended that should not have."""
         if process.name == ROUTER:
@@ -359,6 +434,11 @@ class Conductor:
             what = "started again: robots hold until then" if self._worlds < WORLDS else "given up"
             why = "".join(f": {line}" for line in last)
             self._say("world", "conductor", f"the world ended ({process.exit}); {what}{why}")
+            return
+        if process.name.startswith(STATION):
+            host = process.name.removeprefix(STATION)
+            why = "".join(f": {line}" for line in process.tail().strip().splitlines()[-1:])
+            self._say("host", host, f"the connection to it ended ({process.exit}); without a router robots hold{why}")
             return
         if process.name == f"{self._case}-recorder":
             self._say("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")

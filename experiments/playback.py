@@ -14,8 +14,9 @@ import numpy as np
 
 from agents.lifecycle import Phase
 from agents.rows import Array, Index
-from agents.wire import Contact, Event, State, Status, WorldState
+from agents.wire import Contact, Event, HostClock, State, Status, WorldState
 from experiments.cdr import Undecodable, codec
+from experiments.clocks import Correction, Lie
 from experiments.contacts import ROUNDING_S, looked_for, within
 from experiments.experiment import Experiment
 from experiments.recording import JSON, METADATA, SentPose, World
@@ -72,6 +73,9 @@ def read(path: Path) -> Playback:
     everybody (interrupted by the user, or all robots had come down before), else, when the recorder or the conductor
     was killed, with the last that is known of the robots while they ran. Nothing of a landing is in the trace.
 
+    What robots on other machines stamped is set right by what their clocks drifted in the run; their offset at its
+    beginning was taken off where the stamps were made.
+
     Raises:
         NotStarted: If the run ended before its common start.
         RecordingError: If the file is no recording of zenpark, or of another version.
@@ -108,6 +112,7 @@ class _Content:
     events: list[Event] = field(default_factory=list)
     contacts: list[Contact] = field(default_factory=list)
     world: list[WorldState] = field(default_factory=list)
+    clocks: list[HostClock] = field(default_factory=list)
 
     def fill(self) -> int:
         """Reads all messages and counts them; those of other types are passed over."""
@@ -120,6 +125,7 @@ class _Content:
                 _reader(Event, self.events),
                 _reader(Contact, self.contacts),
                 _reader(World, worlds),
+                _reader(HostClock, self.clocks),
             ]
         )
         readers: dict[int, Callable[[bytes], None] | None] = {}
@@ -135,7 +141,35 @@ class _Content:
                 except Undecodable as error:
                     raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
         self.world += [each.said() for each in worlds]
+        self._set_right()
         return count
+
+    def _set_right(self) -> None:
+        """Takes the drift of other machines' clocks off what was stamped there."""
+        right = Correction(self.clocks)
+        if not self.clocks:
+            return
+        replaced = msgspec.structs.replace
+        self.states = [
+            replaced(
+                state,
+                stamp=right(state.robot, state.stamp),
+                heard=[
+                    replaced(each, stamp=right(each.speaker, each.stamp), arrived=right(state.robot, each.arrived))
+                    for each in state.heard
+                ],
+            )
+            for state in self.states
+        ]
+        self.poses = [replaced(pose, stamp=right(pose.robot, pose.stamp)) for pose in self.poses]
+        self.statuses = [
+            replaced(each, stamp=right(each.robot, each.stamp), started=right(each.robot, each.started))
+            for each in self.statuses
+        ]
+
+    def lies(self) -> tuple[Lie, ...]:
+        """How the clocks of other machines lay to the conductor's."""
+        return Correction(self.clocks).lies()
 
     def start(self, announced: float | None) -> float | None:
         """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
@@ -236,6 +270,7 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         attitude=column("attitude") if told else None,
         shadow_position=column("shadow_position") if shadowed else None,
         shadow_yaw=column("shadow_yaw")[:, :, 0] if shadowed else None,
+        clocks=content.lies(),
     )
 
 

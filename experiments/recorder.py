@@ -50,6 +50,7 @@ class Recorder:
         self._events = network.subscriber(session, keys.event, DEPTH)
         self._contacts = network.subscriber(session, keys.contact, DEPTH)
         self._world = network.subscriber(session, keys.world, DEPTH)
+        self._clocks = network.pose_subscriber(session, keys.clock, DEPTH)
         self._truths = network.subscriber(session, keys.truth("*"), DEPTH)
         self._truth: dict[str, wire.Position] = {}
         self._watch = network.alive_watch(session, keys.alive("*"))
@@ -77,6 +78,7 @@ class Recorder:
             (self._events.handler, self._event),
             (self._contacts.handler, self._contact),
             (self._world.handler, self._said_by_world),
+            (self._clocks.handler, self._clock),
         ):
             for sample in network.received(handler):
                 try:
@@ -123,6 +125,11 @@ class Recorder:
         for pose in said.obstacles.values():
             self._finite(sample, *pose)
         self._recording.world(said)
+
+    def _clock(self, sample: zenoh.Sample) -> None:
+        said = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.HostClock)
+        self._finite(sample, said.stamp, said.offset, said.uncertainty)
+        self._recording.clock(said)
 
     @staticmethod
     def _finite(sample: zenoh.Sample, *numbers: float) -> None:

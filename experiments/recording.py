@@ -6,6 +6,7 @@
     /<robot>/status     zenpark_msgs/Status
     /world/contact      zenpark_msgs/Contact          what touched in the world, when it began
     /world/state        zenpark_msgs/World            what the world says of itself
+    /run/clock          zenpark_msgs/HostClock        how another machine's clock lay to the conductor's
     /events             zenpark_msgs/Event
 
 Attached are the experiment as it was written (`experiment.toml`) and this case with its overrides (`experiment.json`);
@@ -24,7 +25,7 @@ from typing import IO, Any, Final, Literal, Self, cast
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from agents.wire import Contact, Event, Pose, State, Status, Vector, WorldState
+from agents.wire import Contact, Event, HostClock, Pose, State, Status, Vector, WorldState
 from experiments.cdr import POSE_STAMPED, POSE_STAMPED_SCHEMA, Unencodable, codec, pose_stamped
 from experiments.experiment import Experiment
 from experiments.records import RecordingError
@@ -33,7 +34,8 @@ FRAME: Final = "park"
 TOML: Final = "experiment.toml"
 JSON: Final = "experiment.json"
 METADATA: Final = "zenpark"
-WORLD: Final = "world"  # stands where a robot's name would; no robot may be called so
+RUN: Final = "run"  # both stand where a robot's name would; no robot may be called so
+WORLD: Final = "world"
 CHUNK_BYTES: Final = 32 * 1024  # what a kill can cost: a third of a second of seven robots
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 
@@ -129,6 +131,7 @@ class Recording:
         self._state = _topic("state", State)
         self._status = _topic("status", Status)
         self._event = _topic("events", Event)
+        self._clock = _topic("clock", HostClock)
         self._contact, self._world = _topic("contact", Contact), _topic("state", World)
         self._drawn = _Topic("true_pose", POSE_STAMPED, POSE_STAMPED_SCHEMA, _drawing())
         self._over = ""  # why nothing more can be written
@@ -194,6 +197,14 @@ class Recording:
             RecordingError: If it cannot be written; what was written before stays.
         """
         self._record(self._world, WORLD, World.of(said), said.stamp, said.stamp)
+
+    def clock(self, said: HostClock) -> None:
+        """Records how another machine's clock lay to the conductor's.
+
+        Raises:
+            RecordingError: If it cannot be written; what was written before stays.
+        """
+        self._record(self._clock, RUN, said, said.stamp, said.stamp)
 
     def event(self, event: Event) -> None:
         """Records something that happened, and brings all so far to the disk: events are few, and explain the rest.

@@ -20,11 +20,13 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
+from agents.endpoint import Endpoint
 from agents.session import free_endpoint
 from experiments import document, metrics, playback, results, virtual
 from experiments.conductor import Conductor, Result, start_router
 from experiments.document import Document
 from experiments.experiment import Experiment
+from experiments.hosts import Hosts
 from experiments.launcher import Launcher
 from experiments.logbook import Logbook
 from experiments.measured import CaseMetrics
@@ -157,10 +159,12 @@ def fly(
     results: dict[str, Result] = {}
     read.keep(folder / SOURCE)
     with Launcher(folder / "logs") as launcher:
-        endpoints = read.experiment.network.connect
-        if endpoints is None:
-            endpoints = [free_endpoint()]
-            start_router(launcher, endpoints)
+        endpoints = routers = read.experiment.network.connect
+        if endpoints is None or routers is None:
+            routers = read.experiment.network.listen or [free_endpoint()]
+            start_router(launcher, routers)
+            endpoints = [str(here(Endpoint.parse(router))) for router in routers]
+        hosts = Hosts(launcher, routers)
         with show:
             for name, experiment in chosen(read, cases).items():
                 if interrupted():
@@ -176,12 +180,19 @@ def fly(
                     folder=folder,
                     endpoints=endpoints,
                     launcher=launcher,
+                    hosts=hosts,
                     show=show,
                     interrupted=interrupted,
                 ).run()
-    notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost]
+        left = hosts.sweep()
+    notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
     begun = {case: result.recording for case, result in results.items() if result.start is not None}
     return _read_back(folder, begun, notes)
+
+
+def here(router: Endpoint) -> Endpoint:
+    """How this machine reaches a router that listens at an endpoint of it."""
+    return router.at("127.0.0.1") if router.is_wildcard else router
 
 
 def reopen(folder: Path) -> Run:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from agents.rows import Array, Index
 from agents.wire import Contact, Event, WorldState
+from experiments.clocks import Lie
 from experiments.experiment import Experiment
 
 
@@ -87,6 +88,7 @@ class Trace:
         attitude: (T, N, 4) unit quaternions w, x, y, z from robot to room, NaN where unknown; None if none was told.
         shadow_position: (T, N, 3) of the twin beside each robot [m], NaN for robots without one; None if there is none.
         shadow_yaw: (T, N) of those twins [rad].
+        clocks: Of the other machines on which robots ran; what they stamped is set right by it.
     """
 
     case: str
@@ -114,3 +116,4 @@ class Trace:
     attitude: Array | None = None
     shadow_position: Array | None = None
     shadow_yaw: Array | None = None
+    clocks: tuple[Lie, ...] = ()

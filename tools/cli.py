@@ -27,6 +27,7 @@ EXPLAINED: Final = (
     ("experiments.problem", "DocumentError"),
     ("experiments.records", "RecordingError"),
     ("experiments.conductor", "RunFailed"),
+    ("experiments.hosts", "HostError"),
     ("experiments.virtual", "Stuck"),
     ("experiments.sweep_workers", "SweepError"),
     ("experiments.standins", "StandInError"),
@@ -172,11 +173,33 @@ def agent(
     lifeline: Annotated[
         bool, typer.Option("--lifeline", help="Land and end when standard input ends or falls silent.")
     ] = False,
+    clock_correction: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Added to this machine's clock to get the conductor's.")
+    ] = 0.0,
+    once: Annotated[bool, typer.Option("--once", help="End when down after the experiment.")] = False,
 ) -> None:
-    """Be one robot of an experiment, or several that share a device."""
+    """Be one robot of an experiment, or several that share a device; FILE - is a line of JSON on standard input."""
     from experiments.robot import fly  # noqa: PLC0415
 
-    raise typer.Exit(fly(file, names, case=case, connect=connect or [], lifeline=lifeline))
+    raise typer.Exit(
+        fly(
+            file,
+            names,
+            case=case,
+            connect=connect or [],
+            lifeline=lifeline,
+            clock_correction_s=clock_correction,
+            once=once,
+        )
+    )
+
+
+@app.command(hidden=True)
+def station() -> None:
+    """Answer the launcher of another machine; `zenpark run` starts it where robots of the experiment are."""
+    from experiments.station import serve  # noqa: PLC0415
+
+    raise typer.Exit(serve())
 
 
 @app.command()
