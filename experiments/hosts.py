@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import secrets
 import select
+import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -70,6 +71,8 @@ class Station:
             carried = [("-R", ssh.forwarded(router)) for router in self._routers if router.is_loopback]
         except ValueError as error:
             raise HostError(f"{name}: {error}") from None
+        if shutil.which("ssh") is None:
+            raise HostError(f"{name}: there is no ssh here; install it (Debian, Ubuntu: apt install openssh-client)")
         words = self.words("station")
         options = [part for pair in carried for part in pair]
         self.process = launcher.spawn(f"{STATION}{name}", ssh.command(self.address, words, options), answers=True)

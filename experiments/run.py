@@ -20,6 +20,8 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
 from agents.endpoint import Endpoint
 from agents.session import free_endpoint
 from experiments import document, metrics, playback, results, virtual
@@ -140,6 +142,7 @@ def fly(
     show: Shown,
     interrupted: Callable[[], bool] = lambda: False,
     bodies: str | None = None,
+    local: bool = False,
 ) -> Run:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
@@ -151,11 +154,17 @@ def fly(
         interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
         bodies: What every robot is put into instead of the body that the file gives it: "twin", "world", or
             "protocol" for its real bridge and a protocol twin.
+        local: Whether all robots run on this machine, whatever the file says of hosts.
 
     Raises:
         RunFailed: If robots are not ready in time, unless the file says to go on without them.
         Unreachable: If the routers of the file do not answer.
+        HostError: If a host cannot be reached, or has another zenpark.
+        DocumentError: If robots that run on hosts are to be put behind protocol twins.
     """
+    if bodies == "protocol" and read.experiment.hosts and not local:
+        hint = "add --here, which lets all robots run on this machine"
+        raise DocumentError([Problem("--bodies protocol", 0, 0, "protocol twins cannot be seen from hosts", hint)])
     results: dict[str, Result] = {}
     read.keep(folder / SOURCE)
     with Launcher(folder / "logs") as launcher:
@@ -170,6 +179,8 @@ def fly(
                 if interrupted():
                     break
                 experiment = choose_bodies(experiment, bodies)  # noqa: PLW2901
+                if local:
+                    experiment = msgspec.structs.replace(experiment, hosts={})  # noqa: PLW2901
                 file = folder / f"{name}.json"
                 file.write_bytes(document.write_json(experiment))
                 results[name] = Conductor(

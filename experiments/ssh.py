@@ -10,6 +10,7 @@ from typing import Final
 from agents.endpoint import UNIX, Endpoint
 
 CONNECT_S: Final = 10
+BROKEN: Final = 255  # exit code of ssh when it is ssh itself that failed
 
 # BatchMode: nobody could answer a question. Three missed replies end a connection, as silence ends a robot's lifeline.
 OPTIONS: Final = {
@@ -41,6 +42,8 @@ _TROUBLE: Final = (
      "`zenpark hosts install FILE` puts this one there"),
     (r"permission denied$|cannot execute", "'{zenpark}' may not be started there",
      "chmod +x {zenpark} there, or `zenpark hosts install FILE`"),
+    (r"python3\W*: (no such|not found)|env: .*python3", "there is no Python there",
+     "install one, 3.11 or newer (Debian, Ubuntu: apt install python3 python3-pip)"),
     (r"not found|no such file", "there is no zenpark at '{zenpark}'",
      "`zenpark hosts install FILE` puts it there; or say where it is: zenpark = \"...\""),
 )  # fmt: skip
@@ -58,10 +61,9 @@ def command(address: str, words: Sequence[str], options: Sequence[str] = ()) -> 
     return ["ssh", "-T", *settings, *options, "--", address, f"exec {shlex.join(words)}"]
 
 
-def script(address: str, text: str) -> list[str]:
-    """The command line that runs a text in the plain shell of another machine."""
-    settings = [part for name, value in OPTIONS.items() for part in ("-o", f"{name}={value}")]
-    return ["ssh", "-T", *settings, "--", address, f"exec sh -c {shlex.quote(text)}"]
+def script(address: str, text: str, words: Sequence[str]) -> list[str]:
+    """The command line that runs a text in the plain shell of another machine, with words from $0 on."""
+    return command(address, ["sh", "-c", text, *words])
 
 
 def explained(address: str, zenpark: str, said: str) -> str:

@@ -83,6 +83,7 @@ def run(
             help="Every robot in a twin of its own, in one world, or behind a protocol twin (real time).",
         ),
     ] = None,
+    here: Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")] = False,
     anyway: Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")] = False,
     report: Annotated[bool, typer.Option(help="Writes the report.")] = True,
     open_report: Annotated[bool, typer.Option("--open", help="Opens the report in the browser.")] = False,
@@ -101,6 +102,7 @@ def run(
             as_json=as_json,
             seeds=seeds,
             bodies=bodies,
+            here=here,
             anyway=anyway,
             report=report,
             open_report=open_report,
@@ -425,6 +427,29 @@ def world_order(
             realm=realm,
         )
     )
+
+
+hosts: Final = typer.Typer(help="Other machines of an experiment.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(hosts, name="hosts")
+On = Annotated[
+    list[str] | None, typer.Option(metavar="HOST|TAG", help="Only this host, or those with this tag; may be repeated.")
+]
+
+
+@hosts.command(name="check")
+def hosts_check(file: File, settings: Settings = None, on: On = None) -> None:
+    """Say whether each host can take part: version, clock, devices, router."""
+    from tools.hosts import check as command  # noqa: PLC0415
+
+    raise typer.Exit(command(file, settings=settings or [], only=on or []))
+
+
+@hosts.command(name="install")
+def hosts_install(file: File, settings: Settings = None, on: On = None) -> None:
+    """Put this zenpark on every host that has another or none."""
+    from tools.hosts import install as command  # noqa: PLC0415
+
+    raise typer.Exit(command(file, settings=settings or [], only=on or []))
 
 
 @app.command()

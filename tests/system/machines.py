@@ -101,7 +101,7 @@ class Machine:
         known = key.with_suffix(".pub").read_text().split()
         with self.lab.known_hosts.open("a") as file:
             file.write(f"{self.address} {known[0]} {known[1]}\n")
-        until(lambda: (self.folder / "sshd.pid").exists(), f"sshd of {self.name} runs", 10.0)
+        until((self.folder / "sshd.pid").exists, f"sshd of {self.name} runs", 10.0)
 
     def zenpark(self, *, offset_s: float = 0.0, drift: float = 0.0) -> Path:
         """The zenpark of this machine, as a command; its clock may be wrong."""
@@ -120,7 +120,7 @@ class Machine:
                 )
             )
         command.write_text(
-            f"#!/bin/sh\nPYTHONPATH={fake}:{ROOT} exec {sys.executable} -m tools.guard \"$@\"\n", encoding="utf-8"
+            f'#!/bin/sh\nPYTHONPATH={fake}:{ROOT} exec {sys.executable} -m tools.guard "$@"\n', encoding="utf-8"
         )
         command.chmod(command.stat().st_mode | stat.S_IXUSR)
         return command

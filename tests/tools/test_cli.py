@@ -50,6 +50,8 @@ def test_commands():
                 "bridge",
                 "world",
                 "world-order",
+                "hosts",
+                "station",
             ]
         )
         == COMMANDS
