@@ -119,6 +119,8 @@ class Station:
         Raises:
             HostError: If none comes in time.
         """
+        if self._out.closed or self._in.closed:
+            raise HostError(self._broken())  # its end was noticed before
         deadline = time.monotonic() + limit_s
         text = msgspec.json.encode(question) + b"\n"
         left = time.time()

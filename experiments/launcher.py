@@ -138,6 +138,7 @@ class Launcher:
                 del self._processes[process.name]
         for process in dead:
             self._close(process)
+            self._forget(process)
         return dead
 
     def end(self, names: Iterable[str], grace_s: float) -> list[Process]:
@@ -153,6 +154,8 @@ class Launcher:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.handle.pid, number)
             self._wait(stubborn, wait_s)
+        for process in ending:
+            self._forget(process)
         return [process for process in ending if (process.handle.returncode or 0) == -signal.SIGKILL]
 
     @staticmethod
@@ -167,6 +170,12 @@ class Launcher:
         if process.handle.stdin is not None:
             with contextlib.suppress(OSError):
                 process.handle.stdin.close()
+
+    @staticmethod
+    def _forget(process: Process) -> None:
+        """Lets go of what it answered, once it is over."""
+        if process.handle.stdout is not None:
+            process.handle.stdout.close()
 
     def _beats(self) -> None:
         while not self._over.wait(BEAT_S):

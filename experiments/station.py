@@ -153,8 +153,13 @@ def kill(pids: Sequence[int]) -> list[int]:
     return killed
 
 
-def serve(fd: int = 0) -> int:
-    """Answers until the lifeline is lost, then sees the robots off; returns the exit code of the process."""
+def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
+    """Answers until the lifeline is lost, then sees the robots off; returns the exit code of the process.
+
+    Args:
+        fd: Where the questions come in.
+        patience_s: How long robots may take to land and to be gone [s].
+    """
     zero = time.time() - time.monotonic()  # a step of the wall clock does not move the robots, nor what is said of it
     decoder = msgspec.json.Decoder(Question)
     waiting = select.poll()
@@ -176,7 +181,7 @@ def serve(fd: int = 0) -> int:
                     print(f"station: not understood: {error}", file=sys.stderr)
                     continue
                 os.write(1, msgspec.json.encode(answer(question, clock)) + b"\n")
-    deadline = time.monotonic() + LAND_S
+    deadline = time.monotonic() + patience_s
     while _others() and time.monotonic() < deadline:
         time.sleep(POLL_S)
     kill(_others())

@@ -35,7 +35,8 @@ folder=$0
 if [ -e "$folder/.git" ]; then
     echo "$folder is a git checkout: bring it up to date with git, there" >&2; exit 3
 fi
-if [ -d "$folder" ] && [ -n "$(ls -A "$folder")" ] && ! grep -q '^name = "zenpark"' "$folder/pyproject.toml" 2>&-; then
+ours() { grep -q '^name = "zenpark"' "$folder/pyproject.toml" 2>/dev/null; }
+if [ -d "$folder" ] && [ -n "$(ls -A "$folder")" ] && ! ours; then
     echo "$folder holds something else: say in the file where zenpark may go, such as \\"zenpark/zenpark\\"" >&2; exit 3
 fi
 mkdir -p "$folder"

@@ -72,6 +72,9 @@ class Machine:
     def unplug(self) -> None:
         ip("-n", self.lab.switch, "link", "set", self.outer, "down")
 
+    def plug_in_again(self) -> None:
+        ip("-n", self.lab.switch, "link", "set", self.outer, "up")
+
     def serve(self) -> None:
         key = self.folder / "host_key"
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
