@@ -87,6 +87,11 @@ class Keys:
         return f"{self.realm}/run/experiment"
 
     @property
+    def conductor(self) -> str:
+        """Liveliness token of the conductor."""
+        return f"{self.realm}/run/conductor"
+
+    @property
     def clock(self) -> str:
         """How the clocks of other machines lie to the conductor's."""
         return f"{self.realm}/run/clock"

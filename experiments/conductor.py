@@ -36,6 +36,8 @@ ROUTERS: Final = 5  # a router that dies more often is not helped by starting it
 WORLDS: Final = 5  # nor is a world
 
 ADOPT_S: Final = 0.5
+AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead,
+BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behind
 LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
 OUTPUT: Final = "says"  # kind of the events that are a line of a process's output
 
@@ -58,6 +60,7 @@ class Seen:
         sent: Poses that it sent, and `rate` of them over the last second [1/s].
         alive: Whether its liveliness token stands.
         gone: Whether its process has ended or its token has vanished in mid-run.
+        behind: The least time from a stamp of it to its arrival [s]: small, if its clock is right.
     """
 
     status: wire.Status | None = None
@@ -66,6 +69,7 @@ class Seen:
     alive: bool = False
     gone: bool = False
     counted: tuple[float, int] = (0.0, 0)
+    behind: float = float("inf")
 
     @property
     def phase(self) -> str:
@@ -302,6 +306,10 @@ class Conductor:
 
     def _start(self) -> float:
         """One start time for all, in UTC; returns it."""
+        for name, seen in self._robots.items():
+            if not (seen.gone or AHEAD_S < seen.behind < BEHIND_S):
+                remedy = "set it (NTP), or let zenpark start the robot: [hosts]"
+                self._say("clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}")
         at = time.time() + LEAD_S
         self._say("start", "conductor", "common start", stamp=at)
         self._order(wire.Order("start", at=at), only="airborne")
@@ -329,6 +337,7 @@ class Conductor:
 
     def _land(self) -> None:
         """Everybody down."""
+        self._told.undeclare()  # type: ignore[no-untyped-call]  # who joins from now on waits for the next
         self._progress.phase = "landing"
         self._say("phase", "conductor", "landing" + (" (interrupted)" if self._interrupted() else ""))
         if any(not (seen.gone or seen.reached("landing")) for seen in self._robots.values()):
@@ -356,7 +365,8 @@ class Conductor:
             self._say("router", "conductor", f"{there}: look with `zenpark keys --connect {there}`")
         self._clock = network.publisher(self._session, keys.clock, wire.JSON)
         self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
-        self._told.put(self._file.read_bytes())
+        self._told.put(machines.document(self._experiment))
+        self._token = network.alive_token(self._session, keys.conductor)
         self._statuses = network.pose_subscriber(self._session, keys.status("*"), 4096)
         self._states = network.subscriber(self._session, keys.state("*"), 4096)
         self._watch = network.alive_watch(self._session, keys.alive("*"))
@@ -407,6 +417,7 @@ class Conductor:
             seen.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0
             seen.counted = (status.stamp, status.sent)
         seen.status = status
+        seen.behind = min(seen.behind, time.time() - status.stamp)
 
     def _miss(self, sample: zenoh.Sample, seen: Seen) -> None:
         """The token of an adopted robot has vanished: all that is known of its end. Without a router all vanish."""

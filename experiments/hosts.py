@@ -258,9 +258,9 @@ class Hosts:
 
 
 def document(experiment: Experiment) -> bytes:
-    """A case in one line, for a process that has no file: complete, for its arena is in it."""
-    arena = msgspec.structs.replace(experiment.arena, file=None)
-    return msgspec.json.encode(msgspec.structs.replace(experiment, arena=arena))
+    """A case in one line, for robots that have no file of it; where the others are is no robot's business."""
+    arena = msgspec.structs.replace(experiment.arena, file=None)  # what stood there is in it
+    return msgspec.json.encode(msgspec.structs.replace(experiment, arena=arena, hosts={}))
 
 
 def absent(experiment: Experiment) -> dict[str, str]:

@@ -12,10 +12,12 @@ import socket
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Final
 
 from agents import output, plugins
+from agents import session as network
 from agents.body import BodyError
 from agents.clock import Clock
 from agents.fleet import assemble
@@ -23,11 +25,12 @@ from agents.keys import Keys
 from agents.runtime import NameTaken, Ranging, Runtime, Setup
 from agents.session import DEFAULT_ENDPOINT, EndpointError, Unreachable
 from agents.shadow import shadowed
-from experiments import assign, document
+from experiments import assign, document, joining
 from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
 
 STDIN: Final = "-"
+JOIN: Final = "join"
 FAR: Final = ("external", "world")  # bodies that live in another process, their range sensors too
 
 
@@ -43,17 +46,19 @@ def fly(
     lifeline: bool,
     clock_correction_s: float = 0.0,
     once: bool = False,
+    realm: str = "park",
 ) -> int:
     """Runs the robots `names` of an experiment in this process; returns its exit code.
 
     Args:
-        file: The experiment; "-" for the first line of standard input, as JSON.
+        file: The experiment; "-" for the first line of standard input, as JSON; "join" for what is run next.
         names: Of the robots.
         case: Of the file; the first if left out.
         connect: Routers; the file's, or the one of this machine, if left out.
         lifeline: Whether standard input is a lifeline.
         clock_correction_s: What is added to this machine's clock to get that of the experiment [s].
         once: Whether to end when the robots are down after the experiment.
+        realm: In which to join.
 
     Raises:
         DocumentError: If the file is wrong, or has no such robot or case.
@@ -62,15 +67,36 @@ def fly(
     """
     if lifeline:
         output.detach()
-    if file == STDIN:
-        print(f"{', '.join(names)}: on {socket.gethostname()}, process {os.getpid()}", flush=True)
-    read = document.received(told(), "standard input") if file == STDIN else document.read(file)
-    experiment = chosen_case(read, case)
-    clock = Clock(clock_correction_s)
-    unknown = [name for name in names if name not in experiment.robots]
-    if unknown:
-        hint = plugins.did_you_mean(unknown[0], experiment.robots)
-        raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
+    with ExitStack() as stack:
+        endpoints = list(connect)
+        if file == JOIN:
+            session = stack.enter_context(network.open_session(connect or [DEFAULT_ENDPOINT], name=f"{names[0]} joins"))
+            read = joining.offered(session, Keys(realm), names)
+            endpoints = endpoints or [DEFAULT_ENDPOINT]
+            stack.callback(joining.Tether(session, Keys(realm)).close)
+        elif file == STDIN:
+            print(f"{', '.join(names)}: on {socket.gethostname()}, process {os.getpid()}", flush=True)
+            read = document.received(told(), "standard input")
+        else:
+            read = document.read(file)
+        experiment = chosen_case(read, case)
+        unknown = [name for name in names if name not in experiment.robots]
+        if unknown:
+            hint = plugins.did_you_mean(unknown[0], experiment.robots)
+            raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
+        return _run(experiment, names, endpoints, lifeline=lifeline, clock=Clock(clock_correction_s), once=once)
+
+
+def _run(
+    experiment: Experiment,
+    names: Sequence[str],
+    connect: Sequence[str],
+    *,
+    lifeline: bool,
+    clock: Clock,
+    once: bool,
+) -> int:
+    """Runs robots of a case until they end."""
     endpoints = list(connect) or experiment.network.connect or [DEFAULT_ENDPOINT]
     request = replace(assign.request(experiment, names, [experiment.seed], endpoints), clock=clock)
     body = shadowed(assemble(request), request, assign.shadows(experiment, names))
@@ -135,12 +161,13 @@ def chosen_case(read: document.Document, name: str | None) -> Experiment:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
     parser = argparse.ArgumentParser(prog="zenpark agent", description="Robots of an experiment in one process.")
-    parser.add_argument("file", help="experiment file, or name in the catalogue")
+    parser.add_argument("file", help="experiment file, or name in the catalogue; join: what is run next")
     parser.add_argument("names", nargs="+", metavar="ROBOT")
     parser.add_argument("--case", help="which case of the file; the first if left out")
     parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
     parser.add_argument("--lifeline", action="store_true", help="land and end when standard input ends or is silent")
     parser.add_argument("--clock-correction", type=float, default=0.0, metavar="SECONDS", help="added to the clock")
+    parser.add_argument("--realm", default="park", help="in which to join")
     parser.add_argument("--once", action="store_true", help="end when down after the experiment")
     chosen = parser.parse_args(arguments)
     try:
@@ -152,6 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             lifeline=chosen.lifeline,
             clock_correction_s=chosen.clock_correction,
             once=chosen.once,
+            realm=chosen.realm,
         )
     except (DocumentError, BodyError, NameTaken, plugins.PluginError, EndpointError, Unreachable) as error:
         print(f"zenpark: {error}", file=sys.stderr)

@@ -33,7 +33,7 @@ RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run on a 
 POLL_S: Final = 0.1
 REACH_S: Final = 3.0
 USB: Final = Path("/sys/bus/usb/devices")
-RADIO: Final = {"1915:7777": "Crazyradio", "35f0:bad2": "Crazyradio 2.0", "0483:5740": "Crazyflie on USB"}
+RADIO: Final = {"1915:7777": "Crazyradio", "0483:5740": "Crazyflie on USB"}
 UDEV: Final = "add a udev rule for it and plug it in again (docs/crazyflie.md)"
 
 

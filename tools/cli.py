@@ -179,8 +179,12 @@ def agent(
         float, typer.Option(metavar="SECONDS", help="Added to this machine's clock to get the conductor's.")
     ] = 0.0,
     once: Annotated[bool, typer.Option("--once", help="End when down after the experiment.")] = False,
+    realm: Annotated[str, typer.Option(metavar="NAME", help="In which to join.")] = "park",
 ) -> None:
-    """Be one robot of an experiment, or several that share a device; FILE - is a line of JSON on standard input."""
+    """Be one robot of an experiment, or several that share a device.
+
+    FILE "join" waits for whatever is run next; "-" is a line of JSON on standard input.
+    """
     from experiments.robot import fly  # noqa: PLC0415
 
     raise typer.Exit(
@@ -192,6 +196,7 @@ def agent(
             lifeline=lifeline,
             clock_correction_s=clock_correction,
             once=once,
+            realm=realm,
         )
     )
 
