@@ -11,9 +11,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec.structs import replace
 
 from agents.rows import Array
-from agents.wire import HostClock
+from agents.wire import HostClock, State, Status
 
 
 @dataclass(frozen=True)
@@ -72,16 +73,24 @@ class Correction:
             for robot in measured[-1].robots:
                 self._of[robot] = stamps, added
 
-    def concerns(self, robot: str) -> bool:
-        """Whether a robot ran on another machine."""
-        return robot in self._of
-
     def __call__(self, robot: str, stamp: float) -> float:
         """A stamp [s] that a robot's process made, on the conductor's clock."""
         if robot not in self._of:
             return stamp
         stamps, added = self._of[robot]
         return stamp - float(np.interp(stamp, stamps, added))
+
+    def state(self, said: State) -> State:
+        """Telemetry with every stamp set right: its own, and those of the poses that were heard."""
+        heard = [
+            replace(each, stamp=self(each.speaker, each.stamp), arrived=self(said.robot, each.arrived))
+            for each in said.heard
+        ]
+        return replace(said, stamp=self(said.robot, said.stamp), heard=heard)
+
+    def status(self, said: Status) -> Status:
+        """A status with its stamp and its start set right."""
+        return replace(said, stamp=self(said.robot, said.stamp), started=self(said.robot, said.started))
 
     def lies(self) -> tuple[Lie, ...]:
         """What there is to tell of each host."""

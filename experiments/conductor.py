@@ -20,7 +20,8 @@ from agents.keys import Keys
 from experiments import hosts as machines
 from experiments import orders
 from experiments import standins as standins_of
-from experiments.document import read, write_json
+from experiments.crew import Crew
+from experiments.document import write_json
 from experiments.experiment import Experiment
 from experiments.hosts import STATION, Hosts
 from experiments.launcher import LAND_S, ROUTER, Launcher, Process
@@ -144,13 +145,9 @@ class Conductor:
         self._hosts, self._show, self._interrupted = hosts, show, interrupted
         self._keys = Keys(experiment.network.realm)
         self._robots = {name: Seen() for name in experiment.robots}
-        self._groups: dict[str, list[str]] = {}
-        for name, robot in experiment.robots.items():
-            self._groups.setdefault(robot.process or name, []).append(name)
+        self._crew = Crew(experiment, case, launcher, hosts)
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
         self._routers = self._worlds = 1
-        self._abroad: dict[str, Process] = {}  # by host and process, as output is shown
-        self._adopted: set[str] = set()
 
     def run(self) -> Result:
         """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
@@ -181,7 +178,7 @@ class Conductor:
             with ExitStack() as stack:
                 self._join(stack)
                 self._adopt()
-                self._start_robots(addressed)
+                self._crew.start(addressed, connect)
                 if self._until("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
                     self._tell_clocks(clocks)
@@ -202,7 +199,7 @@ class Conductor:
             self._show(self._progress)
             raise
         finally:
-            self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
+            self._launcher.end(self._crew.processes, grace_s=LAND_S)
             self._launcher.end([f"{self._case}-recorder"], grace_s=5.0)
             self._launcher.end(standins, grace_s=2.0)
         gone = tuple(name for name, seen in self._robots.items() if seen.gone)
@@ -214,7 +211,7 @@ class Conductor:
         Raises:
             RunFailed: If one of them has flown already.
         """
-        away = machines.absent(self._experiment)
+        away = self._crew.away
         if self._experiment.network.connect is not None or away:  # a router of our own has nobody else
             self._progress.phase = "looking who is there"
             began = time.monotonic()
@@ -227,27 +224,13 @@ class Conductor:
                 "started by hand flies once: end its process and start it again, next time with --once"
             )
         there = {name for name, seen in self._robots.items() if seen.alive}
-        self._adopted = there | set(away)
-        for name in sorted(self._adopted):
+        for name in self._crew.adopt(there):
             said = f"is there already, {self._robots[name].phase}" if name in there else f"is started on {away[name]}"
             self._say("adopted", name, f"{said}; not started from here")
 
     def _flown(self) -> list[str]:
         """Robots that are there and have flown, or do."""
         return [name for name, seen in self._robots.items() if seen.alive and seen.reached("airborne")]
-
-    def _start_robots(self, addressed: Path) -> None:
-        """Starts every robot that is not there, on its host or here."""
-        document = machines.document(read(addressed).experiment) if self._experiment.hosts else b""
-        for group, names in self._groups.items():
-            missing = [name for name in names if name not in self._adopted]
-            station = self._hosts.of(names[0])
-            process = self._process(group)
-            if station is not None and missing:
-                self._abroad[f"{station.name}/{group}"] = station.start(process, missing, document, self._launcher)
-            elif missing:
-                robot = ("experiments.robot", str(addressed), *missing)
-                self._launcher.start(process, *robot, *self._connect, "--lifeline")
 
     def _tell_clocks(self, clocks: Sequence[wire.HostClock]) -> None:
         """Says how the hosts' clocks lie, for the recording."""
@@ -389,8 +372,7 @@ class Conductor:
                 self._miss(sample, seen)
         for process in self._launcher.died():
             self._mourn(process)
-        for place, process in self._abroad.items():
-            self._progress.events += [wire.Event(now, OUTPUT, place, line) for line in process.news()]
+        self._progress.events += [wire.Event(now, OUTPUT, place, line) for place, line in self._crew.output()]
         for name, seen in self._robots.items():
             if seen.gone and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
                 seen.gone = False  # somebody started it again
@@ -422,7 +404,7 @@ class Conductor:
     def _miss(self, sample: zenoh.Sample, seen: Seen) -> None:
         """The token of an adopted robot has vanished: all that is known of its end. Without a router all vanish."""
         name = self._keys.robot(str(sample.key_expr))
-        if name in self._adopted and not seen.alive and network.connected(self._session):
+        if name in self._crew.adopted and not seen.alive and network.connected(self._session):
             seen.gone = True
             self._say("lost", name, "is not on the network any more")
 
@@ -455,7 +437,7 @@ class Conductor:
             self._say("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
             self._recording_begun = True  # nothing to wait for
             return
-        for name in self._groups.get(process.name.removeprefix(f"{self._case}-"), []):
+        for name in self._crew.of(process.name):
             self._robots[name].gone = True
             self._robots[name].alive = False
             last = process.tail().strip().splitlines()[-1:]
@@ -477,9 +459,6 @@ class Conductor:
 
     # ------------------------------------------------------------------ words
 
-    def _process(self, group: str) -> str:
-        return f"{self._case}-{group}"
-
     def _count(self, phase: str) -> int:
         return sum(seen.reached(phase) for seen in self._robots.values())
 
@@ -492,8 +471,7 @@ class Conductor:
     def _excuse(self, names: Sequence[str], what: str) -> str:
         lines = [f"{', '.join(names)}: {what}; nothing has moved or all have landed"]
         for name in names:
-            group = next(group for group, members in self._groups.items() if name in members)
-            log = self._recording.parent / "logs" / f"{self._process(group)}.log"
+            log = self._recording.parent / "logs" / f"{self._crew.process_of(name)}.log"
             text = log.read_text(errors="replace").strip() if log.exists() else ""
             lines.append(f"  {name}: {self._why(name)}" + (f"\n    {text.splitlines()[-1]}" if text else ""))
         ended = all(self._robots[name].gone for name in names)

@@ -141,31 +141,12 @@ class _Content:
                 except Undecodable as error:
                     raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
         self.world += [each.said() for each in worlds]
-        self._set_right()
-        return count
-
-    def _set_right(self) -> None:
-        """Takes the drift of other machines' clocks off what was stamped there."""
         right = Correction(self.clocks)
-        if not self.clocks:
-            return
-        replaced = msgspec.structs.replace
-        self.states = [
-            replaced(
-                state,
-                stamp=right(state.robot, state.stamp),
-                heard=[
-                    replaced(each, stamp=right(each.speaker, each.stamp), arrived=right(state.robot, each.arrived))
-                    for each in state.heard
-                ],
-            )
-            for state in self.states
-        ]
-        self.poses = [replaced(pose, stamp=right(pose.robot, pose.stamp)) for pose in self.poses]
-        self.statuses = [
-            replaced(each, stamp=right(each.robot, each.stamp), started=right(each.robot, each.started))
-            for each in self.statuses
-        ]
+        if self.clocks:
+            self.states = [right.state(state) for state in self.states]
+            self.poses = [msgspec.structs.replace(p, stamp=right(p.robot, p.stamp)) for p in self.poses]
+            self.statuses = [right.status(status) for status in self.statuses]
+        return count
 
     def lies(self) -> tuple[Lie, ...]:
         """How the clocks of other machines lay to the conductor's."""

@@ -78,3 +78,17 @@ def test_trouble_ends_with_2_and_a_message(bootstrap, monkeypatch, capsys):
 def test_a_failing_command_is_told_with_its_last_lines(bootstrap):
     with pytest.raises(bootstrap.Trouble, match="getting it failed:\n  why\ndo this"):
         bootstrap.call(["sh", "-c", "echo why; exit 3"], {}, "getting it", "do this")
+
+
+@pytest.mark.parametrize(("uid", "installs"), [(0, True), (1000, False)])
+def test_what_tests_need_besides_is_installed_by_root_only(bootstrap, monkeypatch, uid, installs):
+    run = []
+    monkeypatch.setattr(bootstrap.os, "geteuid", lambda: uid)
+    monkeypatch.setattr(
+        bootstrap.shutil, "which", lambda name, path=None: None if name in {"sshd", "ip"} else f"/{name}"
+    )
+    done = bootstrap.subprocess.CompletedProcess([], 0, "")
+    monkeypatch.setattr(bootstrap, "silently", lambda command, environment: run.append(command) or done)
+    bootstrap.add_needed()
+    assert [command[2] for command in run] == (["update", "install"] if installs else [])
+    assert not installs or run[1][-2:] == ["openssh-server", "iproute2"]
