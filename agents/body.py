@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import msgspec
 import numpy as np
 
+from agents.clock import MACHINE, Clock
 from agents.keys import Keys
 from agents.kinds import Kind
 from agents.rows import Array, Index, Mask
@@ -45,7 +46,7 @@ class BodyRequest:
 
     `external` rows get their position from outside, through `Body.locate`. `device` holds each row's settings for its
     hardware, as they stand in the experiment file; the body checks them. `endpoints` and `keys` are for bodies that
-    live on the network.
+    live on the network, and so is `clock`, which makes the stamps there.
     """
 
     names: tuple[str, ...]
@@ -60,6 +61,7 @@ class BodyRequest:
     device: tuple[Mapping[str, Any], ...]
     endpoints: tuple[str, ...]
     keys: Keys
+    clock: Clock = MACHINE
 
     def of(self, rows: Index) -> BodyRequest:
         """The same for some of the rows."""
@@ -76,6 +78,7 @@ class BodyRequest:
             tuple(self.device[row] for row in rows),
             self.endpoints,
             self.keys,
+            self.clock,
         )
 
 

@@ -97,6 +97,16 @@ class Keys:
         return f"{self.realm}/run/experiment"
 
     @property
+    def conductor(self) -> str:
+        """Liveliness token of the conductor."""
+        return f"{self.realm}/run/conductor"
+
+    @property
+    def clock(self) -> str:
+        """How the clocks of other machines lie to the conductor's."""
+        return f"{self.realm}/run/clock"
+
+    @property
     def recorder(self) -> str:
         """Liveliness token of the recorder."""
         return f"{self.realm}/run/recorder"

@@ -5,11 +5,18 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
+import time
 from collections.abc import Sequence
+from typing import Final
+
+import zenoh
 
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
-from agents.session import DEFAULT_ENDPOINT, EndpointError, serve_router
+from agents.session import DEFAULT_ENDPOINT, EndpointError, deserted, serve_router
+
+EMPTY_S: Final = 1.0  # nobody connected for this long: whoever lost its connection would have it again
+LOOK_S: Final = 0.1
 
 
 def serve(endpoints: Sequence[str], *, lifeline: bool = False, linger_s: float = 0.0) -> int:
@@ -20,7 +27,8 @@ def serve(endpoints: Sequence[str], *, lifeline: bool = False, linger_s: float =
     Args:
         endpoints: Where to listen, on loopback.
         lifeline: Whether standard input is a lifeline.
-        linger_s: How long it stays after its lifeline was lost, so that landing robots can still be seen [s].
+        linger_s: How long it stays after its lifeline was lost, so that landing robots can still be seen [s]; less when
+            nobody is connected any more.
 
     Raises:
         EndpointError: If it cannot listen there.
@@ -28,16 +36,25 @@ def serve(endpoints: Sequence[str], *, lifeline: bool = False, linger_s: float =
     stop, lost = threading.Event(), threading.Event()
     rope = Lifeline(lost)
 
-    def leave() -> None:
+    def leave(session: zenoh.Session) -> None:
         lost.wait()
-        stop.wait(linger_s)
+        end = time.monotonic() + linger_s
+        empty = time.monotonic()
+        while (now := time.monotonic()) < end and not stop.wait(LOOK_S):
+            if not deserted(session):
+                empty = now
+            elif now - empty > EMPTY_S:
+                break
         stop.set()
 
-    with told_to_end(stop.set):
+    def ready(session: zenoh.Session) -> None:
+        print(f"router ready on {', '.join(endpoints)}", flush=True)
         if lifeline:
             rope.start()
-            threading.Thread(target=leave, name="linger", daemon=True).start()
-        serve_router(endpoints, stop, ready=lambda: print(f"router ready on {', '.join(endpoints)}", flush=True))
+            threading.Thread(target=leave, args=(session,), name="linger", daemon=True).start()
+
+    with told_to_end(stop.set):
+        serve_router(endpoints, stop, ready=ready)
     if rope.reason is not None:
         print(f"router: {rope.reason}", file=sys.stderr)
     return 0

@@ -6,13 +6,11 @@ One plain loop on the monotonic clock, no asyncio, no callbacks: what arrives wa
 from __future__ import annotations
 
 import gc
-import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import floor, nan
-from types import FrameType
 from typing import Final, Literal
 
 import numpy as np
@@ -24,11 +22,13 @@ from agents.agent import Actions, Agent, links_by_speaker
 from agents.assignment import Assignment
 from agents.body import Body
 from agents.channel import Channel, Conditions, Samples
+from agents.clock import MACHINE, Clock
 from agents.goals import HeardGoals
 from agents.keys import Keys
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
 from agents.orders import carry_out
+from agents.process import told_to_end
 from agents.ranging import HeardRanges, instead
 from agents.rows import Index
 from agents.safety import Limits
@@ -56,6 +56,8 @@ class Setup:
             `ranges` ("world"); or that key too, but the body hears them by itself ("far"). Left out: the bodies.
         conditions: What is done to poses that have come from neighbours, on each link; None: nothing.
         goal_conditions: The same for goals that have come from a centre, for each guided row.
+        clock: Of the experiment.
+        once: Whether the process ends when its robots are down after an experiment.
     """
 
     keys: Keys
@@ -67,6 +69,8 @@ class Setup:
     ranging: Sequence[Ranging] = ()
     conditions: Conditions | None = None
     goal_conditions: Conditions | None = None
+    clock: Clock = MACHINE
+    once: bool = False
 
 
 @dataclass
@@ -123,11 +127,7 @@ class Runtime:
             rope.start()
         asked = threading.Event()
 
-        def end(_signal: int, _frame: FrameType | None) -> None:
-            asked.set()
-
-        before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
+        with told_to_end(asked.set):
             self._body.open()
             try:
                 name = "+".join(self._names)
@@ -140,9 +140,6 @@ class Runtime:
             finally:
                 self._come_down()
                 self._body.close()
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
         return 0
 
     def _come_down(self) -> None:
@@ -351,7 +348,7 @@ class Runtime:
         gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
         zero = time.monotonic()
         # one reading: a step of the wall clock in mid-run does not move the experiment
-        self._utc = self._telemetry.utc = time.time()
+        self._utc = self._telemetry.utc = self._setup.clock.utc()
         farewell = np.inf
         while True:
             wait = zero + self._next - time.monotonic()
@@ -371,7 +368,9 @@ class Runtime:
                 self._stopping = reason
                 for row in range(len(self._names)):
                     self.agent.life.land(row, reason)
-            if self._stopping is not None and (t > farewell or (self.agent.life.phase == Phase.DONE).all()):
+            if (self._stopping is not None or self._setup.once) and (
+                t > farewell or (self.agent.life.phase == Phase.DONE).all()
+            ):
                 self._telemetry.report(t, everything=True)
                 return
 

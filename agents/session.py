@@ -173,8 +173,10 @@ def open_session(
                 ) from None
 
 
-def serve_router(endpoints: Sequence[str], stop: threading.Event, ready: Callable[[], None] | None = None) -> None:
-    """Runs a router on loopback endpoints until `stop` is set; `ready` is called as soon as clients can connect.
+def serve_router(
+    endpoints: Sequence[str], stop: threading.Event, ready: Callable[[zenoh.Session], None] | None = None
+) -> None:
+    """Runs a router on loopback endpoints until `stop` is set; `ready` gets it as soon as clients can connect.
 
     Raises:
         EndpointError: If an endpoint is malformed, not on loopback, or taken.
@@ -189,7 +191,7 @@ def serve_router(endpoints: Sequence[str], stop: threading.Event, ready: Callabl
         ) from None
     with session:
         if ready is not None:
-            ready()
+            ready(session)
         stop.wait()
 
 
@@ -209,6 +211,11 @@ def free_endpoint(preferred_port: int = DEFAULT_PORT) -> str:
 def connected(session: zenoh.Session) -> bool:
     """Whether the session has a router now. Costs 0.6 µs: poll it in the control loop."""
     return bool(session.info.routers_zid())
+
+
+def deserted(session: zenoh.Session) -> bool:
+    """Whether nobody is connected to a router."""
+    return not session.info.transports()
 
 
 def pose_publisher(session: zenoh.Session, key: str, mime: str) -> AdvancedPublisher:

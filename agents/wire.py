@@ -300,6 +300,20 @@ class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     text: str
 
 
+class HostClock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a host's clock lies to the conductor's at `stamp` (the conductor's, UTC [s]).
+
+    `offset` is the host's reading less the conductor's [s], within `uncertainty` [s]. `robots` run there; what they say
+    is stamped on the clock of the first such message of a run, taken off by its `offset`.
+    """
+
+    host: str
+    stamp: float
+    offset: float
+    uncertainty: float
+    robots: list[str]
+
+
 Message = (
     Pose
     | State
@@ -314,6 +328,7 @@ Message = (
     | Stop
     | Event
     | Contact
+    | HostClock
     | WorldState
     | WorldOrder
     | WorldReply
@@ -333,6 +348,7 @@ M = TypeVar(
     Stop,
     Event,
     Contact,
+    HostClock,
     WorldState,
     WorldOrder,
     WorldReply,

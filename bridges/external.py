@@ -73,7 +73,7 @@ class ExternalBody:
         self._endpoints, self._addresses = request.endpoints, request.addresses
         self._flies = np.array([kind.flies for kind in request.kinds])
         self._zero = time.monotonic()
-        self._utc = time.time()  # one reading, as in the runtime: a step of the wall clock moves nothing
+        self._utc = request.clock.utc()  # one reading, as in the runtime: a step of the wall clock moves nothing
         self._shift = np.inf  # from the caller's clock to this one
         self._seen = External(rows)
         self._yaw = np.array(request.yaw, dtype=float)

@@ -3,6 +3,7 @@
 It hears the poses of those robots, and of whom they listen to, as any neighbour would, and sends each its goal. What is
 decided is `agents.centre`; here are the clock and the network. It keeps nothing that it would miss after a death: it is
 started again, hears the last poses, learns from the robots' statuses when and where each began, and goes on.
+It runs where the conductor does, on the clock of the experiment: what robots elsewhere stamp is set right there.
 """
 
 from __future__ import annotations
@@ -10,14 +11,12 @@ from __future__ import annotations
 import argparse
 import gc
 import os
-import signal
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import floor, isfinite
-from types import FrameType
 from typing import Final
 
 import numpy as np
@@ -30,6 +29,7 @@ from agents.channel import Channel, Samples
 from agents.keys import Keys
 from agents.lifecycle import IDLE, Phase
 from agents.lifeline import Lifeline
+from agents.process import told_to_end
 from agents.runtime import reach_of
 from agents.telemetry import resident_mb
 from experiments import conditions, document
@@ -246,30 +246,25 @@ def serve(file: str, *, case: str | None, connect: Sequence[str], lifeline: bool
         raise DocumentError([Problem(file, 0, 0, "every robot of this experiment decides for itself", hint)])
     endpoints = list(connect) or experiment.network.connect or [network.DEFAULT_ENDPOINT]
     over = threading.Event()
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        over.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, end)
-    if lifeline:
-        Lifeline(over).start()
-    with network.open_session(endpoints, name="centre", stop=over) as session:
-        keys = Keys(experiment.network.realm)
-        if network.taken(session, keys.centre_alive):
-            raise CentreTaken(
-                f"a centre guides the robots of the realm '{keys.realm}' already: end it first, choose another router "
-                "with --connect, or another network.realm in the experiment file"
+    with told_to_end(over.set):
+        if lifeline:
+            Lifeline(over).start()
+        with network.open_session(endpoints, name="centre", stop=over) as session:
+            keys = Keys(experiment.network.realm)
+            if network.taken(session, keys.centre_alive):
+                raise CentreTaken(
+                    f"a centre guides the robots of the realm '{keys.realm}' already: end it first, choose another "
+                    "router with --connect, or another network.realm in the experiment file"
+                )
+            process = CentreProcess(experiment, session, keys)
+            heard = [name for name in experiment.robots if name not in steered]
+            print(
+                f"centre ready: guides {', '.join(steered)} at {experiment.rates.coordination_hz:g} Hz"
+                + (f"; {', '.join(heard)} decide for themselves" if heard else "")
+                + f"; realm {experiment.network.realm} at {', '.join(endpoints)}",
+                flush=True,
             )
-        process = CentreProcess(experiment, session, keys)
-        heard = [name for name in experiment.robots if name not in steered]
-        print(
-            f"centre ready: guides {', '.join(steered)} at {experiment.rates.coordination_hz:g} Hz"
-            + (f"; {', '.join(heard)} decide for themselves" if heard else "")
-            + f"; realm {experiment.network.realm} at {', '.join(endpoints)}",
-            flush=True,
-        )
-        process.run(over)
+            process.run(over)
     return 0
 
 

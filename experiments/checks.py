@@ -11,7 +11,7 @@ import numpy as np
 from agents import plugins
 from agents.kinds import KINDS
 from agents.plugins import did_you_mean
-from experiments import channel_checks, formation_checks, outlines
+from experiments import channel_checks, formation_checks, host_checks, outlines
 from experiments.experiment import Arena, Experiment, Hybrid, Robot
 from experiments.problem import Fault
 from twins.scene import Scene
@@ -37,6 +37,7 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
     yield from _furnished(experiment)
     yield from formation_checks.faults(experiment)
     yield from channel_checks.faults(experiment)
+    yield from host_checks.faults(experiment)
     yield from _timeline(experiment)
     yield from _architecture(experiment)
     yield from _triggers(experiment)

@@ -31,6 +31,7 @@ def run(
     as_json: bool,
     seeds: int,
     bodies: str | None,
+    here: bool,
     anyway: bool,
     report: bool,
     open_report: bool,
@@ -65,7 +66,7 @@ def run(
         with interrupted:
             show = shown(quiet=as_json)
             try:
-                runs = [fly(read, folder, cases=cases, show=show, interrupted=interrupted, bodies=bodies)]
+                runs = [fly(read, folder, cases=cases, show=show, interrupted=interrupted, bodies=bodies, local=here)]
             except KeyboardInterrupt:
                 print(f"\nended at once; `zenpark report {folder}` shows what was recorded", file=sys.stderr)
                 return 130
@@ -73,7 +74,7 @@ def run(
         print(f"interrupted before the common start: there is nothing to report; logs: {folder / 'logs'}")
         return 130
     again = _command(
-        file, virtual=virtual, changes=changes, cases=cases, seeds=seeds, bodies=bodies, anyway=anyway
+        file, virtual=virtual, changes=changes, cases=cases, seeds=seeds, bodies=bodies, here=here, anyway=anyway
     )  # fmt: skip
     page = _keep(runs, folder, again) if report else None
     summary: dict[str, Any] = runs[0].summary()
@@ -155,6 +156,7 @@ def _command(
     cases: Sequence[str],
     seeds: int,
     bodies: str | None,
+    here: bool,
     anyway: bool,
 ) -> str:
     parts = ["zenpark", "run", file, *(["--virtual"] if virtual else [])]
@@ -162,6 +164,7 @@ def _command(
     parts += [part for change in changes for part in ("--set", f"'{change}'")]
     parts += ["--seeds", str(seeds)] if seeds > 1 else []
     parts += ["--bodies", bodies] if bodies is not None else []
+    parts += ["--here"] if here else []
     return " ".join([*parts, *(["--anyway"] if anyway else [])])
 
 

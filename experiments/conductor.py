@@ -17,10 +17,12 @@ import zenoh
 from agents import session as network
 from agents import wire
 from agents.keys import Keys
+from experiments import hosts as machines
 from experiments import orders
 from experiments.assign import guided
 from experiments.crew import Crew
 from experiments.experiment import Experiment
+from experiments.hosts import Hosts
 from experiments.launcher import LAND_S, Launcher
 
 POLL_S: Final = 0.05
@@ -29,6 +31,12 @@ CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
 ROUTER_S: Final = 10.0
 FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
 GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
+
+ADOPT_S: Final = 0.5
+AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead,
+BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behind
+LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
+OUTPUT: Final = "says"  # kind of the events that are a line of a process's output
 
 M = TypeVar("M", wire.Status, wire.State)
 
@@ -49,6 +57,7 @@ class Seen:
         sent: Poses that it sent, and `rate` of them over the last second [1/s].
         alive: Whether its liveliness token stands.
         gone: Whether its process has ended or its token has vanished in mid-run.
+        behind: The least time from a stamp of it to its arrival [s]: small, if its clock is right.
     """
 
     status: wire.Status | None = None
@@ -57,6 +66,7 @@ class Seen:
     alive: bool = False
     gone: bool = False
     counted: tuple[float, int] = (0.0, 0)
+    behind: float = float("inf")
 
     @property
     def phase(self) -> str:
@@ -106,6 +116,7 @@ class Conductor:
         folder: Path,
         endpoints: Sequence[str],
         launcher: Launcher,
+        hosts: Hosts,
         show: Show,
         interrupted: Callable[[], bool],
     ) -> None:
@@ -119,6 +130,7 @@ class Conductor:
             folder: Where the recording goes.
             endpoints: Routers.
             launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
+            hosts: Other machines, on which robots may be started.
             show: Called with the progress, about ten times a second.
             interrupted: Asked whether the user wants to end it.
         """
@@ -126,7 +138,7 @@ class Conductor:
         self._file = file
         self._recording = folder / f"{case}.mcap"
         self._endpoints = list(endpoints)
-        self._show, self._interrupted = show, interrupted
+        self._hosts, self._show, self._interrupted = hosts, show, interrupted
         self._keys = Keys(experiment.network.realm)
         steered = guided(experiment)
         self._robots = {name: Seen(error=None if name in steered else 0.0) for name in experiment.robots}
@@ -139,6 +151,7 @@ class Conductor:
             recording=self._recording,
             endpoints=self._endpoints,
             launcher=launcher,
+            hosts=hosts,
         )
 
     def run(self) -> Result:
@@ -148,19 +161,29 @@ class Conductor:
             RunFailed: If robots are not ready in time and the file says that the run must not go on without them.
         """
         began = time.monotonic()
+        self._progress.phase = "connecting the hosts" if self._experiment.hosts else "starting"
+        clocks = self._hosts.join(self._experiment)
         start = ready = None
         try:
-            self._crew.start(self._interrupted)
+            self._crew.prepare(self._interrupted)
             with ExitStack() as stack:
                 self._join(stack)
+                self._adopt()
+                self._crew.start()
                 if self._until("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
+                    self._tell_clocks(clocks)
                     self._say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
                     self._order(wire.Order("takeoff"))
                     if self._until("airborne", CLIMB_S):
                         start = self._start()
                         self._walk(start)
                 self._land()
+                if start is not None:
+                    clocks, trouble = self._hosts.clocks()
+                    self._tell_clocks(clocks)
+                    for each in trouble:
+                        self._say("clock", "conductor", each)
         except RunFailed as failure:
             self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: say it now
             self._progress.events.append(wire.Event(time.time(), "failed", "conductor", self._progress.phase))
@@ -170,6 +193,39 @@ class Conductor:
             self._crew.end()
         gone = tuple(name for name, seen in self._robots.items() if seen.gone)
         return Result(self._recording, self._interrupted(), start, ready, gone)
+
+    def _adopt(self) -> None:
+        """Finds robots that were started by hand or at boot, which nobody needs to start.
+
+        Raises:
+            RunFailed: If one of them has flown already.
+        """
+        away = self._crew.away
+        if self._experiment.network.connect is not None or away:  # a router of our own has nobody else
+            self._progress.phase = "looking who is there"
+            began = time.monotonic()
+            while (past := time.monotonic() - began) < ADOPT_S or (self._flown() and past < LEAVE_S):
+                self._look()
+                time.sleep(POLL_S)
+        if flown := self._flown():
+            raise RunFailed(
+                f"{', '.join(flown)}: on the network already, and {self._robots[flown[0]].phase}; a robot that was "
+                "started by hand flies once: end its process and start it again, next time with --once"
+            )
+        there = {name for name, seen in self._robots.items() if seen.alive}
+        for name in self._crew.adopt(there):
+            said = f"is there already, {self._robots[name].phase}" if name in there else f"is started on {away[name]}"
+            self._say("adopted", name, f"{said}; not started from here")
+
+    def _flown(self) -> list[str]:
+        """Robots that are there and have flown, or do."""
+        return [name for name, seen in self._robots.items() if seen.alive and seen.reached("airborne")]
+
+    def _tell_clocks(self, clocks: Sequence[wire.HostClock]) -> None:
+        """Says how the hosts' clocks lie, for the recording."""
+        for each in clocks:
+            self._clock.put(wire.encode(each))
+            self._say("clock", each.host, f"{each.offset * 1e3:+.2f} ms ± {each.uncertainty * 1e3:.2f} ms against ours")
 
     # ------------------------------------------------------------------ phases
 
@@ -206,6 +262,10 @@ class Conductor:
 
     def _start(self) -> float:
         """One start time for all, in UTC; returns it."""
+        for name, seen in self._robots.items():
+            if not (seen.gone or AHEAD_S < seen.behind < BEHIND_S):
+                remedy = "set it (NTP), or let zenpark start the robot: [hosts]"
+                self._say("clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}")
         at = time.time() + LEAD_S
         self._say("start", "conductor", "common start", stamp=at)
         self._order(wire.Order("start", at=at), only="airborne")
@@ -233,6 +293,7 @@ class Conductor:
 
     def _land(self) -> None:
         """Everybody down."""
+        self._told.undeclare()  # type: ignore[no-untyped-call]  # who joins from now on waits for the next
         self._progress.phase = "landing"
         self._say("phase", "conductor", "landing" + (" (interrupted)" if self._interrupted() else ""))
         if any(not (seen.gone or seen.reached("landing")) for seen in self._robots.values()):
@@ -258,8 +319,10 @@ class Conductor:
         if self._endpoints != [network.DEFAULT_ENDPOINT]:
             there = self._endpoints[0]
             self._say("router", "conductor", f"{there}: look with `zenpark keys --connect {there}`")
+        self._clock = network.publisher(self._session, keys.clock, wire.JSON)
         self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
-        self._told.put(self._file.read_bytes())
+        self._told.put(machines.document(self._experiment))
+        self._token = network.alive_token(self._session, keys.conductor)
         self._statuses = network.pose_subscriber(self._session, keys.status("*"), 4096)
         self._states = network.subscriber(self._session, keys.state("*"), 4096)
         self._watch = network.alive_watch(self._session, keys.alive("*"))
@@ -277,15 +340,17 @@ class Conductor:
             if self._robots[state.robot].error is not None:
                 self._robots[state.robot].error = state.error
         for sample in network.received(self._watch.handler):
-            seen = self._robots.get(self._keys.whose(str(sample.key_expr)) or "")
-            if seen is not None:
+            name = self._keys.whose(str(sample.key_expr))
+            if name is not None and (seen := self._robots.get(name)) is not None:
                 seen.alive = sample.kind == zenoh.SampleKind.PUT
+                self._miss(name, seen)
         for death in self._crew.deaths():
             self._say(death.kind, death.source, death.text)
             if death.kind == "recorder":
                 self._recording_begun = True  # nothing to wait for
             elif death.kind == "lost":
                 self._robots[death.source].gone, self._robots[death.source].alive = True, False
+        self._progress.events += [wire.Event(now, OUTPUT, place, line) for place, line in self._crew.output()]
         for name, seen in self._robots.items():
             if seen.gone and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
                 seen.gone = False  # somebody started it again
@@ -312,6 +377,13 @@ class Conductor:
             seen.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0
             seen.counted = (status.stamp, status.sent)
         seen.status = status
+        seen.behind = min(seen.behind, time.time() - status.stamp)
+
+    def _miss(self, name: str, seen: Seen) -> None:
+        """The token of an adopted robot has vanished: all that is known of its end. Without a router all vanish."""
+        if name in self._crew.adopted and not seen.alive and network.connected(self._session):
+            seen.gone = True
+            self._say("lost", name, "is not on the network any more")
 
     def _order(self, order: wire.Order, only: str | None = None) -> None:
         """Gives an order to every robot that is left; what is refused is said."""

@@ -1,14 +1,20 @@
-"""The processes of one case: recorder, stand-ins for hardware, robots, and the router that all of them meet at."""
+"""The processes of one case: recorder, stand-ins for hardware, robots, and the router that all of them meet at.
+
+Robots are started on the machines that the file says, or by others; all else runs on the launcher's, whose clock is the
+one of the experiment.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from experiments import hosts as machines
 from experiments import standins
 from experiments.document import write_json
 from experiments.experiment import Experiment
+from experiments.hosts import STATION, Hosts
 from experiments.launcher import LAND_S, Launcher, Process
 from experiments.servants import Servants
 
@@ -17,7 +23,7 @@ from experiments.servants import Servants
 class Death:
     """A process has ended that should not have: what it was, whom it concerns, what is done.
 
-    `kind` is "recorder", "lost" (a robot's process), or the name of one that was started again.
+    `kind` is "recorder", "lost" (a robot's process), "host" (the connection to one), or what was started again.
     """
 
     kind: str
@@ -26,7 +32,12 @@ class Death:
 
 
 class Crew:
-    """Starts, watches and ends the processes of one case."""
+    """Starts, watches and ends the processes of one case.
+
+    Attributes:
+        adopted: Robots that somebody else has started, or will.
+        away: Robots that are started on a host without address, and that host.
+    """
 
     def __init__(
         self,
@@ -38,6 +49,7 @@ class Crew:
         recording: Path,
         endpoints: Sequence[str],
         launcher: Launcher,
+        hosts: Hosts,
     ) -> None:
         """Nothing is started yet.
 
@@ -49,10 +61,11 @@ class Crew:
             recording: Where it is recorded; the processes' output goes to `logs/` beside it.
             endpoints: Routers.
             launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
+            hosts: Other machines, on which robots may be started; joined before robots are.
         """
         self._experiment, self._case = experiment, case
         self._file, self._source, self._recording = file, source, recording
-        self._endpoints, self._launcher = endpoints, launcher
+        self._launcher, self._hosts = launcher, hosts
         self._connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
         self._groups: dict[str, list[str]] = {}
         for name, robot in experiment.robots.items():
@@ -60,10 +73,16 @@ class Crew:
         self._recorder = f"{case}-recorder"
         self._standins: tuple[str, ...] = ()
         self._centre: tuple[str, ...] = ()
-        self._servants = Servants(experiment, case, file=file, endpoints=endpoints, launcher=launcher)
+        self._servants = Servants(
+            experiment, case, file=file, endpoints=endpoints, routers=hosts.routers, launcher=launcher
+        )
+        self.adopted: set[str] = set()
+        self.away = machines.absent(experiment)
+        self._addressed, self._reached = file, experiment
+        self._abroad: dict[str, Process] = {}  # by host and group
 
-    def start(self, interrupted: Callable[[], bool]) -> None:
-        """Starts all but the router: the recorder, then what robots need, then the robots.
+    def prepare(self, interrupted: Callable[[], bool]) -> None:
+        """Starts all but router and robots: the recorder, then what robots need.
 
         Args:
             interrupted: Asked while it waits whether the user wants to end it.
@@ -74,11 +93,26 @@ class Crew:
         case = ["--case", self._case, "--source", str(self._source)]
         file = str(self._file)
         self._launcher.start(self._recorder, "experiments.recorder", file, str(self._recording), *case, *self._connect)
-        addressed = self._stand_in(interrupted)
+        self._stand_in(interrupted)
         self._centre = self._servants.start_centre()
+
+    def adopt(self, there: Iterable[str]) -> list[str]:
+        """Robots that are `there` are nobody's to start, nor are those of hosts without address; returns them all."""
+        self.adopted = {*there, *self.away}
+        return sorted(self.adopted)
+
+    def start(self) -> None:
+        """Starts all robots that are not adopted, on their machines."""
+        document = machines.document(self._reached)
         for group, names in self._groups.items():
-            arguments = [str(addressed), *names, *self._connect, "--lifeline"]
-            self._launcher.start(self._process(group), "experiments.robot", *arguments)
+            missing = [name for name in names if name not in self.adopted]
+            station = self._hosts.of(names[0])
+            process = self._process(group)
+            if station is not None and missing:
+                self._abroad[f"{station.name}/{group}"] = station.start(process, missing, document, self._launcher)
+            elif missing:
+                arguments = [str(self._addressed), *missing, *self._connect, "--lifeline"]
+                self._launcher.start(process, "experiments.robot", *arguments)
 
     def end(self) -> None:
         """Ends all but the router: robots land first, and the recorder sees it."""
@@ -95,9 +129,18 @@ class Crew:
                 yield Death(again[0], "conductor", again[1])
             elif process.name == self._recorder:
                 yield Death("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
+            elif process.name.startswith(STATION):
+                what = f"the connection to it ended ({process.exit}); without a router robots hold{_because(process)}"
+                yield Death("host", process.name.removeprefix(STATION), what)
             else:
                 for name in self._groups.get(process.name.removeprefix(f"{self._case}-"), []):
                     yield Death("lost", name, f"its process ended ({process.exit}){_because(process)}")
+
+    def output(self) -> Iterator[tuple[str, str]]:
+        """What processes on other machines have printed since the last call: where, and the line."""
+        for place, process in self._abroad.items():
+            for line in process.news():
+                yield place, line
 
     def last_line(self, robot: str) -> str:
         """The last line that the process of a robot wrote; empty if it wrote none."""
@@ -108,9 +151,9 @@ class Crew:
     def _process(self, group: str) -> str:
         return f"{self._case}-{group}"
 
-    def _stand_in(self, interrupted: Callable[[], bool]) -> Path:
-        """Starts world, protocol twins and positioning; returns the case as a file with the addresses of robots."""
-        experiment, self._standins = standins.start(
+    def _stand_in(self, interrupted: Callable[[], bool]) -> None:
+        """Starts world, protocol twins and positioning, and writes down at which addresses robots are then."""
+        self._reached, self._standins = standins.start(
             self._experiment,
             self._file,
             prefix=self._case,
@@ -118,11 +161,9 @@ class Crew:
             connect=self._connect,
             interrupted=interrupted,
         )
-        if not self._standins:
-            return self._file
-        file = self._file.with_name(f"{self._case}-addressed.json")
-        file.write_bytes(write_json(experiment))
-        return file
+        if self._standins:
+            self._addressed = self._file.with_name(f"{self._case}-addressed.json")
+            self._addressed.write_bytes(write_json(self._reached))
 
 
 def _because(process: Process) -> str:

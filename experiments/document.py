@@ -109,6 +109,15 @@ def _document(file: Path, label: str, text: str, overrides: Sequence[str]) -> Do
         raise DocumentError([Problem(label, 0, 0, "tables or lists are nested too deeply", "flatten them")]) from None
 
 
+def received(text: str, label: str) -> Document:
+    """An experiment that came as JSON over a pipe; its arena is in it.
+
+    Raises:
+        DocumentError: With everything that is wrong with it.
+    """
+    return _Reading(Path(label), label, text, True, parsed(text, label, json=True), ()).document()
+
+
 def listed(texts: Sequence[str]) -> str:
     """The text of an experiment file, and below it those of its arena files: for people."""
     return "\n\n# ---- the arena file ----\n\n".join(texts)

@@ -269,7 +269,35 @@ class Network(Part, frozen=True):
     connect: Annotated[
         list[str] | None, Meta(description="endpoints of routers that run already; left out: one is started")
     ] = None
+    listen: Annotated[
+        list[str] | None,
+        Meta(
+            description="endpoints of the router that is started; left out: on loopback, and hosts reach it through "
+            "their ssh connection"
+        ),
+    ] = None
+    address: Annotated[
+        str | None,
+        Meta(description="name of this machine for hosts, where `listen` is given; left out: as ssh came from there"),
+    ] = None
     encoding: Annotated[Literal["json", "msgpack"], Meta(description="of the payloads")] = "json"
+
+
+class Host(Part, frozen=True):
+    """Another machine, whose robots are started there."""
+
+    address: Annotated[
+        str | None,
+        Meta(
+            description="what ssh takes: a name of its configuration, user@machine, ssh://user@machine:port; left out: "
+            "its robots are started there by hand or at boot, and join"
+        ),
+    ] = None
+    zenpark: Annotated[str, Meta(description="the command there; a path counts from the home folder")] = (
+        "zenpark/zenpark"
+    )
+    robots: Annotated[list[Name], Meta(description="who runs there; robots that no host names run here")] = []
+    tags: Annotated[list[Name], Meta(description="by which `zenpark hosts` chooses among hosts")] = []
 
 
 class Safety(Part, frozen=True):
@@ -347,6 +375,7 @@ class Experiment(Part, frozen=True):
     world: World = World()
     channel: Channel = Channel()
     network: Network = Network()
+    hosts: Annotated[dict[Name, Host], Meta(description="other machines, and which robots run there")] = {}
     safety: Safety = Safety()
     start: Start = Start()
     cases: Annotated[

@@ -1,4 +1,6 @@
-"""Starts, watches and ends processes on this machine; whatever happens to the launcher, none of them outlives it long.
+"""Starts, watches and ends processes; whatever happens to the launcher, none of them outlives it long.
+
+A process on another machine is an `ssh` here, which hands input, output and exit code through (`experiments.hosts`).
 
 Each process holds its standard input as a lifeline (`agents.lifeline`): the launcher writes a byte to it now and then,
 and closing it is the order to end. A killed launcher closes it too.
@@ -14,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
@@ -33,6 +35,8 @@ class Process:
     name: str
     handle: subprocess.Popen[bytes]
     log: Path
+    untold: bytearray = field(default_factory=bytearray)  # what its standard input has yet to get
+    shown: int = 0  # bytes of its output that `Launcher.said` has handed out
 
     @property
     def alive(self) -> bool:
@@ -45,6 +49,17 @@ class Process:
         if code is None:
             return "still running"
         return f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
+
+    def news(self) -> list[str]:
+        """The whole lines of its output that were not handed out before."""
+        try:
+            with self.log.open("rb") as output:
+                output.seek(self.shown)
+                lines, ended, _ = output.read().rpartition(b"\n")
+        except OSError:
+            return []
+        self.shown += len(lines) + len(ended)
+        return lines.decode(errors="replace").splitlines()
 
     def tail(self) -> str:
         """The end of its output."""
@@ -81,22 +96,34 @@ class Launcher:
 
     def start(self, name: str, module: str, *arguments: str) -> Process:
         """Starts a module of this project in a process and session of its own; one thread per numeric library."""
+        return self.spawn(name, [sys.executable, "-m", module, *arguments])
+
+    def spawn(self, name: str, command: Sequence[str], *, told: bytes = b"", answers: bool = False) -> Process:
+        """Starts any command that holds its standard input as a lifeline.
+
+        Args:
+            name: Of the process, and of its log.
+            command: And its arguments.
+            told: What it reads there before the first heartbeat.
+            answers: Its standard output is the caller's to read, and only its errors are logged.
+        """
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
         log = self._logs / f"{name}.log"
         with log.open("ab") as output:
             handle = subprocess.Popen(
-                [sys.executable, "-m", module, *arguments],
+                command,
                 stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=subprocess.STDOUT,
+                stdout=subprocess.PIPE if answers else output,
+                stderr=output,
                 start_new_session=True,  # Ctrl-C is the launcher's: it lands the robots first
                 env=environment,
             )
         assert handle.stdin is not None
         os.set_blocking(handle.stdin.fileno(), False)  # a stopped process must not stop the heartbeat of the others
-        process = Process(name, handle, log)
+        process = Process(name, handle, log, bytearray(told))
         with self._lock:
             self._processes[name] = process
+            self._tell(process)
         return process
 
     def get(self, name: str) -> Process:
@@ -111,6 +138,7 @@ class Launcher:
                 del self._processes[process.name]
         for process in dead:
             self._close(process)
+            self._forget(process)
         return dead
 
     def end(self, names: Iterable[str], grace_s: float) -> list[Process]:
@@ -126,6 +154,8 @@ class Launcher:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.handle.pid, number)
             self._wait(stubborn, wait_s)
+        for process in ending:
+            self._forget(process)
         return [process for process in ending if (process.handle.returncode or 0) == -signal.SIGKILL]
 
     @staticmethod
@@ -141,10 +171,23 @@ class Launcher:
             with contextlib.suppress(OSError):
                 process.handle.stdin.close()
 
+    @staticmethod
+    def _forget(process: Process) -> None:
+        """Lets go of what it answered, once it is over."""
+        if process.handle.stdout is not None:
+            process.handle.stdout.close()
+
     def _beats(self) -> None:
         while not self._over.wait(BEAT_S):
             with self._lock:
                 for process in self._processes.values():
-                    if process.handle.stdin is not None:
-                        with contextlib.suppress(OSError, ValueError):  # dead, or frozen with a full pipe
-                            os.write(process.handle.stdin.fileno(), b"\n")
+                    process.untold += b"" if process.untold else b"\n"
+                    self._tell(process)
+
+    @staticmethod
+    def _tell(process: Process) -> None:
+        """Writes what fits into the pipe: what reads at the other end may take its time."""
+        if process.handle.stdin is not None:
+            with contextlib.suppress(OSError, ValueError):  # dead, or frozen with a full pipe
+                while process.untold:
+                    del process.untold[: os.write(process.handle.stdin.fileno(), process.untold)]

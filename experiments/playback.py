@@ -14,10 +14,11 @@ import numpy as np
 
 from agents.lifecycle import Phase
 from agents.rows import Array, Index
-from agents.wire import CentreState, Contact, Event, State, Status, WorldState
+from agents.wire import CentreState, Contact, Event, HostClock, State, Status, WorldState
 from experiments import assign
 from experiments.assign import guided
 from experiments.cdr import Undecodable, codec
+from experiments.clocks import Correction, Lie
 from experiments.contacts import ROUNDING_S, looked_for, within
 from experiments.experiment import Experiment
 from experiments.goals import of_recording
@@ -75,6 +76,9 @@ def read(path: Path) -> Playback:
     everybody (interrupted by the user, or all robots had come down before), else, when the recorder or the conductor
     was killed, with the last that is known of the robots while they ran. Nothing of a landing is in the trace.
 
+    What robots on other machines stamped is set right by what their clocks drifted in the run; their offset at its
+    beginning was taken off where the stamps were made.
+
     Raises:
         NotStarted: If the run ended before its common start.
         RecordingError: If the file is no recording of zenpark, or of another version.
@@ -114,6 +118,7 @@ class _Content:
     world: list[WorldState] = field(default_factory=list)
     goals: list[SentGoal] = field(default_factory=list)
     reports: list[CentreState] = field(default_factory=list)
+    clocks: list[HostClock] = field(default_factory=list)
 
     def fill(self) -> int:
         """Reads all messages and counts them; those of other types are passed over."""
@@ -127,6 +132,7 @@ class _Content:
                 _reader(WorldState, self.world),
                 _reader(SentGoal, self.goals),
                 _reader(CentreState, self.reports),
+                _reader(HostClock, self.clocks),
             ]
         )
         readers: dict[int, Callable[[bytes], None] | None] = {}
@@ -141,7 +147,17 @@ class _Content:
                     take(message.data)
                 except Undecodable as error:
                     raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
+        right = Correction(self.clocks)
+        if self.clocks:
+            self.states = [right.state(state) for state in self.states]
+            self.poses = [msgspec.structs.replace(p, stamp=right(p.robot, p.stamp)) for p in self.poses]
+            self.statuses = [right.status(status) for status in self.statuses]
+            self.goals = [msgspec.structs.replace(g, pose=right(g.robot, g.pose)) for g in self.goals]
         return count
+
+    def lies(self) -> tuple[Lie, ...]:
+        """How the clocks of other machines lay to the conductor's."""
+        return Correction(self.clocks).lies()
 
     def start(self, announced: float | None) -> float | None:
         """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
@@ -248,6 +264,7 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         shadow_position=column("shadow_position") if shadowed else None,
         shadow_yaw=column("shadow_yaw")[:, :, 0] if shadowed else None,
         goals=goals,
+        clocks=content.lies(),
     )
 
 

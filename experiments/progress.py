@@ -6,7 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final, Protocol, Self
 
-from experiments.conductor import FROZEN_S, Progress, Seen
+from experiments.conductor import FROZEN_S, OUTPUT, Progress, Seen
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -46,7 +46,9 @@ class Lines:
         if progress.case != self._case:
             self._case, self._told = progress.case, 0
         for event in progress.events[self._told :]:
-            if event.kind not in QUIET:
+            if event.kind == OUTPUT:
+                print(f"{event.source}| {event.text}", file=sys.stderr)
+            elif event.kind not in QUIET:
                 print(f"{progress.case}: {event.kind} {event.source}: {event.text}", file=sys.stderr)
         self._told = len(progress.events)
         now = time.monotonic()
@@ -65,6 +67,7 @@ class Table:
 
         self._live = Live(console=Console(stderr=True), refresh_per_second=4, auto_refresh=False)
         self._next = 0.0
+        self._told = 0
 
     def __enter__(self) -> Self:
         self._live.__enter__()
@@ -75,6 +78,10 @@ class Table:
 
     def __call__(self, progress: Progress) -> None:
         """Draws the table anew, four times a second at most."""
+        told, self._told = self._told, len(progress.events)
+        for event in progress.events[told:]:
+            if event.kind == OUTPUT:
+                self._live.console.print(f"{event.source}| {event.text}", markup=False, highlight=False)
         now = time.monotonic()
         if now >= self._next or progress.phase == "done":
             self._next = now + REFRESH_S
@@ -99,7 +106,7 @@ def _table(progress: Progress) -> RenderableType:
     now = time.time()
     for name, seen in progress.robots.items():
         grid.add_row(name, *_cells(seen, now))
-    news = [event for event in progress.events if event.kind not in QUIET][-EVENTS:]
+    news = [event for event in progress.events if event.kind not in (*QUIET, OUTPUT)][-EVENTS:]
     return Group(grid, *(Text(f"  {event.kind} {event.source}: {event.text}", style="dim") for event in news))
 
 

@@ -51,6 +51,7 @@ class Recorder:
         self._world = network.subscriber(session, keys.world, DEPTH)
         self._goals = network.subscriber(session, keys.goal("*"), DEPTH)
         self._centre = network.subscriber(session, keys.centre, DEPTH)
+        self._clocks = network.pose_subscriber(session, keys.clock, DEPTH)
         self._truths = network.subscriber(session, keys.truth("*"), DEPTH)
         self._truth: dict[str, wire.Position] = {}
         self._watch = network.alive_watch(session, keys.alive("*"))
@@ -80,6 +81,7 @@ class Recorder:
             (self._world.handler, self._said_by_world),
             (self._goals.handler, self._goal),
             (self._centre.handler, self._said_by_centre),
+            (self._clocks.handler, self._clock),
         ):
             for sample in network.received(handler):
                 try:
@@ -138,6 +140,11 @@ class Recorder:
         said = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.CentreState)
         self._finite(sample, said.stamp, said.load, said.late_s, said.cpu_s, said.rss_mb)
         self._recording.centre(said)
+
+    def _clock(self, sample: zenoh.Sample) -> None:
+        said = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.HostClock)
+        self._finite(sample, said.stamp, said.offset, said.uncertainty)
+        self._recording.clock(said)
 
     @staticmethod
     def _finite(sample: zenoh.Sample, *numbers: float) -> None:

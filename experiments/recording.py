@@ -8,6 +8,7 @@
     /centre/report      zenpark_msgs/CentreState      what the centre says of itself
     /world/contact      zenpark_msgs/Contact          what touched in the world, when it began
     /world/state        zenpark_msgs/WorldState       what the world says of itself
+    /run/clock          zenpark_msgs/HostClock        how another machine's clock lay to the conductor's
     /events             zenpark_msgs/Event
 
 Attached are the experiment as it was written (`experiment.toml`) and this case with its overrides (`experiment.json`);
@@ -26,7 +27,7 @@ from typing import IO, Any, Final, Literal, Self, cast
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from agents.wire import CentreState, Contact, Event, Goal, Pose, State, Status, Vector, WorldState
+from agents.wire import CentreState, Contact, Event, Goal, HostClock, Pose, State, Status, Vector, WorldState
 from experiments.cdr import POSE_STAMPED, POSE_STAMPED_SCHEMA, Unencodable, codec, pose_stamped
 from experiments.experiment import Experiment
 from experiments.records import RecordingError
@@ -35,8 +36,9 @@ FRAME: Final = "park"
 TOML: Final = "experiment.toml"
 JSON: Final = "experiment.json"
 METADATA: Final = "zenpark"
-WORLD: Final = "world"  # stands where a robot's name would; no robot may be called so,
-CENTRE: Final = "centre"  # nor so
+RUN: Final = "run"  # these stand where a robot's name would; no robot may be called so
+WORLD: Final = "world"
+CENTRE: Final = "centre"
 CHUNK_BYTES: Final = 32 * 1024  # what a kill can cost: a third of a second of seven robots
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 
@@ -109,6 +111,7 @@ class Recording:
         self._state = _topic("state", State)
         self._status = _topic("status", Status)
         self._event = _topic("events", Event)
+        self._clock = _topic("clock", HostClock)
         self._contact, self._world = _topic("contact", Contact), _topic("state", WorldState)
         self._goal, self._centre = _topic("goal", SentGoal), _topic("report", CentreState)
         self._drawn = _Topic("true_pose", POSE_STAMPED, POSE_STAMPED_SCHEMA, _drawing())
@@ -192,6 +195,14 @@ class Recording:
             RecordingError: If it cannot be written; what was written before stays.
         """
         self._record(self._world, WORLD, said, said.stamp, said.stamp)
+
+    def clock(self, said: HostClock) -> None:
+        """Records how another machine's clock lay to the conductor's.
+
+        Raises:
+            RecordingError: If it cannot be written; what was written before stays.
+        """
+        self._record(self._clock, RUN, said, said.stamp, said.stamp)
 
     def event(self, event: Event) -> None:
         """Records something that happened, and brings all so far to the disk: events are few, and explain the rest.

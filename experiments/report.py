@@ -24,6 +24,7 @@ from experiments.report_network import network_tables
 from experiments.report_tables import (
     DEFINITIONS,
     Table,
+    clocks_table,
     events_table,
     gaps_table,
     links_table,
@@ -41,6 +42,11 @@ TEMPLATE: Final = "report.html.jinja"
 PROOF: Final = (
     "Every pose carries a running number, so a gap proves a loss. Heard is counted over all listeners together; a pose "
     "sent in the last instant of the run may still be under way."
+)
+CLOCKS: Final = (
+    "What a host's clock read more than the conductor's, by the shortest of many round trips. The offset before the "
+    "run was taken off wherever robots there made a stamp or obeyed the start; what drift added since, is taken off "
+    "here."
 )
 SEEN: Final = "Contacts are those that the world saw begin; distances are between surfaces, on true positions."
 WORKED_OUT: Final = (
@@ -165,6 +171,7 @@ def write(
             folded="Show all links" if len(cases[0].belief) > MOST_LINKS else "",
         ),
         *_of_worlds(cases, first, len(drawn)),
+        *_of_clocks(first),
         Section("What happened", tables=(events_table(first),)),
         Section("The experiment", listing=listing, folded="Show the file"),
         Section("Definitions", terms=DEFINITIONS),
@@ -314,6 +321,13 @@ def _of_architecture(cases: Sequence[CaseMetrics]) -> list[Section]:
     """Who decides, if not every robot for itself."""
     table = architecture_table(cases)
     return [] if table is None else [Section("Architecture", (EXPLAINED,), (table,))]
+
+
+def _of_clocks(traces: Sequence[Trace]) -> list[Section]:
+    """How the clocks of other machines lay, where robots ran on any."""
+    if not any(trace.clocks for trace in traces):
+        return []
+    return [Section("Clocks of other machines", (CLOCKS,), (clocks_table(traces),))]
 
 
 def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_before: int) -> list[Section]:

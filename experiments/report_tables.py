@@ -270,6 +270,24 @@ def links_table(cases: Sequence[CaseMetrics]) -> Table:
     return Table(("Who holds of whom", *head), tuple(rows))
 
 
+def clocks_table(traces: Sequence[Trace]) -> Table:
+    """How the clocks of other machines lay to the conductor's, and what of it is left in the stamps."""
+    rows = [
+        Row(
+            (
+                *(trace.case, lie.host, ", ".join(lie.robots)),
+                *(f"{1e3 * lie.first:+.3f}", f"{1e3 * lie.last:+.3f}", f"{1e3 * lie.uncertainty:.3f}"),
+                "" if lie.drift is None else f"{1e6 * lie.drift:+.1f} ± {2e6 * lie.uncertainty / lie.over:.1f}",
+                f"{1e3 * (lie.last - lie.first):+.3f}",
+            )
+        )
+        for trace in traces
+        for lie in trace.clocks
+    ]
+    heading = ("Case", "Host", "Robots", "Offset before [ms]", "after [ms]", "± [ms]", "Drift [ppm]", "Added [ms]")
+    return Table(heading, tuple(rows), words=True)
+
+
 def events_table(traces: Sequence[Trace]) -> Table:
     """What the conductor and the robots said, case by case."""
     said = [(trace.case, event) for trace in traces for event in trace.events]

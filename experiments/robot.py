@@ -6,39 +6,99 @@
 from __future__ import annotations
 
 import argparse
+import os
+import select
+import socket
 import sys
+import time
 from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from typing import Final
 
-from agents import plugins
+from agents import output, plugins
+from agents import session as network
 from agents.body import BodyError
+from agents.clock import Clock
 from agents.fleet import assemble
 from agents.keys import Keys
 from agents.runtime import NameTaken, Ranging, Runtime, Setup
 from agents.session import DEFAULT_ENDPOINT, EndpointError, Unreachable
 from agents.shadow import shadowed
-from experiments import assign, conditions, document
+from experiments import assign, conditions, document, joining
 from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
 
+STDIN: Final = "-"
+JOIN: Final = "join"
 FAR: Final = ("external", "world")  # bodies that live in another process, their range sensors too
 
 
-def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[str], lifeline: bool) -> int:
+TOLD_S: Final = 15.0  # how long an experiment may take to come over standard input
+
+
+def fly(
+    file: str,
+    names: Sequence[str],
+    *,
+    case: str | None,
+    connect: Sequence[str],
+    lifeline: bool,
+    clock_correction_s: float = 0.0,
+    once: bool = False,
+    realm: str = "park",
+) -> int:
     """Runs the robots `names` of an experiment in this process; returns its exit code.
+
+    Args:
+        file: The experiment; "-" for the first line of standard input, as JSON; "join" for what is run next.
+        names: Of the robots.
+        case: Of the file; the first if left out.
+        connect: Routers; the file's, or the one of this machine, if left out.
+        lifeline: Whether standard input is a lifeline.
+        clock_correction_s: What is added to this machine's clock to get that of the experiment [s].
+        once: Whether to end when the robots are down after the experiment.
+        realm: In which to join.
 
     Raises:
         DocumentError: If the file is wrong, or has no such robot or case.
         BodyError, UnknownPlugin: If a body cannot be had.
         Unreachable: If no router answers.
     """
-    experiment = chosen_case(document.read(file), case)
-    unknown = [name for name in names if name not in experiment.robots]
-    if unknown:
-        hint = plugins.did_you_mean(unknown[0], experiment.robots)
-        raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
+    if lifeline:
+        output.detach()
+    with ExitStack() as stack:
+        endpoints = list(connect)
+        if file == JOIN:
+            session = stack.enter_context(network.open_session(connect or [DEFAULT_ENDPOINT], name=f"{names[0]} joins"))
+            read = joining.offered(session, Keys(realm), names)
+            endpoints = endpoints or [DEFAULT_ENDPOINT]
+            stack.callback(joining.Tether(session, Keys(realm)).close)
+        elif file == STDIN:
+            print(f"{', '.join(names)}: on {socket.gethostname()}, process {os.getpid()}", flush=True)
+            read = document.received(told(), "standard input")
+        else:
+            read = document.read(file)
+        experiment = chosen_case(read, case)
+        unknown = [name for name in names if name not in experiment.robots]
+        if unknown:
+            hint = plugins.did_you_mean(unknown[0], experiment.robots)
+            raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
+        return _run(experiment, names, endpoints, lifeline=lifeline, clock=Clock(clock_correction_s), once=once)
+
+
+def _run(
+    experiment: Experiment,
+    names: Sequence[str],
+    connect: Sequence[str],
+    *,
+    lifeline: bool,
+    clock: Clock,
+    once: bool,
+) -> int:
+    """Runs robots of a case until they end."""
     endpoints = list(connect) or experiment.network.connect or [DEFAULT_ENDPOINT]
-    request = assign.request(experiment, names, [experiment.seed], endpoints)
+    request = replace(assign.request(experiment, names, [experiment.seed], endpoints), clock=clock)
     body = shadowed(assemble(request), request, assign.shadows(experiment, names))
     assignment = assign.assign(experiment, names)
     setup = Setup(
@@ -51,8 +111,32 @@ def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[
         ranging=[_ranging(experiment.robots[name]) for name in names],
         conditions=conditions.at_listeners(experiment, assignment.links, names),
         goal_conditions=conditions.from_centre(experiment, names),
+        clock=clock,
+        once=once,
     )
     return Runtime(assignment, body, setup).run()
+
+
+def told(fd: int = 0, limit_s: float = TOLD_S) -> str:
+    """The first line that comes in on a descriptor; what follows is the lifeline's.
+
+    Raises:
+        DocumentError: If none comes in time.
+    """
+    deadline = time.monotonic() + limit_s
+    waiting = select.poll()
+    waiting.register(fd, select.POLLIN)
+    text = b""
+    while waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
+        data = os.read(fd, 65536)
+        line, end, _ = data.partition(b"\n")
+        text += line
+        if end:
+            return text.decode(errors="replace")
+        if not data:
+            break
+    hint = "whoever starts a robot with FILE - writes the experiment there, as JSON in one line"
+    raise DocumentError([Problem("standard input", 0, 0, f"no experiment came within {limit_s:g} s", hint)])
 
 
 def _ranging(robot: Robot) -> Ranging:
@@ -80,14 +164,26 @@ def chosen_case(read: document.Document, name: str | None) -> Experiment:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
     parser = argparse.ArgumentParser(prog="zenpark agent", description="Robots of an experiment in one process.")
-    parser.add_argument("file", help="experiment file, or name in the catalogue")
+    parser.add_argument("file", help="experiment file, or name in the catalogue; join: what is run next")
     parser.add_argument("names", nargs="+", metavar="ROBOT")
     parser.add_argument("--case", help="which case of the file; the first if left out")
     parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
     parser.add_argument("--lifeline", action="store_true", help="land and end when standard input ends or is silent")
+    parser.add_argument("--clock-correction", type=float, default=0.0, metavar="SECONDS", help="added to the clock")
+    parser.add_argument("--realm", default="park", help="in which to join")
+    parser.add_argument("--once", action="store_true", help="end when down after the experiment")
     chosen = parser.parse_args(arguments)
     try:
-        return fly(chosen.file, chosen.names, case=chosen.case, connect=chosen.connect, lifeline=chosen.lifeline)
+        return fly(
+            chosen.file,
+            chosen.names,
+            case=chosen.case,
+            connect=chosen.connect,
+            lifeline=chosen.lifeline,
+            clock_correction_s=chosen.clock_correction,
+            once=chosen.once,
+            realm=chosen.realm,
+        )
     except (DocumentError, BodyError, NameTaken, plugins.PluginError, EndpointError, Unreachable) as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2

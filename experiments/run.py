@@ -24,11 +24,15 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
+from agents.endpoint import Endpoint
 from agents.session import free_endpoint
 from experiments import document, metrics, playback, results, virtual
 from experiments.conductor import Conductor, Result
 from experiments.document import Document
 from experiments.experiment import Experiment
+from experiments.hosts import Hosts
 from experiments.launcher import Launcher
 from experiments.logbook import Logbook
 from experiments.measured import CaseMetrics
@@ -168,6 +172,7 @@ def fly(
     show: Shown,
     interrupted: Callable[[], bool] = lambda: False,
     bodies: str | None = None,
+    local: bool = False,
 ) -> Run:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
@@ -179,23 +184,33 @@ def fly(
         interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
         bodies: What every robot is put into instead of the body that the file gives it: "twin", "world", or
             "protocol" for its real bridge and a protocol twin.
+        local: Whether all robots run on this machine, whatever the file says of hosts.
 
     Raises:
         RunFailed: If robots are not ready in time, unless the file says to go on without them.
         Unreachable: If the routers of the file do not answer.
+        HostError: If a host cannot be reached, or has another zenpark.
+        DocumentError: If robots that run on hosts are to be put behind protocol twins.
     """
+    if bodies == "protocol" and read.experiment.hosts and not local:
+        hint = "add --here, which lets all robots run on this machine"
+        raise DocumentError([Problem("--bodies protocol", 0, 0, "protocol twins cannot be seen from hosts", hint)])
     results: dict[str, Result] = {}
     read.keep(folder / SOURCE)
     with Launcher(folder / "logs") as launcher:
-        endpoints = read.experiment.network.connect
-        if endpoints is None:
-            endpoints = [free_endpoint()]
-            start_router(launcher, endpoints)
+        endpoints = routers = read.experiment.network.connect
+        if endpoints is None or routers is None:
+            routers = read.experiment.network.listen or [free_endpoint()]
+            start_router(launcher, routers)
+            endpoints = [str(here(Endpoint.parse(router))) for router in routers]
+        hosts = Hosts(launcher, routers)
         with show:
             for name, experiment in chosen(read, cases).items():
                 if interrupted():
                     break
                 experiment = choose_bodies(experiment, bodies)  # noqa: PLW2901
+                if local:
+                    experiment = msgspec.structs.replace(experiment, hosts={})  # noqa: PLW2901
                 file = folder / f"{name}.json"
                 file.write_bytes(document.write_json(experiment))
                 results[name] = Conductor(
@@ -206,12 +221,19 @@ def fly(
                     folder=folder,
                     endpoints=endpoints,
                     launcher=launcher,
+                    hosts=hosts,
                     show=show,
                     interrupted=interrupted,
                 ).run()
-    notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost]
+        left = hosts.sweep()
+    notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
     begun = {case: result.recording for case, result in results.items() if result.start is not None}
     return _read_back(folder, begun, notes)
+
+
+def here(router: Endpoint) -> Endpoint:
+    """How this machine reaches a router that listens at an endpoint of it."""
+    return router.at("127.0.0.1") if router.is_wildcard else router
 
 
 def reopen(folder: Path) -> Run:

@@ -30,13 +30,29 @@ class Servants:
     """Those of one case."""
 
     def __init__(
-        self, experiment: Experiment, case: str, *, file: Path, endpoints: Sequence[str], launcher: Launcher
+        self,
+        experiment: Experiment,
+        case: str,
+        *,
+        file: Path,
+        endpoints: Sequence[str],
+        routers: Sequence[str],
+        launcher: Launcher,
     ) -> None:
-        """The router and the world are started by others, for the first time; the centre by `start_centre`."""
+        """The router and the world are started by others, for the first time; the centre by `start_centre`.
+
+        Args:
+            experiment: The case.
+            case: Its name.
+            file: The same as a file.
+            endpoints: Routers as this machine reaches them.
+            routers: Where a router of our own listens, which other machines must find again.
+            launcher: Starts them.
+        """
         connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
         self._centre = f"{case}-centre" if guided(experiment) else None
         self._known = {
-            ROUTER: _Servant(lambda: start_router(launcher, endpoints), "", ": the robots hold, and land at the end"),
+            ROUTER: _Servant(lambda: start_router(launcher, routers), "", ": the robots hold, and land at the end"),
             standins.world_name(case): _Servant(
                 lambda: standins.start_world(experiment, file, prefix=case, launcher=launcher, connect=connect)
             ),

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from agents.rows import Array, Index
 from agents.wire import Contact, Event, WorldState
+from experiments.clocks import Lie
 from experiments.experiment import Experiment
 from experiments.goals import Goals
 
@@ -91,6 +92,7 @@ class Trace:
         dropped: (E,) samples that the modelled network dropped on each of `assign.heard_links`, in their order; None
             if that is not known.
         goals: What the centre told robots, and heard of them; None if every robot decides for itself.
+        clocks: Of the other machines on which robots ran; what they stamped is set right by it.
     """
 
     case: str
@@ -120,3 +122,4 @@ class Trace:
     shadow_yaw: Array | None = None
     dropped: Index | None = None
     goals: Goals | None = None
+    clocks: tuple[Lie, ...] = ()

@@ -89,6 +89,7 @@ def process() -> Iterator[Figure]:
     from agents.session import free_endpoint  # noqa: PLC0415
     from experiments import document  # noqa: PLC0415
     from experiments.conductor import Conductor, Progress  # noqa: PLC0415
+    from experiments.hosts import Hosts  # noqa: PLC0415
     from experiments.launcher import Launcher  # noqa: PLC0415
     from experiments.run import SOURCE, load  # noqa: PLC0415
     from experiments.servants import start_router  # noqa: PLC0415
@@ -120,6 +121,7 @@ def process() -> Iterator[Figure]:
                 folder=folder,
                 endpoints=endpoints,
                 launcher=launcher,
+                hosts=Hosts(launcher, endpoints),
                 show=look,
                 interrupted=lambda: False,
             ).run()

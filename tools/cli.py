@@ -28,6 +28,7 @@ EXPLAINED: Final = (
     ("experiments.records", "RecordingError"),
     ("experiments.export", "ExportError"),
     ("experiments.conductor", "RunFailed"),
+    ("experiments.hosts", "HostError"),
     ("experiments.virtual", "Stuck"),
     ("experiments.sweep_workers", "SweepError"),
     ("experiments.standins", "StandInError"),
@@ -84,6 +85,7 @@ def run(
             help="Every robot in a twin of its own, in one world, or behind a protocol twin (real time).",
         ),
     ] = None,
+    here: Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")] = False,
     anyway: Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")] = False,
     report: Annotated[bool, typer.Option(help="Writes the report.")] = True,
     open_report: Annotated[bool, typer.Option("--open", help="Opens the report in the browser.")] = False,
@@ -102,6 +104,7 @@ def run(
             as_json=as_json,
             seeds=seeds,
             bodies=bodies,
+            here=here,
             anyway=anyway,
             report=report,
             open_report=open_report,
@@ -174,11 +177,38 @@ def agent(
     lifeline: Annotated[
         bool, typer.Option("--lifeline", help="Land and end when standard input ends or falls silent.")
     ] = False,
+    clock_correction: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Added to this machine's clock to get the conductor's.")
+    ] = 0.0,
+    once: Annotated[bool, typer.Option("--once", help="End when down after the experiment.")] = False,
+    realm: Annotated[str, typer.Option(metavar="NAME", help="In which to join.")] = "park",
 ) -> None:
-    """Be one robot of an experiment, or several that share a device."""
+    """Be one robot of an experiment, or several that share a device.
+
+    FILE "join" waits for whatever is run next; "-" is a line of JSON on standard input.
+    """
     from experiments.robot import fly  # noqa: PLC0415
 
-    raise typer.Exit(fly(file, names, case=case, connect=connect or [], lifeline=lifeline))
+    raise typer.Exit(
+        fly(
+            file,
+            names,
+            case=case,
+            connect=connect or [],
+            lifeline=lifeline,
+            clock_correction_s=clock_correction,
+            once=once,
+            realm=realm,
+        )
+    )
+
+
+@app.command(hidden=True)
+def station() -> None:
+    """Answer the launcher of another machine; `zenpark run` starts it where robots of the experiment are."""
+    from experiments.station import serve  # noqa: PLC0415
+
+    raise typer.Exit(serve())
 
 
 @app.command()
@@ -433,6 +463,29 @@ def world_order(
             realm=realm,
         )
     )
+
+
+hosts: Final = typer.Typer(help="Other machines of an experiment.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(hosts, name="hosts")
+On = Annotated[
+    list[str] | None, typer.Option(metavar="HOST|TAG", help="Only this host, or those with this tag; may be repeated.")
+]
+
+
+@hosts.command(name="check")
+def hosts_check(file: File, settings: Settings = None, on: On = None) -> None:
+    """Say whether each host can take part: version, clock, devices, router."""
+    from tools.hosts import check as command  # noqa: PLC0415
+
+    raise typer.Exit(command(file, settings=settings or [], only=on or []))
+
+
+@hosts.command(name="install")
+def hosts_install(file: File, settings: Settings = None, on: On = None) -> None:
+    """Put this zenpark on every host that has another or none."""
+    from tools.hosts import install as command  # noqa: PLC0415
+
+    raise typer.Exit(command(file, settings=settings or [], only=on or []))
 
 
 @app.command()

@@ -43,7 +43,7 @@ def file(tmp_path):
 def test_it_runs_and_reports_without_links(file, tmp_path, capsys):
     assert commands.run(
         str(file), virtual=True, cases=[], out=str(tmp_path / "run"), seed=None, settings=[], as_json=False, seeds=1,
-        bodies=None, anyway=False, report=True, open_report=False,
+        bodies=None, here=False, anyway=False, report=True, open_report=False,
     ) == 0  # fmt: skip
     said = capsys.readouterr().out
     assert "no link was measured" in said

@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from agents.wire import Contact, Event, Heard, Pose, Standing, State, Status, WorldState
+from agents.wire import Contact, Event, Heard, HostClock, Pose, Standing, State, Status, WorldState
 from experiments.experiment import Experiment, Formation, Rates, Robot
 from experiments.playback import NotStarted, read
 from experiments.recording import Recording
@@ -112,6 +112,8 @@ def put(recording, messages):
                 recording.event(message)
             case Contact():
                 recording.contact(message)
+            case HostClock():
+                recording.clock(message)
             case WorldState():
                 recording.world(message)
 
@@ -421,6 +423,27 @@ def test_only_poses_of_the_run_are_sent(path):
     sent = read(path).trace.sent
     assert sent.time.tolist() == [0.0, 0.5]  # the pose at the end, 1.0, belongs to the landing
     assert sent.seq.tolist() == [5, 6]
+
+
+def test_what_a_drifting_clock_stamped_is_set_right(path):
+    """50 ppm over an hour are 0.18 s: what CF01 says at 3600 s it stamps 0.18 s later."""
+    long = msgspec.structs.replace(PAIR, duration_s=3600.0, rates=Rates(state_hz=1.0))
+    clocks = [HostClock("lab2", START, 0.2, 1e-4, ["CF01"]), HostClock("lab2", START + 3600.0, 0.38, 1e-4, ["CF01"])]
+    heard = [Heard("CF01", 9, START + 1800.09, START + 1800.01, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))]
+    messages = [begun(), *clocks]
+    for k in range(0, 3601, 10):
+        messages += [state("TB01", k + 1, k, 0.001 * k), state("CF01", k + 1, k * (1 + 50e-6), 0.001 * k)]
+    messages += [state("TB01", 9000, 3600.5, 3.6, heard=heard), pose("CF01", 1, 1800.09), landed(3600.0)]
+    write(path, *messages, experiment=long)
+    trace = read(path).trace
+    asked = [600, 1800, 3600]
+    np.testing.assert_allclose(trace.position[asked, 1, 0], [0.6, 1.8, 3.6], atol=1e-6)
+    np.testing.assert_allclose(trace.position[asked, 0, 0], trace.position[asked, 1, 0], atol=1e-6)
+    assert trace.sent.time[0] == pytest.approx(1800.0, abs=1e-4)
+    assert trace.heard.stamp[0] == pytest.approx(1800.0, abs=1e-4), "on the speaker's clock"
+    assert trace.heard.time[0] == pytest.approx(1800.01, abs=1e-4), "on the listener's"
+    (lie,) = trace.clocks
+    assert lie.drift == pytest.approx(50e-6)
 
 
 def test_the_start_is_the_conductors_else_the_robots(path, tmp_path):

@@ -16,9 +16,10 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
     place, rest = (-0.5, -0.4, 0.0), (0.0, 0.0, 0.0)
     heard = wire.Heard("KH02", seq, now, now, place, rest)
     status = wire.Status(
-        robot=robot, stamp=now, phase="running", reason="", body="", battery=0.5, sent=seq, heard=2, lost={"KH01": 1},
-        malformed=0, refused=0, ticks=5, missed=1, decisions=2, interventions=0, avoided=0, late_s=0.001,
-        started=now - 1.0, missing=["KH02"], pid=1, cpu_s=0.1, rss_mb=60.0,
+        robot=robot, stamp=now, phase="running", reason="", body="", battery=0.5, sent=seq, heard=2,
+        lost={"KH01": 1}, dropped={"KH02": 1}, malformed=0, refused=0, ticks=5, missed=1,
+        decisions=2, interventions=0, avoided=0, late_s=0.001, started=now - 1.0, missing=["KH02"],
+        pid=1, cpu_s=0.1, rss_mb=60.0,
     )  # fmt: skip
     commands = [
         wire.Command(robot, seq + 10, now, "drive", (0.1, 0.2, 0.0, 0.0)),
@@ -30,7 +31,7 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
         "pose": [wire.Pose(robot, seq + k, now + 0.01 * k, place, rest, 0.1) for k in range(2)],
         "state": [
             wire.State(robot, seq, now, "running", place, rest, 0.1, place, (0.1, 0.2, 0.0, 0.0), 0.1, place,
-            0.1, [heard]),
+            0.1, [heard], followed=[wire.Followed(seq, now, now, now)]),
             wire.State(robot, seq, now, "idle", place, rest, 0.1, None, None, 0.1, attitude=(1.0, 0.0, 0.0, 0.0)),
         ],
         "status": [status],
@@ -43,7 +44,7 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
             wire.Order("stop"), wire.Order("get", name="clamp"), wire.Order("set", name="clamp", value=0.2),
             wire.Order("set", name="trigger.period_s", value=0.05),
         ],
-        "goal": [wire.Position(robot, now, place, 0.1)],
+        "goal": [wire.Goal(robot, seq + k, now, place, 0.1 if k else None, now - 0.01) for k in range(2)],
     }  # fmt: skip
 
 
@@ -51,7 +52,12 @@ def of_all() -> dict[str, list[object]]:
     """By key what is nobody's."""
     now = time.time()
     world = wire.WorldState(
-        now, "pymunk", 1.0, 1.0, 0.1, False, ["KH01"], ["CF01"], {"box": (0.1, 0.2, 0.3)}, 1, 0, 0, ""
+        now, "pymunk", 1.0, 1.0, 0.1, False, ["KH01"], ["CF01"],
+        [wire.Standing("box", (0.1, 0.2, 0.3))], 1, 0, 0, "",
+    )  # fmt: skip
+    centre = wire.CentreState(
+        stamp=now, robots=["KH01"], missing=["KH02"], load=0.1, late_s=0.001, decisions=5, missed=1, goals=5,
+        heard={"KH01": 2}, lost={"KH01": 1}, malformed=0, pid=1, cpu_s=0.1, rss_mb=60.0,
     )  # fmt: skip
     orders = [
         wire.WorldOrder("pause"), wire.WorldOrder("resume"), wire.WorldOrder("step", steps=3),
@@ -69,6 +75,8 @@ def of_all() -> dict[str, list[object]]:
         KEYS.event: [wire.Event(now, "phase", "conductor", "landing")],
         KEYS.contact: [wire.Contact(now, "KH01", "wall", 0.1, 0.001)],
         KEYS.world: [world],
+        KEYS.centre: [centre],
+        KEYS.clock: [wire.HostClock("lab1", now, 0.2, 0.001, ["KH01"])],
         KEYS.world_order: list(orders),
     }
 

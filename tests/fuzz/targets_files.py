@@ -22,7 +22,7 @@ from agents.session import EndpointError
 from experiments import catalogue, document
 from experiments.document import DocumentError, write_json
 from experiments.records import RecordingError
-from tests.fuzz.messages import good
+from tests.fuzz.messages import KEYS, good, of_all
 from tests.fuzz.target import Place, Target
 
 MALFORMED = Path(__file__).parents[1] / "experiments" / "malformed"
@@ -167,9 +167,23 @@ def recording_bytes(*, plain: bool) -> list[bytes]:
             writer.contact(wire.Contact(began + 0.5, "KH01", "CF01", 0.1, 0.01))
             writer.world(
                 wire.WorldState(
-                    began, "pymunk", 0.0, 1.0, 0.1, False, ["KH01"], [], {"b": (0.0, 0.0, 0.0)}, 1, 0, 0, ""
+                    began,
+                    "pymunk",
+                    0.0,
+                    1.0,
+                    0.1,
+                    False,
+                    ["KH01"],
+                    [],
+                    [wire.Standing("b", (0.0, 0.0, 0.0))],
+                    1,
+                    0,
+                    0,
+                    "",
                 )
             )
+            for stamp, lies in ((began, 0.2), (began + 1.0, 0.21)):
+                writer.clock(wire.HostClock("lab1", stamp, lies, 0.001, ["KH01"]))
             writer.event(wire.Event(began + 1.0, "phase", "conductor", "landing"))
         made.append(path.read_bytes())
         if not plain:
@@ -242,16 +256,15 @@ def forged() -> Iterator[Target]:
 def cdr() -> Iterator[Target]:
     """Every recorded struct: name and CDR with a zero byte between them; what is decoded can be encoded."""
     from experiments.cdr import Undecodable, Unencodable, codec  # noqa: PLC0415
-    from experiments.recording import SentPose, World  # noqa: PLC0415
+    from experiments.recording import SentGoal, SentPose  # noqa: PLC0415
 
     said = good("KH01")
     pose: Any = said["pose"][0]
     fields = [getattr(pose, name) for name in ("robot", "seq", "stamp", "position", "velocity", "yaw")]
     made: list[Any] = [
         said["state"][0], said["state"][1], said["status"][0], SentPose(*fields, 1.0, 150),
-        wire.Event(1.0, "start", "conductor", "go"), wire.Contact(1.0, "KH01", "wall", 0.1, 0.01),
-        World.of(wire.WorldState(1.0, "pymunk", 0.0, 1.0, 0.1, False, ["KH01"], ["a"], {"b": (0.0, 0.0, 0.0)},
-            1, 0, 0, "")),
+        *(of_all()[key][0] for key in (KEYS.event, KEYS.contact, KEYS.world, KEYS.centre, KEYS.clock)),
+        SentGoal("KH01", 1, 1.0, (0.0, 0.0, 0.0), None, 0.9, 1.0, 150),
     ]  # fmt: skip
     codecs = {type(each).__name__: codec(type(each)) for each in made}
     examples = [type(each).__name__.encode() + b"\0" + codecs[type(each).__name__].encode(each) for each in made]

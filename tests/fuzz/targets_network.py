@@ -166,6 +166,7 @@ def recorder() -> Iterator[Target]:
 def conductor() -> Iterator[Target]:
     """The conductor follows the robots' statuses, states and tokens."""
     from experiments.conductor import Conductor  # noqa: PLC0415
+    from experiments.hosts import Hosts  # noqa: PLC0415
 
     experiment = document.read("triangle").experiment
 
@@ -179,7 +180,8 @@ def conductor() -> Iterator[Target]:
         file.write_bytes(document.write_json(experiment))
         made = Conductor(
             experiment, "only", file=file, source=file, folder=Path(folder), endpoints=["tcp/127.0.0.1:1"],
-            launcher=Nobody(), show=lambda _: None, interrupted=lambda: False,  # type: ignore[arg-type]
+            launcher=Nobody(), hosts=Hosts(Nobody(), []),  # type: ignore[arg-type]
+            show=lambda _: None, interrupted=lambda: False,
         )  # fmt: skip
         made._join(ExitStack())
 

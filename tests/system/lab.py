@@ -12,9 +12,12 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import psutil
 import zenoh
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from agents import session as network
 from agents import wire
@@ -33,6 +36,13 @@ def until(true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) ->
     while not true():
         assert time.monotonic() < deadline, f"not in {limit_s:g} s: {what}"
         pause.wait(0.01)
+
+
+def typed(file: Path, topic: str) -> list[Any]:
+    """Messages of a topic, as another library decodes them from the schema in the file."""
+    with file.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return [message for *_, message in reader.iter_decoded_messages([topic])]
 
 
 class Looking:
@@ -148,7 +158,7 @@ class Flight:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "tools.guard", "run", file, "--out", str(folder), *arguments],
             cwd=ROOT,
-            env=ENVIRONMENT,
+            env={**ENVIRONMENT, "PATH": os.environ["PATH"]},  # a test may put an ssh of its own there
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=self._errors,

@@ -5,28 +5,19 @@ from __future__ import annotations
 import json
 import signal
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from experiments import playback
 from experiments.recover import recover
-from tests.system.lab import Flight, Watcher, gone, until
+from tests.system.lab import Flight, Watcher, gone, typed, until
 
 pytestmark = pytest.mark.system
 
 SHORT = ("--set", "duration_s=5")
-
-
-def typed(file: Path, topic: str) -> list[Any]:
-    """Messages of a topic, as another library decodes them from the schema in the file."""
-    with file.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [message for *_, message in reader.iter_decoded_messages([topic])]
 
 
 def test_a_run_forms_up_loses_nothing_and_reports(tmp_path: Path) -> None:

@@ -1,29 +1,10 @@
-import importlib.util
 import re
 import tomllib
-from importlib.machinery import SourceFileLoader
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture
-def bootstrap(tmp_path, monkeypatch):
-    """The script as a module, for a checkout that has its three files only."""
-    loader = SourceFileLoader("bootstrap", str(ROOT / "zenpark"))
-    module = importlib.util.module_from_spec(importlib.util.spec_from_loader("bootstrap", loader))
-    loader.exec_module(module)
-    for name in ("pyproject.toml", "requirements.lock", "requirements-hardware.lock", "requirements-dev.lock"):
-        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
-    (tmp_path / ".venv" / "bin").mkdir(parents=True)
-    (tmp_path / ".venv" / "bin" / "python").touch()
-    monkeypatch.setattr(module, "ROOT", tmp_path)
-    monkeypatch.setattr(module, "PYTHON", tmp_path / ".venv" / "bin" / "python")
-    monkeypatch.setattr(module, "STAMP", tmp_path / ".venv" / "zenpark.stamp")
-    monkeypatch.setattr(module, "LOCKS", {level: tmp_path / path.name for level, path in module.LOCKS.items()})
-    return module
 
 
 def locked(name):
@@ -97,3 +78,17 @@ def test_trouble_ends_with_2_and_a_message(bootstrap, monkeypatch, capsys):
 def test_a_failing_command_is_told_with_its_last_lines(bootstrap):
     with pytest.raises(bootstrap.Trouble, match="getting it failed:\n  why\ndo this"):
         bootstrap.call(["sh", "-c", "echo why; exit 3"], {}, "getting it", "do this")
+
+
+@pytest.mark.parametrize(("uid", "installs"), [(0, True), (1000, False)])
+def test_what_tests_need_besides_is_installed_by_root_only(bootstrap, monkeypatch, uid, installs):
+    run = []
+    monkeypatch.setattr(bootstrap.os, "geteuid", lambda: uid)
+    monkeypatch.setattr(
+        bootstrap.shutil, "which", lambda name, path=None: None if name in {"sshd", "ip"} else f"/{name}"
+    )
+    done = bootstrap.subprocess.CompletedProcess([], 0, "")
+    monkeypatch.setattr(bootstrap, "silently", lambda command, environment: run.append(command) or done)
+    bootstrap.add_needed()
+    assert [command[2] for command in run] == (["update", "install"] if installs else [])
+    assert not installs or run[1][-2:] == ["openssh-server", "iproute2"]

@@ -52,6 +52,8 @@ def test_commands():
                 "centre",
                 "world",
                 "world-order",
+                "hosts",
+                "station",
             ]
         )
         == COMMANDS

@@ -1,0 +1,72 @@
+"""What stands in a Zenoh endpoint: `protocol/host:port`, and behind `?` or `#` settings that only Zenoh reads."""
+
+from __future__ import annotations
+
+import ipaddress
+from dataclasses import dataclass, replace
+from typing import Self
+
+UNIX = "unixsock-stream"
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """An endpoint in its parts.
+
+    Attributes:
+        protocol: tcp, tls, quic, ...
+        host: Name or address, without brackets; the path of a Unix socket.
+        port: 0 for a Unix socket.
+        rest: Settings, with the `?` or `#` before them.
+    """
+
+    protocol: str
+    host: str
+    port: int
+    rest: str = ""
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Takes an endpoint apart.
+
+        Raises:
+            ValueError: If it is none; says how one is written.
+        """
+        protocol, _, whole = text.partition("/")
+        end = min((at for mark in "?#" if (at := whole.find(mark)) >= 0), default=len(whole))
+        address, rest = whole[:end], whole[end:]
+        if protocol == UNIX and address:
+            return cls(protocol, address, 0, rest)
+        host, _, port = address.rpartition(":")
+        if not (protocol and host and port.isdecimal() and 0 < int(port) < 65536):
+            raise ValueError(f"'{text}' is not an endpoint; write it like tcp/127.0.0.1:7447")
+        return cls(protocol, host.removeprefix("[").removesuffix("]"), int(port), rest)
+
+    def __str__(self) -> str:
+        if self.protocol == UNIX:
+            return f"{self.protocol}/{self.host}{self.rest}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.protocol}/{host}:{self.port}{self.rest}"
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine reaches it."""
+        address = self._address
+        return self.protocol == UNIX or self.host == "localhost" or (address is not None and address.is_loopback)
+
+    @property
+    def is_wildcard(self) -> bool:
+        """Whether it means every address of a machine, so that one can listen there but not connect."""
+        address = self._address
+        return address is not None and address.is_unspecified
+
+    def at(self, host: str, port: int | None = None) -> Endpoint:
+        """The same under another name of its machine, or at another port."""
+        return replace(self, host=host, port=self.port if port is None else port)
+
+    @property
+    def _address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+        try:
+            return ipaddress.ip_address(self.host)
+        except ValueError:
+            return None

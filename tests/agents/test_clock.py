@@ -1,0 +1,44 @@
+"""One clock for everybody: what a neighbour whose clock is 0.2 s ahead does to a listener, and what sets it right."""
+
+import time
+
+import numpy as np
+import pytest
+
+from agents.clock import MACHINE, Clock
+from agents.graph import links
+from agents.hearing import Hearing
+from agents.prediction import HOLD, ConstantVelocity, Predictor
+
+AHEAD_S = 0.2
+SPEED = 0.3  # [m/s] of a neighbour along x
+T = 5.0  # [s] it is heard the moment it speaks,
+LATER = 1.0  # [s] and believed to be somewhere this much later
+
+
+def misbelieved(stamp: float, predictor: Predictor) -> float:
+    """How far the listener's belief is from that by a right stamp [m]."""
+    return abs(believed(stamp, predictor) - believed(T, predictor))
+
+
+def believed(stamp: float, predictor: Predictor) -> float:
+    """Where along x the listener believes the neighbour to be [m]."""
+    hearing = Hearing(links([(0, 1)], [0.5], [1.0]), None, 1.0)
+    where = np.array([[SPEED * T, 0.0, 0.0]])
+    at = np.array([0])
+    hearing.hear(at, where, np.array([[SPEED, 0.0, 0.0]]), np.array([stamp]), np.array([T]))
+    return float(hearing.heard.believed(predictor, T + LATER, at)[0, 0])
+
+
+def test_a_wrong_clock_moves_the_neighbours_of_those_who_predict():
+    assert misbelieved(T + AHEAD_S, HOLD) == 0.0, "who holds the last pose does not look at its age"
+    assert misbelieved(T + AHEAD_S, ConstantVelocity()) == pytest.approx(SPEED * AHEAD_S)
+    assert misbelieved(T - AHEAD_S, ConstantVelocity()) == pytest.approx(SPEED * AHEAD_S)
+
+
+def test_corrected_where_stamps_are_made_it_moves_nobody(monkeypatch):
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + AHEAD_S)
+    assert MACHINE.utc() == now + AHEAD_S
+    clock = Clock(-AHEAD_S)
+    assert misbelieved(T + clock.utc() - now, ConstantVelocity()) < 1e-6

@@ -1,0 +1,118 @@
+"""The station of a host: what it answers, and that nobody of its run stays behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import msgspec
+import psutil
+import pytest
+
+from experiments import version
+from experiments.station import RUN, Answer, Question, answer, devices
+from tests.system.lab import ENVIRONMENT, ROOT
+
+
+def test_it_says_who_it_is():
+    said = answer(Question("hello"), 12.0)
+    assert (said.zenpark, said.clock) == (version.digest(), 12.0)
+    assert said.python == ".".join(map(str, sys.version_info[:3]))
+    assert len(said.zenpark) == 64
+
+
+def test_a_digest_is_that_of_names_and_contents(tmp_path):
+    (tmp_path / "agents").mkdir()
+    file = tmp_path / "agents" / "a.py"
+    file.write_text("x = 1\n")
+    first = version.digest(tmp_path)
+    (tmp_path / "agents" / "notes.txt").write_text("not code")
+    version.digest.cache_clear()
+    assert version.digest(tmp_path) == first
+    file.rename(tmp_path / "agents" / "b.py")
+    version.digest.cache_clear()
+    assert version.digest(tmp_path) != first
+
+
+def test_a_router_that_is_not_there_is_not_reached():
+    (found,) = answer(Question("reach", endpoints=["tcp/127.0.0.1:9"]), 0.0).found
+    assert not found.well
+    assert "no router answers" in found.text
+
+
+def test_serial_ports_are_looked_at():
+    (found,) = devices(["kteam:///dev/no-such-port", "twin"])
+    assert (found.what, found.well) == ("/dev/no-such-port", False)
+    assert "plugged in" in found.text
+    assert list(devices(["twin", "world"])) == []
+
+
+class Started:
+    """A station process of a run, and a pipe to it."""
+
+    def __init__(self, run):
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", "from experiments.station import serve; serve(patience_s=0.5)"],
+            cwd=ROOT,
+            env={**ENVIRONMENT, RUN: run},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+
+    def ask(self, question):
+        self.process.stdin.write(b"\n" + msgspec.json.encode(question) + b"\n")
+        self.process.stdin.flush()
+        return msgspec.json.decode(self.process.stdout.readline(), type=Answer)
+
+    def leave(self):
+        self.process.stdin.close()
+        code = self.process.wait(30)
+        self.process.stdout.close()
+        return code
+
+
+def sleeper(run):
+    return subprocess.Popen([sys.executable, "-c", "input()"], env={**os.environ, RUN: run}, stdin=subprocess.PIPE)
+
+
+@pytest.mark.system
+def test_it_answers_until_its_lifeline_ends():
+    started = Started("a")
+    before = time.time()
+    said = started.ask(Question("clock"))
+    assert before - 1e-3 <= said.clock <= time.time() + 1e-3
+    started.process.stdin.write(b"nonsense\n")
+    assert started.ask(Question("clock")).clock > said.clock
+    assert started.leave() == 0
+
+
+@pytest.mark.system
+def test_it_sweeps_up_its_own_run_only():
+    started, mine, other = Started("run.lab1"), sleeper("run.lab1"), sleeper("run.lab2")
+    try:
+        found = []
+        deadline = time.monotonic() + 10.0
+        while not found and time.monotonic() < deadline:  # a process has its environment only after its exec
+            found = started.ask(Question("sweep")).found
+        assert [each.what for each in found] == [str(mine.pid)]
+        assert mine.wait(5) == -9
+        assert other.poll() is None
+        assert started.leave() == 0
+        assert psutil.pid_exists(other.pid)
+    finally:
+        for process in (mine, other):
+            process.stdin.close()
+            process.wait(5)
+
+
+@pytest.mark.system
+def test_it_waits_for_robots_that_land_and_kills_those_that_do_not():
+    started, frozen = Started("run.lab1"), sleeper("run.lab1")
+    try:
+        started.ask(Question("clock"))
+        frozen.send_signal(signal.SIGSTOP)
+        assert started.leave() == 0
+        assert frozen.wait(5) == -signal.SIGKILL
+    finally:
+        frozen.stdin.close()

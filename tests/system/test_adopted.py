@@ -1,0 +1,70 @@
+"""Robots that were started by hand or at boot: a run takes them as they are, and starts only the others."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+
+from agents import wire
+from experiments import document, playback
+from tests.conftest import RouterProcess
+from tests.system.lab import Flight, RobotProcess, Watcher
+
+pytestmark = pytest.mark.system
+
+
+def experiment(folder: Path, endpoint: str) -> str:
+    file = folder / "x.toml"
+    text = document.catalogue_path("triangle").read_text("utf-8")
+    text += f'\n[network]\nconnect = ["{endpoint}"]\n[hosts.board]\nrobots = ["KH02"]\n'
+    file.write_text(text)
+    return str(file)
+
+
+def test_who_is_there_is_adopted_and_who_has_flown_is_not(router: RouterProcess, tmp_path: Path) -> None:
+    file = experiment(tmp_path, router.endpoint)
+    short = ("--case", "event", "--json", "--set", "duration_s=2", "--no-report")
+    at_boot = RobotProcess(router.endpoint, "join", "KH02", "--once")
+    by_hand = RobotProcess(router.endpoint, "triangle", "CF01", "--case", "event")
+    watcher = Watcher(router.endpoint)
+    try:
+        watcher.until(lambda: "CF01" in watcher.alive, "it is there")
+        flight = Flight(tmp_path / "run", file, *short)
+        flight.until_said("adopted CF01: is there already, idle")
+        flight.until_said("adopted KH02: is ")
+        watcher.until(lambda: watcher.phase("KH02") == "running", "it takes part")
+        assert at_boot.wait() == 0, "with --once it ends when it is down, so that its service starts it anew"
+        watcher.until(lambda: watcher.status["KH02"].reason == "finished", "it knew what --set had changed", 3.0)
+        assert watcher.order("CF01", wire.Order("land")).ok, "its own file has twenty seconds"
+    finally:
+        watcher.close()
+    code, out = flight.finish()
+    assert code == 0
+    assert by_hand.process.poll() is None
+    assert sorted(file.stem for file in (tmp_path / "run" / "logs").glob("event-*")) == ["event-KH01", "event-recorder"]
+    assert set(json.loads(out)["cases"]["event"]["robots"]) == {"KH01", "KH02", "CF01"}
+    assert playback.read(tmp_path / "run" / "event.mcap").complete
+
+    again = Flight(tmp_path / "again", file, *short)
+    again.until_said("CF01: on the network already, and done; a robot that was started by hand flies once")
+    assert again.finish()[0] == 2
+    assert by_hand.end() == 0
+
+
+def test_who_joined_lands_when_the_conductor_is_dead(router: RouterProcess, tmp_path: Path) -> None:
+    joined = RobotProcess(router.endpoint, "join", "KH02", "--once")
+    flight = Flight(tmp_path / "run", experiment(tmp_path, router.endpoint), "--case", "event")
+    watcher = Watcher(router.endpoint)
+    try:
+        watcher.until(lambda: watcher.phase("KH02") == "running", "it takes part")
+        flight.signal(signal.SIGKILL)
+        flight.finish()
+        assert joined.wait(15.0) == 0
+        watcher.look()
+        assert (watcher.phase("KH02"), watcher.status["KH02"].reason) == ("done", "told to end")
+        watcher.until(lambda: not watcher.alive, "so do the others")
+    finally:
+        watcher.close()

@@ -1,0 +1,187 @@
+"""The reference experiment on three machines, started from a fourth: network namespaces with a real sshd in each."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import document, playback
+from tests.system.lab import ROOT, typed, until
+from tests.system.machines import Machines, machines, why_not
+
+LACKING = why_not()
+pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(LACKING), reason=LACKING)]
+
+ROBOTS = {"lab1": ["TB01", "KH01"], "lab2": ["KH02", "CF01"], "lab3": ["KH03", "CF02", "CF03"]}
+OFFSET_S, DRIFT = 0.2, 50e-6  # of the second machine
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
+    with machines(tmp_path_factory.mktemp("machines"), ["desk", *ROBOTS]) as made:
+        yield made
+
+
+def experiment(lab: Machines, folder: Path, duration_s: float) -> Path:
+    """The reference experiment, its robots on the lab's machines."""
+    text = document.catalogue_path("robotic-park").read_text("utf-8")
+    text = text.replace("duration_s = 45.0", f"duration_s = {duration_s}").replace("at_s = 21.0", "at_s = 1.0")
+    for host, robots in ROBOTS.items():
+        wrong = {"offset_s": OFFSET_S, "drift": DRIFT} if host == "lab2" else {}
+        zenpark = lab[host].zenpark(**wrong)
+        text += f'\n[hosts.{host}]\naddress = "{host}"\nzenpark = "{zenpark}"\nrobots = {json.dumps(robots)}\n'
+    file = folder / "experiment.toml"
+    file.write_text(text)
+    return file
+
+
+def zenpark(lab: Machines, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        lab["desk"].command(sys.executable, "-m", "tools.guard", *arguments),
+        cwd=ROOT,
+        env=lab.environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def busy(lab: Machines) -> list[str]:
+    """What still runs on any machine."""
+    return [f"{name}: {process}" for name, each in lab.machines.items() for process in each.processes()]
+
+
+def test_one_command_flies_the_reference_experiment_and_brings_everything_back(lab: Machines, tmp_path: Path) -> None:
+    file, folder = experiment(lab, tmp_path, 4.0), tmp_path / "run"
+    flight = zenpark(lab, "run", str(file), "--case", "periodic", "--out", str(folder), "--anyway", "--json")
+    out, _ = flight.communicate(timeout=100)
+    assert flight.returncode == 0, out
+    assert "lab2/CF01| CF01: running" in out, "output is streamed, with where it comes from"
+    until(lambda: not busy(lab), f"nothing is left: {busy(lab)}", 5.0)
+
+    for robots in ROBOTS.values():
+        for robot in robots:
+            log = (folder / "logs" / f"periodic-{robot}.log").read_text()
+            assert [f"{robot}: running", f"{robot}: done (finished)"] == re.findall(r".*(?:running|done.*)", log)
+    read = playback.read(folder / "periodic.mcap")
+    assert read.complete
+    trace = read.trace
+    assert not trace.lost.any()
+    assert np.isfinite(trace.true_position).all(axis=(1, 2)).mean() > 0.99
+
+    lies = {lie.host: lie for lie in trace.clocks}
+    assert set(lies) == set(ROBOTS)
+    assert lies["lab2"].robots == ("KH02", "CF01")
+    for host, lie in lies.items():
+        true = OFFSET_S if host == "lab2" else 0.0
+        assert abs(lie.first - true) < 2e-3 + lie.uncertainty, "the fake drifts from when it was made"
+        assert lie.uncertainty < 5e-3
+    drifted = lies["lab2"].last - lies["lab2"].first
+    assert drifted == pytest.approx(DRIFT * lies["lab2"].over, abs=2 * lies["lab2"].uncertainty)
+
+    # robots start when their clock says so: the same moment if their stamps are of one clock. The recorder has its
+    # own, looks every 20 ms, and so gets one of two hundred poses as soon as it is there
+    begun, under_way = {}, {}
+    for robot in trace.robots:
+        begun[robot] = typed(folder / "periodic.mcap", f"/{robot}/status")[-1].started
+        poses = typed(folder / "periodic.mcap", f"/{robot}/pose")
+        under_way[robot] = min(pose.received - pose.stamp for pose in poses)
+    assert np.ptp(list(begun.values())) < 1e-5
+    assert np.ptp(list(under_way.values())) < 5e-3
+    assert 0.0 < min(under_way.values()) < 5e-3
+    report = (folder / "report.html").read_text()
+    assert "Clocks of other machines" in report
+    assert re.search(r"\+20\d\.\d{3}", report)
+
+
+def test_after_the_death_of_the_launcher_everybody_lands_and_all_is_gone_in_five_seconds(
+    lab: Machines, tmp_path: Path
+) -> None:
+    file, folder = experiment(lab, tmp_path, 40.0), tmp_path / "run"
+    flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--anyway")
+    logs = folder / "logs"
+    flying = [robot for robots in ROBOTS.values() for robot in robots]
+    until(lambda: all(f"{robot}: running" in said(logs, robot) for robot in flying), "all are in the experiment", 60.0)
+    os.kill(flight.pid, signal.SIGKILL)
+    killed = time.monotonic()
+    until(lambda: not busy(lab), "nobody is left", 10.0)
+    took = time.monotonic() - killed
+    flight.communicate(timeout=5)
+    assert took < 5.0
+    for robot in flying:
+        assert said(logs, robot).splitlines()[-2:] == [
+            f"{robot}: landing (the starter is gone)",
+            f"{robot}: done (the starter is gone)",
+        ]
+    assert playback.read(folder / "event.mcap").complete
+
+
+def said(logs: Path, robot: str) -> str:
+    file = logs / f"event-{robot}.log"
+    return file.read_text() if file.exists() else ""
+
+
+def test_a_machine_that_is_cut_off_lands_its_robots_and_the_others_go_on(lab: Machines, tmp_path: Path) -> None:
+    file, folder = experiment(lab, tmp_path, 8.0), tmp_path / "run"
+    flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--anyway", "--no-report")
+    until(lambda: all("running" in said(folder / "logs", robot) for robot in ROBOTS["lab3"]), "it runs", 60.0)
+    try:
+        lab["lab3"].unplug()
+        cut = time.monotonic()
+        until(lambda: not lab["lab3"].processes(), "its robots land by themselves, and are gone", 20.0)
+        assert time.monotonic() - cut > 3.0, "silence must last before it is believed"
+        out, _ = flight.communicate(timeout=60)
+    finally:
+        lab["lab3"].plug_in_again()
+    assert flight.returncode == 0, out
+    assert "lost CF02: its process ended" in out
+    assert "done (finished)" in said(folder / "logs", "CF01")
+    until(lambda: not busy(lab), "nothing is left", 5.0)
+
+
+def test_hosts_check_tells_of_each_machine(lab: Machines, tmp_path: Path) -> None:
+    file = experiment(lab, tmp_path, 4.0)
+    checked = zenpark(lab, "hosts", "check", str(file))
+    out, _ = checked.communicate(timeout=60)
+    assert checked.returncode == 0, out
+    rows = {line.split()[0]: line for line in out.splitlines()[1:]}
+    assert set(rows) == set(ROBOTS)
+    assert all(row.count("✓") == 6 for row in rows.values()), out
+    offset = re.search(r"([+-]\d+\.\d+) ± (\d+\.\d+) ms", rows["lab2"])
+    assert offset is not None
+    assert abs(float(offset[1]) - 1e3 * OFFSET_S) < 5.0
+
+
+def test_what_is_wrong_with_a_machine_is_told_with_a_remedy(lab: Machines, tmp_path: Path) -> None:
+    file = experiment(lab, tmp_path, 4.0)
+    text = file.read_text()
+    text = text.replace(str(lab["lab1"].folder / "zenpark"), "nowhere/zenpark")
+    text = text.replace('"lab2"', '"10.77.0.99"').replace('"lab3"', f'"127.0.0.1@{lab["lab3"].address}"')
+    file.write_text(text)
+    flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(tmp_path / "run"), "--anyway")
+    out, _ = flight.communicate(timeout=60)
+    assert flight.returncode == 2
+    assert "lab1: there is no zenpark at 'nowhere/zenpark'; `zenpark hosts install FILE` puts it there" in out
+    assert "lab2: it cannot be reached; is it on" in out
+    assert "lab3: none of our keys lets us in; ssh-copy-id" in out
+    assert "Traceback" not in out
+    known = lab.known_hosts.read_text()
+    try:
+        lab.known_hosts.write_text("")
+        checked = zenpark(lab, "hosts", "check", str(file), "--on", "lab1")
+        out, _ = checked.communicate(timeout=60)
+    finally:
+        lab.known_hosts.write_text(known)
+    assert checked.returncode == 1
+    assert "lab1: its host key is not known here; log in once by hand (ssh lab1)" in out

@@ -1,0 +1,244 @@
+"""The machines of an experiment: can each of them take part, and has it the zenpark that is here."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+import tarfile
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from agents.session import free_endpoint
+from experiments import document, ssh, version
+from experiments.experiment import Experiment, Host
+from experiments.hosts import HostError, Station
+from experiments.launcher import Launcher
+from experiments.problem import DocumentError, Problem
+from experiments.servants import start_router
+from experiments.station import Question
+
+YES, NO, DOUBTFUL, NOTHING = "✓", "✗", "!", "–"
+HEADING: Final = ("host", "reachable", "zenpark", "Python", "clock", "devices", "router")
+VAGUE_S: Final = 0.02  # a clock that cannot be told within this lets robots start apart
+REACH_S: Final = 15.0
+INSTALL_S: Final = 900.0
+FILES: Final = ("zenpark", "pyproject.toml", "README.md", "LICENSE")
+
+# $0 is the folder, the rest is what to put there; a checkout or a folder of something else is not ours to change
+PUT: Final = """set -eu
+folder=$0
+if [ -e "$folder/.git" ]; then
+    echo "$folder is a git checkout: bring it up to date with git, there" >&2; exit 3
+fi
+ours() { grep -q '^name = "zenpark"' "$folder/pyproject.toml" 2>/dev/null; }
+if [ -d "$folder" ] && [ -n "$(ls -A "$folder")" ] && ! ours; then
+    echo "$folder holds something else: say in the file where zenpark may go, such as \\"zenpark/zenpark\\"" >&2; exit 3
+fi
+mkdir -p "$folder"
+rm -rf "$folder/.incoming"
+mkdir "$folder/.incoming"
+tar -xzf - -C "$folder/.incoming"
+for each in "$@"; do
+    rm -rf "$folder/$each"
+    mv "$folder/.incoming/$each" "$folder/$each"
+done
+rmdir "$folder/.incoming"
+exec "$folder/zenpark" --version
+"""
+
+
+@dataclass
+class Row:
+    """What was found on one host: a cell of each column, and what is to be done."""
+
+    cells: list[str]
+    trouble: list[str] = field(default_factory=list)
+
+    @property
+    def well(self) -> bool:
+        """Whether nothing stands in the way of a run."""
+        return not any(cell.startswith(NO) for cell in self.cells)
+
+
+def check(file: str, *, settings: Sequence[str], only: Sequence[str]) -> int:
+    """`zenpark hosts check`: a table; returns 1 if something stands in the way of a run, else 0."""
+    experiment = document.read(file, settings).experiment
+    chosen = choose(experiment.hosts, only)
+    rows = [looked_at(name, experiment) for name, host in chosen.items() if host.address is None]
+    with stations(experiment, {name: host for name, host in chosen.items() if host.address is not None}) as found:
+        rows += [_row(each, experiment) for each in found]
+    for line in table(rows):
+        print(line)
+    for row in rows:
+        for each in row.trouble:
+            print(each, file=sys.stderr)
+    return 0 if all(row.well for row in rows) else 1
+
+
+def install(file: str, *, settings: Sequence[str], only: Sequence[str]) -> int:
+    """`zenpark hosts install`: puts this zenpark on every host that has another or none; returns 1 if one fails."""
+    experiment = document.read(file, settings).experiment
+    chosen = {name: host for name, host in choose(experiment.hosts, only).items() if host.address is not None}
+    code = 0
+    with stations(experiment, chosen) as found:
+        for (name, host), there in zip(chosen.items(), found, strict=True):
+            if not isinstance(there, HostError) and there.same_version:
+                print(f"{name}: has it already ({version.digest()[: version.SHOWN]})")
+                continue
+            try:
+                print(f"{name}: {put(name, host)}", flush=True)
+            except HostError as error:
+                print(error, file=sys.stderr)
+                code = 1
+    return code
+
+
+def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:
+    """Hosts by name or tag, all if none is named.
+
+    Raises:
+        DocumentError: If there is none, or a name means none.
+    """
+    known = {*hosts, *(tag for host in hosts.values() for tag in host.tags)}
+    for name in only:
+        if name not in known:
+            hint = f"there are: {', '.join(sorted(known))}"
+            raise DocumentError([Problem(f"--on {name}", 0, 0, "is neither a host nor a tag", hint)])
+    if not hosts:
+        hint = 'add one: [hosts.lab1] with address = "user@machine" and robots = ["..."]'
+        raise DocumentError([Problem("[hosts]", 0, 0, "the experiment has no hosts: all robots run here", hint)])
+    return {name: host for name, host in hosts.items() if not only or {name, *host.tags} & set(only)}
+
+
+@contextmanager
+def stations(experiment: Experiment, hosts: Mapping[str, Host]) -> Iterator[list[Station | HostError]]:
+    """A connection to each host, or why there is none, and a router as a run would have it."""
+    with tempfile.TemporaryDirectory() as folder, Launcher(Path(folder)) as launcher:
+        routers = experiment.network.connect
+        if routers is None:
+            routers = experiment.network.listen or [free_endpoint()]
+            start_router(launcher, routers)
+        begun: list[Station | HostError] = []
+        for name, host in hosts.items():
+            try:
+                begun.append(Station(name, host, launcher=launcher, routers=routers, run="check"))
+            except HostError as error:
+                begun.append(error)
+        found: list[Station | HostError] = []
+        for each in begun:
+            try:
+                if isinstance(each, Station):
+                    each.greet(experiment.network.address)
+                found.append(each)
+            except HostError as error:
+                found.append(error)
+        yield found
+
+
+def looked_at(name: str, experiment: Experiment) -> Row:
+    """A host that nobody here can reach: its robots come by themselves."""
+    robots = ", ".join(experiment.hosts[name].robots) or "no robots"
+    return Row([name, f"{NOTHING} no address: {robots} started there", *[NOTHING] * 5])
+
+
+def _row(there: Station | HostError, experiment: Experiment) -> Row:
+    """Everything about one host."""
+    if isinstance(there, HostError):
+        name = str(there).partition(":")[0]
+        return Row([name, NO, *[NOTHING] * 5], [str(there)])
+    row = Row([there.name])
+    try:
+        _fill(row, there, experiment)
+    except HostError as error:
+        row.cells += [NO] * (len(HEADING) - len(row.cells))
+        row.trouble.append(str(error))
+    return row
+
+
+def _fill(row: Row, there: Station, experiment: Experiment) -> None:
+    here = version.digest()[: version.SHOWN]
+    row.cells.append(f"{YES} {there.hello.machine}")
+    if there.same_version:
+        row.cells.append(f"{YES} {here}")
+    else:
+        row.cells.append(f"{NO} {there.hello.zenpark[: version.SHOWN]}, here {here}")
+        row.trouble.append(f"{there.name}: another zenpark is there; `zenpark hosts install FILE` puts this one there")
+    row.cells.append(f"{YES} {there.hello.python}")
+    clock = there.measure()
+    vague = clock.uncertainty > VAGUE_S
+    row.cells.append(f"{DOUBTFUL if vague else YES} {clock.offset * 1e3:+.2f} ± {clock.uncertainty * 1e3:.2f} ms")
+    if vague:
+        row.trouble.append(f"{there.name}: the connection is slow; robots may start up to that much apart")
+    bodies = [experiment.robots[robot].body for robot in there.host.robots]
+    devices = there.ask(Question("devices", bodies=bodies), REACH_S)[0].found
+    wrong = [each for each in devices if not each.well]
+    words = ", ".join(each.what for each in devices) or "none needed"
+    row.cells.append(f"{NO if wrong else YES} {words}")
+    row.trouble += [f"{there.name}: {each.what} {each.text}" for each in wrong]
+    routers = there.ask(Question("reach", endpoints=there.endpoints), REACH_S)[0].found
+    unreached = [each for each in routers if not each.well]
+    row.cells.append(f"{NO if unreached else YES} {', '.join(each.text for each in routers if each.well)}".rstrip())
+    row.trouble += [
+        f"{there.name}: {each.what} does not answer there; mend address or listen in [network], or leave both out: "
+        "then ssh carries it"
+        for each in unreached
+    ]
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """The lines of the table, columns as wide as they must be."""
+    lines = [list(HEADING), *(row.cells for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(HEADING))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
+
+
+def put(name: str, host: Host) -> str:
+    """Puts this zenpark on a host, and makes it ready; returns what it then says of itself.
+
+    Raises:
+        HostError: If there is no place for it, or it cannot be made ready there.
+    """
+    assert host.address is not None
+    place = PurePosixPath(host.zenpark.removeprefix("~/"))
+    if place.name != "zenpark" or place.parent in (PurePosixPath(), PurePosixPath("/")):
+        raise HostError(f"{name}: '{host.zenpark}' names no folder of its own; write zenpark = \"zenpark/zenpark\"")
+    if not (version.ROOT / "zenpark").is_file():
+        raise HostError(f"{name}: this zenpark is no checkout, which is what can be copied; start ./zenpark of one")
+    names = [*version.PACKAGES, *FILES, *sorted(path.name for path in version.ROOT.glob("requirements*.lock"))]
+    try:
+        done = subprocess.run(
+            ssh.script(host.address, PUT, [str(place.parent), *names]),
+            input=packed(version.ROOT, names),
+            capture_output=True,
+            check=False,
+            timeout=INSTALL_S,
+        )
+    except subprocess.TimeoutExpired:
+        raise HostError(f"{name}: not ready after {INSTALL_S / 60:g} minutes; start {place} there by hand") from None
+    said = done.stderr.decode(errors="replace").strip()
+    if done.returncode == ssh.BROKEN:
+        raise HostError(f"{name}: {ssh.explained(host.address, host.zenpark, said)}")
+    if done.returncode != 0:
+        raise HostError(f"{name}: not installed: {said or 'it said nothing'}")
+    return f"{done.stdout.decode(errors='replace').strip()} ({version.digest()[: version.SHOWN]}) installed"
+
+
+def packed(root: Path, names: Sequence[str]) -> bytes:
+    """What stands at a place, as a compressed tar; nothing that was made there by running it."""
+    sink = io.BytesIO()
+
+    def kept(member: tarfile.TarInfo) -> tarfile.TarInfo | None:
+        member.uid = member.gid = 0
+        member.uname = member.gname = ""
+        return None if "__pycache__" in PurePosixPath(member.name).parts else member
+
+    with tarfile.open(fileobj=sink, mode="w:gz", compresslevel=6) as tar:
+        for name in names:
+            if (root / name).exists():
+                tar.add(root / name, name, filter=kept)
+    return sink.getvalue()
