@@ -119,7 +119,9 @@ class Runtime:
             self._body.open()
             try:
                 name = "+".join(self._names)
-                with network.open_session(self._setup.endpoints, name=name, stop=asked) as session:
+                with network.open_session(
+                    self._setup.endpoints, name=name, stop=asked, identity=self._names[0]
+                ) as session:
                     self._refuse_doubles(session)
                     self._join(session)
                     self._loop(lambda: rope.reason if lost.is_set() else ("told to end" if asked.is_set() else None))

@@ -108,6 +108,7 @@ class Conductor:
         source: Path,
         folder: Path,
         endpoints: Sequence[str],
+        rights: Path | None = None,
         launcher: Launcher,
         show: Show,
         interrupted: Callable[[], bool],
@@ -121,6 +122,7 @@ class Conductor:
             source: The experiment file as it was written, for the recording.
             folder: Where the recording goes.
             endpoints: Routers.
+            rights: Who may do what, for a router that is started again, in a lab.
             launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
             show: Called with the progress, about ten times a second.
             interrupted: Asked whether the user wants to end it.
@@ -128,7 +130,7 @@ class Conductor:
         self._experiment, self._case = experiment, case
         self._file, self._source = file, source
         self._recording = folder / f"{case}.mcap"
-        self._endpoints, self._launcher = list(endpoints), launcher
+        self._endpoints, self._launcher, self._rights = list(endpoints), launcher, rights
         self._show, self._interrupted = show, interrupted
         self._keys = Keys(experiment.network.realm)
         self._robots = {name: Seen() for name in experiment.robots}
@@ -285,7 +287,9 @@ class Conductor:
 
     def _join(self, stack: ExitStack) -> None:
         keys = self._keys
-        self._session = stack.enter_context(network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S))
+        self._session = stack.enter_context(
+            network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S, identity="operator")
+        )
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
         if self._endpoints != [network.DEFAULT_ENDPOINT]:
             there = self._endpoints[0]
@@ -345,7 +349,7 @@ class Conductor:
         if process.name == ROUTER:
             self._routers += 1
             if self._routers < ROUTERS:
-                start_router(self._launcher, self._endpoints)
+                start_router(self._launcher, self._endpoints, self._rights)
             what = "started again" if self._routers < ROUTERS else "given up: the robots hold, and land at the end"
             self._say("router", "conductor", f"the router ended ({process.exit}); {what}")
             return
@@ -411,7 +415,8 @@ class Conductor:
         return "\n".join(lines)
 
 
-def start_router(launcher: Launcher, endpoints: Sequence[str]) -> None:
+def start_router(launcher: Launcher, endpoints: Sequence[str], rights: Path | None = None) -> None:
     """A router of our own, which outlives a killed launcher by as long as robots take to land."""
     listen = [part for endpoint in endpoints for part in ("--listen", endpoint)]
-    launcher.start(ROUTER, "agents.router", *listen, "--lifeline", "--linger", str(LINGER_S))
+    enforced = [] if rights is None else ["--rights", str(rights)]
+    launcher.start(ROUTER, "agents.router", *listen, *enforced, "--lifeline", "--linger", str(LINGER_S))

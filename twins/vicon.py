@@ -300,7 +300,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     host, port = chosen.listen
     endpoints = chosen.connect or [network.DEFAULT_ENDPOINT]
     try:
-        with network.open_session(endpoints, name="vicon twin", stop=stop) as session:
+        with network.open_session(endpoints, name="vicon twin", stop=stop, identity="twin") as session:
             vicon = ViconTwin(
                 chosen.robots,
                 rate_hz=chosen.rate,
