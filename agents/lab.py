@@ -151,6 +151,12 @@ def bare(endpoints: Sequence[str]) -> list[str]:
     return [endpoint.partition(MARK)[0] for endpoint in endpoints]
 
 
+def options(endpoint: str) -> str:
+    """What to write on a command line to reach an endpoint."""
+    plain, mark, folder = endpoint.partition(MARK)
+    return f"--connect {plain}" + (f" --lab {folder}" if mark else "")
+
+
 def of(endpoints: Sequence[str]) -> Path | None:
     """The lab of some endpoints.
 

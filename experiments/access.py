@@ -51,13 +51,14 @@ def _rights(experiment: Experiment) -> Rights:
     heard = _heard(experiment)
     robots: dict[str, Grant] = {}
     for group in _processes(experiment):
-        others = sorted({speaker for name in group for speaker in heard[name]} - set(group))
+        others = sorted({speaker for name in group for speaker in heard[name]})
+        told = _each(group, keys.position, keys.ranges, keys.goal)
         own = [keys.below(name) for name in group]
         foreign = [key for name in group for key in _foreign(name, experiment.robots[name])]
         tokens = [key for name in group for key in _foreign_tokens(name, experiment.robots[name])]
         grant = Grant(
             say=[*own, *foreign],
-            hear=[*own, *map(keys.pose, others), keys.estop, *foreign],
+            hear=[*told, *map(keys.pose, others), keys.estop, *foreign],
             answer=own,
             be=[*own, *tokens],
             watch=[*own, *map(keys.alive, others), keys.below("centre"), *tokens],

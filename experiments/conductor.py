@@ -14,8 +14,8 @@ from typing import Final, TypeVar
 
 import zenoh
 
+from agents import lab, wire
 from agents import session as network
-from agents import wire
 from agents.keys import Keys
 from experiments import orders
 from experiments import standins as standins_of
@@ -293,7 +293,8 @@ class Conductor:
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
         if self._endpoints != [network.DEFAULT_ENDPOINT]:
             there = self._endpoints[0]
-            self._say("router", "conductor", f"{there}: look with `zenpark keys --connect {there}`")
+            look = f"zenpark keys {lab.options(there)}"
+            self._say("router", "conductor", f"{lab.bare([there])[0]}: look with `{look}`")
         self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
         self._told.put(self._file.read_bytes())
         self._statuses = network.pose_subscriber(self._session, keys.status("*"), 4096)

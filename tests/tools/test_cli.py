@@ -47,6 +47,7 @@ def test_commands():
                 "hz",
                 "twin",
                 "order",
+                "estop",
                 "bridge",
                 "world",
                 "world-order",
