@@ -6,6 +6,7 @@ import argparse
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
@@ -19,6 +20,8 @@ from agents.access import Rights
 from agents.lifeline import Lifeline
 from agents.session import DEFAULT_ENDPOINT, EndpointError, config
 
+FREED_S: Final = 10.0  # so long may the port of a router that begins anew stay taken by what it was before
+AGAIN_S: Final = 0.1
 LOOK_S: Final = 0.5  # how often it looks whether somebody's certificate has been revoked
 
 
@@ -69,7 +72,7 @@ def serve(
 def serve_router(
     endpoints: Sequence[str],
     stop: threading.Event,
-    ready: Callable[[], None] | None = None,
+    ready: Callable[[], None] = lambda: None,
     rights: Rights | None = None,
 ) -> None:
     """Runs a router on loopback endpoints, or on those of a lab, until `stop` is set.
@@ -88,21 +91,22 @@ def serve_router(
             cannot be used.
     """
     register = _register(endpoints)
+    patience_s = 0.0
+    seen = _stamp(register)  # before it is read: what changes in between is seen then
     settings = config("router", listen=endpoints, name="router", rights=rights)
     while True:
-        seen = _stamp(register)
-        with _routing(settings, endpoints):
-            if ready is not None:
+        with _routing(settings, endpoints, patience_s, stop):
+            if not patience_s:
                 ready()
-                ready = None
+            patience_s = FREED_S
             while not stop.wait(None if register is None else LOOK_S):
-                if _stamp(register) == seen:
+                if (now := _stamp(register)) == seen:
                     continue
+                seen = now
                 try:
                     settings = config("router", listen=endpoints, name="router", rights=rights)
                 except EndpointError as error:  # what stood there before still holds
                     print(f"router: {error}", file=sys.stderr, flush=True)
-                    seen = _stamp(register)
                     continue
                 print("router: the lab has changed; its rules are enforced from now on", flush=True)
                 break
@@ -110,14 +114,18 @@ def serve_router(
                 return
 
 
-def _routing(settings: zenoh.Config, endpoints: Sequence[str]) -> zenoh.Session:
-    try:
-        return zenoh.open(settings)
-    except zenoh.ZError as error:
-        raise EndpointError(
-            f"cannot listen on {', '.join(lab.bare(endpoints))}: {_reason(error)}. If a router runs there already, "
-            "use it; else choose another port with --listen"
-        ) from None
+def _routing(settings: zenoh.Config, endpoints: Sequence[str], wait_s: float, stop: threading.Event) -> zenoh.Session:
+    deadline = time.monotonic() + wait_s
+    while True:
+        try:
+            return zenoh.open(settings)
+        except zenoh.ZError as error:
+            if time.monotonic() < deadline and not stop.wait(AGAIN_S):
+                continue
+            raise EndpointError(
+                f"cannot listen on {', '.join(lab.bare(endpoints))}: {_reason(error)}. If a router runs there already, "
+                "use it; else choose another port with --listen"
+            ) from None
 
 
 def _register(endpoints: Sequence[str]) -> Path | None:
