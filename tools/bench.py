@@ -18,7 +18,7 @@ from typing import Final
 
 import msgspec
 
-from tools import bench_world
+from tools import bench_intruders, bench_world
 from tools.figure import REPEATS, Figure, cpu
 
 FLIGHT_S: Final = 20.0
@@ -157,6 +157,7 @@ BENCHMARKS: Final[dict[str, Callable[[], Iterator[Figure]]]] = {
     "process": process,
     "world": bench_world.world,
     "encounters": bench_world.encounters,
+    "intruders": bench_intruders.intruders,
 }
 
 

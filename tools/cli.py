@@ -362,7 +362,8 @@ def schema() -> None:
 @app.command()
 def bench(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME...]", help="start, codec, virtual, process.")
+        list[str] | None,
+        typer.Argument(metavar="[NAME...]", help="start, codec, virtual, process, world, encounters, intruders."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

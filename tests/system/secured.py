@@ -38,6 +38,7 @@ class Laboratory:
         self.plain = network.free_endpoint(preferred_port=0, protocol=protocol)
         (self.endpoint,) = lab.secured([self.plain], self.folder)
         self.robots: list[RobotProcess] = []
+        self.last: dict[str, wire.Status] = {}
         self.process: subprocess.Popen[str]
         self.start()
 
@@ -75,7 +76,8 @@ class Laboratory:
         since = time.time()
         watcher = self.watcher
         watcher.until(lambda: all(watcher.status[name].stamp > since for name in FLOWN), "fresh statuses", 5.0)
-        return {name: watcher.status[name] for name in FLOWN}
+        self.last = {name: watcher.status[name] for name in FLOWN}
+        return self.last
 
     def session(self, identity: str, folder: Path | None = None) -> zenoh.Session:
         """A session of whoever has these certificates; at once, or zenoh.ZError."""

@@ -44,7 +44,7 @@ class Flight:
 @pytest.fixture(autouse=True)
 def flight(laboratory: Laboratory) -> Iterator[Flight]:
     """Whatever a test does: the robots run on, have believed and refused nothing, and have lost nobody."""
-    made = Flight(laboratory.statuses())
+    made = Flight(laboratory.last or laboratory.statuses())
     yield made
     after = laboratory.statuses()
     for name in FLOWN:
