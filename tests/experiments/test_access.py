@@ -153,9 +153,7 @@ def test_avoidance_gives_ears_and_nothing_else():
     one = next(iter(read.cases().values()))
     grants = access.rights([one]).robots
     mates = [name for name, robot in one.robots.items() if robot.process == "squad_E1"]
-    assert {key for key in grants[mates[0]].hear if key.endswith("/pose")} == {
-        f"park/{each}/pose" for each in one.robots
-    }
+    assert [key for key in grants[mates[0]].hear if key.endswith("/pose")] == ["park/*/pose"], "all forty of them"
     assert grants[mates[0]].say == [f"park/{mate}/**" for mate in mates]
 
 
