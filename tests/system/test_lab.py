@@ -41,7 +41,7 @@ def test_one_command_runs_it_and_others_look_and_stop_it(tmp_path: Path) -> None
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
     file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
     assert zenpark("keys", "init", tmp_path / "lab", file).returncode == 0
-    flight = Flight(tmp_path / "run", str(file), "--case", "event", "--no-report")
+    flight = Flight(tmp_path / "run", str(file), "--case", "event", "--no-report", "--set", "duration_s=90")
     flight.until_said("phase conductor: formation")
     endpoint, _, lab = flight.endpoint().partition("#lab=")
     assert endpoint.startswith("tls/127.0.0.1:")
