@@ -14,8 +14,8 @@ from typing import Final, TypeVar
 
 import zenoh
 
+from agents import lab, wire
 from agents import session as network
-from agents import wire
 from agents.keys import Keys
 from experiments import orders
 from experiments.assign import guided
@@ -105,6 +105,7 @@ class Conductor:
         source: Path,
         folder: Path,
         endpoints: Sequence[str],
+        rights: Path | None = None,
         launcher: Launcher,
         show: Show,
         interrupted: Callable[[], bool],
@@ -118,6 +119,7 @@ class Conductor:
             source: The experiment file as it was written, for the recording.
             folder: Where the recording goes.
             endpoints: Routers.
+            rights: Who may do what, for a router that is started again, in a lab.
             launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
             show: Called with the progress, about ten times a second.
             interrupted: Asked whether the user wants to end it.
@@ -138,6 +140,7 @@ class Conductor:
             source=source,
             recording=self._recording,
             endpoints=self._endpoints,
+            rights=rights,
             launcher=launcher,
         )
 
@@ -253,11 +256,14 @@ class Conductor:
 
     def _join(self, stack: ExitStack) -> None:
         keys = self._keys
-        self._session = stack.enter_context(network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S))
+        self._session = stack.enter_context(
+            network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S, identity="operator")
+        )
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
         if self._endpoints != [network.DEFAULT_ENDPOINT]:
             there = self._endpoints[0]
-            self._say("router", "conductor", f"{there}: look with `zenpark keys --connect {there}`")
+            look = f"zenpark keys {lab.options(there)}"
+            self._say("router", "conductor", f"{lab.bare([there])[0]}: look with `{look}`")
         self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
         self._told.put(self._file.read_bytes())
         self._statuses = network.pose_subscriber(self._session, keys.status("*"), 4096)

@@ -37,6 +37,7 @@ class Crew:
         source: Path,
         recording: Path,
         endpoints: Sequence[str],
+        rights: Path | None = None,
         launcher: Launcher,
     ) -> None:
         """Nothing is started yet.
@@ -48,6 +49,7 @@ class Crew:
             source: The experiment file as it was written, for the recording.
             recording: Where it is recorded; the processes' output goes to `logs/` beside it.
             endpoints: Routers.
+            rights: Who may do what, for a router that is started again, in a lab.
             launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
         """
         self._experiment, self._case = experiment, case
@@ -60,7 +62,7 @@ class Crew:
         self._recorder = f"{case}-recorder"
         self._standins: tuple[str, ...] = ()
         self._centre: tuple[str, ...] = ()
-        self._servants = Servants(experiment, case, file=file, endpoints=endpoints, launcher=launcher)
+        self._servants = Servants(experiment, case, file=file, endpoints=endpoints, rights=rights, launcher=launcher)
 
     def start(self, interrupted: Callable[[], bool]) -> None:
         """Starts all but the router: the recorder, then what robots need, then the robots.

@@ -270,6 +270,10 @@ class Network(Part, frozen=True):
         list[str] | None, Meta(description="endpoints of routers that run already; left out: one is started")
     ] = None
     encoding: Annotated[Literal["json", "msgpack"], Meta(description="of the payloads")] = "json"
+    lab: Annotated[
+        str | None,
+        Meta(description="folder of certificates (`zenpark keys init`), beside this file; left out: loopback only"),
+    ] = None
 
 
 class Safety(Part, frozen=True):

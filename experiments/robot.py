@@ -20,11 +20,20 @@ from agents.shadow import shadowed
 from experiments import assign, conditions, document
 from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
+from experiments.reach import routers
 
 FAR: Final = ("external", "world")  # bodies that live in another process, their range sensors too
 
 
-def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[str], lifeline: bool) -> int:
+def fly(
+    file: str,
+    names: Sequence[str],
+    *,
+    case: str | None,
+    connect: Sequence[str],
+    lifeline: bool,
+    lab: str | None = None,
+) -> int:
     """Runs the robots `names` of an experiment in this process; returns its exit code.
 
     Raises:
@@ -32,12 +41,13 @@ def fly(file: str, names: Sequence[str], *, case: str | None, connect: Sequence[
         BodyError, UnknownPlugin: If a body cannot be had.
         Unreachable: If no router answers.
     """
-    experiment = chosen_case(document.read(file), case)
+    read = document.read(file)
+    experiment = chosen_case(read, case)
     unknown = [name for name in names if name not in experiment.robots]
     if unknown:
         hint = plugins.did_you_mean(unknown[0], experiment.robots)
         raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
-    endpoints = list(connect) or experiment.network.connect or [DEFAULT_ENDPOINT]
+    endpoints = routers(experiment, read.path, connect, lab) or [DEFAULT_ENDPOINT]
     request = assign.request(experiment, names, [experiment.seed], endpoints)
     body = shadowed(assemble(request), request, assign.shadows(experiment, names))
     assignment = assign.assign(experiment, names)

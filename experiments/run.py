@@ -24,8 +24,13 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
+from agents.access import rules
+from agents.lab import of as lab_of
+from agents.lab import register, require
 from agents.session import free_endpoint
-from experiments import document, metrics, playback, results, virtual
+from experiments import access, document, metrics, playback, reach, results, virtual
 from experiments.conductor import Conductor, Result
 from experiments.document import Document
 from experiments.experiment import Experiment
@@ -168,6 +173,7 @@ def fly(
     show: Shown,
     interrupted: Callable[[], bool] = lambda: False,
     bodies: str | None = None,
+    lab: str | None = None,
 ) -> Run:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
@@ -179,23 +185,28 @@ def fly(
         interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
         bodies: What every robot is put into instead of the body that the file gives it: "twin", "world", or
             "protocol" for its real bridge and a protocol twin.
+        lab: Folder of certificates, instead of the file's.
 
     Raises:
+        LabError: If a certificate is missing.
         RunFailed: If robots are not ready in time, unless the file says to go on without them.
         Unreachable: If the routers of the file do not answer.
     """
     results: dict[str, Result] = {}
     read.keep(folder / SOURCE)
+    embodied = {name: choose_bodies(case, bodies) for name, case in chosen(read, cases).items()}
+    own_router = read.experiment.network.connect is None
+    secure = reach.folder(read.experiment, read.path, lab) is not None
+    given = [free_endpoint(protocol="tls" if secure else "tcp")] if own_router else []
+    endpoints = reach.routers(read.experiment, read.path, given, lab)
+    rights = _rights(embodied, endpoints, folder)
     with Launcher(folder / "logs") as launcher:
-        endpoints = read.experiment.network.connect
-        if endpoints is None:
-            endpoints = [free_endpoint()]
-            start_router(launcher, endpoints)
+        if own_router:
+            start_router(launcher, endpoints, rights)
         with show:
-            for name, experiment in chosen(read, cases).items():
+            for name, experiment in embodied.items():
                 if interrupted():
                     break
-                experiment = choose_bodies(experiment, bodies)  # noqa: PLW2901
                 file = folder / f"{name}.json"
                 file.write_bytes(document.write_json(experiment))
                 results[name] = Conductor(
@@ -205,6 +216,7 @@ def fly(
                     source=folder / SOURCE,
                     folder=folder,
                     endpoints=endpoints,
+                    rights=rights,
                     launcher=launcher,
                     show=show,
                     interrupted=interrupted,
@@ -212,6 +224,23 @@ def fly(
     notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost]
     begun = {case: result.recording for case, result in results.items() if result.start is not None}
     return _read_back(folder, begun, notes)
+
+
+def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: Path) -> Path | None:
+    """Who may do what, as a file for the router; None without a lab.
+
+    Raises:
+        LabError: If a certificate is missing, or somebody else's.
+    """
+    of = lab_of(endpoints)
+    if of is None:
+        return None
+    require(of, list(dict.fromkeys(name for case in cases.values() for name in access.needed(case))))
+    made = access.rights(cases.values())
+    rules(made, register(of))  # what is wrong with it is said now, and not by a router that does not start
+    file = folder / "rights.json"
+    file.write_bytes(msgspec.json.format(msgspec.json.encode(made), indent=1))
+    return file
 
 
 def reopen(folder: Path) -> Run:

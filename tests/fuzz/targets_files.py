@@ -242,7 +242,7 @@ def forged() -> Iterator[Target]:
 def cdr() -> Iterator[Target]:
     """Every recorded struct: name and CDR with a zero byte between them; what is decoded can be encoded."""
     from experiments.cdr import Undecodable, Unencodable, codec  # noqa: PLC0415
-    from experiments.recording import SentPose, World  # noqa: PLC0415
+    from experiments.recording import SentPose  # noqa: PLC0415
 
     said = good("KH01")
     pose: Any = said["pose"][0]
@@ -250,8 +250,8 @@ def cdr() -> Iterator[Target]:
     made: list[Any] = [
         said["state"][0], said["state"][1], said["status"][0], SentPose(*fields, 1.0, 150),
         wire.Event(1.0, "start", "conductor", "go"), wire.Contact(1.0, "KH01", "wall", 0.1, 0.01),
-        World.of(wire.WorldState(1.0, "pymunk", 0.0, 1.0, 0.1, False, ["KH01"], ["a"], {"b": (0.0, 0.0, 0.0)},
-            1, 0, 0, "")),
+        wire.WorldState(1.0, "pymunk", 0.0, 1.0, 0.1, False, ["KH01"], ["a"], [wire.Standing("b", (0.0, 0.0, 0.0))],
+            1, 0, 0, ""),
     ]  # fmt: skip
     codecs = {type(each).__name__: codec(type(each)) for each in made}
     examples = [type(each).__name__.encode() + b"\0" + codecs[type(each).__name__].encode(each) for each in made]
