@@ -111,6 +111,15 @@ class Keys:
         """Liveliness token of the recorder."""
         return f"{self.realm}/run/recorder"
 
+    def below(self, name: str) -> str:
+        """Everything of a robot, or of a part of the system that has a name: `world`, `run`, `centre`."""
+        return f"{self.realm}/{name}/**"
+
+    @property
+    def everything(self) -> str:
+        """All keys of the realm."""
+        return f"{self.realm}/**"
+
     def robot(self, key: str) -> str:
         """The robot that a key of this realm belongs to.
 

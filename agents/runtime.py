@@ -132,7 +132,11 @@ class Runtime:
             try:
                 name = "+".join(self._names)
                 with network.open_session(
-                    self._setup.endpoints, name=name, stop=asked, lease_s=network.ROBOT_LEASE_S
+                    self._setup.endpoints,
+                    name=name,
+                    stop=asked,
+                    lease_s=network.ROBOT_LEASE_S,
+                    identity=self._names[0],
                 ) as session:
                     self._refuse_doubles(session)
                     self._join(session)

@@ -15,7 +15,8 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Final, Literal, Protocol, Self, TypeVar
 
 import zenoh
@@ -31,6 +32,8 @@ from zenoh.ext import (
 )
 from zenoh.handlers import Callback, Handler, RingChannel
 
+from agents import access, lab
+
 Mode = Literal["client", "peer", "router"]
 T_co = TypeVar("T_co", covariant=True)
 
@@ -41,6 +44,8 @@ RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `c
 GHOST_S: Final = 2.5  # so long may the token of somebody who hangs stand after his end
 LEASE_S: Final = 2.0  # whoever is silent for so long is held for dead
 ROBOT_LEASE_S: Final = 1.2  # the same for robots: neighbours of one that hangs must know within 1.5 s
+OPEN_S: Final = 3.0  # a router that answers nothing for so long is passed over for the next one
+MOST_BYTES: Final = 4 * 1024 * 1024  # of a message that a router of a lab puts together; the largest is an experiment
 HEARTBEAT_S: Final = 0.5  # how long the loss of the last pose before a silence goes unnoticed
 
 # 4 threads instead of 7 in each client and a sixth less CPU at 50 Hz. Zenoh reads it once, at the first open.
@@ -70,8 +75,12 @@ def config(
     listen: Sequence[str] = (),
     name: str | None = None,
     lease_s: float = LEASE_S,
+    identity: str | None = None,
+    rights: access.Rights | None = None,
 ) -> zenoh.Config:
     """The configuration of every session: no multicast, no gossip, no shared memory, listening on loopback only.
+
+    With a lab (`agents.lab`) both ends show certificates, and listening beyond loopback is allowed.
 
     Args:
         mode: Robots are clients: a router forwards between clients, but not between two peers.
@@ -79,14 +88,25 @@ def config(
         listen: Loopback endpoints to listen on; a client needs none.
         name: Shown by `zenpark keys`.
         lease_s: After this silence [s] the others hold this session for dead. A killed process is noticed at once.
+        identity: Whose certificate is shown, in a lab; `name` if left out.
+        rights: Who may do what; a router of a lab needs them.
 
     Raises:
-        EndpointError: If an endpoint is malformed, or one to listen on can be reached from outside this machine.
+        EndpointError: If an endpoint is malformed, or one to listen on can be reached from outside this machine
+            although there is no lab, or the lab has no such identity, or its router no rights to enforce.
     """
     for endpoint in (*connect, *listen):
         _check_form(endpoint)
-    for endpoint in listen:
-        _check_loopback(endpoint)
+    try:
+        of_lab, folder = _of_lab([*connect, *listen], identity or name or "", bool(listen), rights)
+    except lab.LabError as error:
+        raise EndpointError(str(error)) from None
+    connect, listen = lab.bare(connect), lab.bare(listen)
+    if folder is None:
+        for endpoint in listen:
+            _check_loopback(endpoint)
+    elif mode == "router" and rights is None:
+        raise EndpointError(f"a router of the lab {folder} must know who may do what: name the experiment")
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     settings: dict[str, object] = {
         "mode": mode,
@@ -104,15 +124,36 @@ def config(
     }
     if name is not None:
         settings["metadata"] = {"name": name}
+    settings |= of_lab
     made = zenoh.Config()
     for key, value in settings.items():
         try:
             made.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
             raise EndpointError(
-                f"{', '.join((*connect, *listen))}: {_reason(error)}; write endpoints like {DEFAULT_ENDPOINT}"
+                f"{', '.join((*connect, *listen))}: {reason(error)}; write endpoints like {DEFAULT_ENDPOINT}"
             ) from None
     return made
+
+
+def _of_lab(
+    endpoints: Sequence[str], identity: str, listens: bool, rights: access.Rights | None
+) -> tuple[dict[str, object], Path | None]:
+    """What the lab of some endpoints adds to a configuration, and its folder; nothing and None without one.
+
+    Raises:
+        LabError: If the lab has no such identity, or its register does not go with the rights.
+    """
+    folder = lab.of(endpoints)
+    if folder is None:
+        return {}, None
+    settings = lab.settings(folder, identity, listens=listens)
+    settings["transport/unicast/open_timeout"] = settings["transport/unicast/accept_timeout"] = round(OPEN_S * 1000)
+    if rights is not None:
+        settings["access_control"] = access.rules(rights, lab.register(folder))
+        settings["low_pass_filter"] = access.sizes(rights)
+        settings["transport/link/rx/max_message_size"] = MOST_BYTES
+    return settings, folder
 
 
 def _check_form(endpoint: str) -> None:
@@ -122,7 +163,7 @@ def _check_form(endpoint: str) -> None:
 
 
 def _check_loopback(endpoint: str) -> None:
-    """Refuses to listen where others could connect: there is no authentication yet."""
+    """Refuses to listen where others could connect: without a lab there is no authentication."""
     protocol, _, address = endpoint.partition("/")
     if protocol == "unixsock-stream":
         return
@@ -133,7 +174,8 @@ def _check_loopback(endpoint: str) -> None:
         loopback = False
     if not loopback:
         raise EndpointError(
-            f"will not listen on {endpoint}: whoever reaches it could command the robots. Listen on "
+            f"will not listen on {endpoint}: whoever reaches it could command the robots. Make certificates with "
+            "`zenpark keys init LAB FILE`, then listen on tls/... with --lab LAB; or listen on "
             f"{DEFAULT_ENDPOINT} and let other machines in through an SSH tunnel (ssh -R 7447:127.0.0.1:7447 HOST)"
         )
 
@@ -145,6 +187,7 @@ def open_session(
     wait_s: float = 10.0,
     stop: threading.Event | None = None,
     lease_s: float = LEASE_S,
+    identity: str | None = None,
 ) -> zenoh.Session:
     """A client session on the first router that answers; use it in a `with`.
 
@@ -154,12 +197,13 @@ def open_session(
         wait_s: How long to try [s].
         stop: Ends the wait when it is set.
         lease_s: See `config`.
+        identity: Whose certificate is shown, where the endpoints are of a lab; `name` if left out.
 
     Raises:
-        EndpointError: If an endpoint is malformed.
+        EndpointError: If an endpoint is malformed, or its lab has no such identity.
         Unreachable: If no router answered in time, or `stop` was set before one did.
     """
-    settings = config("client", connect=endpoints, name=name, lease_s=lease_s)
+    settings = config("client", connect=endpoints, name=name, lease_s=lease_s, identity=identity)
     gone = stop or threading.Event()
     deadline = time.monotonic() + wait_s
     while True:
@@ -167,35 +211,23 @@ def open_session(
             return zenoh.open(settings)
         except zenoh.ZError:
             if time.monotonic() >= deadline or gone.wait(RETRY_S):
-                raise Unreachable(
-                    f"no router answers at {', '.join(endpoints) or 'no endpoint'}: "
-                    "`zenpark router` starts one, --connect names another"
-                ) from None
+                raise Unreachable(_silence(endpoints, identity or name)) from None
 
 
-def serve_router(
-    endpoints: Sequence[str], stop: threading.Event, ready: Callable[[zenoh.Session], None] | None = None
-) -> None:
-    """Runs a router on loopback endpoints until `stop` is set; `ready` gets it as soon as clients can connect.
-
-    Raises:
-        EndpointError: If an endpoint is malformed, not on loopback, or taken.
-    """
-    settings = config("router", listen=endpoints, name="router")
-    try:
-        session = zenoh.open(settings)
-    except zenoh.ZError as error:
-        raise EndpointError(
-            f"cannot listen on {', '.join(endpoints)}: {_reason(error)}. If a router runs there already, use it; "
-            "else choose another port with --listen"
-        ) from None
-    with session:
-        if ready is not None:
-            ready(session)
-        stop.wait()
+def _silence(endpoints: Sequence[str], identity: str) -> str:
+    folder = lab.of(endpoints)
+    refused = (
+        ""
+        if folder is None
+        else f", or it refuses the certificate of {identity} (`zenpark keys show {folder}` says until when it is valid)"
+    )
+    return (
+        f"no router answers at {', '.join(lab.bare(endpoints)) or 'no endpoint'}{refused}: "
+        "`zenpark router` starts one, --connect names another"
+    )
 
 
-def free_endpoint(preferred_port: int = DEFAULT_PORT) -> str:
+def free_endpoint(preferred_port: int = DEFAULT_PORT, protocol: str = "tcp") -> str:
     """A loopback endpoint to listen on: of the preferred port, or of any free one when that is taken."""
     for port in (preferred_port, 0):
         with socket.socket() as probe:
@@ -204,7 +236,7 @@ def free_endpoint(preferred_port: int = DEFAULT_PORT) -> str:
                 probe.bind(("127.0.0.1", port))
             except OSError:
                 continue
-            return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+            return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
     raise EndpointError("no free TCP port on 127.0.0.1: end some of the processes that listen there")
 
 
@@ -364,6 +396,6 @@ def received(handler: Polled[T_co]) -> Iterator[T_co]:
         yield item
 
 
-def _reason(error: zenoh.ZError) -> str:
+def reason(error: zenoh.ZError) -> str:
     """The innermost reason in a message of Zenoh, without the place in its source."""
     return str(error).partition(" at /")[0].rpartition(": ")[2]

@@ -96,7 +96,7 @@ class ExternalBody:
         deadline = time.monotonic() + OPEN_S
         try:
             name = f"body of {'+'.join(self._names)}"
-            self._session = network.open_session(self._endpoints, name=name, wait_s=OPEN_S)
+            self._session = network.open_session(self._endpoints, name=name, wait_s=OPEN_S, identity=self._names[0])
         except (network.Unreachable, network.EndpointError) as error:
             raise BodyError(f"{', '.join(self._names)}: {error}") from None
         session, keys, mime = self._session, self._keys, wire.MIME["json"]

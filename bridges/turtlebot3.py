@@ -72,7 +72,9 @@ class TurtleBot3:
         if robot.endpoints not in self._sessions:
             wait = max(0.0, deadline - self._clock())
             try:
-                session = network.open_session(robot.endpoints, name=f"{robot.name} ROS 2", wait_s=wait)
+                session = network.open_session(
+                    robot.endpoints, name=f"{robot.name} ROS 2", wait_s=wait, identity=robot.name
+                )
             except (network.Unreachable, network.EndpointError) as error:
                 raise BodyError(f"{robot.name}: {error}; or set device.endpoint to the router of the robot") from None
             self._sessions[robot.endpoints] = session

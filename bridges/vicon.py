@@ -211,7 +211,10 @@ def bridge(
 
     if lifeline:
         Lifeline(lost).start()
-    with told_to_end(stop.set), network.open_session(endpoints, name="vicon", stop=stop) as session:
+    with (
+        told_to_end(stop.set),
+        network.open_session(endpoints, name="vicon", stop=stop, identity="positioning") as session,
+    ):
         keys, robots = Keys(realm), list(subjects)
         farewell = Farewell(session, keys, robots, lost)
         made = Bridge(host, port, Sieve(subjects, say), Positions(session, keys, robots), say)

@@ -36,6 +36,7 @@ from experiments import conditions, document
 from experiments.assign import assign_centre, guided
 from experiments.experiment import Experiment
 from experiments.problem import DocumentError, Problem
+from experiments.reach import routers
 from experiments.robot import chosen_case
 
 REPORT_S: Final = 1.0
@@ -230,7 +231,9 @@ class CentreProcess:
         self._reports.put(wire.encode(report))
 
 
-def serve(file: str, *, case: str | None, connect: Sequence[str], lifeline: bool = False) -> int:
+def serve(
+    file: str, *, case: str | None, connect: Sequence[str], lifeline: bool = False, lab: str | None = None
+) -> int:
     """Runs the centre of an experiment until it is told to end; returns the exit code.
 
     Raises:
@@ -239,12 +242,13 @@ def serve(file: str, *, case: str | None, connect: Sequence[str], lifeline: bool
         CentreTaken: If a centre is on the network already.
         Unreachable: If no router answers.
     """
-    experiment = chosen_case(document.read(file), case)
+    read = document.read(file)
+    experiment = chosen_case(read, case)
     steered = guided(experiment)
     if not steered:
         hint = 'write architecture = "centralised" at the top of the file, or choose another case with --case'
         raise DocumentError([Problem(file, 0, 0, "every robot of this experiment decides for itself", hint)])
-    endpoints = list(connect) or experiment.network.connect or [network.DEFAULT_ENDPOINT]
+    endpoints = routers(experiment, read.path, connect, lab) or [network.DEFAULT_ENDPOINT]
     over = threading.Event()
     with told_to_end(over.set):
         if lifeline:

@@ -35,16 +35,12 @@ def run(
     anyway: bool,
     report: bool,
     open_report: bool,
+    lab: str | None = None,
 ) -> int:
     """`zenpark run`; returns the exit code: 0, 2 if the check finds errors, or 130 after Ctrl-C."""
     changes = [*settings, *([] if seed is None else [f"seed={seed}"])]
     read = load(file, *changes)
-    if seeds > 1 and not virtual:
-        raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
-    if bodies not in (None, *BODIES):
-        raise DocumentError([Problem(f"--bodies {bodies}", 0, 0, "is not known", f"there are: {', '.join(BODIES)}")])
-    if bodies is not None and virtual:
-        raise DocumentError([Problem("--bodies", 0, 0, "is for real time", "leave out --virtual")])
+    _refuse(virtual=virtual, seeds=seeds, bodies=bodies, lab=lab)
     chosen(read, cases)
     if not sound(read, changes) and not anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
@@ -66,7 +62,18 @@ def run(
         with interrupted:
             show = shown(quiet=as_json)
             try:
-                runs = [fly(read, folder, cases=cases, show=show, interrupted=interrupted, bodies=bodies, local=here)]
+                runs = [
+                    fly(
+                        read,
+                        folder,
+                        cases=cases,
+                        show=show,
+                        interrupted=interrupted,
+                        bodies=bodies,
+                        local=here,
+                        lab=lab,
+                    )
+                ]
             except KeyboardInterrupt:
                 print(f"\nended at once; `zenpark report {folder}` shows what was recorded", file=sys.stderr)
                 return 130
@@ -74,7 +81,8 @@ def run(
         print(f"interrupted before the common start: there is nothing to report; logs: {folder / 'logs'}")
         return 130
     again = _command(
-        file, virtual=virtual, changes=changes, cases=cases, seeds=seeds, bodies=bodies, here=here, anyway=anyway
+        file, virtual=virtual, changes=changes, cases=cases, seeds=seeds, bodies=bodies,
+        here=here, anyway=anyway, lab=lab,
     )  # fmt: skip
     page = _keep(runs, folder, again) if report else None
     summary: dict[str, Any] = runs[0].summary()
@@ -87,6 +95,17 @@ def run(
     if open_report and page is not None:
         webbrowser.open(page.resolve().as_uri())
     return 130 if interrupted.asked else 0
+
+
+def _refuse(*, virtual: bool, seeds: int, bodies: str | None, lab: str | None) -> None:
+    """Raises DocumentError for options that do not go together."""
+    if seeds > 1 and not virtual:
+        raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
+    if bodies not in (None, *BODIES):
+        raise DocumentError([Problem(f"--bodies {bodies}", 0, 0, "is not known", f"there are: {', '.join(BODIES)}")])
+    for option, given in (("--bodies", bodies), ("--lab", lab)):
+        if given is not None and virtual:
+            raise DocumentError([Problem(option, 0, 0, "is for real time", "leave out --virtual")])
 
 
 def sound(read: document.Document, changes: Sequence[str]) -> bool:
@@ -158,6 +177,7 @@ def _command(
     bodies: str | None,
     here: bool,
     anyway: bool,
+    lab: str | None,
 ) -> str:
     parts = ["zenpark", "run", file, *(["--virtual"] if virtual else [])]
     parts += [part for case in cases for part in ("--case", case)]
@@ -165,6 +185,7 @@ def _command(
     parts += ["--seeds", str(seeds)] if seeds > 1 else []
     parts += ["--bodies", bodies] if bodies is not None else []
     parts += ["--here"] if here else []
+    parts += ["--lab", lab] if lab is not None else []
     return " ".join([*parts, *(["--anyway"] if anyway else [])])
 
 

@@ -14,8 +14,8 @@ from typing import Final, TypeVar
 
 import zenoh
 
+from agents import lab, wire
 from agents import session as network
-from agents import wire
 from agents.keys import Keys
 from experiments import hosts as machines
 from experiments import orders
@@ -115,6 +115,7 @@ class Conductor:
         source: Path,
         folder: Path,
         endpoints: Sequence[str],
+        rights: Path | None = None,
         launcher: Launcher,
         hosts: Hosts,
         show: Show,
@@ -129,6 +130,7 @@ class Conductor:
             source: The experiment file as it was written, for the recording.
             folder: Where the recording goes.
             endpoints: Routers.
+            rights: Who may do what, for a router that is started again, in a lab.
             launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
             hosts: Other machines, on which robots may be started.
             show: Called with the progress, about ten times a second.
@@ -150,6 +152,7 @@ class Conductor:
             source=source,
             recording=self._recording,
             endpoints=self._endpoints,
+            rights=rights,
             launcher=launcher,
             hosts=hosts,
         )
@@ -314,11 +317,14 @@ class Conductor:
 
     def _join(self, stack: ExitStack) -> None:
         keys = self._keys
-        self._session = stack.enter_context(network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S))
+        self._session = stack.enter_context(
+            network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S, identity="operator")
+        )
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
         if self._endpoints != [network.DEFAULT_ENDPOINT]:
             there = self._endpoints[0]
-            self._say("router", "conductor", f"{there}: look with `zenpark keys --connect {there}`")
+            look = f"zenpark keys {lab.options(there)}"
+            self._say("router", "conductor", f"{lab.bare([there])[0]}: look with `{look}`")
         self._clock = network.publisher(self._session, keys.clock, wire.JSON)
         self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
         self._told.put(machines.document(self._experiment))

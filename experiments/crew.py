@@ -48,6 +48,7 @@ class Crew:
         source: Path,
         recording: Path,
         endpoints: Sequence[str],
+        rights: Path | None = None,
         launcher: Launcher,
         hosts: Hosts,
     ) -> None:
@@ -60,6 +61,7 @@ class Crew:
             source: The experiment file as it was written, for the recording.
             recording: Where it is recorded; the processes' output goes to `logs/` beside it.
             endpoints: Routers.
+            rights: Who may do what, for a router that is started again, in a lab.
             launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
             hosts: Other machines, on which robots may be started; joined before robots are.
         """
@@ -74,7 +76,13 @@ class Crew:
         self._standins: tuple[str, ...] = ()
         self._centre: tuple[str, ...] = ()
         self._servants = Servants(
-            experiment, case, file=file, endpoints=endpoints, routers=hosts.routers, launcher=launcher
+            experiment,
+            case,
+            file=file,
+            endpoints=endpoints,
+            routers=hosts.routers,
+            rights=rights,
+            launcher=launcher,
         )
         self.adopted: set[str] = set()
         self.away = machines.absent(experiment)

@@ -30,6 +30,7 @@ from agents.process import told_to_end
 from experiments import assign, document, json_text
 from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
+from experiments.reach import routers
 from twins.device import Device, DeviceRequest, Faults
 
 EXPLAINED: Final = (
@@ -105,13 +106,14 @@ def stand_in(file: str, names: Sequence[str], *, faults: Faults, connect: Sequen
         DocumentError: If the file is wrong, or the robots do not ask for one and the same protocol twin.
         Unreachable: If no router answers.
     """
-    experiment = document.read(file).experiment
+    read = document.read(file)
+    experiment = read.experiment
     words = {experiment.robots[name].body if name in experiment.robots else "" for name in names}
     known = plugins.names(plugins.DEVICES)
     if len(words) != 1 or not words <= set(known):
         hint = f"their `body` must be one of {', '.join(known)}"
         raise DocumentError([Problem(file, 0, 0, f"{', '.join(names)} cannot share a protocol twin", hint)])
-    endpoints = list(connect) or experiment.network.connect or [network.DEFAULT_ENDPOINT]
+    endpoints = routers(experiment, read.path, connect) or [network.DEFAULT_ENDPOINT]
     request = DeviceRequest(assign.request(experiment, names, [experiment.seed], endpoints), faults)
     word = words.pop()
     keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
@@ -159,7 +161,7 @@ def _serve(
     with told_to_end(over.set), ExitStack() as stack:
         session = None
         if connect:
-            session = stack.enter_context(network.open_session(connect, name=word, stop=over))
+            session = stack.enter_context(network.open_session(connect, name=word, stop=over, identity="twin"))
         device: Device = plugins.load(plugins.DEVICES, word)(request)
         stack.callback(device.close)
         for name, address in zip(names, device.addresses, strict=True):

@@ -281,6 +281,10 @@ class Network(Part, frozen=True):
         Meta(description="name of this machine for hosts, where `listen` is given; left out: as ssh came from there"),
     ] = None
     encoding: Annotated[Literal["json", "msgpack"], Meta(description="of the payloads")] = "json"
+    lab: Annotated[
+        str | None,
+        Meta(description="folder of certificates (`zenpark keys init`), beside this file; left out: loopback only"),
+    ] = None
 
 
 class Host(Part, frozen=True):

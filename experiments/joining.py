@@ -9,10 +9,12 @@ import os
 import signal
 import threading
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 import zenoh
 
+from agents import lab
 from agents import session as network
 from agents.keys import Keys
 from agents.lifeline import SILENCE_S
@@ -82,3 +84,15 @@ class Tether:
                 print("the conductor is gone", flush=True)
                 os.kill(os.getpid(), signal.SIGTERM)
                 return
+
+
+def reached(connect: Sequence[str], folder: str | None) -> list[str]:
+    """The routers to ask, each with its lab if there is one.
+
+    Raises:
+        EndpointError: If a router of a lab asks for no certificates.
+    """
+    try:
+        return lab.secured(connect, None if folder is None else Path(folder).absolute())
+    except lab.LabError as error:
+        raise network.EndpointError(str(error)) from None

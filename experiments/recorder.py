@@ -205,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     try:
         record(chosen.file, chosen.target, case=chosen.case, source=chosen.source, connect=chosen.connect)
-    except (DocumentError, RecordingError, network.Unreachable, OSError) as error:
+    except (DocumentError, RecordingError, network.EndpointError, network.Unreachable, OSError) as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2
     return 0

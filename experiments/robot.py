@@ -28,6 +28,7 @@ from agents.shadow import shadowed
 from experiments import assign, conditions, document, joining
 from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
+from experiments.reach import routers
 
 STDIN: Final = "-"
 JOIN: Final = "join"
@@ -47,6 +48,7 @@ def fly(
     clock_correction_s: float = 0.0,
     once: bool = False,
     realm: str = "park",
+    lab: str | None = None,
 ) -> int:
     """Runs the robots `names` of an experiment in this process; returns its exit code.
 
@@ -70,9 +72,9 @@ def fly(
     with ExitStack() as stack:
         endpoints = list(connect)
         if file == JOIN:
-            session = stack.enter_context(network.open_session(connect or [DEFAULT_ENDPOINT], name=f"{names[0]} joins"))
+            endpoints = joining.reached(connect or [DEFAULT_ENDPOINT], lab)
+            session = stack.enter_context(network.open_session(endpoints, name=f"{names[0]} joins", identity=names[0]))
             read = joining.offered(session, Keys(realm), names)
-            endpoints = endpoints or [DEFAULT_ENDPOINT]
             stack.callback(joining.Tether(session, Keys(realm)).close)
         elif file == STDIN:
             print(f"{', '.join(names)}: on {socket.gethostname()}, process {os.getpid()}", flush=True)
@@ -84,20 +86,20 @@ def fly(
         if unknown:
             hint = plugins.did_you_mean(unknown[0], experiment.robots)
             raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
+        endpoints = routers(experiment, read.path, endpoints, lab) or [DEFAULT_ENDPOINT]
         return _run(experiment, names, endpoints, lifeline=lifeline, clock=Clock(clock_correction_s), once=once)
 
 
 def _run(
     experiment: Experiment,
     names: Sequence[str],
-    connect: Sequence[str],
+    endpoints: Sequence[str],
     *,
     lifeline: bool,
     clock: Clock,
     once: bool,
 ) -> int:
     """Runs robots of a case until they end."""
-    endpoints = list(connect) or experiment.network.connect or [DEFAULT_ENDPOINT]
     request = replace(assign.request(experiment, names, [experiment.seed], endpoints), clock=clock)
     body = shadowed(assemble(request), request, assign.shadows(experiment, names))
     assignment = assign.assign(experiment, names)

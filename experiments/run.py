@@ -26,9 +26,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from agents.access import rules
 from agents.endpoint import Endpoint
+from agents.lab import of as lab_of
+from agents.lab import register, require
 from agents.session import free_endpoint
-from experiments import document, metrics, playback, results, virtual
+from experiments import access, document, metrics, playback, reach, results, virtual
 from experiments.conductor import Conductor, Result
 from experiments.document import Document
 from experiments.experiment import Experiment
@@ -173,6 +176,7 @@ def fly(
     interrupted: Callable[[], bool] = lambda: False,
     bodies: str | None = None,
     local: bool = False,
+    lab: str | None = None,
 ) -> Run:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
@@ -185,8 +189,10 @@ def fly(
         bodies: What every robot is put into instead of the body that the file gives it: "twin", "world", or
             "protocol" for its real bridge and a protocol twin.
         local: Whether all robots run on this machine, whatever the file says of hosts.
+        lab: Folder of certificates, instead of the file's.
 
     Raises:
+        LabError: If a certificate is missing.
         RunFailed: If robots are not ready in time, unless the file says to go on without them.
         Unreachable: If the routers of the file do not answer.
         HostError: If a host cannot be reached, or has another zenpark.
@@ -197,18 +203,24 @@ def fly(
         raise DocumentError([Problem("--bodies protocol", 0, 0, "protocol twins cannot be seen from hosts", hint)])
     results: dict[str, Result] = {}
     read.keep(folder / SOURCE)
+    embodied = {name: choose_bodies(case, bodies) for name, case in chosen(read, cases).items()}
+    own_router = read.experiment.network.connect is None
+    secure = reach.folder(read.experiment, read.path, lab) is not None
+    if secure and read.experiment.hosts and not local:
+        hint = "leave the lab out (what goes to hosts goes through ssh), or add --here"
+        raise DocumentError([Problem(read.path.name, 0, 0, "hosts have no certificates of a lab", hint)])
+    own = read.experiment.network.listen or [free_endpoint(protocol="tls" if secure else "tcp")]
+    listening = reach.routers(read.experiment, read.path, own if own_router else [], lab)
+    endpoints = [str(here(Endpoint.parse(router))) for router in listening] if own_router else listening
+    rights = _rights(embodied, endpoints, folder)
     with Launcher(folder / "logs") as launcher:
-        endpoints = routers = read.experiment.network.connect
-        if endpoints is None or routers is None:
-            routers = read.experiment.network.listen or [free_endpoint()]
-            start_router(launcher, routers)
-            endpoints = [str(here(Endpoint.parse(router))) for router in routers]
-        hosts = Hosts(launcher, routers)
+        if own_router:
+            start_router(launcher, listening, rights)
+        hosts = Hosts(launcher, listening)
         with show:
-            for name, experiment in chosen(read, cases).items():
+            for name, experiment in embodied.items():
                 if interrupted():
                     break
-                experiment = choose_bodies(experiment, bodies)  # noqa: PLW2901
                 if local:
                     experiment = msgspec.structs.replace(experiment, hosts={})  # noqa: PLW2901
                 file = folder / f"{name}.json"
@@ -220,6 +232,7 @@ def fly(
                     source=folder / SOURCE,
                     folder=folder,
                     endpoints=endpoints,
+                    rights=rights,
                     launcher=launcher,
                     hosts=hosts,
                     show=show,
@@ -234,6 +247,23 @@ def fly(
 def here(router: Endpoint) -> Endpoint:
     """How this machine reaches a router that listens at an endpoint of it."""
     return router.at("127.0.0.1") if router.is_wildcard else router
+
+
+def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: Path) -> Path | None:
+    """Who may do what, as a file for the router; None without a lab.
+
+    Raises:
+        LabError: If a certificate is missing, or somebody else's.
+    """
+    of = lab_of(endpoints)
+    if of is None:
+        return None
+    require(of, list(dict.fromkeys(name for case in cases.values() for name in access.needed(case))))
+    made = access.rights(cases.values())
+    rules(made, register(of))  # what is wrong with it is said now, and not by a router that does not start
+    file = folder / "rights.json"
+    file.write_bytes(msgspec.json.format(msgspec.json.encode(made), indent=1))
+    return file
 
 
 def reopen(folder: Path) -> Run:

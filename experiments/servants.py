@@ -37,6 +37,7 @@ class Servants:
         file: Path,
         endpoints: Sequence[str],
         routers: Sequence[str],
+        rights: Path | None,
         launcher: Launcher,
     ) -> None:
         """The router and the world are started by others, for the first time; the centre by `start_centre`.
@@ -47,12 +48,15 @@ class Servants:
             file: The same as a file.
             endpoints: Routers as this machine reaches them.
             routers: Where a router of our own listens, which other machines must find again.
+            rights: Who may do what, in a lab; None without one.
             launcher: Starts them.
         """
         connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
         self._centre = f"{case}-centre" if guided(experiment) else None
         self._known = {
-            ROUTER: _Servant(lambda: start_router(launcher, routers), "", ": the robots hold, and land at the end"),
+            ROUTER: _Servant(
+                lambda: start_router(launcher, routers, rights), "", ": the robots hold, and land at the end"
+            ),
             standins.world_name(case): _Servant(
                 lambda: standins.start_world(experiment, file, prefix=case, launcher=launcher, connect=connect)
             ),
@@ -86,7 +90,8 @@ class Servants:
         return kind, f"the {kind} ended ({process.exit}); {what}" + "".join(f": {line}" for line in last)
 
 
-def start_router(launcher: Launcher, endpoints: Sequence[str]) -> None:
-    """A router of our own, which outlives a killed launcher by as long as robots take to land."""
+def start_router(launcher: Launcher, endpoints: Sequence[str], rights: Path | None = None) -> None:
+    """A router of our own, which outlives a killed launcher by as long as robots take to land; with a lab, `rights`."""
     listen = [part for endpoint in endpoints for part in ("--listen", endpoint)]
-    launcher.start(ROUTER, "agents.router", *listen, "--lifeline", "--linger", str(LINGER_S))
+    enforced = [] if rights is None else ["--rights", str(rights)]
+    launcher.start(ROUTER, "agents.router", *listen, *enforced, "--lifeline", "--linger", str(LINGER_S))

@@ -31,6 +31,7 @@ from experiments.exchange import Exchange
 from experiments.experiment import Experiment
 from experiments.population import Population, Refused
 from experiments.problem import DocumentError, Problem
+from experiments.reach import routers
 from experiments.robot import chosen_case
 
 REPORT_S: Final = 1.0
@@ -207,7 +208,13 @@ class WorldProcess:
 
 
 def serve(
-    file: str, *, case: str | None, connect: Sequence[str], lifeline: bool = False, engine: str | None = None
+    file: str,
+    *,
+    case: str | None,
+    connect: Sequence[str],
+    lifeline: bool = False,
+    engine: str | None = None,
+    lab: str | None = None,
 ) -> int:
     """Runs the world of an experiment until it is told to end and its robots are down; returns the exit code.
 
@@ -217,7 +224,8 @@ def serve(
         WorldTaken: If a world is on the network already.
         Unreachable: If no router answers.
     """
-    experiment = chosen_case(document.read(file), case)
+    read = document.read(file)
+    experiment = chosen_case(read, case)
     robots = experiment.robots.values()
     if not any(WORLD in (robot.body, robot.ranges) for robot in robots):
         hint = 'give robots `body = "world"` (or start it all with `zenpark run FILE --bodies world`)'
@@ -225,7 +233,7 @@ def serve(
     if engine is not None:
         changed = msgspec.structs.replace(experiment.world, engine=engine)
         experiment = msgspec.structs.replace(experiment, world=changed)
-    endpoints = list(connect) or experiment.network.connect or [network.DEFAULT_ENDPOINT]
+    endpoints = routers(experiment, read.path, connect, lab) or [network.DEFAULT_ENDPOINT]
     over, lost = threading.Event(), threading.Event()
 
     def end() -> None:

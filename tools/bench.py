@@ -18,7 +18,7 @@ from typing import Final
 
 import msgspec
 
-from tools import bench_safety, bench_world
+from tools import bench_intruders, bench_safety, bench_world
 from tools.figure import REPEATS, Figure, cpu
 
 FLIGHT_S: Final = 20.0
@@ -161,6 +161,7 @@ BENCHMARKS: Final[dict[str, Callable[[], Iterator[Figure]]]] = {
     "world": bench_world.world,
     "encounters": bench_world.encounters,
     "safety": bench_safety.safety,
+    "intruders": bench_intruders.intruders,
 }
 
 

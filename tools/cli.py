@@ -7,6 +7,8 @@ from typing import Annotated, Final
 
 import typer
 
+from tools.keys import app as keys
+
 app: Final = typer.Typer(
     name="zenpark",
     help="Distributed experiments with several robots, on Zenoh.",
@@ -20,6 +22,7 @@ app: Final = typer.Typer(
 # so that nothing needs to be imported to recognise it.
 EXPLAINED: Final = (
     ("agents.session", "EndpointError"),
+    ("agents.lab", "LabError"),
     ("agents.session", "Unreachable"),
     ("agents.body", "BodyError"),
     ("agents.runtime", "NameTaken"),
@@ -42,6 +45,8 @@ File = Annotated[str, typer.Argument(metavar="FILE", help="Experiment file, or t
 Connect = Annotated[
     list[str] | None, typer.Option(metavar="ENDPOINT", help="A router; may be repeated. [tcp/127.0.0.1:7447]")
 ]
+Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`zenpark keys init`).")]
+As = Annotated[str, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab.")]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="PATH=VALUE", help="Changes a value of the file; may be repeated."),
@@ -89,6 +94,7 @@ def run(
     anyway: Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")] = False,
     report: Annotated[bool, typer.Option(help="Writes the report.")] = True,
     open_report: Annotated[bool, typer.Option("--open", help="Opens the report in the browser.")] = False,
+    lab: Lab = None,
 ) -> None:
     """Run an experiment: one process per robot, or in virtual time."""
     from experiments.commands import run as command  # noqa: PLC0415
@@ -108,6 +114,7 @@ def run(
             anyway=anyway,
             report=report,
             open_report=open_report,
+            lab=lab,
         )
     )
 
@@ -182,6 +189,7 @@ def agent(
     ] = 0.0,
     once: Annotated[bool, typer.Option("--once", help="End when down after the experiment.")] = False,
     realm: Annotated[str, typer.Option(metavar="NAME", help="In which to join.")] = "park",
+    lab: Lab = None,
 ) -> None:
     """Be one robot of an experiment, or several that share a device.
 
@@ -199,6 +207,7 @@ def agent(
             clock_correction_s=clock_correction,
             once=once,
             realm=realm,
+            lab=lab,
         )
     )
 
@@ -213,18 +222,25 @@ def station() -> None:
 
 @app.command()
 def router(
+    file: Annotated[
+        str | None, typer.Argument(metavar="[FILE]", help="The experiment whose rights it enforces, in a lab.")
+    ] = None,
     listen: Annotated[
-        list[str] | None, typer.Option(metavar="ENDPOINT", help="On loopback; may be repeated. [tcp/127.0.0.1:7447]")
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help="Without a lab on loopback; may be repeated. [tcp/127.0.0.1:7447]"),
     ] = None,
     lifeline: Annotated[
         bool, typer.Option("--lifeline", help="End when standard input ends or is silent for 3 s.")
     ] = False,
+    lab: Lab = None,
+    bodies: Annotated[
+        str | None, typer.Option(metavar="twin|world|protocol", help="As behind `zenpark run`, for the rights.")
+    ] = None,
 ) -> None:
     """Run the Zenoh router that the robots meet at."""
-    from agents.router import serve  # noqa: PLC0415
-    from agents.session import DEFAULT_ENDPOINT  # noqa: PLC0415
+    from tools.router import command  # noqa: PLC0415
 
-    raise typer.Exit(serve(listen or [DEFAULT_ENDPOINT], lifeline=lifeline))
+    raise typer.Exit(command(file, listen=listen or [], lifeline=lifeline, lab=lab, bodies=bodies))
 
 
 @app.command()
@@ -234,11 +250,12 @@ def centre(
     case: Annotated[str | None, typer.Option(metavar="NAME", help="A case of the file. [the first]")] = None,
     connect: Connect = None,
     lifeline: Annotated[bool, typer.Option("--lifeline", help="End when standard input ends or falls silent.")] = False,
+    lab: Lab = None,
 ) -> None:
     """Be the centre of an experiment: decide for the robots that it guides."""
     from experiments.centre import serve  # noqa: PLC0415
 
-    raise typer.Exit(serve(file, case=case, connect=connect or [], lifeline=lifeline))
+    raise typer.Exit(serve(file, case=case, connect=connect or [], lifeline=lifeline, lab=lab))
 
 
 @app.command()
@@ -251,11 +268,12 @@ def world(
     lifeline: Annotated[
         bool, typer.Option("--lifeline", help="End, after its robots, when standard input ends or falls silent.")
     ] = False,
+    lab: Lab = None,
 ) -> None:
     """Be the world of an experiment: carry its twins, with obstacles, contacts and range sensors."""
     from experiments.world import serve  # noqa: PLC0415
 
-    raise typer.Exit(serve(file, case=case, connect=connect or [], lifeline=lifeline, engine=engine))
+    raise typer.Exit(serve(file, case=case, connect=connect or [], lifeline=lifeline, engine=engine, lab=lab))
 
 
 @app.command()
@@ -407,7 +425,9 @@ def schema() -> None:
 def bench(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME...]", help="start, codec, virtual, process, world, encounters or safety."),
+        typer.Argument(
+            metavar="[NAME...]", help="start, codec, virtual, process, world, encounters, safety or intruders."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -421,13 +441,16 @@ def bench(
 def order(
     what: Annotated[str, typer.Argument(metavar="ORDER", help="takeoff, start, hold, land or stop.")],
     robots: Annotated[list[str] | None, typer.Argument(metavar="[ROBOT...]", help="All, if none is named.")] = None,
+    *,
     connect: Connect = None,
     realm: Annotated[str, typer.Option(metavar="NAME", help="First chunk of the keys.")] = "park",
+    lab: Lab = None,
+    identity: As = "operator",
 ) -> None:
     """Tell robots that were started by hand what to do."""
     from tools.order import command  # noqa: PLC0415
 
-    raise typer.Exit(command(what, robots or [], connect=connect or [], realm=realm))
+    raise typer.Exit(command(what, robots or [], connect=_routers(connect, lab), realm=realm, identity=identity))
 
 
 @app.command(name="world-order")
@@ -446,6 +469,8 @@ def world_order(
     ] = None,
     connect: Connect = None,
     realm: Annotated[str, typer.Option(metavar="NAME", help="First chunk of the keys.")] = "park",
+    lab: Lab = None,
+    identity: As = "operator",
 ) -> None:
     """Tell a running world what to do."""
     from tools.world import command  # noqa: PLC0415
@@ -459,8 +484,9 @@ def world_order(
             at=at,
             yaw=yaw,
             obstacle=obstacle,
-            connect=connect or [],
+            connect=_routers(connect, lab),
             realm=realm,
+            identity=identity,
         )
     )
 
@@ -488,33 +514,57 @@ def hosts_install(file: File, settings: Settings = None, on: On = None) -> None:
     raise typer.Exit(command(file, settings=settings or [], only=on or []))
 
 
-@app.command()
-def keys(connect: Connect = None, as_json: AsJson = False) -> None:
-    """Show who is on the network and which keys they hold."""
-    from tools.network import keys as show  # noqa: PLC0415
-
-    show(connect or [], as_json=as_json)
+app.add_typer(keys, name="keys")
 
 
 @app.command()
 def echo(
     key: KeyExpression,
+    *,
     connect: Connect = None,
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after so many samples.")] = None,
     seconds: Seconds = None,
+    lab: Lab = None,
+    identity: As = "observer",
 ) -> None:
     """Print what is said on a key, the last poses first."""
     from tools.network import echo as listen  # noqa: PLC0415
 
-    listen(key, connect or [], count=count, seconds=seconds)
+    listen(key, _routers(connect, lab), count=count, seconds=seconds, identity=identity)
 
 
 @app.command()
-def hz(key: KeyExpression, connect: Connect = None, seconds: Seconds = None) -> None:
+def hz(
+    key: KeyExpression,
+    connect: Connect = None,
+    seconds: Seconds = None,
+    lab: Lab = None,
+    identity: As = "observer",
+) -> None:
     """Print how often something is said on a key."""
     from tools.network import hz as measure  # noqa: PLC0415
 
-    measure(key, connect or [], seconds=seconds)
+    measure(key, _routers(connect, lab), seconds=seconds, identity=identity)
+
+
+@app.command()
+def estop(
+    connect: Connect = None,
+    realm: Annotated[str, typer.Option(metavar="NAME", help="First chunk of the keys.")] = "park",
+    reason: Annotated[str, typer.Option(metavar="TEXT", help="Said with it.")] = "zenpark estop",
+    lab: Lab = None,
+    identity: As = "operator",
+) -> None:
+    """Cut the motors of every robot, wherever it is."""
+    from tools.estop import command  # noqa: PLC0415
+
+    raise typer.Exit(command(connect=_routers(connect, lab), realm=realm, reason=reason, who=identity))
+
+
+def _routers(connect: list[str] | None, lab: str | None) -> list[str]:
+    from agents.lab import secured  # noqa: PLC0415
+
+    return secured(connect or [], lab)
 
 
 def _explained() -> tuple[type[BaseException], ...]:

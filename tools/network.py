@@ -113,13 +113,15 @@ def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[
                 continue  # somebody else's idea of JSON
 
 
-def keys(connect: Sequence[str] = (), *, as_json: bool = False, out: Printer = at_once) -> None:
+def keys(
+    connect: Sequence[str] = (), *, as_json: bool = False, out: Printer = at_once, identity: str = "observer"
+) -> None:
     """Prints who is on the network now.
 
     Raises:
         Unreachable: If no router answers.
     """
-    with open_session(connect or [DEFAULT_ENDPOINT], name="zenpark keys", wait_s=WAIT_S) as session:
+    with open_session(connect or [DEFAULT_ENDPOINT], name="zenpark keys", wait_s=WAIT_S, identity=identity) as session:
         found = members(session)
     if as_json:
         out(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
@@ -160,6 +162,7 @@ def echo(
     count: int | None = None,
     seconds: float | None = None,
     out: Printer = at_once,
+    identity: str = "observer",
 ) -> None:
     """Prints `key payload` for each sample, the last value of every pose first.
 
@@ -169,6 +172,7 @@ def echo(
         count: How many samples [no end].
         seconds: How long [s, no end].
         out: Prints a line.
+        identity: Whose certificate is shown to the routers of a lab.
 
     Raises:
         KeyExpressionError: If `key` is none.
@@ -178,7 +182,7 @@ def echo(
     deadline = math.inf if seconds is None else time.monotonic() + seconds
     left = math.inf if count is None else count
     with (
-        open_session(connect or [DEFAULT_ENDPOINT], name="zenpark echo", wait_s=WAIT_S) as session,
+        open_session(connect or [DEFAULT_ENDPOINT], name="zenpark echo", wait_s=WAIT_S, identity=identity) as session,
         pose_subscriber(session, expression, DEPTH) as samples,
     ):
         while left > 0 and time.monotonic() < deadline:
@@ -257,6 +261,7 @@ def hz(
     seconds: float | None = None,
     window_s: float = 1.0,
     out: Printer = at_once,
+    identity: str = "observer",
 ) -> None:
     """Prints rate, bytes and intervals of each key, window by window.
 
@@ -269,7 +274,7 @@ def hz(
     expression = key_expression(key)
     cadence = Cadence()
     with (
-        open_session(connect or [DEFAULT_ENDPOINT], name="zenpark hz", wait_s=WAIT_S) as session,
+        open_session(connect or [DEFAULT_ENDPOINT], name="zenpark hz", wait_s=WAIT_S, identity=identity) as session,
         subscriber(session, expression, DEPTH) as samples,
     ):
         out(HEADING)

@@ -15,7 +15,7 @@ from experiments import orders
 LEAD_S: Final = 0.5  # a common start lies so far ahead, that every robot has it by then
 
 
-def command(what: str, robots: Sequence[str], *, connect: Sequence[str], realm: str) -> int:
+def command(what: str, robots: Sequence[str], *, connect: Sequence[str], realm: str, identity: str = "operator") -> int:
     """Gives an order to robots, to all that are there if none is named, and prints their replies.
 
     Returns:
@@ -29,7 +29,9 @@ def command(what: str, robots: Sequence[str], *, connect: Sequence[str], realm: 
         print(f"zenpark: no order '{what}'; there are: {', '.join(kinds)}", file=sys.stderr)
         return 2
     keys = Keys(realm)
-    with network.open_session(list(connect) or [network.DEFAULT_ENDPOINT], name="order", wait_s=2.0) as session:
+    with network.open_session(
+        list(connect) or [network.DEFAULT_ENDPOINT], name="order", wait_s=2.0, identity=identity
+    ) as session:
         there = [
             robot
             for reply in session.liveliness().get(keys.alive("*"), timeout=2.0)

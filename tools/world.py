@@ -30,6 +30,7 @@ def command(
     obstacle: str | None,
     connect: Sequence[str],
     realm: str,
+    identity: str = "operator",
 ) -> int:
     """Gives an order to the world and prints its reply.
 
@@ -51,7 +52,9 @@ def command(
         if what == "spawn" and not given.keys() & {"at", "wall"}:
             raise WorldOrderError(f"{name or 'the obstacle'} has no place; say where, with --at X Y")
     order = wire.WorldOrder(what, steps=steps, name=name, kind=kind, at=at, yaw=yaw, obstacle=given)  # type: ignore[arg-type]
-    with network.open_session(list(connect) or [network.DEFAULT_ENDPOINT], name="world-order", wait_s=2.0) as session:
+    with network.open_session(
+        list(connect) or [network.DEFAULT_ENDPOINT], name="world-order", wait_s=2.0, identity=identity
+    ) as session:
         reply = orders.give_world(session, Keys(realm), order)
     if not reply.ok:
         print(f"no: {reply.reason}", file=sys.stderr)

@@ -7,7 +7,6 @@ as it likes. `watchdog_s` in the robot's settings adds what careful people run o
 
 from __future__ import annotations
 
-import re
 import socket
 import time
 from collections import deque
@@ -104,9 +103,7 @@ class TurtleBot3Twin:
                 if body.kinds[row].name != "turtlebot3":
                     raise BodyError(f"{name} is a {body.kinds[row].name}, this is the twin of a turtlebot3")
                 chosen = settings(Settings, name, body.device[row])
-                where = Address(
-                    chosen.style, re.sub(r"\W|^(?=\d)", "_", name, flags=re.ASCII), chosen.distro, chosen.domain
-                )
+                where = turtlebot3.twin(name, chosen)
                 endpoints = (chosen.endpoint,) if chosen.endpoint else body.endpoints
                 which = (endpoints, where.style, where.distro, where.domain)
                 if which not in participants:
@@ -121,7 +118,7 @@ class TurtleBot3Twin:
 
     def _participant(self, endpoints: tuple[str, ...], where: Address) -> Participant:
         if endpoints not in self._sessions:
-            session = network.open_session(endpoints, name="turtlebot3-twin", wait_s=JOIN_S)
+            session = network.open_session(endpoints, name="turtlebot3-twin", wait_s=JOIN_S, identity="twin")
             self._sessions[endpoints] = session
         return Participant(
             self._sessions[endpoints],

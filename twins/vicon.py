@@ -293,7 +293,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     host, port = chosen.listen
     endpoints = chosen.connect or [network.DEFAULT_ENDPOINT]
     try:
-        with told_to_end(stop.set), network.open_session(endpoints, name="vicon twin", stop=stop) as session:
+        with (
+            told_to_end(stop.set),
+            network.open_session(endpoints, name="vicon twin", stop=stop, identity="twin") as session,
+        ):
             vicon = ViconTwin(
                 chosen.robots,
                 rate_hz=chosen.rate,

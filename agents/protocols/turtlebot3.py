@@ -101,6 +101,11 @@ def address(name: str, text: str, chosen: Settings) -> Address:
     return Address(style, namespace, distro, int(domain))  # type: ignore[arg-type]
 
 
+def twin(name: str, chosen: Settings) -> Address:
+    """The address of a robot's protocol twin: its own name is the namespace."""
+    return Address(chosen.style, re.sub(r"\W|^(?=\d)", "_", name, flags=re.ASCII), chosen.distro, chosen.domain)
+
+
 def command_type(distro: Distro, stamped: bool | None) -> str:
     """Type of cmd_vel: Twist on Humble, TwistStamped from Jazzy on, unless the robot is set up otherwise."""
     if stamped is None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from agents.router import serve_router
 from agents.session import (
     Alarm,
     EndpointError,
@@ -23,7 +24,6 @@ from agents.session import (
     pose_subscriber,
     publisher,
     received,
-    serve_router,
     subscriber,
 )
 

@@ -21,7 +21,9 @@ def test_a_router_that_died_listens_again_where_other_machines_look_for_it(tmp_p
     launcher, file = Starts(), tmp_path / "case.json"
     here, everywhere = "tcp/127.0.0.1:7447", "tcp/0.0.0.0:7447"
     experiment = document.read("triangle").experiment
-    servants = Servants(experiment, "only", file=file, endpoints=[here], routers=[everywhere], launcher=launcher)
+    servants = Servants(
+        experiment, "only", file=file, endpoints=[here], routers=[everywhere], rights=None, launcher=launcher
+    )
     dead = SimpleNamespace(name=ROUTER, exit="killed by SIGKILL")
     said = [servants.again(dead, "only") for _ in range(STARTS)]
     assert [words[:2] for words in launcher.told] == [(ROUTER, "agents.router")] * (STARTS - 1)

@@ -57,7 +57,7 @@ def of_all() -> dict[str, list[object]]:
     )  # fmt: skip
     centre = wire.CentreState(
         stamp=now, robots=["KH01"], missing=["KH02"], load=0.1, late_s=0.001, decisions=5, missed=1, goals=5,
-        heard={"KH01": 2}, lost={"KH01": 1}, malformed=0, pid=1, cpu_s=0.1, rss_mb=60.0,
+        heard={"KH01": 2}, lost={"KH01": 1}, dropped={"KH01": 0}, malformed=0, pid=1, cpu_s=0.1, rss_mb=60.0,
     )  # fmt: skip
     orders = [
         wire.WorldOrder("pause"), wire.WorldOrder("resume"), wire.WorldOrder("step", steps=3),

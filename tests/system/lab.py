@@ -67,7 +67,7 @@ class Watcher(Looking):
 
     def __init__(self, endpoint: str) -> None:
         self.keys = Keys()
-        self.session = network.open_session([endpoint], name="test")
+        self.session = network.open_session([endpoint], name="test", identity="operator")
         self._statuses = network.pose_subscriber(self.session, self.keys.status("*"), 4096)
         self._states = network.subscriber(self.session, self.keys.state("*"), 8192)
         self._alive = network.alive_watch(self.session, self.keys.alive("*"))

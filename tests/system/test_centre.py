@@ -15,9 +15,10 @@ from agents import session as network
 from agents import wire
 from agents.keys import Keys
 from experiments import playback
-from experiments.run import reopen
+from experiments.run import load, reopen
 from tests.conftest import RouterProcess
 from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher, gone, until
+from tools import authority
 
 pytestmark = pytest.mark.system
 
@@ -141,9 +142,9 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
     def reported() -> object:
         came = network.received(subscriber.handler)
         reports.extend(wire.decode(each.payload.to_bytes(), str(each.encoding), wire.CentreState) for each in came)
-        return reports and reports[-1].heard["KH01"] > 0  # the first may be from before the start
+        return bool(reports) and reports[-1].heard["KH01"] > 0  # the first may be from before the run
 
-    watcher.until(reported, "the centre says how it is")
+    watcher.until(reported, "the centre says how it is, and that it hears KH01")
     assert (reports[-1].robots, reports[-1].missing) == (["TB01", "KH01", "KH02"], [])
     centre.terminate()
     assert centre.wait(10.0) == 0
@@ -153,3 +154,41 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
         robot.process.terminate()
     assert [robot.wait() for robot in robots] == [0, 0, 0]
     watcher.close()
+
+
+@pytest.mark.timeout(120)
+def test_a_lab_lets_the_centre_decide_and_nobody_else(tmp_path: Path) -> None:
+    """Its own certificate is its right: a robot's gives none over others, and a router that died enforces it again."""
+    file, folder = tmp_path / "three.toml", tmp_path / "run"
+    file.write_text(FAST.format(duration=8.0, architecture=HYBRID) + '[network]\nlab = "lab"\n')
+    robots = dict.fromkeys(load(file).experiment.robots, "robot")
+    authority.create(tmp_path / "lab", {**{role: role for role in authority.SERVICES}, **robots})
+    (tmp_path / "lab" / "ca.key").unlink()  # no run needs it
+    flight = Flight(folder, str(file), "--json", "--no-report")
+    flight.until_said(r"phase conductor: TB01 under way", 40.0)
+    watcher = Watcher(flight.endpoint())
+    watcher.until(lambda: {"TB01", "KH01", "KH02"} <= {*watcher.state}, "telemetry")
+    goal, own = (network.subscriber(watcher.session, key) for key in (KEYS.goal("KH01"), KEYS.ranges("KH02")))
+    flight.children()["router"].kill()
+    flight.until_said(r"router conductor: the router ended \(killed by SIGKILL\); started again")
+    again = time.time()
+    watcher.until(lambda: watcher.state["KH01"].followed and watcher.state["KH01"].stamp > again, "it is guided again")
+    with network.open_session([flight.endpoint()], name="KH02") as session:
+        before = watcher.status["KH01"].malformed
+
+        def arrives() -> bool:
+            session.put(KEYS.goal("KH01"), b"of another robot", encoding=wire.JSON)
+            session.put(KEYS.ranges("KH02"), b"its own", encoding=wire.JSON)
+            return any(network.received(own.handler))
+
+        watcher.until(arrives, "what it says on its own key is heard")
+    watcher.until(lambda: watcher.state["TB01"].position[0] < -0.7, "the leader goes on")
+    heard = [sample.payload.to_bytes() for sample in network.received(goal.handler)]
+    assert b"of another robot" not in heard
+    assert max(wire.decode(each, wire.JSON, wire.Goal).stamp for each in heard) > again
+    assert watcher.status["KH01"].malformed == before
+    watcher.close()
+    code, out = flight.finish(60.0)
+    assert code == 0
+    assert json.loads(out)["cases"]["default"]["guidance"]["goals"] > 60
+    assert set(reopen(folder).metrics["default"].guidance.guided) == {"TB01", "KH01"}

@@ -48,6 +48,7 @@ def test_commands():
                 "hz",
                 "twin",
                 "order",
+                "estop",
                 "bridge",
                 "centre",
                 "world",

@@ -1,0 +1,193 @@
+"""A laboratory's identities: who has a certificate, where its files are, and how an endpoint asks for one.
+
+A lab is a folder. `lab.json`, the register, says who is who; `ca.pem` is what everybody trusts; `CF01.pem` and
+`CF01.key` are an identity. A robot's computer needs `ca.pem` and its own two files, a router the register as well.
+`ca.key`, which makes new identities, belongs on the computer of whoever runs the lab and nowhere else.
+
+Within the project an endpoint carries its lab behind it, `tls/127.0.0.1:7447#lab=/home/ana/lab`: whoever is told where
+a router is, is told by that how to be let in.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Literal, NamedTuple, get_args
+
+import msgspec
+
+Role = Literal[
+    "robot", "operator", "observer", "router", "recorder", "world", "positioning", "twin", "centre", "ros2"
+]  # fmt: skip
+ROLES: Final[tuple[Role, ...]] = get_args(Role)
+
+REGISTER: Final = "lab.json"
+AUTHORITY: Final = "ca"
+MARK: Final = "#lab="
+SECURE: Final = ("tls", "quic")
+DEFAULT_SECURE: Final = "tls/127.0.0.1:7447"
+
+
+class LabError(ValueError):
+    """A lab, a certificate or an endpoint of a lab that cannot be used, with the remedy."""
+
+
+class Identity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Somebody with a certificate.
+
+    Attributes:
+        role: What it may do.
+        common_name: What its present certificate is made out to: its name, or `CF01.2` when it is the second that
+            counts. A certificate on an earlier name is still the lab's, and gives no right.
+        serial: Of that certificate, in hexadecimal.
+        until: When it ends, UTC, ISO 8601.
+        hosts: At which names and addresses it may listen.
+    """
+
+    role: Role
+    common_name: str
+    serial: str
+    until: str
+    hosts: list[str] = []
+
+
+class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Who is who in a lab, by name."""
+
+    identities: dict[str, Identity]
+
+
+class Files(NamedTuple):
+    """The files of an identity."""
+
+    authority: Path
+    certificate: Path
+    key: Path
+
+
+def register(folder: Path) -> Register:
+    """The register of a lab.
+
+    Raises:
+        LabError: If there is none, or it cannot be read.
+    """
+    file = folder / REGISTER
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=Register)
+    except FileNotFoundError:
+        raise LabError(
+            f"{folder} is no lab, {REGISTER} is missing: `zenpark keys init {folder} FILE` makes one"
+        ) from None
+    except OSError as error:
+        raise LabError(f"{file}: cannot be read: {error.strerror}") from None
+    except msgspec.MsgspecError as error:
+        raise LabError(f"{file}: {error}; put it back as `zenpark keys` wrote it") from None
+
+
+def files(folder: Path, name: str) -> Files:
+    """The files of an identity, which are there and whose key nobody else can read.
+
+    Raises:
+        LabError: If not.
+    """
+    found = Files(folder / f"{AUTHORITY}.pem", folder / f"{name}.pem", folder / f"{name}.key")
+    for file in found:
+        try:
+            mode = file.stat().st_mode
+            with file.open("rb"):
+                pass
+        except FileNotFoundError:
+            raise LabError(
+                f"{file} is missing: copy it from the lab's own folder, or make it there with "
+                f"`zenpark keys issue {folder} {name}`"
+            ) from None
+        except OSError as error:
+            raise LabError(f"{file}: cannot be read: {error.strerror}") from None
+        if file == found.key and stat.S_IMODE(mode) & 0o077:
+            raise LabError(f"{file}: others can read this key: `chmod 600 {file}`, or revoke it if somebody has")
+    return found
+
+
+def require(folder: Path, names: Sequence[str]) -> None:
+    """Checks identities before anything is started.
+
+    Raises:
+        LabError: If some cannot be used here: the first, and which others are missing altogether.
+    """
+    gone = [name for name in names if not (folder / f"{name}.pem").exists()]
+    if len(gone) > 1:
+        remedy = f"`zenpark keys issue {folder} {' '.join(gone)}`"
+        raise LabError(f"{folder} has no certificates of {', '.join(gone)}: {remedy}")
+    for name in names:
+        files(folder, name)
+
+
+def secured(endpoints: Sequence[str], lab: str | Path | None) -> list[str]:
+    """The endpoints, each with the lab that it needs; as they are without a lab.
+
+    Args:
+        endpoints: Routers; none: the usual one on this machine. Those that name a lab already keep it.
+        lab: The folder.
+
+    Raises:
+        LabError: If one is neither tls/ nor quic/, so that certificates would not be asked for.
+    """
+    if lab is None:
+        return list(endpoints)
+    folder = Path(lab).absolute()
+    made = []
+    for endpoint in endpoints or [DEFAULT_SECURE]:
+        plain = endpoint.partition(MARK)[0]
+        protocol, _, address = plain.partition("/")
+        if protocol not in SECURE:
+            raise LabError(f"{plain} asks for no certificate, which a lab needs: write tls/{address} or quic/{address}")
+        made.append(endpoint if MARK in endpoint else f"{endpoint}{MARK}{folder}")
+    return made
+
+
+def bare(endpoints: Sequence[str]) -> list[str]:
+    """The endpoints as Zenoh takes them."""
+    return [endpoint.partition(MARK)[0] for endpoint in endpoints]
+
+
+def options(endpoint: str) -> str:
+    """What to write on a command line to reach an endpoint."""
+    plain, mark, folder = endpoint.partition(MARK)
+    return f"--connect {plain}" + (f" --lab {folder}" if mark else "")
+
+
+def of(endpoints: Sequence[str]) -> Path | None:
+    """The lab of some endpoints.
+
+    Raises:
+        LabError: If they are of several labs, or only some are of one: a session has one identity.
+    """
+    folders = {endpoint.partition(MARK)[2] for endpoint in endpoints}
+    if len(folders) > 1:
+        raise LabError(f"{', '.join(endpoints)}: a session belongs to one lab or to none; name routers of one only")
+    folder = folders.pop() if folders else ""
+    if not folder:
+        return None
+    secured(endpoints, folder)
+    return Path(folder)
+
+
+def settings(folder: Path, name: str, *, listens: bool) -> dict[str, object]:
+    """Zenoh's settings by which an identity shows its certificate and asks for that of the other end.
+
+    Raises:
+        LabError: If its files are not there.
+    """
+    authority, certificate, key = (str(file) for file in files(folder, name))
+    tls: dict[str, object] = {
+        "root_ca_certificate": authority,
+        "connect_certificate": certificate,
+        "connect_private_key": key,
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    if listens:
+        tls |= {"listen_certificate": certificate, "listen_private_key": key}
+    return {"transport/link/tls": tls}

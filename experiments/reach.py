@@ -1,0 +1,37 @@
+"""Where the routers of an experiment are, and which lab lets one in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from agents import lab
+from agents.session import EndpointError
+from experiments.experiment import Experiment
+
+
+def folder(experiment: Experiment, file: Path, chosen: str | None = None) -> Path | None:
+    """The folder of the lab: that of the command line, or the one that the file names, which lies beside it."""
+    if chosen is not None:
+        return Path(chosen).absolute()
+    own = experiment.network.lab
+    return None if own is None else file.absolute().parent / own
+
+
+def routers(experiment: Experiment, file: Path, connect: Sequence[str], chosen: str | None = None) -> list[str]:
+    """The routers of an experiment, each with its lab if there is one; empty where neither says which.
+
+    Args:
+        experiment: Its `network.connect` holds if nothing else is said.
+        file: The experiment's.
+        connect: Of the command line.
+        chosen: The lab of the command line.
+
+    Raises:
+        EndpointError: If a router of a lab asks for no certificates.
+    """
+    endpoints = list(connect) or experiment.network.connect or []
+    try:
+        return lab.secured(endpoints, folder(experiment, file, chosen))
+    except lab.LabError as error:
+        raise EndpointError(str(error)) from None

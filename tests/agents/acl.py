@@ -1,0 +1,60 @@
+"""What a Zenoh router makes of an `access_control`, as a model: enough of it to ask who may do what."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import zenoh
+
+
+def permitted(control: dict[str, Any], common_name: str, flow: str, message: str, key: str) -> bool:
+    """Whether a message passes: a rule of one of the sender's policies includes its key."""
+    assert control["enabled"]
+    assert control["default_permission"] == "deny"
+    assert all(rule["permission"] == "allow" for rule in control["rules"])
+    mine = {each["id"] for each in control["subjects"] if common_name in each["cert_common_names"]}
+    held = {rule for policy in control["policies"] if mine & set(policy["subjects"]) for rule in policy["rules"]}
+    return any(
+        rule["id"] in held
+        and flow in rule["flows"]
+        and message in rule["messages"]
+        and any(zenoh.KeyExpr(each).includes(key) for each in rule["key_exprs"])
+        for rule in control["rules"]
+    )
+
+
+def may(control: dict[str, Any], common_name: str, action: str, key: str) -> bool:
+    """Whether an action is possible: all the messages that it takes pass."""
+    adv = f"{key}/@adv/pub/1/1/_"
+    takes = {
+        "put": [("ingress", "put", key)],
+        "delete": [("ingress", "delete", key)],
+        "keep": [
+            ("ingress", "put", key),
+            ("ingress", "put", adv),
+            ("ingress", "declare_queryable", adv),
+            ("ingress", "liveliness_token", adv),
+            ("egress", "query", f"{key}/@adv/pub/**"),
+            ("ingress", "reply", key),
+        ],
+        "hear": [("ingress", "declare_subscriber", key), ("egress", "put", key)],
+        "last": [
+            ("ingress", "declare_subscriber", f"{key}/@adv/pub/**"),
+            ("ingress", "query", f"{key}/@adv/pub/**"),
+            ("ingress", "declare_liveliness_subscriber", f"{key}/@adv/pub/**"),
+            ("egress", "reply", key),
+            ("egress", "liveliness_token", adv),
+        ],
+        "ask": [("ingress", "query", key), ("egress", "reply", key)],
+        "answer": [("ingress", "declare_queryable", key), ("egress", "query", key), ("ingress", "reply", key)],
+        "be": [("ingress", "liveliness_token", key)],
+        "watch": [
+            ("ingress", "liveliness_query", key),
+            ("ingress", "declare_liveliness_subscriber", key),
+            ("egress", "liveliness_token", key),
+        ],
+    }
+    return all(permitted(control, common_name, *message) for message in takes[action])
+
+
+ACTIONS = ("put", "delete", "keep", "hear", "last", "ask", "answer", "be", "watch")

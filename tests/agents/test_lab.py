@@ -1,0 +1,96 @@
+import pytest
+
+from agents import lab
+from agents.access import Grant, Rights
+from agents.lab import LabError, bare, files, of, options, register, require, secured
+from agents.session import EndpointError, config
+from tools import authority
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("labs") / "our lab #1; a=b"  # nothing in it may mean anything to Zenoh
+    authority.create(made, {"router": "router", "operator": "operator", "CF01": "robot"})
+    return made
+
+
+def test_endpoints_carry_their_lab(folder):
+    made = secured(["tls/127.0.0.1:7447", "quic/lab.example.org:7448"], folder)
+    assert made == [f"tls/127.0.0.1:7447#lab={folder}", f"quic/lab.example.org:7448#lab={folder}"]
+    assert secured(made, folder) == made
+    assert bare(made) == ["tls/127.0.0.1:7447", "quic/lab.example.org:7448"]
+    assert of(made) == folder
+    assert options(made[0]) == f"--connect tls/127.0.0.1:7447 --lab {folder}"
+    assert options("tcp/127.0.0.1:7447") == "--connect tcp/127.0.0.1:7447"
+
+
+def test_without_endpoints_a_lab_is_on_this_machine(folder):
+    assert secured([], folder) == [f"tls/127.0.0.1:7447#lab={folder}"]
+    assert secured([], None) == []
+    assert of(["tcp/127.0.0.1:7447"]) is None
+    assert of([]) is None
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "udp/127.0.0.1:7447", "unixsock-stream/tmp/x", "ws/a:1"])
+def test_a_lab_needs_endpoints_that_ask_for_certificates(folder, endpoint):
+    with pytest.raises(LabError, match=rf"{endpoint} asks for no certificate.*write tls/"):
+        secured([endpoint], folder)
+    with pytest.raises(EndpointError, match="asks for no certificate"):
+        config("client", connect=[f"{endpoint}#lab={folder}"], name="CF01")
+
+
+def test_a_session_has_one_identity(folder):
+    with pytest.raises(LabError, match="one lab or to none"):
+        of([f"tls/127.0.0.1:1#lab={folder}", "tls/127.0.0.1:2"])
+
+
+def test_sessions_of_a_lab_show_certificates_and_ask_for_them(folder):
+    made = config("client", connect=[f"tls/127.0.0.1:7447#lab={folder}"], name="CF01+CF02", identity="CF01")
+    assert made.get_json("connect/endpoints") == '["tls/127.0.0.1:7447"]'
+    tls = made.get_json("transport/link/tls")
+    for part in (
+        '"enable_mtls":true',
+        '"verify_name_on_connect":true',
+        '"close_link_on_expiration":true',
+        f'"connect_certificate":"{folder}/CF01.pem"',
+        '"listen_certificate":null',
+    ):
+        assert part in tls
+
+
+RIGHTS = Rights("park", {"CF01": Grant(say=["park/CF01/**"])}, {})
+
+
+@pytest.mark.parametrize("endpoint", ["tls/0.0.0.0:7447", "quic/[::]:7447", "tls/lab.example.org:7447"])
+def test_with_a_lab_a_router_listens_anywhere_and_without_nowhere_else(folder, endpoint):
+    made = config("router", listen=[f"{endpoint}#lab={folder}"], name="router", rights=RIGHTS)
+    assert made.get_json("listen/endpoints") == f'["{endpoint}"]'
+    assert '"default_permission":"deny"' in made.get_json("access_control")
+    with pytest.raises(EndpointError, match=r"zenpark keys init LAB FILE.*--lab LAB"):
+        config("router", listen=[endpoint], name="router")
+
+
+def test_a_router_of_a_lab_must_know_who_may_do_what(folder):
+    with pytest.raises(EndpointError, match="name the experiment"):
+        config("router", listen=[f"tls/0.0.0.0:7447#lab={folder}"], name="router")
+
+
+def test_what_is_missing_is_named_with_its_remedy(folder, tmp_path):
+    with pytest.raises(LabError, match=r"CF09\.pem is missing: .*`zenpark keys issue .* CF09`"):
+        files(folder, "CF09")
+    with pytest.raises(LabError, match=r"no certificates of CF08, CF09: `zenpark keys issue .* CF08 CF09`"):
+        require(folder, ["CF01", "CF08", "CF09"])
+    with pytest.raises(EndpointError, match=r"CF09\.pem is missing"):
+        config("client", connect=[f"tls/127.0.0.1:7447#lab={folder}"], name="CF09")
+    with pytest.raises(LabError, match=r"is no lab, lab\.json is missing: `zenpark keys init"):
+        register(tmp_path)
+    (tmp_path / lab.REGISTER).write_text("{")
+    with pytest.raises(LabError, match="put it back"):
+        register(tmp_path)
+
+
+def test_a_key_that_others_can_read_is_refused(tmp_path):
+    authority.create(tmp_path / "lab", {"CF01": "robot"})
+    (tmp_path / "lab" / "CF01.key").chmod(0o640)
+    with pytest.raises(LabError, match="chmod 600"):
+        files(tmp_path / "lab", "CF01")

@@ -1,0 +1,270 @@
+"""The rights that follow from an experiment, row by row: who, which key, what."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.access import Rights, rules, sizes
+from agents.keys import Keys
+from agents.lab import ROLES, Identity, LabError, Register
+from experiments import access
+from experiments.experiment import Experiment, Formation, Hybrid, Network, Robot
+from experiments.run import load
+from experiments.standins import choose_bodies
+from tests.agents.acl import ACTIONS, may
+
+KEYS = Keys()
+OUTSIDER = "mallory"
+
+
+def register(robots):
+    """Everybody of a lab, each under its own name."""
+    names = {**dict.fromkeys(robots, "robot"), **{role: role for role in ROLES if role != "robot"}}
+    return Register({name: Identity(role, name, "1", "2100-01-01") for name, role in names.items()})
+
+
+def control(experiment):
+    return rules(access.rights([experiment]), register(experiment.robots))
+
+
+def experiment(links, processes=(), architecture="distributed", **more):
+    robots = {f"R{k}": Robot(kind="khepera4", start=[0.1 * k, 0.0], **more) for k in range(4)}
+    for group, names in enumerate(processes):
+        for name in names:
+            robots[name] = msgspec.structs.replace(robots[name], process=f"shared{group}")
+    formation = Formation(links={f"R{a} > R{b}": 0.5 for a, b in links})
+    return Experiment(title="Four", robots=robots, duration_s=1.0, formation=formation, architecture=architecture)
+
+
+SAID = ("pose", "state", "status", "ranges", "setpoint", "order", "alive", "position", "goal", "truth")
+
+
+def wanted(who, action, robot, what, *, hears, mates, guided):
+    """The table, in the words of whoever asks for it: may `who` do this on `park/<robot>/<what>`?"""
+    own = robot in mates
+    if who in ("observer", "recorder", "operator"):
+        asks = {"observer": ("pose",), "recorder": (), "operator": ("pose", "order")}[who]
+        return action in ("hear", "last", "watch") or (action == "ask" and what in asks)
+    if who == "world":  # no robot of these lives in one
+        return (what in ("setpoint", "status", "state") and action in ("hear", "last")) or (
+            what == "alive" and action == "watch"
+        )
+    if who == "centre":
+        return (
+            (what == "goal" and robot in guided and action in ("put", "keep"))
+            or (what in ("pose", "status") and action in ("hear", "last"))
+            or (what == "alive" and action == "watch")
+        )
+    if who == "ros2":
+        return (
+            (what == "goal" and robot in guided and action in ("put", "keep"))
+            or (what in ("state", "status") and action in ("hear", "last"))
+            or (what == "alive" and action == "watch")
+        )
+    if who.startswith("R"):
+        return (
+            (own and action in ("put", "keep", "answer", "be", "watch"))
+            or (own and what in ("position", "ranges") and action in ("hear", "last"))
+            or (own and what == "goal" and robot in guided and action in ("hear", "last"))
+            or (robot in hears and what == "pose" and action in ("hear", "last"))
+            or (robot in hears and what == "alive" and action == "watch")
+        )
+    return False  # router, positioning, twin: there is nothing here to measure; and whoever is not in the lab
+
+
+LINKS = st.sets(st.tuples(st.integers(0, 3), st.integers(0, 3)).filter(lambda pair: pair[0] != pair[1]), max_size=6)
+GROUPS = st.sampled_from([(), (("R0", "R1"),), (("R0", "R3"), ("R1", "R2"))])
+GUIDED = st.sampled_from([(), ("R0", "R1"), ("R0", "R1", "R2", "R3")])
+ARCHITECTURES = {0: "distributed", 2: Hybrid("hybrid", ["R0", "R1"]), 4: "centralised"}
+
+
+@settings(max_examples=15, deadline=None)
+@given(links=LINKS, groups=GROUPS, guided=GUIDED)
+def test_every_right_is_the_wanted_one(links, groups, guided):
+    made = control(experiment(links, groups, ARCHITECTURES[len(guided)]))
+    for who in (*(f"R{k}" for k in range(4)), *ROLES[1:], OUTSIDER):
+        mates = next((group for group in groups if who in group), (who,))
+        hears = {f"R{a}" for a, b in links if f"R{b}" in mates and f"R{b}" not in guided}  # these need no neighbours
+        for robot, what, action in product(("R0", "R1", "R2", "R3"), SAID, ACTIONS):
+            key = f"park/{robot}/{what}"
+            expected = wanted(who, action, robot, what, hears=hears, mates=mates, guided=guided)
+            assert may(made, who, action, key) == expected, (who, action, key, links, groups, guided)
+
+
+@pytest.mark.parametrize(
+    ("who", "action", "key"),
+    [
+        ("operator", "put", KEYS.estop),
+        ("operator", "keep", KEYS.event),
+        ("operator", "keep", KEYS.experiment),
+        ("operator", "ask", KEYS.world_order),
+        ("operator", "ask", "@/**"),
+        ("observer", "ask", "@/*/router/**"),
+        ("observer", "hear", KEYS.estop),
+        ("observer", "last", KEYS.everything),
+        ("observer", "last", "park/*/pose"),
+        ("recorder", "be", KEYS.recorder),
+        ("world", "keep", KEYS.world),
+        ("world", "put", KEYS.contact),
+        ("world", "put", KEYS.event),
+        ("world", "answer", KEYS.world_order),
+        ("world", "be", KEYS.world_alive),
+        ("world", "watch", "park/*/alive"),
+        ("world", "hear", "park/*/setpoint"),
+        ("R0", "hear", KEYS.estop),
+    ],
+)
+def test_what_keeps_an_experiment_going_is_allowed(who, action, key):
+    assert may(control(experiment({(0, 1)})), who, action, key)
+
+
+@pytest.mark.parametrize(
+    ("who", "action", "key"),
+    [
+        ("centre", "keep", KEYS.centre),
+        ("centre", "be", KEYS.centre_alive),
+        ("centre", "watch", KEYS.centre_alive),
+        ("R0", "watch", KEYS.centre_alive),
+        ("ros2", "watch", KEYS.centre_alive),
+        ("recorder", "last", KEYS.centre),
+    ],
+)
+def test_what_a_centre_needs_is_allowed(who, action, key):
+    assert may(control(experiment({(0, 1)}, architecture="centralised")), who, action, key)
+
+
+NO_OPERATORS = ("R0", "R1", *(role for role in ROLES[1:] if role != "operator"), OUTSIDER)
+BROAD = (KEYS.estop, "park/**", "park/*/pose", "park/*", "**", "*/*/*", "park/R3/pos$*", KEYS.experiment)
+
+
+@pytest.mark.parametrize(
+    ("who", "action", "key"),
+    [
+        *((who, action, key) for who in NO_OPERATORS for action in ("put", "delete") for key in BROAD),
+        *((who, "ask", "park/*/order") for who in ("R0", "observer", "recorder", "world", "ros2", OUTSIDER)),
+        *((who, "ask", key) for who in ("observer", "operator") for key in ("park/**", "park/R0/*", "park/*/*")),
+        *((who, "ask", KEYS.world_order) for who in ("R0", "observer", "recorder", OUTSIDER)),
+        *(("R0", "hear", key) for key in ("park/**", "park/*/pose", "park/R1/*", "**", "park/R1/state", KEYS.event)),
+        *((who, "hear", "**") for who in ("observer", "operator", "recorder")),
+        *(("R0", action, "park/R1/pose/@adv/pub/1/1/_") for action in ("put", "answer", "be")),
+        *((who, "be", KEYS.centre_alive) for who in ("R0", "operator", "observer", "world", "ros2", OUTSIDER)),
+        *((who, "put", KEYS.centre) for who in ("R0", "operator", "observer", "world", "ros2", OUTSIDER)),
+        *((who, "put", "park/R1/goal") for who in ("centre", "ros2", "R0", "operator")),
+        *((who, "be", "park/R0/alive") for who in ("R1", "operator", "observer", "world", OUTSIDER)),
+        ("R0", "ask", "@/**"),
+        ("R0", "answer", "@/*/router/**"),
+        ("operator", "put", "park/R0/pose"),
+        ("operator", "delete", KEYS.estop),
+        ("observer", "be", KEYS.recorder),
+    ],
+)  # fmt: skip
+def test_what_would_do_harm_is_denied(who, action, key):
+    assert not may(control(experiment({(1, 0)})), who, action, key)
+
+
+def test_avoidance_gives_ears_and_nothing_else():
+    """Who keeps clear of those that it hears must hear them, though no link says so."""
+    read = load("crowd")
+    one = next(iter(read.cases().values()))
+    grants = access.rights([one]).robots
+    mates = [name for name, robot in one.robots.items() if robot.process == "squad_E1"]
+    assert [key for key in grants[mates[0]].hear if key.endswith("/pose")] == ["park/*/pose"], "all forty of them"
+    assert grants[mates[0]].say == [f"park/{mate}/**" for mate in mates]
+
+
+def test_whoever_carries_bodies_speaks_of_them_and_of_no_others():
+    four = experiment({(0, 1)})
+    robots = {**four.robots, "R1": msgspec.structs.replace(four.robots["R1"], body="world"),
+              "R2": msgspec.structs.replace(four.robots["R2"], ranges="world"),
+              "R3": msgspec.structs.replace(four.robots["R3"], position="external")}  # fmt: skip
+    made = control(msgspec.structs.replace(four, robots=robots))
+    allowed = {
+        (who, key)
+        for who in ("world", "positioning", "twin")
+        for key in (f"park/{name}/{what}" for name in robots for what in SAID)
+        if may(made, who, "put", key)
+    }
+    assert allowed == {
+        ("world", "park/R1/position"),
+        ("world", "park/R1/truth"),
+        ("world", "park/R1/ranges"),
+        ("world", "park/R2/ranges"),
+        ("positioning", "park/R3/position"),
+    }
+
+
+def test_ros_2_is_reached_on_its_own_keys():
+    reference = load("robotic-park").cases()["event"]
+    behind = choose_bodies(reference, "protocol")
+    made = control(behind)
+    for who in ("TB01", "twin"):
+        assert may(made, who, "put", "TB01/cmd_vel")
+        assert may(made, who, "hear", "TB01/odom")
+        assert may(made, who, "be", "@/1234/@ros2_lv/MP/TB01§odom/nav_msgs§msg§Odometry/:1:0:0,10")
+    assert not may(made, "KH01", "put", "TB01/cmd_vel")
+    assert not may(control(reference), "TB01", "put", "TB01/cmd_vel")
+    assert may(made, "CF01", "put", "park/CF03/pose"), "one radio, one process, one session"
+    assert not may(control(reference), "CF01", "put", "park/CF03/pose")
+
+
+def test_a_rmw_robot_has_its_domain():
+    one = experiment(set(), body="rmw://tb3_0?domain=7")
+    made = control(one)
+    assert may(made, "R0", "put", "7/tb3_0/cmd_vel/geometry_msgs::msg::dds_::Twist_/RIHS01_0")
+    assert may(made, "R0", "watch", "@ros2_lv/7/**")
+    assert not may(made, "R0", "put", "0/tb3_0/cmd_vel/geometry_msgs::msg::dds_::Twist_/RIHS01_0")
+
+
+def test_cases_that_share_a_router_share_their_rights():
+    one, other = experiment({(0, 1)}), experiment({(2, 1)})
+    both = access.rights([one, other])
+    made = rules(both, register(one.robots))
+    assert may(made, "R1", "hear", "park/R0/pose")
+    assert may(made, "R1", "hear", "park/R2/pose")
+    assert not may(made, "R1", "hear", "park/R3/pose")
+    elsewhere = msgspec.structs.replace(one, network=Network(realm="yard"))
+    with pytest.raises(LabError, match=r"realms park and yard share no router"):
+        access.rights([one, elsewhere])
+
+
+def test_rights_go_through_a_file():
+    made = access.rights(load("robotic-park").cases().values())
+    assert msgspec.json.decode(msgspec.json.encode(made), type=Rights) == made
+
+
+def test_a_certificate_on_an_earlier_name_gives_no_right():
+    four = experiment({(0, 1)})
+    known = register(four.robots)
+    moved = msgspec.structs.replace(known.identities["R0"], common_name="R0.2")
+    made = rules(access.rights([four]), Register({**known.identities, "R0": moved}))
+    assert not may(made, "R0", "put", "park/R0/pose")
+    assert may(made, "R0.2", "put", "park/R0/pose")
+
+
+def test_a_robot_cannot_take_the_name_of_an_office():
+    four = experiment(set())
+    known = register(four.robots)
+    clash = Register({**known.identities, "R0": Identity("operator", "R0", "1", "2100-01-01")})
+    with pytest.raises(LabError, match=r"'R0' is a robot of the experiment and operator of the lab"):
+        rules(access.rights([four]), clash)
+
+
+def test_sizes_bound_what_robots_say_and_not_the_experiment():
+    (limit,) = sizes(access.rights([experiment(set())]))
+    assert limit["size_limit"] == 65536
+    assert "park/R0/**" in limit["key_exprs"]
+    assert "park/R0/**/@adv/**" in limit["key_exprs"]
+    assert not any("run" in key for key in limit["key_exprs"])
+
+
+def test_needed_identities():
+    reference = load("robotic-park").cases()["event"]
+    assert set(access.needed(reference)) == {"router", "operator", "recorder", *reference.robots}
+    assert {"world"} < set(access.needed(choose_bodies(reference, "world")))
+    assert {"centre"} < set(access.needed(load("architectures").cases()["hybrid"]))
+    assert {"twin", "positioning"} < set(access.needed(choose_bodies(reference, "protocol")))

@@ -1,0 +1,132 @@
+"""A laboratory as an intruder finds it: a router that knows who may do what, robots in flight, and certificates."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import zenoh
+
+from agents import lab, wire
+from agents import session as network
+from experiments import access
+from experiments.run import load
+from tests.system.lab import ENVIRONMENT, ROOT, RobotProcess, Watcher, until
+from tools import authority
+
+FILE = ROOT / "tests" / "system" / "secured.toml"
+FLOWN = ("KH01", "KH02", "CF01")
+
+
+class Laboratory:
+    """Three robots in flight on a router that asks for certificates; `KH03`, who hears `KH01`, has not been started."""
+
+    def __init__(self, folder: Path, protocol: str = "tls") -> None:
+        self.folder = folder / "lab"
+        cases = load(FILE).cases()
+        robots = dict.fromkeys(next(iter(cases.values())).robots, "robot")
+        authority.create(self.folder, {**{role: role for role in authority.SERVICES}, **robots})
+        self.rights = folder / "rights.json"
+        self.rights.write_bytes(msgspec.json.encode(access.rights(cases.values())))
+        self.plain = network.free_endpoint(preferred_port=0, protocol=protocol)
+        (self.endpoint,) = lab.secured([self.plain], self.folder)
+        self.robots: list[RobotProcess] = []
+        self.last: dict[str, wire.Status] = {}
+        self.process: subprocess.Popen[str]
+        self.start()
+
+    def start(self) -> None:
+        """Starts the router."""
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "agents.router", "--listen", self.endpoint, "--rights", str(self.rights)],
+            cwd=ROOT,
+            env=ENVIRONMENT,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == f"router ready on {self.endpoint}\n"
+
+    def fly(self) -> None:
+        """Starts the robots and brings them to where they run."""
+        self.robots = [RobotProcess(self.endpoint, FILE, name) for name in FLOWN]
+        self.watcher = Watcher(self.endpoint)
+        self.reach("ready")
+        for name in FLOWN:
+            assert self.watcher.order(name, wire.Order("takeoff")).ok
+        self.reach("airborne")
+        at = time.time() + 0.3
+        for name in FLOWN:
+            assert self.watcher.order(name, wire.Order("start", at=at)).ok
+        self.reach("running")
+
+    def reach(self, phase: str) -> None:
+        self.watcher.until(lambda: all(self.watcher.phase(name) == phase for name in FLOWN), f"all are {phase}")
+
+    def statuses(self) -> dict[str, wire.Status]:
+        """Fresh ones, of every robot."""
+        since = time.time()
+        watcher = self.watcher
+        watcher.until(lambda: all(watcher.status[name].stamp > since for name in FLOWN), "fresh statuses", 5.0)
+        self.last = {name: watcher.status[name] for name in FLOWN}
+        return self.last
+
+    def session(self, identity: str, folder: Path | None = None) -> zenoh.Session:
+        """A session of whoever has these certificates; at once, or zenoh.ZError."""
+        (endpoint,) = lab.secured([self.plain], folder or self.folder)
+        return zenoh.open(network.config("client", connect=[endpoint], name="intruder", identity=identity))
+
+    def close(self) -> None:
+        for robot in self.robots:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                robot.end() if robot.process.returncode is None else None
+        if self.robots:
+            self.watcher.close()
+        self.process.terminate()
+        self.process.wait(10)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+def elsewhere(folder: Path, days: float = 90.0) -> Path:
+    """Another lab with the same names, whose authority nobody here knows."""
+    authority.create(folder, {**{role: role for role in authority.SERVICES}, "KH01": "robot"}, days=days)
+    return folder
+
+
+def copy(folder: Path, target: Path) -> Path:
+    """What a thief has of a lab."""
+    shutil.copytree(folder, target)
+    return target
+
+
+@contextlib.contextmanager
+def flying(folder: Path) -> Iterator[Laboratory]:
+    made = Laboratory(folder)
+    try:
+        made.fly()
+        yield made
+    finally:
+        made.close()
+
+
+def steady(rate_hz: float, seconds: float) -> Iterator[int]:
+    """Counts up, so many times a second."""
+    begin, done = time.monotonic(), 0
+    pause = threading.Event()
+    while (now := time.monotonic() - begin) < seconds:
+        while done < now * rate_hz:
+            yield done
+            done += 1
+        pause.wait(0.001)
+
+
+__all__ = ["FILE", "FLOWN", "Laboratory", "copy", "elsewhere", "flying", "steady", "until"]

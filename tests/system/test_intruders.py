@@ -1,0 +1,293 @@
+"""What intruders get from a secured network: nothing. Real processes, real certificates, robots in flight."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from agents import lab, wire
+from agents import session as network
+from agents.keys import Keys
+from experiments import orders
+from tests.system.secured import FLOWN, Laboratory, copy, elsewhere, flying, steady
+from tools import authority
+
+pytestmark = pytest.mark.system
+
+KEYS = Keys()
+STOP = wire.encode(wire.Stop("mallory", "because"))
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Laboratory]:
+    with flying(tmp_path_factory.mktemp("secured")) as made:
+        yield made
+
+
+@dataclass
+class Flight:
+    """The robots before a test, and whose key is used to say nonsense where that robot may speak."""
+
+    before: dict[str, wire.Status]
+    mad: str = ""
+
+
+@pytest.fixture(autouse=True)
+def flight(laboratory: Laboratory) -> Iterator[Flight]:
+    """Whatever a test does: the robots run on, have believed and refused nothing, and have lost nobody."""
+    made = Flight(laboratory.last or laboratory.statuses())
+    yield made
+    after = laboratory.statuses()
+    for name in FLOWN:
+        assert after[name].phase == "running"
+        assert after[name].pid == made.before[name].pid
+        assert not after[name].missing
+        lost = {other: count - made.before[name].lost[other] for other, count in after[name].lost.items()}
+        assert {other for other, count in lost.items() if count} <= {made.mad}, "nonsense crowds out whom it imitates"
+        assert after[name].refused == made.before[name].refused
+        assert after[name].decisions > made.before[name].decisions
+        assert made.mad or after[name].malformed == made.before[name].malformed
+
+
+def say(session: zenoh.Session, key: str, payload: bytes) -> None:
+    session.put(key, payload, encoding=wire.JSON)
+
+
+def forged(robot: str) -> bytes:
+    """A pose that every check would believe."""
+    return wire.encode(wire.pose(robot, 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
+
+
+def settled(laboratory: Laboratory, seconds: float = 0.5) -> None:
+    """Time for what was said to arrive, if it does."""
+    threading.Event().wait(seconds)
+    laboratory.watcher.look()
+
+
+# ---------------------------------------------------------------------- who is not let in
+
+
+@pytest.mark.parametrize("protocol", ["tcp", "tls", "quic"])
+def test_without_a_certificate_nobody_gets_in(laboratory: Laboratory, protocol: str) -> None:
+    address = laboratory.plain.partition("/")[2]
+    settings = network.config("client", connect=[f"{protocol}/{address}"], name="intruder")
+    settings.insert_json5("transport/unicast/open_timeout", "1000")
+    if protocol != "tcp":  # it trusts the router, and has nothing to show
+        settings.insert_json5(
+            "transport/link/tls", json.dumps({"root_ca_certificate": str(laboratory.folder / "ca.pem")})
+        )
+    with pytest.raises(zenoh.ZError, match="Unable to connect"):
+        zenoh.open(settings)
+
+
+def test_a_certificate_of_another_authority_is_refused(laboratory: Laboratory, tmp_path: Path) -> None:
+    rogue = elsewhere(tmp_path / "rogue")
+    (rogue / "ca.pem").write_bytes((laboratory.folder / "ca.pem").read_bytes())  # it does trust the router
+    for identity in ("operator", "KH01", "router"):
+        with pytest.raises(zenoh.ZError, match="Unable to connect"):
+            laboratory.session(identity, rogue)
+
+
+def test_an_ended_certificate_is_refused(laboratory: Laboratory, tmp_path: Path) -> None:
+    old = copy(laboratory.folder, tmp_path / "old")
+    authority.renew(old, ["operator", "KH01"], days=-0.01)
+    for identity in ("operator", "KH01"):
+        with pytest.raises(zenoh.ZError, match="Unable to connect"):
+            laboratory.session(identity, old)
+
+
+def test_a_self_made_authority_of_the_same_name_is_refused(laboratory: Laboratory, tmp_path: Path) -> None:
+    forger = copy(laboratory.folder, tmp_path / "forger")
+    authority.renew(forger, authority=True)
+    (forger / "ca.pem").write_bytes((laboratory.folder / "ca.pem").read_bytes())
+    with pytest.raises(zenoh.ZError, match="Unable to connect"):
+        laboratory.session("operator", forger)
+
+
+def test_a_robots_certificate_does_not_make_a_router(laboratory: Laboratory, tmp_path: Path) -> None:
+    """A stolen robot cannot pose as the router to the others."""
+    thief = copy(laboratory.folder, tmp_path / "thief")
+    for part in ("key", "pem"):
+        (thief / f"router.{part}").write_bytes((thief / f"KH03.{part}").read_bytes())
+    plain = network.free_endpoint(preferred_port=0, protocol="tls")
+    (endpoint,) = lab.secured([plain], thief)
+    settings = network.config("peer", listen=[endpoint], name="router")
+    (honest,) = lab.secured([plain], laboratory.folder)
+    with zenoh.open(settings), pytest.raises(zenoh.ZError, match="Unable to connect"):
+        zenoh.open(network.config("client", connect=[honest], name="KH01"))
+
+
+def test_a_router_elsewhere_than_its_certificate_says_is_refused(laboratory: Laboratory) -> None:
+    address = laboratory.plain.rpartition(":")[2]
+    (endpoint,) = lab.secured([f"tls/127.0.0.2:{address}"], laboratory.folder)
+    with pytest.raises(zenoh.ZError, match="Unable to connect"):
+        zenoh.open(network.config("client", connect=[endpoint], name="KH01"))
+
+
+# ---------------------------------------------------------------------- who is let in, and wants more than its due
+
+
+@pytest.mark.parametrize("who", ["KH03", "observer", "recorder", "world", "positioning", "twin", "router"])
+def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory: Laboratory, who: str) -> None:
+    heard = network.subscriber(laboratory.watcher.session, "park/**", 20_000)
+    with laboratory.session(who) as session:
+        threading.Event().wait(0.1)
+        for key in ("park/KH01/pose", "park/*/pose", "park/**", "park/*/*", "**", "park/$*1/pose", "park/KH01/**"):
+            say(session, key, forged("KH01"))
+            session.delete(key)
+        for key in (KEYS.estop, "park/*", "park/est$*", "*/estop"):
+            say(session, key, STOP)
+            session.delete(key)
+        settled(laboratory)
+    keys = {str(sample.key_expr) for sample in network.received(heard.handler) if "mallory" in str(sample.payload)}
+    heard.undeclare()  # type: ignore[no-untyped-call]
+    assert not keys
+
+
+@pytest.mark.parametrize("who", ["KH03", "observer", "recorder", "world", "centre", "ros2"])
+def test_orders_are_the_operators(laboratory: Laboratory, who: str) -> None:
+    with laboratory.session(who) as session:
+        reply = orders.give(session, KEYS, "CF01", wire.Order("land"))
+        assert (reply.ok, reply.reason) == (False, "no answer")
+        for key in ("park/*/order", "park/**", "park/CF01/*", "**"):
+            assert not list(session.get(key, payload=wire.encode(wire.Order("land")), encoding=wire.JSON, timeout=1.0))
+        say(session, KEYS.order("CF01"), wire.encode(wire.Order("land")))
+    assert laboratory.watcher.order("CF01", wire.Order("get", name="clamp")).ok, "the operator is heard"
+
+
+def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory: Laboratory) -> None:
+    with laboratory.session("KH03") as session:
+        neighbour = network.pose_subscriber(session, KEYS.pose("KH01"))
+        others = [
+            network.pose_subscriber(session, key)
+            for key in (KEYS.pose("KH02"), KEYS.state("KH01"), "park/*/pose", "park/**", "**", KEYS.event)
+        ]
+        watches = [network.alive_watch(session, key) for key in ("park/KH02/alive", "park/*/alive", "park/**")]
+        settled(laboratory)
+        assert len(list(network.received(neighbour.handler))) > 10
+        heard = {str(sample.key_expr) for other in others for sample in network.received(other.handler)}
+        assert heard <= {KEYS.pose("KH01")}, "what comes for the neighbour's sake reaches all ears of the session"
+        assert not [sample for watch in watches for sample in network.received(watch.handler)]
+        assert not list(session.get("park/KH02/pose", timeout=1.0))
+        assert not list(session.get("@/*/router/**", timeout=1.0))
+
+
+def test_no_one_takes_anothers_place(laboratory: Laboratory) -> None:
+    """Neither its orders, nor its token, nor the memory of its last value."""
+    with laboratory.session("KH03") as session:
+        order = network.orders(session, KEYS.order("KH02"))
+        last = network.last_value(session, KEYS.pose("KH02"), wire.JSON)
+        last.hold(forged("KH02"))
+        token = network.alive_token(session, KEYS.alive("KH09"))
+        memory = network.pose_publisher(session, KEYS.pose("KH02"), wire.JSON)
+        memory.put(forged("KH02"))
+        settled(laboratory)
+        assert laboratory.watcher.order("KH02", wire.Order("get", name="clamp")).robot == "KH02"
+        late = network.pose_subscriber(laboratory.watcher.session, KEYS.pose("KH02"))
+        settled(laboratory, 0.2)
+        poses = [wire.decode(s.payload.to_bytes(), wire.JSON, wire.Pose) for s in network.received(late.handler)]
+        assert poses
+        assert all(pose.seq < 10**8 for pose in poses)
+        late.undeclare()  # type: ignore[no-untyped-call]
+        assert "KH09" not in laboratory.watcher.alive
+        assert not list(network.received(order.handler))
+        assert not last.answer()
+        token.undeclare()  # type: ignore[no-untyped-call]
+
+
+# ---------------------------------------------------------------------- who has stolen a key of somebody who may
+
+
+def test_samples_that_are_said_again_are_not_believed_again(laboratory: Laboratory, flight: Flight) -> None:
+    """With the very key of KH01, its own poses of a moment ago, twenty times each."""
+    with network.pose_subscriber(laboratory.watcher.session, KEYS.pose("KH01"), 500) as ear:
+        settled(laboratory)
+        taken = [sample.payload.to_bytes() for sample in network.received(ear.handler)]
+    assert len(taken) > 10
+    with laboratory.session("KH01") as thief:
+        for _ in range(20):
+            for payload in taken:
+                say(thief, KEYS.pose("KH01"), payload)
+        settled(laboratory)
+    after = laboratory.statuses()
+    for name in ("KH02", "CF01"):
+        said = sum(after[other].sent - flight.before[other].sent for other in FLOWN if other != name)
+        twice = after[name].heard - flight.before[name].heard - said
+        assert twice < 120 < 20 * len(taken), "each once, give or take the age of a status"
+
+
+def test_nonsense_at_ten_thousand_a_second_is_counted_and_forgotten(laboratory: Laboratory, flight: Flight) -> None:
+    """From a robot that has gone mad, on its own key: KH01's, in a thief's hands."""
+    flight.mad = "KH01"
+    nonsense = [b"", b"{", b"[" * 1000, os.urandom(200), b'{"robot":"KH01","seq":NaN}', forged("KH02"), b"null"]
+    sent = 0
+    with laboratory.session("KH01") as thief:
+        mad = network.publisher(thief, KEYS.pose("KH01"), wire.JSON)
+        for count in steady(10_000, 1.5):
+            mad.put(nonsense[count % len(nonsense)])
+            sent = count
+    assert sent > 5_000
+    after = laboratory.statuses()
+    for name in ("KH02", "CF01"):
+        assert after[name].malformed > flight.before[name].malformed, "it is counted"
+
+
+def test_what_is_too_large_does_not_arrive(laboratory: Laboratory) -> None:
+    with laboratory.session("KH01") as thief:
+        for size in (65_537, 300_000, 3_000_000):
+            for _ in range(20):
+                say(thief, KEYS.pose("KH01"), b" " * size)
+        settled(laboratory)
+
+
+def test_denied_samples_at_ten_thousand_a_second_arrive_nowhere(laboratory: Laboratory) -> None:
+    with laboratory.session("observer") as session:
+        for count in steady(10_000, 1.5):
+            say(session, (KEYS.estop, KEYS.pose("KH01"), "park/**")[count % 3], STOP)
+        assert count > 5_000
+
+
+# ---------------------------------------------------------------------- who only wants to be in the way
+
+
+@pytest.mark.timeout(90)
+def test_half_open_connections_are_dropped_and_disturb_nobody(laboratory: Laboratory) -> None:
+    """Slowloris: handshakes that begin and never end. Those who are in stay in; the router drops the others."""
+    host, _, port = laboratory.plain.partition("/")[2].rpartition(":")
+    half = []
+    try:
+        for _ in range(60):
+            one = socket.create_connection((host, int(port)))
+            one.sendall(b"\x16\x03\x01")  # the beginning of a ClientHello
+            one.setblocking(False)
+            half.append(one)
+        assert laboratory.watcher.order("CF01", wire.Order("get", name="clamp")).ok
+
+        def dropped() -> bool:
+            laboratory.watcher.look()
+            return all(_closed(one) for one in half)
+
+        laboratory.watcher.until(dropped, "the router drops them all", 40.0)
+    finally:
+        for one in half:
+            one.close()
+    with laboratory.session("observer") as session:
+        assert list(session.liveliness().get("park/*/alive", timeout=1.0))
+
+
+def _closed(one: socket.socket) -> bool:
+    try:
+        return one.recv(64) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True

@@ -1,0 +1,173 @@
+"""A lab in use: one command runs an experiment, certificates are revoked and renewed while routers run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from tests.system.lab import ENVIRONMENT, ROOT, Flight, until
+from tests.system.secured import FILE, Laboratory, copy
+from tools import authority
+
+pytestmark = pytest.mark.system
+
+KEYS = Keys()
+
+
+def zenpark(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "tools.guard", *map(str, arguments)],
+        cwd=ROOT,
+        env=ENVIRONMENT,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=30,
+    )
+
+
+def test_one_command_runs_it_and_others_look_and_stop_it(tmp_path: Path) -> None:
+    file = tmp_path / "triangle.toml"
+    text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
+    file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
+    assert zenpark("keys", "init", tmp_path / "lab", file).returncode == 0
+    flight = Flight(tmp_path / "run", str(file), "--case", "event", "--no-report", "--set", "duration_s=90")
+    flight.until_said("phase conductor: formation")
+    endpoint, _, lab = flight.endpoint().partition("#lab=")
+    assert endpoint.startswith("tls/127.0.0.1:")
+    assert Path(lab) == tmp_path / "lab"
+    reach = ("--connect", endpoint, "--lab", lab)
+    shown = zenpark("keys", *reach)
+    assert shown.returncode == 0
+    for name in ("KH01", "KH02", "CF01", "recorder", "conductor", "router"):
+        assert f"\n{name}  (" in f"\n{shown.stdout}"
+    assert "park/CF01/order" in shown.stdout
+    assert zenpark("echo", "park/*/pose", "-n", "3", *reach).stdout.count('"robot":') == 3
+    assert "park/CF01/state" in zenpark("hz", "park/*/state", "--seconds", "1", *reach).stdout
+    assert zenpark("echo", "park/*/pose", "--seconds", "0.3", "--connect", endpoint).returncode == 2
+    assert zenpark("order", "land", *reach, "--as", "observer").stdout.count("no, unknown: no answer") == 3
+    denied = zenpark("estop", *reach, "--as", "observer")
+    assert denied.returncode == 1
+    assert "NOT known to have stopped: CF01, KH01, KH02" in denied.stderr
+    stopped = zenpark("estop", *reach, "--reason", "enough")
+    assert (stopped.returncode, stopped.stdout) == (0, "stopped: CF01, KH01, KH02\n")
+    assert flight.finish()[0] == 0
+    assert flight.logs().count("done (emergency stop by operator: enough)") == 3
+
+
+def test_what_is_missing_is_said_before_anything_starts(tmp_path: Path) -> None:
+    lab = tmp_path / "lab"
+    authority.create(lab, {"router": "router", "operator": "operator", "recorder": "recorder", "KH01": "robot"})
+    for arguments, said in (
+        (("run", "triangle", "--lab", lab, "--out", tmp_path / "a"), f"`zenpark keys issue {lab} KH02 CF01`"),
+        (("run", "triangle", "--lab", tmp_path / "no", "--out", tmp_path / "b"), "zenpark keys issue"),
+        (("router", "--listen", "tls/0.0.0.0:0"), "zenpark keys init LAB FILE"),
+        (("router", "--listen", "tcp/0.0.0.0:0"), "zenpark keys init LAB FILE"),
+        (("router", "--lab", lab), "name the experiment too"),
+        (("router", "triangle", "--lab", lab, "--listen", "tcp/127.0.0.1:0"), "write tls/127.0.0.1:0"),
+        (("agent", "triangle", "CF01", "--lab", lab), "CF01.pem is missing"),
+        (("echo", "park/**", "--lab", lab), "observer.pem is missing"),
+        (("keys", "init", lab, "triangle"), "is a lab already"),
+    ):
+        done = zenpark(*arguments)
+        assert done.returncode == 2, (arguments, done.stderr)
+        assert said in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_a_router_of_a_lab_listens_on_every_interface(tmp_path: Path) -> None:
+    authority.create(tmp_path / "lab", {"router": "router"})
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tools.guard", "router", str(FILE), "--lab", str(tmp_path / "lab"),
+         "--listen", "tls/0.0.0.0:0", "--listen", "quic/[::]:0"],
+        cwd=ROOT, env=ENVIRONMENT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("router ready on tls/0.0.0.0:0")
+    process.terminate()
+    assert process.wait(10) == 0
+    process.stdout.close()
+
+
+@pytest.fixture(params=["tls", "quic"])
+def laboratory(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Laboratory]:
+    made = Laboratory(tmp_path, request.param)
+    yield made
+    made.close()
+
+
+class Ear:
+    """What the operator hears on a key."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._samples = network.subscriber(session, key)
+        self._seen: set[str] = set()
+
+    def heard(self, speaker: zenoh.Session, key: str, word: str) -> bool:
+        """Whether a word that is said now is heard."""
+        speaker.put(key, word)
+        self._seen |= {sample.payload.to_string() for sample in network.received(self._samples.handler)}
+        return word in self._seen
+
+
+def test_a_revoked_key_is_refused_by_a_router_that_runs(laboratory: Laboratory, tmp_path: Path) -> None:
+    stolen = copy(laboratory.folder, tmp_path / "stolen")
+    key = KEYS.pose("KH01")
+    with laboratory.session("operator") as operator, laboratory.session("KH01", stolen) as thief:
+        ear = Ear(operator, key)
+        until(lambda: ear.heard(thief, key, "before"), "the key is good")
+        authority.revoke(laboratory.folder, ["KH01"])
+        # the operator's certificate is the same as ever: it is connected again by itself
+        with laboratory.session("KH01") as honest:
+            until(lambda: ear.heard(honest, key, "after"), "the new key is good")
+        until(lambda: network.connected(thief), "it is let in, and nothing else")
+        threading.Event().wait(0.3)
+        for _ in range(20):
+            assert not ear.heard(thief, key, "thief")
+            threading.Event().wait(0.02)
+        with laboratory.session("KH01", stolen) as again:
+            for _ in range(10):
+                assert not ear.heard(again, key, "again")
+                threading.Event().wait(0.02)
+
+
+def test_a_new_authority_refuses_every_earlier_file(laboratory: Laboratory, tmp_path: Path) -> None:
+    stolen = copy(laboratory.folder, tmp_path / "stolen")
+    with laboratory.session("operator", stolen) as before:
+        assert network.connected(before)
+        authority.renew(laboratory.folder, authority=True)
+
+        def lets_in() -> bool:
+            try:
+                laboratory.session("operator").close()  # type: ignore[no-untyped-call]
+            except zenoh.ZError:
+                return False
+            return True
+
+        until(lets_in, "the router has taken the new authority up")
+        for identity in ("operator", "KH01"):
+            with pytest.raises(zenoh.ZError, match="Unable to connect"):
+                laboratory.session(identity, stolen)
+        until(lambda: not network.connected(before), "who was connected is out")
+
+
+def test_robots_go_on_with_their_new_files_where_those_are_put(laboratory: Laboratory) -> None:
+    """A revocation costs a moment of the network; whoever finds new files in its folder is back by itself."""
+    laboratory.fly()
+    authority.revoke(laboratory.folder, ["KH01", "KH03"])
+    watcher = laboratory.watcher
+    before = {name: status.heard for name, status in laboratory.statuses().items()}
+    watcher.until(lambda: all(watcher.status[name].heard > before[name] + 100 for name in before), "all hear again")
+    for name, status in laboratory.statuses().items():
+        assert status.phase == "running", (name, status.reason)
+    assert watcher.order("CF01", wire.Order("land")).ok

@@ -1,0 +1,155 @@
+import ipaddress
+import stat
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from cryptography import x509
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from typer.testing import CliRunner
+
+from agents.lab import LabError, files, register
+from tools import authority
+from tools.cli import app
+
+ROBOTS = {"router": "router", "operator": "operator", "CF01": "robot", "CF02": "robot"}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    authority.create(tmp_path / "lab", ROBOTS, hosts=["192.0.2.7", "lab.example.org"], days=30.0)
+    return tmp_path / "lab"
+
+
+def certificate(folder, name):
+    return x509.load_pem_x509_certificate((folder / f"{name}.pem").read_bytes())
+
+
+def common_name(folder, name):
+    return certificate(folder, name).subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
+
+
+def extension(made, kind):
+    return made.extensions.get_extension_for_class(kind).value
+
+
+def test_a_certificate_says_who_and_until_when_and_who_vouches(folder):
+    ca = certificate(folder, "ca")
+    assert extension(ca, x509.BasicConstraints) == x509.BasicConstraints(ca=True, path_length=0)
+    for name in ROBOTS:
+        made = certificate(folder, name)
+        made.verify_directly_issued_by(ca)
+        assert common_name(folder, name) == name
+        assert made.public_key().curve.name == "secp256r1"
+        left = made.not_valid_after_utc - datetime.now(UTC)
+        assert timedelta(days=29.9) < left < timedelta(days=30.0)
+        known = register(folder).identities[name]
+        assert int(known.serial, 16) == made.serial_number
+        assert datetime.fromisoformat(known.until) == made.not_valid_after_utc
+        assert not extension(made, x509.BasicConstraints).ca
+
+
+def test_only_who_listens_can_pose_as_a_router(folder):
+    purposes = extension(certificate(folder, "router"), x509.ExtendedKeyUsage)
+    assert set(purposes) == {ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH}
+    names = extension(certificate(folder, "router"), x509.SubjectAlternativeName)
+    assert names.get_values_for_type(x509.DNSName) == ["localhost", "lab.example.org"]
+    assert [str(each) for each in names.get_values_for_type(x509.IPAddress)] == ["127.0.0.1", "::1", "192.0.2.7"]
+    authority.issue(folder, {"KH01": "robot"}, hosts=["192.0.2.9"])
+    assert ExtendedKeyUsageOID.SERVER_AUTH in extension(certificate(folder, "KH01"), x509.ExtendedKeyUsage)
+    meshed = extension(certificate(folder, "KH01"), x509.SubjectAlternativeName)
+    assert meshed.get_values_for_type(x509.IPAddress) == [ipaddress.ip_address("192.0.2.9")]
+    authority.issue(folder, {"KH02": "robot"})
+    assert list(extension(certificate(folder, "KH02"), x509.ExtendedKeyUsage)) == [ExtendedKeyUsageOID.CLIENT_AUTH]
+
+
+def test_keys_are_for_their_owner_alone(folder):
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    for key in folder.glob("*.key"):
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    assert not list(folder.glob(".*")), "nothing half-written is left"
+
+
+def test_revoking_moves_the_name_that_counts(folder):
+    before = (folder / "CF01.key").read_bytes()
+    authority.revoke(folder, ["CF01"])
+    assert common_name(folder, "CF01") == register(folder).identities["CF01"].common_name == "CF01.2"
+    assert (folder / "CF01.key").read_bytes() != before
+    authority.revoke(folder, ["CF01"])
+    assert common_name(folder, "CF01") == "CF01.3"
+    assert common_name(folder, "CF02") == "CF02"
+
+
+def test_renewing_keeps_the_name(folder):
+    authority.revoke(folder, ["CF01"])
+    serial = register(folder).identities["CF01"].serial
+    authority.renew(folder, ["CF01"], days=60.0)
+    assert common_name(folder, "CF01") == "CF01.2"
+    assert register(folder).identities["CF01"].serial != serial
+    left = certificate(folder, "CF01").not_valid_after_utc - datetime.now(UTC)
+    assert timedelta(days=59.9) < left < timedelta(days=60.0)
+    assert "192.0.2.7" in authority.renew(folder).identities["router"].hosts
+
+
+def test_a_new_authority_signs_everybody_anew(folder):
+    before = certificate(folder, "ca")
+    authority.renew(folder, authority=True)
+    after = certificate(folder, "ca")
+    assert after.subject != before.subject
+    for name in ROBOTS:
+        certificate(folder, name).verify_directly_issued_by(after)
+        files(folder, name)
+    with pytest.raises(LabError, match="name nobody behind --authority"):
+        authority.renew(folder, ["CF01"], authority=True)
+
+
+def test_no_certificate_outlives_the_authority(tmp_path):
+    authority.create(tmp_path / "lab", {"CF01": "robot"}, days=90.0, authority_days=2.0)
+    end = certificate(tmp_path / "lab", "ca").not_valid_after_utc
+    assert certificate(tmp_path / "lab", "CF01").not_valid_after_utc == end
+
+
+def test_what_cannot_be_done_is_said(folder, tmp_path):
+    with pytest.raises(LabError, match="is a lab already"):
+        authority.create(folder, ROBOTS)
+    with pytest.raises(LabError, match="CF01: in the lab already"):
+        authority.issue(folder, {"CF01": "robot"})
+    with pytest.raises(LabError, match="CF07: not in this lab, which knows router, operator, CF01, CF02"):
+        authority.revoke(folder, ["CF07"])
+    for name in ("ca", "a/b", "", "../x", "é", "1a", "CF01.2"):
+        with pytest.raises(LabError, match="cannot be an identity"):
+            authority.issue(folder, {name: "robot"})
+    for host in ("a b", "lab_1.org", "300.1.1.1.1;", "*"):
+        with pytest.raises(LabError, match="neither a host's name nor an address"):
+            authority.issue(folder, {"KH01": "robot"}, hosts=[host])
+    assert not (folder / "KH01.pem").exists()
+    (folder / "ca.key").rename(tmp_path / "away.key")
+    with pytest.raises(LabError, match="where the authority of the lab is kept"):
+        authority.renew(folder)
+
+
+def said(*arguments):
+    return CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+def test_the_commands(tmp_path):
+    folder = tmp_path / "lab"
+    first = said("keys", "init", folder, "robotic-park", "KH09", "--host", "192.0.2.7", "--days", "10")
+    assert first.exit_code == 0
+    assert {"TB01", "KH03", "CF02", "KH09", "observer", "operator"} < register(folder).identities.keys()
+    assert "10 days left  renew it  listens at localhost, 127.0.0.1, ::1, 192.0.2.7" in first.stdout
+    assert "zenpark run FILE --lab" in first.stdout
+    assert said("keys", "issue", folder, "ana", "--role", "operator").exit_code == 0
+    assert register(folder).identities["ana"].role == "operator"
+    assert said("keys", "revoke", folder, "ana").stdout.count("as ana.2") == 1
+    assert said("keys", "renew", folder, "--authority").exit_code == 0
+    assert said("keys", "show", folder).exit_code == 0
+    assert '"ana.2"' in said("keys", "show", folder, "--json").stdout
+    assert isinstance(said("keys", "init", tmp_path / "b", "router").exception, LabError)
+    assert isinstance(said("keys", "issue", folder, "bob", "--role", "operater").exception, LabError)
+
+
+def test_an_ended_certificate_is_shown(tmp_path):
+    authority.create(tmp_path / "lab", {"CF01": "robot"}, days=-0.01)
+    shown = said("keys", "show", tmp_path / "lab")
+    assert shown.exit_code == 1
+    assert "ENDED" in shown.stdout

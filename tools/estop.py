@@ -1,0 +1,68 @@
+"""`zenpark estop`: motors off, everybody."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from typing import Final
+
+import zenoh
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+
+ANSWER_S: Final = 2.0
+AGAIN_S: Final = 0.05
+STOPPED: Final = "done"
+
+
+def command(*, connect: Sequence[str], realm: str, reason: str, who: str) -> int:
+    """Says stop until every robot that is there says that it has stopped; prints who has not.
+
+    Returns:
+        The exit code: 0, or 1 if one has not stopped in time.
+
+    Raises:
+        EndpointError, Unreachable: If no router can be reached.
+    """
+    keys = Keys(realm)
+    with network.open_session(
+        list(connect) or [network.DEFAULT_ENDPOINT], name="estop", wait_s=2.0, identity=who
+    ) as session:
+        stop = wire.encode(wire.Stop(who, reason))
+        urgent = session.declare_publisher(
+            keys.estop,
+            encoding=wire.JSON,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+        )
+        urgent.put(stop)
+        begun = time.monotonic()
+        statuses = network.pose_subscriber(session, keys.status("*"), 4096)
+        there = {
+            keys.robot(str(reply.ok.key_expr))
+            for reply in session.liveliness().get(keys.alive("*"), timeout=ANSWER_S)
+            if reply.ok is not None
+        }
+        left = set(there)
+        while left and time.monotonic() < begun + ANSWER_S:
+            urgent.put(stop)
+            time.sleep(AGAIN_S)
+            for sample in network.received(statuses.handler):
+                try:
+                    status = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Status)
+                except wire.Malformed:
+                    continue
+                if status.phase == STOPPED and keys.robot(str(sample.key_expr)) == status.robot:
+                    left.discard(status.robot)
+    if not there:
+        print(f"stop was said, but no robot is seen in the realm '{realm}'", file=sys.stderr)
+        return 1
+    if left:
+        print(f"NOT known to have stopped: {', '.join(sorted(left))}", file=sys.stderr)
+        return 1
+    print(f"stopped: {', '.join(sorted(there))}")
+    return 0

@@ -1,0 +1,173 @@
+"""`zenpark keys`: alone it shows who is on the network; behind it stand the commands for a lab's certificates."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from agents.lab import Register, Role
+
+app: Final = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
+
+Folder = Annotated[str, typer.Argument(metavar="LAB", help="Folder of the lab.")]
+Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Identities.")]
+Days = Annotated[float, typer.Option(min=0.01, help="For which a certificate is valid.")]
+Hosts = Annotated[
+    list[str] | None,
+    typer.Option("--host", metavar="HOST", help="Name or address at which it listens; may be repeated."),
+]
+SOON_DAYS: Final = 14.0
+
+
+@app.callback(invoke_without_command=True)
+def _keys(
+    context: typer.Context,
+    connect: Annotated[
+        list[str] | None, typer.Option(metavar="ENDPOINT", help="A router; may be repeated. [tcp/127.0.0.1:7447]")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    lab: Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab.")] = None,
+    identity: Annotated[str, typer.Option("--as", metavar="NAME", help="Whose certificate.")] = "observer",
+) -> None:
+    """Show who is on the network and which keys they hold; make certificates (init, issue, renew, revoke, show)."""
+    if context.invoked_subcommand is None:
+        from agents.lab import secured  # noqa: PLC0415
+        from tools.network import keys as show_keys  # noqa: PLC0415
+
+        show_keys(secured(connect or [], lab), as_json=as_json, identity=identity)
+
+
+@app.command()
+def init(
+    folder: Folder,
+    who: Annotated[
+        list[str] | None, typer.Argument(metavar="[FILE|ROBOT...]", help="Experiments, whose robots; or their names.")
+    ] = None,
+    host: Hosts = None,
+    days: Days = 90.0,
+    authority_days: Annotated[float, typer.Option(min=0.01, help="For which the lab itself is valid.")] = 1826.0,
+) -> None:
+    """Found a lab: its authority, a certificate per robot, and those of router, operator, observer and helpers."""
+    from pathlib import Path  # noqa: PLC0415
+
+    from tools.authority import SERVICES, create  # noqa: PLC0415
+
+    place = Path(folder)
+    identities: dict[str, Role] = {role: role for role in SERVICES}
+    identities |= _robots(who or [], set(SERVICES))
+    known = create(place, identities, hosts=host or [], days=days, authority_days=authority_days)
+    _tell(place, known, list(known.identities))
+    typer.echo(
+        f"{place}/ca.key makes new identities: keep it here. A robot's computer needs ca.pem and its own .pem and .key,"
+        f" a router's ca.pem, lab.json and router.*\nNow: zenpark run FILE --lab {place}, or [network] lab in the file"
+    )
+
+
+@app.command()
+def issue(
+    folder: Folder,
+    names: Names,
+    role: Annotated[str, typer.Option(help="robot, operator, observer, router, ...; or by the name itself.")] = "",
+    host: Hosts = None,
+    days: Days = 90.0,
+) -> None:
+    """Make certificates for more robots, people or routers."""
+    from pathlib import Path  # noqa: PLC0415
+
+    from agents.lab import ROLES, LabError  # noqa: PLC0415
+    from agents.plugins import did_you_mean  # noqa: PLC0415
+    from tools.authority import issue as made  # noqa: PLC0415
+
+    if role and role not in ROLES:
+        raise LabError(f"no role '{role}' in a lab; {did_you_mean(role, ROLES)}")
+    roles: dict[str, Role] = {each: each for each in ROLES}
+    identities = {name: roles.get(role or name, "robot") for name in names}
+    _tell(Path(folder), made(Path(folder), identities, hosts=host or [], days=days), names)
+
+
+@app.command()
+def renew(
+    folder: Folder,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME...]", help="All, if none is named.")] = None,
+    days: Days = 90.0,
+    authority: Annotated[
+        bool, typer.Option("--authority", help="A new authority too: every file from before is refused.")
+    ] = False,
+) -> None:
+    """Make new certificates for the same names; those before are valid until they end."""
+    from pathlib import Path  # noqa: PLC0415
+
+    from tools.authority import renew as made  # noqa: PLC0415
+
+    known = made(Path(folder), names or [], days=days, authority=authority)
+    _tell(Path(folder), known, names or list(known.identities))
+
+
+@app.command()
+def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
+    """Take all rights from certificates that are lost or stolen, and make new ones."""
+    from pathlib import Path  # noqa: PLC0415
+
+    from tools.authority import revoke as made  # noqa: PLC0415
+
+    _tell(Path(folder), made(Path(folder), names, days=days), names)
+    typer.echo(
+        "The old keys have no rights from now on, at every router that reads this lab.json: one that runs notices it "
+        "in a second, elsewhere copy the file. Who was connected with them is no longer heard: give it the new files"
+    )
+
+
+@app.command()
+def show(folder: Folder, as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
+    """Show who is in a lab and until when; exit code 1 if a certificate has ended."""
+    from pathlib import Path  # noqa: PLC0415
+
+    import msgspec  # noqa: PLC0415
+
+    from agents.lab import register  # noqa: PLC0415
+
+    known = register(Path(folder))
+    if as_json:
+        typer.echo(msgspec.json.format(msgspec.json.encode(known), indent=2).decode())
+    else:
+        _tell(Path(folder), known, list(known.identities))
+    now = datetime.now(UTC)
+    raise typer.Exit(any(datetime.fromisoformat(each.until) < now for each in known.identities.values()))
+
+
+def _robots(who: list[str], taken: set[str]) -> dict[str, Role]:
+    """Robots of experiments, and those that are named themselves."""
+    from pathlib import Path  # noqa: PLC0415
+
+    from agents.lab import LabError  # noqa: PLC0415
+    from experiments import document  # noqa: PLC0415
+
+    catalogue = {name for name, _ in document.names()}
+    found: dict[str, Role] = {}
+    for each in who:
+        if each in catalogue or Path(each).suffix or Path(each).exists():
+            cases = document.read(each).cases().values()
+            found |= {robot: "robot" for case in cases for robot in case.robots}
+        else:
+            found[each] = "robot"
+    if clash := sorted(set(found) & taken):
+        raise LabError(f"{', '.join(clash)}: every lab has an identity of that name; rename the robot")
+    return found
+
+
+def _tell(folder: Path, known: Register, names: list[str]) -> None:
+    now = datetime.now(UTC)
+    width = max(map(len, names))
+    for name in names:
+        each = known.identities[name]
+        left = (datetime.fromisoformat(each.until) - now).total_seconds() / 86400.0
+        state = "ENDED" if left < 0 else f"{left:.0f} days left" + ("  renew it" if left < SOON_DAYS else "")
+        as_name = "" if each.common_name == name else f"  as {each.common_name}"
+        hosts = f"  listens at {', '.join(each.hosts)}" if each.hosts else ""
+        typer.echo(f"{name:<{width}}  {each.role:<11}  until {each.until[:16]}  {state}{as_name}{hosts}")
+    typer.echo(f"lab: {folder}")
