@@ -11,7 +11,7 @@ from agents.graph import rigid_motions, rigidity_matrix
 from agents.rows import Array, Index, Mask
 
 SINGULAR: Final = 1e-9  # relative to the largest: smaller singular values are arithmetic
-CERTAIN: Final = 1e-6  # of 1: a link that bears this share of its own load alone bears all of it
+CERTAIN: Final = 1e-12  # a link that bears all but this share of its own load alone bears all of it: shares are squares
 
 
 @dataclass(frozen=True)
