@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from experiments import document, playback
+from experiments.recording import CHUNK_BYTES
 from tests.system.lab import ROOT, typed, until
 from tests.system.machines import Machines, machines, why_not
 
@@ -113,6 +114,9 @@ def test_after_the_death_of_the_launcher_everybody_lands_and_all_is_gone_in_five
     logs = folder / "logs"
     flying = [robot for robots in ROBOTS.values() for robot in robots]
     until(lambda: all(f"{robot}: running" in said(logs, robot) for robot in flying), "all are in the experiment", 60.0)
+    recording = folder / "event.mcap"
+    begun = recording.stat().st_size
+    until(lambda: recording.stat().st_size > begun + CHUNK_BYTES, "the experiment comes to the disk", 20.0)
     os.kill(flight.pid, signal.SIGKILL)
     killed = time.monotonic()
     until(lambda: not busy(lab), "nobody is left", 10.0)
@@ -124,7 +128,7 @@ def test_after_the_death_of_the_launcher_everybody_lands_and_all_is_gone_in_five
             f"{robot}: landing (the starter is gone)",
             f"{robot}: done (the starter is gone)",
         ]
-    assert playback.read(folder / "event.mcap").complete
+    assert playback.read(recording).complete
 
 
 def said(logs: Path, robot: str) -> str:
