@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from experiments import document, playback
+from experiments.recording import CHUNK_BYTES
 from tests.system.lab import ROOT, typed, until
 from tests.system.machines import Machines, machines, why_not
 
@@ -105,6 +106,24 @@ def test_one_command_flies_the_reference_experiment_and_brings_everything_back(l
     assert re.search(r"\+20\d\.\d{3}", report)
 
 
+def test_a_centre_here_guides_robots_elsewhere_and_all_stamp_by_one_clock(lab: Machines, tmp_path: Path) -> None:
+    file, folder = experiment(lab, tmp_path, 3.0), tmp_path / "run"
+    options = ["--case", "periodic", "--set", "architecture=centralised", "--anyway", "--no-report"]
+    flight = zenpark(lab, "run", str(file), *options, "--out", str(folder))
+    out, _ = flight.communicate(timeout=100)
+    assert flight.returncode == 0, out
+    until(lambda: not busy(lab), f"nothing is left: {busy(lab)}", 5.0)
+    trace = playback.read(folder / "periodic.mcap").trace
+    assert trace.goals is not None
+    sent = np.bincount(trace.goals.robot, minlength=len(trace.robots))
+    assert (sent >= 25).all()
+    assert (trace.goals.reached >= sent - 2).all(), "none is refused, neither as old nor as of tomorrow"
+    for robot in trace.robots:
+        goals = typed(folder / "periodic.mcap", f"/{robot}/goal")
+        old = np.median([goal.stamp - goal.pose for goal in goals])  # on the centre's clock, less one on the robot's
+        assert -0.01 < old < 0.5 * OFFSET_S, robot
+
+
 def test_after_the_death_of_the_launcher_everybody_lands_and_all_is_gone_in_five_seconds(
     lab: Machines, tmp_path: Path
 ) -> None:
@@ -113,6 +132,9 @@ def test_after_the_death_of_the_launcher_everybody_lands_and_all_is_gone_in_five
     logs = folder / "logs"
     flying = [robot for robots in ROBOTS.values() for robot in robots]
     until(lambda: all(f"{robot}: running" in said(logs, robot) for robot in flying), "all are in the experiment", 60.0)
+    recording = folder / "event.mcap"
+    begun = recording.stat().st_size
+    until(lambda: recording.stat().st_size > begun + CHUNK_BYTES, "the experiment comes to the disk", 20.0)
     os.kill(flight.pid, signal.SIGKILL)
     killed = time.monotonic()
     until(lambda: not busy(lab), "nobody is left", 10.0)
@@ -124,7 +146,7 @@ def test_after_the_death_of_the_launcher_everybody_lands_and_all_is_gone_in_five
             f"{robot}: landing (the starter is gone)",
             f"{robot}: done (the starter is gone)",
         ]
-    assert playback.read(folder / "event.mcap").complete
+    assert playback.read(recording).complete
 
 
 def said(logs: Path, robot: str) -> str:
