@@ -17,8 +17,8 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
     heard = wire.Heard("KH02", seq, now, now, place, rest)
     status = wire.Status(
         robot=robot, stamp=now, phase="running", reason="", body="", battery=0.5, sent=seq, heard=2, lost={"KH01": 1},
-        malformed=0, refused=0, ticks=5, missed=1, decisions=2, interventions=0, avoided=0, late_s=0.001,
-        started=now - 1.0, missing=["KH02"], pid=1, cpu_s=0.1, rss_mb=60.0,
+        dropped={"KH01": 1}, malformed=0, refused=0, ticks=5, missed=1, decisions=2, interventions=0, avoided=0,
+        late_s=0.001, started=now - 1.0, missing=["KH02"], pid=1, cpu_s=0.1, rss_mb=60.0,
     )  # fmt: skip
     commands = [
         wire.Command(robot, seq + 10, now, "drive", (0.1, 0.2, 0.0, 0.0)),
@@ -43,7 +43,7 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
             wire.Order("stop"), wire.Order("get", name="clamp"), wire.Order("set", name="clamp", value=0.2),
             wire.Order("set", name="trigger.period_s", value=0.05),
         ],
-        "goal": [wire.Position(robot, now, place, 0.1)],
+        "goal": [wire.Goal(robot, seq, now, place, 0.1, now), wire.Goal(robot, seq + 1, now, place, None, now)],
     }  # fmt: skip
 
 
@@ -51,7 +51,7 @@ def of_all() -> dict[str, list[object]]:
     """By key what is nobody's."""
     now = time.time()
     world = wire.WorldState(
-        now, "pymunk", 1.0, 1.0, 0.1, False, ["KH01"], ["CF01"], {"box": (0.1, 0.2, 0.3)}, 1, 0, 0, ""
+        now, "pymunk", 1.0, 1.0, 0.1, False, ["KH01"], ["CF01"], [wire.Standing("box", (0.1, 0.2, 0.3))], 1, 0, 0, ""
     )  # fmt: skip
     orders = [
         wire.WorldOrder("pause"), wire.WorldOrder("resume"), wire.WorldOrder("step", steps=3),
