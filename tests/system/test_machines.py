@@ -99,8 +99,9 @@ def test_one_command_flies_the_reference_experiment_and_brings_everything_back(l
         poses = typed(folder / "periodic.mcap", f"/{robot}/pose")
         under_way[robot] = min(pose.received - pose.stamp for pose in poses)
     assert np.ptp(list(begun.values())) < 1e-5
-    assert np.ptp(list(under_way.values())) < 5e-3
-    assert 0.0 < min(under_way.values()) < 5e-3
+    doubt = max(lie.uncertainty for lie in lies.values())  # of a busy machine: how well its clocks could be compared
+    assert np.ptp(list(under_way.values())) < 5e-3 + doubt
+    assert -doubt < min(under_way.values()) < 5e-3 + doubt
     report = (folder / "report.html").read_text()
     assert "Clocks of other machines" in report
     assert re.search(r"\+20\d\.\d{3}", report)

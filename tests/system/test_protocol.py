@@ -77,7 +77,8 @@ def heard_of(folder: Path) -> dict[str, object]:
         poses = [message for *_, message in reader.iter_decoded_messages([t for t in topics if t.endswith("/pose")])]
     trace = playback.read(folder / "periodic.mcap").trace
     rates = np.bincount(trace.sent.robot, minlength=3) / trace.time[-1]
-    return {"topics": topics, "fields": {tuple(pose.__slots__) for pose in poses}, "rates": rates.round(0).tolist()}
+    assert rates == pytest.approx([50.0] * 3, abs=2.5), "a busy machine makes a robot miss some"
+    return {"topics": topics, "fields": {tuple(pose.__slots__) for pose in poses}}
 
 
 def test_a_swap_is_one_word_and_neighbours_hear_no_difference(tmp_path: Path) -> None:
