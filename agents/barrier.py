@@ -14,6 +14,7 @@ SECTORS: Final = 8  # of what surrounds a robot; the tightest half-plane of each
 SLACK: Final = 1e-9  # [m/s] violations smaller than this are arithmetic
 PARALLEL: Final = 1e-9  # sine of the angle below which two half-planes have no corner
 SKEW: Final = 0.2  # a robot on wheels hardly flees along a heading this far (its cosine) from broadside
+LEAST: Final = 1e-100  # to divide by: beyond any speed, and still a number
 
 
 class Barrier(Avoidance, frozen=True):
@@ -164,7 +165,7 @@ class Barrier(Avoidance, frozen=True):
         # where standing still is allowed the limit is exact; where it is not, a robot that stands broadside to what it
         # should flee from must not be driven at full speed for next to nothing
         stands = bound >= 0.0
-        safe = np.where(gain == 0.0, 1.0, gain)
+        safe = np.copysign(np.maximum(np.abs(gain), LEAST), gain)
         limit = np.where(stands, bound / safe, bound * gain / (gain**2 + SKEW**2))
         high, low = np.full(len(own.yaw), np.inf), np.full(len(own.yaw), -np.inf)
         ahead, behind = gain > 0.0, gain < 0.0
