@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from tools.options import As, AsJson, Connect, Lab, routers
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -27,19 +29,16 @@ SOON_DAYS: Final = 14.0
 @app.callback(invoke_without_command=True)
 def _keys(
     context: typer.Context,
-    connect: Annotated[
-        list[str] | None, typer.Option(metavar="ENDPOINT", help="A router; may be repeated. [tcp/127.0.0.1:7447]")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
-    lab: Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab.")] = None,
-    identity: Annotated[str, typer.Option("--as", metavar="NAME", help="Whose certificate.")] = "observer",
+    connect: Connect = None,
+    as_json: AsJson = False,
+    lab: Lab = None,
+    identity: As = "observer",
 ) -> None:
     """Show who is on the network and which keys they hold; make certificates (init, issue, renew, revoke, show)."""
     if context.invoked_subcommand is None:
-        from agents.lab import secured  # noqa: PLC0415
         from tools.network import keys as show_keys  # noqa: PLC0415
 
-        show_keys(secured(connect or [], lab), as_json=as_json, identity=identity)
+        show_keys(routers(connect, lab), as_json=as_json, identity=identity)
 
 
 @app.command()

@@ -1,0 +1,246 @@
+"""Commands that run experiments, and those that deal with their files and results."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+import typer
+
+from tools.options import Anyway, AsJson, Cases, File, Lab, OpenReport, Settings
+
+app: Final = typer.Typer()
+
+
+@app.command()
+def run(
+    file: File,
+    *,
+    virtual: Annotated[
+        bool, typer.Option("--virtual", help="In virtual time, in this process, as fast as it goes.")
+    ] = False,
+    case: Cases = None,
+    out: Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all randomness, instead of the file's.")] = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs so many seeds: mean and spread (virtual only).")] = 1,
+    bodies: Annotated[
+        str | None,
+        typer.Option(
+            metavar="twin|world|protocol",
+            help="Every robot in a twin of its own, in one world, or behind a protocol twin (real time).",
+        ),
+    ] = None,
+    here: Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")] = False,
+    anyway: Anyway = False,
+    report: Annotated[bool, typer.Option(help="Writes the report.")] = True,
+    open_report: OpenReport = False,
+    lab: Lab = None,
+) -> None:
+    """Run an experiment: one process per robot, or in virtual time."""
+    from experiments.commands import run as command  # noqa: PLC0415
+
+    raise typer.Exit(
+        command(
+            file,
+            virtual=virtual,
+            cases=case or [],
+            out=out,
+            seed=seed,
+            settings=settings or [],
+            as_json=as_json,
+            seeds=seeds,
+            bodies=bodies,
+            here=here,
+            anyway=anyway,
+            report=report,
+            open_report=open_report,
+            lab=lab,
+        )
+    )
+
+
+@app.command()
+def sweep(
+    file: File,
+    given: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[PATH=VALUES...]",
+            help="What changes: trigger.threshold=0.002:0.05:log12, or lin12, or a list 1,2,3; several make a grid. "
+            "seeds=50 or seeds=101:150 [20 from the file's on]; tuning=1001:1060 for --optimize.",
+        ),
+    ] = None,
+    *,
+    case: Cases = None,
+    settings: Settings = None,
+    optimize: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WISH",
+            help="Seeks values in the ranges instead: 'messages, iae<=1.01' (relative to the first case).",
+        ),
+    ] = None,
+    out: Annotated[str | None, typer.Option(metavar="FOLDER", help="Where runs and table are kept. [runs/...]")] = None,
+    processes: Annotated[int | None, typer.Option(min=1, help="How many at once. [one per core]")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="On the workers of this dask scheduler, tcp://HOST:PORT.")
+    ] = None,
+    as_json: AsJson = False,
+    anyway: Anyway = False,
+    report: Annotated[bool, typer.Option(help="Writes the page and the figure.")] = True,
+    open_report: OpenReport = False,
+) -> None:
+    """Run cases x values x seeds in virtual time on all cores; what is done is never run again."""
+    from experiments.sweep_command import Request  # noqa: PLC0415
+    from experiments.sweep_command import command as run_sweep  # noqa: PLC0415
+
+    raise typer.Exit(
+        run_sweep(
+            Request(
+                file=file,
+                given=given or [],
+                settings=settings or [],
+                cases=case or [],
+                out=out,
+                scheduler=scheduler,
+                processes=processes,
+                optimize=optimize,
+                as_json=as_json,
+                anyway=anyway,
+                report=report,
+                open_report=open_report,
+            )
+        )
+    )
+
+
+@app.command()
+def check(file: File, settings: Settings = None, as_json: AsJson = False) -> None:
+    """Check an experiment file and say what theory says of it."""
+    from experiments.check import command  # noqa: PLC0415
+
+    raise typer.Exit(command(file, settings=settings or [], as_json=as_json))
+
+
+@app.command()
+def report(
+    runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs.")],
+    out: Annotated[str | None, typer.Option(metavar="FILE", help="Where the report goes. [the run's folder]")] = None,
+) -> None:
+    """Write the report of one run, or compare several."""
+    from experiments.commands import report as command  # noqa: PLC0415
+
+    raise typer.Exit(command(runs, out=out))
+
+
+@app.command()
+def export(
+    folder: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    target: Annotated[
+        str | None, typer.Argument(metavar="FILE", help="FILE.mat or FILE.csv. [run.mat in the run's folder]")
+    ] = None,
+    as_csv: Annotated[bool, typer.Option("--csv", help="A table of trajectories: case, time, robot, x, ...")] = False,
+) -> None:
+    """Write a run for MATLAB, or its trajectories as one table."""
+    from experiments.export import command  # noqa: PLC0415
+
+    raise typer.Exit(command(folder, target, as_csv=as_csv))
+
+
+@app.command()
+def recover(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording that was cut off.")],
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Where the whole one goes.")] = None,
+) -> None:
+    """Repair a recording whose writer was killed."""
+    from experiments.recover import recover_command  # noqa: PLC0415
+
+    raise typer.Exit(recover_command(file, target))
+
+
+@app.command()
+def new(
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="NAME", help="A ready-made experiment (`zenpark list`); TARGET behind a formation."),
+    ] = None,
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
+    *,
+    polygon: Annotated[int | None, typer.Option(metavar="N", help="Robots on a regular polygon.")] = None,
+    grid: Annotated[str | None, typer.Option(metavar="RxC", help="Robots on a grid, such as 5x8.")] = None,
+    hemisphere: Annotated[int | None, typer.Option(metavar="N", help="On a hemisphere, with Delaunay links.")] = None,
+    henneberg: Annotated[int | None, typer.Option(metavar="N", help="Minimally rigid: 2N - 3 links.")] = None,
+    circulant: Annotated[int | None, typer.Option(metavar="N", help="On a circle, linked by --jumps.")] = None,
+    jumps: Annotated[str, typer.Option(metavar="J,J", help="Of a circulant: i hears i ± J.")] = "1,2",
+    kind: Annotated[str, typer.Option(metavar="KIND", help="Of the robots of a formation.")] = "crazyflie",
+    spacing: Annotated[float, typer.Option(min=0.01, help="Between neighbours [m].")] = 0.6,
+    scatter: Annotated[
+        float | None, typer.Option(min=0.0, help="Starts are drawn this far around, by seed [m]. [0.3 spacing]")
+    ] = None,
+    law: Annotated[str, typer.Option(metavar="distance|displacement", help="Of a formation.")] = "distance",
+    seed: Annotated[int, typer.Option(min=0, help="Of the file.")] = 1,
+    duration: Annotated[float, typer.Option(min=1.0, help="[s]")] = 60.0,
+) -> None:
+    """Begin an experiment file from a ready-made one, or with a formation of any size."""
+    asked = {"polygon": polygon, "grid": grid, "hemisphere": hemisphere, "henneberg": henneberg, "circulant": circulant}
+    formations = [(what, str(size)) for what, size in asked.items() if size is not None]
+    if not formations:
+        if name is None:
+            raise typer.BadParameter("give a NAME (`zenpark list`), or a formation such as --hemisphere 40")
+        from experiments.commands import new as copied  # noqa: PLC0415
+
+        raise typer.Exit(copied(name, target))
+    if len(formations) > 1 or target is not None:
+        what = f"--{formations[1][0]}" if len(formations) > 1 else f"'{target}'"
+        raise typer.BadParameter(f"{what} is too much behind --{formations[0][0]}: one formation, one TARGET")
+    from experiments.generate import Wanted, command  # noqa: PLC0415
+
+    wanted = Wanted(kind=kind, spacing=spacing, scatter=scatter, seed=seed, duration_s=duration, law=law)
+    raise typer.Exit(command(*formations[0], name, wanted, jumps))
+
+
+@app.command(name="import")
+def import_(
+    file: Annotated[str, typer.Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
+    duration: Annotated[float, typer.Option(min=1.0, help="Their files do not say how long [s].")] = 60.0,
+) -> None:
+    """Turn an experiment file of Robotic Park's authors into one of zenpark."""
+    from experiments.importing import command  # noqa: PLC0415
+
+    raise typer.Exit(command(file, target, duration))
+
+
+@app.command(name="list")
+def list_() -> None:
+    """List the ready-made experiments and the plugins."""
+    from experiments.commands import list_all  # noqa: PLC0415
+
+    raise typer.Exit(list_all())
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of the experiment file."""
+    import json  # noqa: PLC0415
+
+    from experiments.schema import schema as made  # noqa: PLC0415
+
+    typer.echo(json.dumps(made(), indent=2))
+
+
+@app.command()
+def bench(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME...]", help="start, codec, virtual, process, world, encounters, safety or intruders."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what this machine can do, each figure beside a baseline."""
+    from tools.bench import command  # noqa: PLC0415
+
+    raise typer.Exit(command(names or [], as_json=as_json))
