@@ -9,6 +9,7 @@ message, so that a put on `park/**` would slip through beside a rule that denies
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import reduce
 from typing import Any, Final, Literal
 
 import msgspec
@@ -20,6 +21,10 @@ Flow = Literal["ingress", "egress"]
 MOST_BYTES: Final = 64 * 1024  # of a message below a robot's name; what readers refuse need not travel
 ADMIN: Final = "@/**"  # Zenoh's own keys: who is connected to a router
 OWN_ADMIN: Final = "@/*/client/**"
+PASSED: Final = (
+    "put", "query", "reply", "declare_subscriber", "declare_queryable",
+    "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
+)  # fmt: skip
 
 
 class Grant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -122,9 +127,12 @@ def rules(rights: Rights, register: Register) -> dict[str, Any]:
                 raise LabError(
                     f"'{name}' is a robot of the experiment and {identity.role} of the lab: rename the robot"
                 )
-        if grant is None:
+        if identity.role == "router":
+            own = list(_passed(name, rights))
+        elif grant is None:
             continue
-        own = list(_rules(name, grant, rights.realm))
+        else:
+            own = list(_rules(name, grant, rights.realm))
         made += own
         subjects.append({"id": name, "cert_common_names": [identity.common_name]})
         policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
@@ -155,6 +163,21 @@ def _rules(name: str, grant: Grant, realm: str) -> Iterator[dict[str, Any]]:
             "messages": messages,
             "key_exprs": list(same),
         }
+
+
+def _passed(name: str, rights: Rights) -> Iterator[dict[str, Any]]:
+    """The rules of a router that is linked with another: what either has let in passes, on keys of somebody's right."""
+    anybody = reduce(Grant.joined, (*rights.robots.values(), *rights.roles.values()), Grant())
+    granted = {key for verb in Grant.__struct_fields__ for key in getattr(anybody, verb)}
+    foreign = sorted(key for key in granted if not key.startswith((f"{rights.realm}/", "@/**")))
+    keys = [f"{rights.realm}/**", *foreign]
+    yield {
+        "id": f"{name}-linked",
+        "permission": "allow",
+        "flows": ["ingress", "egress"],
+        "messages": list(PASSED),
+        "key_exprs": [*keys, *_kept(keys), ADMIN],
+    }
 
 
 def sizes(rights: Rights) -> list[dict[str, Any]]:

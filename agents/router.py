@@ -27,7 +27,12 @@ REVOKED_S: Final = 0.5  # how often it looks whether somebody's certificate has 
 
 
 def serve(
-    endpoints: Sequence[str], *, lifeline: bool = False, linger_s: float = 0.0, rights: Rights | None = None
+    endpoints: Sequence[str],
+    *,
+    link: Sequence[str] = (),
+    lifeline: bool = False,
+    linger_s: float = 0.0,
+    rights: Rights | None = None,
 ) -> int:
     """Runs a router until SIGINT, SIGTERM or the loss of its lifeline; returns the exit code of the process.
 
@@ -35,6 +40,7 @@ def serve(
 
     Args:
         endpoints: Where to listen: on loopback, or anywhere with a lab.
+        link: Other routers: who is there is seen here, and the other way round.
         lifeline: Whether standard input is a lifeline.
         linger_s: How long it stays after its lifeline was lost, so that landing robots can still be seen [s]; less when
             nobody is connected any more.
@@ -70,7 +76,7 @@ def serve(
             threading.Thread(target=leave, args=(open_now,), name="linger", daemon=True).start()
 
     with told_to_end(stop.set):
-        serve_router(endpoints, stop, ready=ready, rights=rights)
+        serve_router(endpoints, stop, link=link, ready=ready, rights=rights)
     if rope.reason is not None:
         print(f"router: {rope.reason}", file=sys.stderr)
     return 0
@@ -79,6 +85,8 @@ def serve(
 def serve_router(
     endpoints: Sequence[str],
     stop: threading.Event,
+    *,
+    link: Sequence[str] = (),
     ready: Callable[[zenoh.Session], None] = lambda _: None,
     rights: Rights | None = None,
 ) -> None:
@@ -90,6 +98,7 @@ def serve_router(
     Args:
         endpoints: Where it listens.
         stop: Ends it.
+        link: Other routers, sought until they answer.
         ready: Gets the router as soon as clients can connect, and again when it has begun anew.
         rights: Who may do what, in a lab.
 
@@ -100,7 +109,7 @@ def serve_router(
     register = _register(endpoints)
     patience_s = 0.0
     seen = _stamp(register)  # before it is read: what changes in between is seen then
-    settings = config("router", listen=endpoints, name="router", rights=rights)
+    settings = config("router", listen=endpoints, connect=link, name="router", rights=rights)
     while True:
         with _routing(settings, endpoints, patience_s, stop) as session:
             ready(session)
@@ -110,7 +119,7 @@ def serve_router(
                     continue
                 seen = now
                 try:
-                    settings = config("router", listen=endpoints, name="router", rights=rights)
+                    settings = config("router", listen=endpoints, connect=link, name="router", rights=rights)
                 except EndpointError as error:  # what stood there before still holds
                     print(f"router: {error}", file=sys.stderr, flush=True)
                     continue
@@ -152,6 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the router process."""
     parser = argparse.ArgumentParser(prog="zenpark router", description="A Zenoh router on this machine.")
     parser.add_argument("--listen", action="append", metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="another router")
     parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent for 3 s")
     parser.add_argument("--linger", type=float, default=0.0, metavar="SECONDS", help="and then stay for so long")
     parser.add_argument("--rights", type=Path, metavar="FILE", help="who may do what, in a lab")
@@ -159,7 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         rights = None if chosen.rights is None else msgspec.json.decode(chosen.rights.read_bytes(), type=Rights)
         listen = chosen.listen or [DEFAULT_ENDPOINT]
-        return serve(listen, lifeline=chosen.lifeline, linger_s=chosen.linger, rights=rights)
+        return serve(listen, link=chosen.connect, lifeline=chosen.lifeline, linger_s=chosen.linger, rights=rights)
     except (EndpointError, OSError, msgspec.MsgspecError) as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2

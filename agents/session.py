@@ -84,7 +84,8 @@ def config(
 
     Args:
         mode: Robots are clients: a router forwards between clients, but not between two peers.
-        connect: Endpoints of the routers; a client uses the first that answers and fails over to the others.
+        connect: Endpoints of the routers; a client uses the first that answers and fails over to the others, and a
+            router is linked with every one.
         listen: Loopback endpoints to listen on; a client needs none.
         name: Shown by `zenpark keys`.
         lease_s: After this silence [s] the others hold this session for dead. A killed process is noticed at once.
@@ -111,8 +112,11 @@ def config(
     settings: dict[str, object] = {
         "mode": mode,
         "connect/endpoints": list(connect),
-        # An open that waits inside Zenoh does not hear Ctrl-C: fail at once and try again in Python.
-        "connect/timeout_ms": 0,
+        # A client's open that waits inside Zenoh does not hear Ctrl-C: fail at once and try again in Python. Others
+        # open without waiting, and seek whom they miss for as long as they live.
+        "connect/timeout_ms": 0 if mode == "client" else -1,
+        "connect/exit_on_failure": mode == "client",
+        "open/return_conditions/connect_scouted": mode == "client",
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
         "listen/endpoints": list(listen),
         "scouting/multicast/enabled": False,
@@ -240,14 +244,22 @@ def free_endpoint(preferred_port: int = DEFAULT_PORT, protocol: str = "tcp") -> 
     raise EndpointError("no free TCP port on 127.0.0.1: end some of the processes that listen there")
 
 
+def free_endpoints(count: int, protocol: str = "tcp") -> list[str]:
+    """So many different ones, of the usual port and those after it where they are free."""
+    made: dict[str, None] = {}
+    while len(made) < count:
+        made[free_endpoint(DEFAULT_PORT + len(made), protocol)] = None
+    return list(made)
+
+
 def connected(session: zenoh.Session) -> bool:
     """Whether the session has a router now. Costs 0.6 µs: poll it in the control loop."""
     return bool(session.info.routers_zid())
 
 
 def deserted(session: zenoh.Session) -> bool:
-    """Whether nobody is connected to a router."""
-    return not session.info.transports()
+    """Whether nobody but other routers is connected to a router."""
+    return all(transport.whatami == zenoh.WhatAmI.ROUTER for transport in session.info.transports())
 
 
 def pose_publisher(session: zenoh.Session, key: str, mime: str) -> AdvancedPublisher:

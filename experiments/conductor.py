@@ -33,6 +33,7 @@ FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as sil
 GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
 
 ADOPT_S: Final = 0.5
+MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
 AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead,
 BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behind
 LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
@@ -57,6 +58,7 @@ class Seen:
         sent: Poses that it sent, and `rate` of them over the last second [1/s].
         alive: Whether its liveliness token stands.
         gone: Whether its process has ended or its token has vanished in mid-run.
+        vanished: Since when the token of one that is adopted is missing [s, monotonic].
         behind: The least time from a stamp of it to its arrival [s]: small, if its clock is right.
     """
 
@@ -67,6 +69,7 @@ class Seen:
     gone: bool = False
     counted: tuple[float, int] = (0.0, 0)
     behind: float = float("inf")
+    vanished: float = float("inf")
 
     @property
     def phase(self) -> str:
@@ -322,9 +325,8 @@ class Conductor:
         )
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
         if self._endpoints != [network.DEFAULT_ENDPOINT]:
-            there = self._endpoints[0]
-            look = f"zenpark keys {lab.options(there)}"
-            self._say("router", "conductor", f"{lab.bare([there])[0]}: look with `{look}`")
+            look = f"zenpark keys {lab.options(*self._endpoints)}"
+            self._say("router", "conductor", f"{', '.join(lab.bare(self._endpoints))}: look with `{look}`")
         self._clock = network.publisher(self._session, keys.clock, wire.JSON)
         self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
         self._told.put(machines.document(self._experiment))
@@ -334,6 +336,7 @@ class Conductor:
         self._watch = network.alive_watch(self._session, keys.alive("*"))
         self._recorder_watch = network.alive_watch(self._session, keys.recorder)
         self._recording_begun = False
+        self._cut_off = float("-inf")
 
     def _look(self) -> None:
         """Takes in what has happened since the last look."""
@@ -349,7 +352,8 @@ class Conductor:
             name = self._keys.whose(str(sample.key_expr))
             if name is not None and (seen := self._robots.get(name)) is not None:
                 seen.alive = sample.kind == zenoh.SampleKind.PUT
-                self._miss(name, seen)
+                seen.vanished = float("inf") if seen.alive else time.monotonic()
+        self._miss()
         for death in self._crew.deaths():
             self._say(death.kind, death.source, death.text)
             if death.kind == "recorder":
@@ -385,11 +389,19 @@ class Conductor:
         seen.status = status
         seen.behind = min(seen.behind, time.time() - status.stamp)
 
-    def _miss(self, name: str, seen: Seen) -> None:
-        """The token of an adopted robot has vanished: all that is known of its end. Without a router all vanish."""
-        if name in self._crew.adopted and not seen.alive and network.connected(self._session):
-            seen.gone = True
-            self._say("lost", name, "is not on the network any more")
+    def _miss(self) -> None:
+        """The tokens of adopted robots that have vanished are all that is known of their end.
+
+        Without a router all vanish, and come back one by one where there is another.
+        """
+        now = time.monotonic()
+        if not network.connected(self._session):
+            self._cut_off = now
+        for name in self._crew.adopted:
+            seen = self._robots[name]
+            if not seen.gone and now - max(seen.vanished, self._cut_off) > MISSED_S:
+                seen.gone = True
+                self._say("lost", name, "is not on the network any more")
 
     def _order(self, order: wire.Order, only: str | None = None) -> None:
         """Gives an order to every robot that is left; what is refused is said."""

@@ -273,9 +273,17 @@ class Network(Part, frozen=True):
         list[str] | None,
         Meta(
             description="endpoints of the router that is started; left out: on loopback, and hosts reach it through "
-            "their ssh connection"
+            "their ssh connection; of several routers, each has one in turn"
         ),
     ] = None
+    routers: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=8,
+            description="how many are started, each in a process of its own; who loses one goes on at the next",
+        ),
+    ] = 1
     address: Annotated[
         str | None,
         Meta(description="name of this machine for hosts, where `listen` is given; left out: as ssh came from there"),

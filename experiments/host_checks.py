@@ -76,6 +76,13 @@ def _network(experiment: Experiment) -> Iterator[Fault]:
             except ValueError as error:
                 message, _, hint = str(error).partition("; ")
                 yield Fault(("network", name, number), message, hint)
+    if network.routers > 1 and network.connect is not None:
+        message = "`routers` says how many zenpark starts, and with `connect` it starts none"
+        hint = "leave routers out; link the routers that you start: zenpark router --connect OTHER"
+        yield Fault(("network", "routers"), message, hint, on_key=True)
+    if network.listen and len(network.listen) % network.routers:
+        message = f"{network.routers} routers cannot share {len(network.listen)} endpoints"
+        yield Fault(("network", "routers"), message, "give each an endpoint of its own in listen, or leave listen out")
     if network.address is not None and network.listen is None:
         message = "`address` says where hosts find what `listen` listens on, and that is not given"
         hint = 'add listen = ["tls/0.0.0.0:7447"], or leave address out: hosts then use their ssh connection'

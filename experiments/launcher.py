@@ -23,7 +23,7 @@ from typing import Final, Self
 
 from agents.lifeline import BEAT_S
 
-ROUTER: Final = "router"
+ROUTER: Final = "router"  # the first; others are router2, router3, ...
 LAND_S: Final = 15.0  # what robots may take to come down after their lifeline was cut
 TAIL: Final = 12  # lines of a dead process's output that are worth showing
 
@@ -70,6 +70,11 @@ class Process:
         return "\n".join(lines[-TAIL:])
 
 
+def is_router(process: str) -> bool:
+    """Whether a process of this name is a router."""
+    return process.removeprefix(ROUTER).isdecimal() if process != ROUTER else True
+
+
 class Launcher:
     """Processes of one run; a context manager that leaves none behind."""
 
@@ -89,8 +94,8 @@ class Launcher:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.end([name for name in self._processes if name != ROUTER], grace_s=LAND_S)
-        self.end([ROUTER], grace_s=0.0)  # everybody is down: nobody needs it any more
+        self.end([name for name in self._processes if not is_router(name)], grace_s=LAND_S)
+        self.end(list(self._processes), grace_s=0.0)  # everybody is down: nobody needs a router any more
         self._over.set()
         self._beat.join()
 

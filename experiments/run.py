@@ -30,7 +30,7 @@ from agents.access import rules
 from agents.endpoint import Endpoint
 from agents.lab import of as lab_of
 from agents.lab import register, require
-from agents.session import free_endpoint
+from agents.session import free_endpoints
 from experiments import access, document, metrics, playback, reach, results, virtual
 from experiments.conductor import Conductor, Result
 from experiments.document import Document
@@ -41,7 +41,7 @@ from experiments.logbook import Logbook
 from experiments.measured import CaseMetrics
 from experiments.problem import DocumentError, Problem
 from experiments.progress import Shown
-from experiments.servants import start_router
+from experiments.servants import divided, from_here
 from experiments.standins import choose_bodies
 from experiments.trace import Trace
 
@@ -209,13 +209,15 @@ def fly(
     if secure and read.experiment.hosts and not local:
         hint = "leave the lab out (what goes to hosts goes through ssh), or add --here"
         raise DocumentError([Problem(read.path.name, 0, 0, "hosts have no certificates of a lab", hint)])
-    own = read.experiment.network.listen or [free_endpoint(protocol="tls" if secure else "tcp")]
+    own = read.experiment.network.listen or free_endpoints(
+        read.experiment.network.routers, protocol="tls" if secure else "tcp"
+    )
     listening = reach.routers(read.experiment, read.path, own if own_router else [], lab)
-    endpoints = [str(here(Endpoint.parse(router))) for router in listening] if own_router else listening
+    endpoints = [str(from_here(Endpoint.parse(router))) for router in listening] if own_router else listening
     rights = _rights(embodied, endpoints, folder)
     with Launcher(folder / "logs") as launcher:
-        if own_router:
-            start_router(launcher, listening, rights)
+        for router in divided(listening, read.experiment.network.routers) if own_router else ():
+            router.start(launcher, rights)
         hosts = Hosts(launcher, listening)
         with show:
             for name, experiment in embodied.items():
@@ -242,11 +244,6 @@ def fly(
     notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
     begun = {case: result.recording for case, result in results.items() if result.start is not None}
     return _read_back(folder, begun, notes)
-
-
-def here(router: Endpoint) -> Endpoint:
-    """How this machine reaches a router that listens at an endpoint of it."""
-    return router.at("127.0.0.1") if router.is_wildcard else router
 
 
 def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: Path) -> Path | None:

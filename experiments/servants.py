@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
+from agents.endpoint import Endpoint
 from experiments import standins
 from experiments.assign import guided
 from experiments.experiment import Experiment
-from experiments.launcher import ROUTER, Launcher, Process
+from experiments.launcher import ROUTER, Launcher, Process, is_router
 
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 STARTS: Final = 4  # who dies more often is not helped by starting it again
@@ -47,16 +49,21 @@ class Servants:
             case: Its name.
             file: The same as a file.
             endpoints: Routers as this machine reaches them.
-            routers: Where a router of our own listens, which other machines must find again.
+            routers: Where routers of our own listen, which other machines must find again.
             rights: Who may do what, in a lab; None without one.
             launcher: Starts them.
         """
         connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
         self._centre = f"{case}-centre" if guided(experiment) else None
+        several = experiment.network.routers > 1
         self._known = {
-            ROUTER: _Servant(
-                lambda: start_router(launcher, routers, rights), "", ": the robots hold, and land at the end"
-            ),
+            each.name: _Servant(
+                partial(each.start, launcher, rights),
+                ": all go on at another meanwhile" if several else "",
+                ": no other takes its place" if several else ": the robots hold, and land at the end",
+            )
+            for each in divided(routers, experiment.network.routers)
+        } | {
             standins.world_name(case): _Servant(
                 lambda: standins.start_world(experiment, file, prefix=case, launcher=launcher, connect=connect)
             ),
@@ -86,12 +93,46 @@ class Servants:
             servant.starts += 1
             servant.start()
         what = f"started again{servant.meanwhile}" if more else f"given up{servant.given_up}"
-        last = process.tail().strip().splitlines()[-1:] if kind != ROUTER else []
+        last = [] if is_router(process.name) else process.tail().strip().splitlines()[-1:]
         return kind, f"the {kind} ended ({process.exit}); {what}" + "".join(f": {line}" for line in last)
 
 
+@dataclass(frozen=True)
+class Router:
+    """A router of our own.
+
+    Attributes:
+        name: Of its process.
+        listen: Where it listens.
+        link: The routers before it, which it seeks for as long as it lives, so that any two are linked once.
+    """
+
+    name: str
+    listen: Sequence[str]
+    link: Sequence[str] = ()
+
+    def start(self, launcher: Launcher, rights: Path | None = None) -> None:
+        """Starts it; it outlives a killed launcher by as long as robots take to land. In a lab it enforces `rights`."""
+        listen = [part for endpoint in self.listen for part in ("--listen", endpoint)]
+        link = [part for endpoint in self.link for part in ("--connect", endpoint)]
+        enforced = [] if rights is None else ["--rights", str(rights)]
+        launcher.start(self.name, "agents.router", *listen, *link, *enforced, "--lifeline", "--linger", str(LINGER_S))
+
+
 def start_router(launcher: Launcher, endpoints: Sequence[str], rights: Path | None = None) -> None:
-    """A router of our own, which outlives a killed launcher by as long as robots take to land; with a lab, `rights`."""
-    listen = [part for endpoint in endpoints for part in ("--listen", endpoint)]
-    enforced = [] if rights is None else ["--rights", str(rights)]
-    launcher.start(ROUTER, "agents.router", *listen, *enforced, "--lifeline", "--linger", str(LINGER_S))
+    """Starts one router, which listens at all of these."""
+    Router(ROUTER, endpoints).start(launcher, rights)
+
+
+def divided(endpoints: Sequence[str], count: int) -> list[Router]:
+    """So many routers, with these endpoints in turn."""
+    made: list[Router] = []
+    for number in range(count):
+        link = [str(from_here(Endpoint.parse(before.listen[0]))) for before in made]
+        made.append(Router(f"{ROUTER}{number + 1}" if number else ROUTER, list(endpoints[number::count]), link))
+    return made
+
+
+def from_here(router: Endpoint) -> Endpoint:
+    """How this machine reaches a router that listens at an endpoint of it."""
+    return router.at("127.0.0.1") if router.is_wildcard else router

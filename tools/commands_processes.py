@@ -62,9 +62,13 @@ def router(
     file: Annotated[
         str | None, typer.Argument(metavar="[FILE]", help="The experiment whose rights it enforces, in a lab.")
     ] = None,
+    *,
     listen: Annotated[
         list[str] | None,
         typer.Option(metavar="ENDPOINT", help="Without a lab on loopback; may be repeated. [tcp/127.0.0.1:7447]"),
+    ] = None,
+    connect: Annotated[
+        list[str] | None, typer.Option(metavar="ENDPOINT", help="Another router to be linked with; may be repeated.")
     ] = None,
     lifeline: Annotated[
         bool, typer.Option("--lifeline", help="End when standard input ends or is silent for 3 s.")
@@ -77,7 +81,7 @@ def router(
     """Run the Zenoh router that the robots meet at."""
     from tools.router import command  # noqa: PLC0415
 
-    raise typer.Exit(command(file, listen=listen or [], lifeline=lifeline, lab=lab, bodies=bodies))
+    raise typer.Exit(command(file, listen=listen or [], link=connect or [], lifeline=lifeline, lab=lab, bodies=bodies))
 
 
 @app.command()

@@ -15,6 +15,7 @@ def command(
     file: str | None,
     *,
     listen: Sequence[str],
+    link: Sequence[str] = (),
     lifeline: bool = False,
     lab: str | None = None,
     bodies: str | None = None,
@@ -24,6 +25,7 @@ def command(
     Args:
         file: The experiment, in a lab: who may say and hear what follows from it.
         listen: Endpoints.
+        link: Other routers, with which it is linked.
         lifeline: Whether standard input is a lifeline.
         lab: Folder of certificates, instead of that of the file.
         bodies: What every robot is put into, as in `zenpark run --bodies`.
@@ -36,11 +38,12 @@ def command(
     if file is None:
         if lab is not None:
             raise LabError(f"name the experiment too, from which the rights follow: zenpark router FILE --lab {lab}")
-        return serve(listen or [DEFAULT_ENDPOINT], lifeline=lifeline)
+        return serve(listen or [DEFAULT_ENDPOINT], link=link, lifeline=lifeline)
     rights, folder = _rights(file, lab, bodies)
     if folder is None:
-        return serve(listen or [DEFAULT_ENDPOINT], lifeline=lifeline)
-    return serve(secured(listen, folder), lifeline=lifeline, rights=rights)
+        return serve(listen or [DEFAULT_ENDPOINT], link=link, lifeline=lifeline)
+    linked = secured(link, folder) if link else []
+    return serve(secured(listen, folder), link=linked, lifeline=lifeline, rights=rights)
 
 
 def _rights(file: str, lab: str | None, bodies: str | None) -> tuple[Rights, Path | None]:
