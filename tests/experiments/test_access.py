@@ -74,7 +74,9 @@ def wanted(who, action, robot, what, *, hears, mates, guided):
             or (robot in hears and what == "pose" and action in ("hear", "last"))
             or (robot in hears and what == "alive" and action == "watch")
         )
-    return False  # router, positioning, twin: there is nothing here to measure; and whoever is not in the lab
+    if who == "router":  # another one: whatever it passes on it has let in by the same rules
+        return action != "delete"
+    return False  # positioning, twin: there is nothing here to measure; and whoever is not in the lab
 
 
 LINKS = st.sets(st.tuples(st.integers(0, 3), st.integers(0, 3)).filter(lambda pair: pair[0] != pair[1]), max_size=6)
@@ -138,7 +140,7 @@ def test_what_a_centre_needs_is_allowed(who, action, key):
     assert may(control(experiment({(0, 1)}, architecture="centralised")), who, action, key)
 
 
-NO_OPERATORS = ("R0", "R1", *(role for role in ROLES[1:] if role != "operator"), OUTSIDER)
+NO_OPERATORS = ("R0", "R1", *(role for role in ROLES[1:] if role not in ("operator", "router")), OUTSIDER)
 BROAD = (KEYS.estop, "park/**", "park/*/pose", "park/*", "**", "*/*/*", "park/R3/pos$*", KEYS.experiment)
 
 
@@ -160,6 +162,9 @@ BROAD = (KEYS.estop, "park/**", "park/*/pose", "park/*", "**", "*/*/*", "park/R3
         ("R0", "answer", "@/*/router/**"),
         ("operator", "put", "park/R0/pose"),
         ("operator", "delete", KEYS.estop),
+        ("router", "delete", KEYS.estop),
+        ("router", "put", "**"),
+        ("router", "hear", "yard/**"),
         ("observer", "be", KEYS.recorder),
     ],
 )  # fmt: skip
