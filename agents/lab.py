@@ -151,10 +151,10 @@ def bare(endpoints: Sequence[str]) -> list[str]:
     return [endpoint.partition(MARK)[0] for endpoint in endpoints]
 
 
-def options(*endpoints: str) -> str:
-    """What to write on a command line to reach endpoints of one lab, or of none."""
-    _, mark, folder = endpoints[0].partition(MARK)
-    return " ".join(f"--connect {plain}" for plain in bare(endpoints)) + (f" --lab {folder}" if mark else "")
+def options(endpoint: str) -> str:
+    """What to write on a command line to reach an endpoint."""
+    plain, mark, folder = endpoint.partition(MARK)
+    return f"--connect {plain}" + (f" --lab {folder}" if mark else "")
 
 
 def of(endpoints: Sequence[str]) -> Path | None:

@@ -18,6 +18,7 @@ import zenoh
 
 from agents import plausibility, wire
 from agents import session as network
+from agents.access import Rights
 from agents.agent import Actions, Agent, links_by_speaker
 from agents.assignment import Assignment
 from agents.body import Body
@@ -47,7 +48,7 @@ class Setup:
 
     Attributes:
         keys: Key expressions of the realm.
-        endpoints: Routers.
+        endpoints: Routers, or the members of a mesh.
         encoding: Of the payloads that it sends.
         state_hz: Rate of telemetry.
         lifeline: Whether standard input is a lifeline.
@@ -58,6 +59,7 @@ class Setup:
         goal_conditions: The same for goals that have come from a centre, for each guided row.
         clock: Of the experiment.
         once: Whether the process ends when its robots are down after an experiment.
+        rights: Who may do what, which robots enforce themselves in the mesh of a lab.
     """
 
     keys: Keys
@@ -71,6 +73,7 @@ class Setup:
     goal_conditions: Conditions | None = None
     clock: Clock = MACHINE
     once: bool = False
+    rights: Rights | None = None
 
 
 @dataclass
@@ -137,6 +140,7 @@ class Runtime:
                     stop=asked,
                     lease_s=network.ROBOT_LEASE_S,
                     identity=self._names[0],
+                    rights=self._setup.rights,
                 ) as session:
                     self._refuse_doubles(session)
                     self._join(session)

@@ -17,7 +17,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final, Literal, Protocol, Self, TypeVar
+from typing import Final, Protocol, Self, TypeVar
 
 import zenoh
 from zenoh.ext import (
@@ -32,15 +32,17 @@ from zenoh.ext import (
 )
 from zenoh.handlers import Callback, Handler, RingChannel
 
-from agents import access, lab
+from agents import access, lab, topology
+from agents.topology import Mode
 
-Mode = Literal["client", "peer", "router"]
 T_co = TypeVar("T_co", covariant=True)
 
 DEFAULT_PORT: Final = 7447
 DEFAULT_ENDPOINT: Final = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 
 RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
+GATHER_S: Final = 1.0  # so long are members of a mesh waited for that do not answer while others do
+LINK_S: Final = 0.01
 GHOST_S: Final = 2.5  # so long may the token of somebody who hangs stand after his end
 LEASE_S: Final = 2.0  # whoever is silent for so long is held for dead
 ROBOT_LEASE_S: Final = 1.2  # the same for robots: neighbours of one that hangs must know within 1.5 s
@@ -102,12 +104,12 @@ def config(
         of_lab, folder = _of_lab([*connect, *listen], identity or name or "", bool(listen), rights)
     except lab.LabError as error:
         raise EndpointError(str(error)) from None
-    connect, listen = lab.bare(connect), lab.bare(listen)
+    connect, listen = topology.bare(connect), topology.bare(listen)
     if folder is None:
         for endpoint in listen:
             _check_loopback(endpoint)
-    elif mode == "router" and rights is None:
-        raise EndpointError(f"a router of the lab {folder} must know who may do what: name the experiment")
+    elif listen and rights is None:
+        raise EndpointError(f"who listens in the lab {folder} must know who may do what: name the experiment")
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     settings: dict[str, object] = {
         "mode": mode,
@@ -192,30 +194,66 @@ def open_session(
     stop: threading.Event | None = None,
     lease_s: float = LEASE_S,
     identity: str | None = None,
+    rights: access.Rights | None = None,
 ) -> zenoh.Session:
-    """A client session on the first router that answers; use it in a `with`.
+    """A session on the network that some endpoints make; use it in a `with`.
+
+    It is a client of the first router that answers. In a mesh (`agents.topology`) it is linked with all, some of
+    whom may come later.
 
     Args:
-        endpoints: Routers, best first.
+        endpoints: Routers, best first; or members of a mesh.
         name: Who this is, as `zenpark keys` shows it.
         wait_s: How long to try [s].
         stop: Ends the wait when it is set.
         lease_s: See `config`.
         identity: Whose certificate is shown, where the endpoints are of a lab; `name` if left out.
+        rights: Who may do what; a member of a mesh needs them in a lab, for nobody else enforces them.
 
     Raises:
-        EndpointError: If an endpoint is malformed, or its lab has no such identity.
-        Unreachable: If no router answered in time, or `stop` was set before one did.
+        EndpointError: If an endpoint is malformed, or its lab has no such identity, or it cannot listen there.
+        Unreachable: If nobody answered in time, or `stop` was set before anybody did.
     """
-    settings = config("client", connect=endpoints, name=name, lease_s=lease_s, identity=identity)
+    ends = topology.ends(endpoints, name)
+    settings = config(
+        ends.mode,
+        connect=ends.connect,
+        listen=ends.listen,
+        name=name,
+        lease_s=lease_s,
+        identity=identity,
+        rights=rights if ends.listen else None,
+    )
     gone = stop or threading.Event()
     deadline = time.monotonic() + wait_s
     while True:
         try:
-            return zenoh.open(settings)
-        except zenoh.ZError:
-            if time.monotonic() >= deadline or gone.wait(RETRY_S):
-                raise Unreachable(_silence(endpoints, identity or name)) from None
+            session = zenoh.open(settings)
+        except zenoh.ZError as error:
+            if time.monotonic() < deadline and not gone.wait(RETRY_S):
+                continue
+            if ends.listen:
+                raise EndpointError(
+                    f"{name} cannot listen on {', '.join(topology.bare(ends.listen))}: {reason(error)}. If it is on "
+                    "the network already, end it first; or give it another endpoint in network.addresses"
+                ) from None
+        else:
+            if not ends.visits or _gathered(session, len(ends.connect), gone, deadline):
+                return session
+            session.close()  # type: ignore[no-untyped-call]
+        raise Unreachable(_silence(endpoints, identity or name)) from None
+
+
+def _gathered(session: zenoh.Session, members: int, gone: threading.Event, deadline: float) -> bool:
+    """Waits until a visitor is linked with all members of a mesh, or after a while with those that are there."""
+    begun = time.monotonic()
+    while (linked := len(session.info.transports())) < members:
+        now = time.monotonic()
+        if linked and now - begun > GATHER_S:
+            return True
+        if now > deadline or gone.wait(LINK_S):
+            return linked > 0
+    return True
 
 
 def _silence(endpoints: Sequence[str], identity: str) -> str:
@@ -226,7 +264,8 @@ def _silence(endpoints: Sequence[str], identity: str) -> str:
         else f", or it refuses the certificate of {identity} (`zenpark keys show {folder}` says until when it is valid)"
     )
     return (
-        f"no router answers at {', '.join(lab.bare(endpoints)) or 'no endpoint'}{refused}: "
+        f"{'nobody' if topology.is_mesh(endpoints) else 'no router'} answers at "
+        f"{', '.join(topology.bare(endpoints)) or 'no endpoint'}{refused}: "
         "`zenpark router` starts one, --connect names another"
     )
 
@@ -253,8 +292,8 @@ def free_endpoints(count: int, protocol: str = "tcp") -> list[str]:
 
 
 def connected(session: zenoh.Session) -> bool:
-    """Whether the session has a router now. Costs 0.6 µs: poll it in the control loop."""
-    return bool(session.info.routers_zid())
+    """Whether the session has a router now, or a neighbour in a mesh. Costs 0.6 µs: poll it in the control loop."""
+    return bool(session.info.routers_zid() or session.info.peers_zid())
 
 
 def deserted(session: zenoh.Session) -> bool:

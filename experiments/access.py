@@ -51,10 +51,10 @@ def needed(experiment: Experiment) -> list[str]:
 
 def _rights(experiment: Experiment) -> Rights:
     keys = Keys(experiment.network.realm)
-    heard, steered = _heard(experiment), assign.guided(experiment)
+    hears, steered = heard(experiment), assign.guided(experiment)
     robots: dict[str, Grant] = {}
-    for group in _processes(experiment):
-        others = sorted({speaker for name in group for speaker in heard[name]})
+    for group in processes(experiment):
+        others = sorted({speaker for name in group for speaker in hears[name]})
         if len(others) >= MANY and {*others, *group} == set(experiment.robots):
             others = ["*"]
         led = [name for name in group if name in steered]
@@ -128,20 +128,21 @@ def _each(names: Iterable[str], *of: Callable[[str], str]) -> list[str]:
     return [key(name) for name in names for key in of]
 
 
-def _processes(experiment: Experiment) -> list[list[str]]:
+def processes(experiment: Experiment) -> list[list[str]]:
+    """The robots of each process."""
     groups: dict[str, list[str]] = {}
     for name, robot in experiment.robots.items():
         groups.setdefault(f"process {robot.process}" if robot.process else name, []).append(name)
     return list(groups.values())
 
 
-def _heard(experiment: Experiment) -> dict[str, set[str]]:
+def heard(experiment: Experiment) -> dict[str, set[str]]:
     """Whom each robot listens to: what its process subscribes to, and no one else."""
     told = assign.assign(experiment, tuple(experiment.robots))
-    heard: dict[str, set[str]] = {name: set() for name in told.names}
+    found: dict[str, set[str]] = {name: set() for name in told.names}
     for listener, speaker in zip(told.links.listener.tolist(), told.links.speaker.tolist(), strict=True):
-        heard[told.names[listener]].add(told.speakers[speaker])
-    return heard
+        found[told.names[listener]].add(told.speakers[speaker])
+    return found
 
 
 def _ros(name: str, robot: Robot) -> turtlebot3.Address | None:

@@ -32,7 +32,7 @@ from agents.lifeline import Lifeline
 from agents.process import told_to_end
 from agents.runtime import reach_of
 from agents.telemetry import resident_mb
-from experiments import conditions, document
+from experiments import conditions, document, mesh
 from experiments.assign import assign_centre, guided
 from experiments.experiment import Experiment
 from experiments.problem import DocumentError, Problem
@@ -253,7 +253,9 @@ def serve(
     with told_to_end(over.set):
         if lifeline:
             Lifeline(over).start()
-        with network.open_session(endpoints, name="centre", stop=over) as session:
+        with network.open_session(
+            endpoints, name="centre", stop=over, rights=mesh.rights(experiment, endpoints)
+        ) as session:
             keys = Keys(experiment.network.realm)
             if network.taken(session, keys.centre_alive):
                 raise CentreTaken(

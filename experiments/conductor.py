@@ -14,11 +14,11 @@ from typing import Final, TypeVar
 
 import zenoh
 
-from agents import lab, wire
+from agents import lab, topology, wire
 from agents import session as network
 from agents.keys import Keys
 from experiments import hosts as machines
-from experiments import orders
+from experiments import mesh, orders
 from experiments.assign import guided
 from experiments.crew import Crew
 from experiments.experiment import Experiment
@@ -321,12 +321,21 @@ class Conductor:
     def _join(self, stack: ExitStack) -> None:
         keys = self._keys
         self._session = stack.enter_context(
-            network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S, identity="operator")
+            network.open_session(
+                self._endpoints,
+                name="conductor",
+                wait_s=ROUTER_S,
+                identity="operator",
+                rights=mesh.rights(self._experiment, self._endpoints),
+            )
         )
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
         if self._endpoints != [network.DEFAULT_ENDPOINT]:
-            look = f"zenpark keys {lab.options(*self._endpoints)}"
-            self._say("router", "conductor", f"{', '.join(lab.bare(self._endpoints))}: look with `{look}`")
+            there = self._endpoints[0]
+            file = self._recording.parent / mesh.ENDPOINTS
+            options = lab.options(there) if len(self._endpoints) == 1 else f"--connect @{file}"
+            where = "a mesh" if topology.is_mesh(self._endpoints) else ", ".join(lab.bare(self._endpoints))
+            self._say("router", "conductor", f"{where}: look with `zenpark keys {options}`")
         self._clock = network.publisher(self._session, keys.clock, wire.JSON)
         self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
         self._told.put(machines.document(self._experiment))

@@ -276,6 +276,14 @@ class Network(Part, frozen=True):
             "their ssh connection; of several routers, each has one in turn"
         ),
     ] = None
+    topology: Annotated[
+        Literal["routers", "mesh"],
+        Meta(description="all meet at routers; or without any, each robot is linked with exactly its neighbours"),
+    ] = "routers"
+    addresses: Annotated[
+        dict[Name, str],
+        Meta(description="where robots listen in a mesh; left out: at free ports on loopback"),
+    ] = {}
     routers: Annotated[
         int,
         Meta(

@@ -76,6 +76,11 @@ def _network(experiment: Experiment) -> Iterator[Fault]:
             except ValueError as error:
                 message, _, hint = str(error).partition("; ")
                 yield Fault(("network", name, number), message, hint)
+    if network.topology == "mesh":
+        yield from _mesh(experiment)
+    elif network.addresses:
+        hint = 'add topology = "mesh", or leave addresses out'
+        yield Fault(("network", "addresses"), "`addresses` are where robots listen in a mesh", hint, on_key=True)
     if network.routers > 1 and network.connect is not None:
         message = "`routers` says how many zenpark starts, and with `connect` it starts none"
         hint = "leave routers out; link the routers that you start: zenpark router --connect OTHER"
@@ -87,3 +92,30 @@ def _network(experiment: Experiment) -> Iterator[Fault]:
         message = "`address` says where hosts find what `listen` listens on, and that is not given"
         hint = 'add listen = ["tls/0.0.0.0:7447"], or leave address out: hosts then use their ssh connection'
         yield Fault(("network", "address"), message, hint, on_key=True)
+
+
+def _mesh(experiment: Experiment) -> Iterator[Fault]:
+    """A mesh has no routers, and who is elsewhere must be told where to listen."""
+    network = experiment.network
+    for name, given in (("listen", network.listen), ("connect", network.connect), ("routers", network.routers > 1)):
+        if given:
+            message = f"a mesh has no routers, and `{name}` is about them"
+            yield Fault(("network", name), message, "leave it out, or leave topology out", on_key=True)
+    away = {robot: host for host, each in experiment.hosts.items() for robot in each.robots}
+    for robot, host in away.items():
+        if robot in experiment.robots and robot not in network.addresses:
+            message = f"'{robot}' runs on '{host}', and nobody knows where it listens there"
+            hint = f'add addresses.{robot} = "tls/ADDRESS:PORT" to [network], with a lab; or leave topology out'
+            yield Fault(("network", "topology"), message, hint)
+    for robot, endpoint in network.addresses.items():
+        path = ("network", "addresses", robot)
+        if robot not in experiment.robots:
+            yield Fault(path, f"no robot is called '{robot}'", did_you_mean(robot, experiment.robots))
+        try:
+            found = Endpoint.parse(endpoint)
+        except ValueError as error:
+            message, _, hint = str(error).partition("; ")
+            yield Fault(path, message, hint)
+        else:
+            if found.is_wildcard:
+                yield Fault(path, "nobody can connect to every address", "give the one at which its neighbours find it")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from agents import lab
@@ -30,8 +30,28 @@ def routers(experiment: Experiment, file: Path, connect: Sequence[str], chosen: 
     Raises:
         EndpointError: If a router of a lab asks for no certificates.
     """
-    endpoints = list(connect) or experiment.network.connect or []
+    endpoints = listed(connect) or experiment.network.connect or []
     try:
         return lab.secured(endpoints, folder(experiment, file, chosen))
     except lab.LabError as error:
         raise EndpointError(str(error)) from None
+
+
+def listed(given: Iterable[str]) -> list[str]:
+    """Endpoints, each as it is or, behind an @, line by line from a file.
+
+    Raises:
+        EndpointError: If a file cannot be read.
+    """
+    found: list[str] = []
+    for each in given:
+        if not each.startswith("@"):
+            found.append(each)
+            continue
+        try:
+            found += Path(each[1:]).read_text("utf-8").split("\n")
+        except (OSError, UnicodeDecodeError) as error:
+            raise EndpointError(
+                f"{each[1:]}: cannot be read ({error}); `zenpark run` writes one, network.txt"
+            ) from None
+    return [each for each in found if each]

@@ -22,7 +22,7 @@ from agents import wire
 from agents.keys import Keys
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
-from experiments import document
+from experiments import document, mesh
 from experiments.problem import DocumentError
 from experiments.recording import Recording
 from experiments.records import RecordingError
@@ -175,7 +175,7 @@ def record(file: str, target: Path, *, case: str, source: Path, connect: Sequenc
     text = source.read_text("utf-8")
     with (
         told_to_end(asked.set),
-        network.open_session(connect, name="recorder", stop=asked) as session,
+        network.open_session(connect, name="recorder", stop=asked, rights=mesh.rights(experiment, connect)) as session,
         Recording(target, experiment, text, case=case, seed=experiment.seed, clock="real") as recording,
     ):
         recorder = Recorder(session, Keys(experiment.network.realm), recording)

@@ -25,7 +25,7 @@ from agents.keys import Keys
 from agents.runtime import NameTaken, Ranging, Runtime, Setup
 from agents.session import DEFAULT_ENDPOINT, EndpointError, Unreachable
 from agents.shadow import shadowed
-from experiments import assign, conditions, document, joining
+from experiments import assign, conditions, document, joining, mesh
 from experiments.experiment import Experiment, Robot
 from experiments.problem import DocumentError, Problem
 from experiments.reach import routers
@@ -100,6 +100,7 @@ def _run(
     once: bool,
 ) -> int:
     """Runs robots of a case until they end."""
+    endpoints = mesh.near(experiment, names, endpoints)
     request = replace(assign.request(experiment, names, [experiment.seed], endpoints), clock=clock)
     body = shadowed(assemble(request), request, assign.shadows(experiment, names))
     assignment = assign.assign(experiment, names)
@@ -115,6 +116,7 @@ def _run(
         goal_conditions=conditions.from_centre(experiment, names),
         clock=clock,
         once=once,
+        rights=mesh.rights(experiment, endpoints),
     )
     return Runtime(assignment, body, setup).run()
 

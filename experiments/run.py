@@ -27,11 +27,11 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from agents.access import rules
-from agents.endpoint import Endpoint
 from agents.lab import of as lab_of
-from agents.lab import register, require
+from agents.lab import register, require, secured
 from agents.session import free_endpoints
-from experiments import access, document, metrics, playback, reach, results, virtual
+from agents.topology import from_here
+from experiments import access, document, mesh, metrics, playback, reach, results, virtual
 from experiments.conductor import Conductor, Result
 from experiments.document import Document
 from experiments.experiment import Experiment
@@ -41,7 +41,7 @@ from experiments.logbook import Logbook
 from experiments.measured import CaseMetrics
 from experiments.problem import DocumentError, Problem
 from experiments.progress import Shown
-from experiments.servants import divided, from_here
+from experiments.servants import divided
 from experiments.standins import choose_bodies
 from experiments.trace import Trace
 
@@ -204,21 +204,25 @@ def fly(
     results: dict[str, Result] = {}
     read.keep(folder / SOURCE)
     embodied = {name: choose_bodies(case, bodies) for name, case in chosen(read, cases).items()}
-    own_router = read.experiment.network.connect is None
-    secure = reach.folder(read.experiment, read.path, lab) is not None
+    network = read.experiment.network
+    meshed = network.topology == "mesh"
+    own_router = network.connect is None and not meshed
+    of_lab = reach.folder(read.experiment, read.path, lab)
+    secure = of_lab is not None
     if secure and read.experiment.hosts and not local:
         hint = "leave the lab out (what goes to hosts goes through ssh), or add --here"
         raise DocumentError([Problem(read.path.name, 0, 0, "hosts have no certificates of a lab", hint)])
-    own = read.experiment.network.listen or free_endpoints(
-        read.experiment.network.routers, protocol="tls" if secure else "tcp"
-    )
+    own = network.listen or free_endpoints(network.routers, protocol="tls" if secure else "tcp")
     listening = reach.routers(read.experiment, read.path, own if own_router else [], lab)
-    endpoints = [str(from_here(Endpoint.parse(router))) for router in listening] if own_router else listening
+    endpoints = list(map(from_here, listening)) if own_router else listening
+    if meshed:
+        endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)
     rights = _rights(embodied, endpoints, folder)
+    (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
     with Launcher(folder / "logs") as launcher:
-        for router in divided(listening, read.experiment.network.routers) if own_router else ():
+        for router in divided(listening, network.routers) if own_router else ():
             router.start(launcher, rights)
-        hosts = Hosts(launcher, listening)
+        hosts = Hosts(launcher, endpoints if meshed else listening)
         with show:
             for name, experiment in embodied.items():
                 if interrupted():

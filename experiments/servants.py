@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from agents.endpoint import Endpoint
+from agents import topology
 from experiments import standins
 from experiments.assign import guided
 from experiments.experiment import Experiment
@@ -128,11 +128,6 @@ def divided(endpoints: Sequence[str], count: int) -> list[Router]:
     """So many routers, with these endpoints in turn."""
     made: list[Router] = []
     for number in range(count):
-        link = [str(from_here(Endpoint.parse(before.listen[0]))) for before in made]
+        link = [topology.from_here(before.listen[0]) for before in made]
         made.append(Router(f"{ROUTER}{number + 1}" if number else ROUTER, list(endpoints[number::count]), link))
     return made
-
-
-def from_here(router: Endpoint) -> Endpoint:
-    """How this machine reaches a router that listens at an endpoint of it."""
-    return router.at("127.0.0.1") if router.is_wildcard else router

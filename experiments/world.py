@@ -25,7 +25,7 @@ from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
-from experiments import document
+from experiments import document, mesh
 from experiments.assign import WORLD
 from experiments.exchange import Exchange
 from experiments.experiment import Experiment
@@ -243,7 +243,9 @@ def serve(
         Lifeline(lost).start()
     with told_to_end(end):
         population = Population(experiment)
-        with network.open_session(endpoints, name="world", stop=lost) as session:
+        with network.open_session(
+            endpoints, name="world", stop=lost, rights=mesh.rights(experiment, endpoints)
+        ) as session:
             keys = Keys(experiment.network.realm)
             if network.taken(session, keys.world_alive):
                 raise WorldTaken(

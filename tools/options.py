@@ -8,7 +8,10 @@ import typer
 
 File = Annotated[str, typer.Argument(metavar="FILE", help="Experiment file, or the name of a ready-made one.")]
 Connect = Annotated[
-    list[str] | None, typer.Option(metavar="ENDPOINT", help="A router; may be repeated. [tcp/127.0.0.1:7447]")
+    list[str] | None,
+    typer.Option(
+        metavar="ENDPOINT", help="A router; may be repeated. @FILE: those of a running run. [tcp/127.0.0.1:7447]"
+    ),
 ]
 Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`zenpark keys init`).")]
 As = Annotated[str, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab.")]
@@ -28,7 +31,13 @@ OpenReport = Annotated[bool, typer.Option("--open", help="Opens it in the browse
 
 
 def routers(connect: list[str] | None, lab: str | None) -> list[str]:
-    """Endpoints as given on the command line, with the certificates of a lab where one is named."""
-    from agents.lab import secured  # noqa: PLC0415
+    """Endpoints as given on the command line, with the certificates of a lab where one is named.
 
-    return secured(connect or [], lab)
+    Raises:
+        EndpointError: If a file of endpoints cannot be read.
+        LabError: If one of them asks for no certificate.
+    """
+    from agents.lab import secured  # noqa: PLC0415
+    from experiments.reach import listed  # noqa: PLC0415
+
+    return secured(listed(connect or []), lab)

@@ -295,7 +295,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with (
             told_to_end(stop.set),
-            network.open_session(endpoints, name="vicon twin", stop=stop, identity="twin") as session,
+            network.open_session(endpoints, name="vicon-twin", stop=stop, identity="twin") as session,
         ):
             vicon = ViconTwin(
                 chosen.robots,
