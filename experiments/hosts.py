@@ -18,9 +18,10 @@ from typing import Final
 
 import msgspec
 
+from agents import lab
 from agents.endpoint import Endpoint
 from agents.wire import HostClock
-from experiments import clocks, ssh, version
+from experiments import certificates, clocks, ssh, version
 from experiments.experiment import Experiment, Host
 from experiments.launcher import Launcher, Process
 from experiments.station import RUN, Answer, Question
@@ -47,6 +48,7 @@ class Station:
         hello: What the station said of itself.
         endpoints: Routers as the host reaches them.
         clock: Its clock, as it was measured last.
+        lab: The folder of the lab, on this machine; None without one.
     """
 
     def __init__(self, name: str, host: Host, *, launcher: Launcher, routers: Sequence[str], run: str) -> None:
@@ -56,7 +58,7 @@ class Station:
             name: Of the host.
             host: Has an address.
             launcher: Starts the ssh, and keeps its lifeline.
-            routers: As this machine reaches them; those on loopback go through this connection.
+            routers: As this machine reaches them; those on loopback go through this connection. Of a lab, if any is.
             run: By which the station finds the run's processes.
 
         Raises:
@@ -65,7 +67,8 @@ class Station:
         assert host.address is not None
         self.name, self.host, self.address = name, host, host.address
         self.clock: HostClock | None = None
-        self._routers = [Endpoint.parse(router) for router in routers]
+        self.lab = lab.of(routers)
+        self._routers = [Endpoint.parse(router) for router in lab.bare(routers)]
         self._run = f"{run}.{name}"  # two hosts may be one machine
         try:
             carried = [("-R", ssh.forwarded(router)) for router in self._routers if router.is_loopback]
@@ -97,6 +100,7 @@ class Station:
 
         Raises:
             HostError: If the host cannot be reached, or zenpark does not run there.
+            LabError: If the register of the lab cannot be read.
         """
         self.hello, _, _ = self.ask(Question("hello"), HELLO_S)
         ports = iter(ssh.allocated(self.process.log.read_text(errors="replace")))
@@ -105,6 +109,20 @@ class Station:
             self.endpoints = [str(self._abroad(router, ports, here)) for router in self._routers]
         except StopIteration:
             raise HostError(f"{self.name}: ssh does not say which port it forwards; use listen in [network]") from None
+        self._recognise()
+
+    def _recognise(self) -> None:
+        """Robots there believe a router only under a name that stands in its certificate."""
+        if self.lab is None:
+            return
+        named = {name for each in lab.register(self.lab).identities.values() if each.role == "router"
+                 for name in each.hosts}  # fmt: skip
+        for endpoint in map(Endpoint.parse, self.endpoints):
+            if endpoint.host not in named:
+                raise HostError(
+                    f"{self.name}: reaches the router at {endpoint.host}, which stands in no router's certificate; "
+                    f"`zenpark keys renew {self.lab} router --host {endpoint.host}` adds it"
+                )
 
     @staticmethod
     def _abroad(router: Endpoint, ports: Iterator[int], here: str) -> Endpoint:
@@ -162,6 +180,31 @@ class Station:
         self.clock = HostClock(self.name, samples[-1].back, offset, uncertainty, list(robots))
         return self.clock
 
+    def holds(self, names: Sequence[str]) -> certificates.Holding:
+        """What its folder holds of the certificates of some robots.
+
+        Raises:
+            HostError: If it does not answer.
+        """
+        return self.ask(Question("certificates", lab=self.folder, names=list(names)))[0].holds
+
+    def distrusted(self, names: Sequence[str]) -> list[str]:
+        """What is the matter with the certificates of its robots there, in a lab, each with its remedy.
+
+        Raises:
+            HostError: If it does not answer.
+            LabError: If the register of the lab cannot be read.
+        """
+        if self.lab is None:
+            return []
+        answer = self.ask(Question("certificates", lab=self.folder, names=list(names)))[0]
+        return [f"{self.name}: {fault}" for fault in certificates.faults(answer.holds, self.lab, answer.clock)]
+
+    @property
+    def folder(self) -> str:
+        """Of certificates, there."""
+        return self.host.lab.removeprefix("~/")
+
     def start(self, name: str, robots: Sequence[str], document: bytes, launcher: Launcher) -> Process:
         """Starts the process of some robots there.
 
@@ -175,6 +218,7 @@ class Station:
             time.sleep(POLL_S)
         assert self.clock is not None
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
+        connect += [] if self.lab is None else ["--lab", self.folder]
         correction = f"{-self.clock.offset:.6f}"
         words = self.words("agent", "-", *robots, *connect, f"--clock-correction={correction}", "--lifeline")
         process = launcher.spawn(name, ssh.command(self.address, words), told=document + b"\n")
@@ -227,6 +271,8 @@ class Hosts:
                 station.greet(experiment.network.address)
                 if not station.same_version:
                     trouble.append(_other_version(station))
+                else:
+                    trouble += station.distrusted(station.host.robots)
             except HostError as error:
                 trouble.append(str(error))
         if trouble:

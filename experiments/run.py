@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
@@ -205,14 +205,13 @@ def fly(
     read.keep(folder / SOURCE)
     embodied = {name: choose_bodies(case, bodies) for name, case in chosen(read, cases).items()}
     own_router = read.experiment.network.connect is None
+    if local:
+        embodied = {name: msgspec.structs.replace(case, hosts={}) for name, case in embodied.items()}
     secure = reach.folder(read.experiment, read.path, lab) is not None
-    if secure and read.experiment.hosts and not local:
-        hint = "leave the lab out (what goes to hosts goes through ssh), or add --here"
-        raise DocumentError([Problem(read.path.name, 0, 0, "hosts have no certificates of a lab", hint)])
     own = read.experiment.network.listen or [free_endpoint(protocol="tls" if secure else "tcp")]
     listening = reach.routers(read.experiment, read.path, own if own_router else [], lab)
     endpoints = [str(here(Endpoint.parse(router))) for router in listening] if own_router else listening
-    rights = _rights(embodied, endpoints, folder)
+    rights = enforced(embodied.values(), endpoints, folder)
     with Launcher(folder / "logs") as launcher:
         if own_router:
             start_router(launcher, listening, rights)
@@ -221,8 +220,6 @@ def fly(
             for name, experiment in embodied.items():
                 if interrupted():
                     break
-                if local:
-                    experiment = msgspec.structs.replace(experiment, hosts={})  # noqa: PLW2901
                 file = folder / f"{name}.json"
                 file.write_bytes(document.write_json(experiment))
                 results[name] = Conductor(
@@ -249,8 +246,10 @@ def here(router: Endpoint) -> Endpoint:
     return router.at("127.0.0.1") if router.is_wildcard else router
 
 
-def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: Path) -> Path | None:
+def enforced(cases: Collection[Experiment], endpoints: Sequence[str], folder: Path) -> Path | None:
     """Who may do what, as a file for the router; None without a lab.
+
+    Robots on hosts have their certificates there, and need none here.
 
     Raises:
         LabError: If a certificate is missing, or somebody else's.
@@ -258,8 +257,8 @@ def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: P
     of = lab_of(endpoints)
     if of is None:
         return None
-    require(of, list(dict.fromkeys(name for case in cases.values() for name in access.needed(case))))
-    made = access.rights(cases.values())
+    require(of, list(dict.fromkeys(name for case in cases for name in access.needed(case))))
+    made = access.rights(cases)
     rules(made, register(of))  # what is wrong with it is said now, and not by a router that does not start
     file = folder / "rights.json"
     file.write_bytes(msgspec.json.format(msgspec.json.encode(made), indent=1))
