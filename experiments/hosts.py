@@ -18,7 +18,7 @@ from typing import Final
 
 import msgspec
 
-from agents import lab
+from agents import clock, lab
 from agents.endpoint import Endpoint
 from agents.wire import HostClock
 from experiments import certificates, clocks, ssh, version
@@ -48,6 +48,7 @@ class Station:
         hello: What the station said of itself.
         endpoints: Routers as the host reaches them.
         clock: Its clock, as it was measured last.
+        applied: What robots there take off its reading [s].
         lab: The folder of the lab, on this machine; None without one.
     """
 
@@ -87,6 +88,14 @@ class Station:
         self._waiting.register(stdout.fileno(), select.POLLIN)
         self._rest = b""
         self._starting: list[Process] = []
+        self._robots: list[tuple[Process, Launcher]] = []
+        self._silent = False
+        self.set_out()
+
+    def set_out(self) -> None:
+        """Takes the wall clock as it is now: a step of it in mid-run is no drift of the host's."""
+        self._zero = time.time() - time.monotonic()
+        self.applied, self._robots = 0.0, []
 
     def words(self, *arguments: str) -> list[str]:
         """A zenpark command as it is spelled there, of this run."""
@@ -137,22 +146,23 @@ class Station:
         Raises:
             HostError: If none comes in time.
         """
-        if self._out.closed or self._in.closed:
+        if self._silent or self._out.closed or self._in.closed:
             raise HostError(self._broken())  # its end was noticed before
         deadline = time.monotonic() + limit_s
         text = msgspec.json.encode(question) + b"\n"
-        left = time.time()
+        left = self._zero + time.monotonic()
         with suppress(BrokenPipeError):  # what was said on the other channel tells why
             os.write(self._out.fileno(), text)
         while self._waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
             data = os.read(self._in.fileno(), 65536)
-            back = time.time()
+            back = self._zero + time.monotonic()
             if not data:
                 raise HostError(self._broken())
             *lines, self._rest = (self._rest + data).split(b"\n")
             for line in lines:
                 with suppress(msgspec.MsgspecError):  # a greeting of the shell
                     return msgspec.json.decode(line, type=Answer), left, back
+        self._silent = True  # a late answer would be taken for that to the next question
         raise HostError(f"{self.name}: its station says nothing for {limit_s:g} s; is that machine overloaded?")
 
     def _broken(self) -> str:
@@ -166,18 +176,27 @@ class Station:
         """Whether its zenpark is this one."""
         return self.hello.zenpark == version.digest()
 
-    def measure(self, robots: Sequence[str] = ()) -> HostClock:
-        """Measures its clock; `robots` run there.
+    def measure(self, robots: Sequence[str] = (), samples: int = SAMPLES) -> HostClock:
+        """Measures its clock, by some round trips; `robots` run there.
 
         Raises:
             HostError: If it does not answer.
         """
-        samples = []
-        for _ in range(SAMPLES):
+        trips = []
+        for _ in range(samples):
             answer, left, back = self.ask(Question("clock"))
-            samples.append(clocks.Sample(left, answer.clock, back))
-        offset, uncertainty = clocks.offset(samples)
-        self.clock = HostClock(self.name, samples[-1].back, offset, uncertainty, list(robots))
+            trips.append(clocks.Sample(left, answer.clock, back))
+        offset, uncertainty = clocks.offset(trips)
+        self.clock = HostClock(self.name, trips[-1].back, offset, uncertainty, list(robots), self.applied)
+        return self.clock
+
+    def follow(self, applied: float) -> HostClock:
+        """Has its robots take so much off its reading from now on [s], those that are started later too."""
+        assert self.clock is not None
+        self.applied = applied
+        for process, launcher in self._robots:
+            launcher.tell(process, clock.said(-applied))
+        self.clock = msgspec.structs.replace(self.clock, applied=applied)
         return self.clock
 
     def holds(self, names: Sequence[str]) -> certificates.Holding:
@@ -216,13 +235,13 @@ class Station:
         """
         while len(self._under_way()) >= HANDSHAKES:
             time.sleep(POLL_S)
-        assert self.clock is not None
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
         connect += [] if self.lab is None else ["--lab", self.folder]
-        correction = f"{-self.clock.offset:.6f}"
+        correction = f"{-self.applied:.6f}"
         words = self.words("agent", "-", *robots, *connect, f"--clock-correction={correction}", "--lifeline")
         process = launcher.spawn(name, ssh.command(self.address, words), told=document + b"\n")
         self._starting.append(process)
+        self._robots.append((process, launcher))
         return process
 
     def _under_way(self) -> list[Process]:
@@ -280,7 +299,17 @@ class Hosts:
                 del self._stations[station.name]
             raise HostError("\n".join(trouble))
         self._robots = {robot: self._stations[name] for name, host in wanted.items() for robot in host.robots}
-        return [self._stations[name].measure(host.robots) for name, host in wanted.items()]
+        return [self._begin(self._stations[name], host.robots) for name, host in wanted.items()]
+
+    @staticmethod
+    def _begin(station: Station, robots: Sequence[str]) -> HostClock:
+        station.set_out()
+        return station.follow(station.measure(robots).offset)
+
+    def followed(self) -> list[tuple[Station, list[str]]]:
+        """Hosts of the case, and who runs there."""
+        stations = dict.fromkeys(self._robots.values())
+        return [(each, [name for name, place in self._robots.items() if place is each]) for each in stations]
 
     def of(self, robot: str) -> Station | None:
         """Where a robot runs; None: here."""
@@ -289,8 +318,7 @@ class Hosts:
     def clocks(self) -> tuple[list[HostClock], list[str]]:
         """The clocks of all hosts of the case now, and what is in the way of reading the others."""
         measured, trouble = [], []
-        for station in dict.fromkeys(self._robots.values()):
-            robots = [robot for robot, place in self._robots.items() if place is station]
+        for station, robots in self.followed():
             try:
                 measured.append(station.measure(robots))
             except HostError as error:

@@ -116,7 +116,6 @@ def test_robots_elsewhere_reach_a_router_that_listens_for_them(lab: Machines, tm
     shutil.rmtree(made.out)
     authority.renew(made.keys, ["router"], hosts=[here])
     made.flew()
-    assert f"tls/{here}:7447" in (made.out / "logs" / "host-lab1.log").read_text() or True
 
 
 def test_what_is_wrong_with_certificates_is_told_with_a_remedy(lab: Machines, tmp_path: Path) -> None:
