@@ -7,13 +7,13 @@ The runtime finds bodies by the entry-point group `zenpark.bodies`: the word bef
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import msgspec
 import numpy as np
 
-from agents.clock import MACHINE, Clock
+from agents.clock import Clock
 from agents.keys import Keys
 from agents.kinds import Kind
 from agents.rows import Array, Index, Mask
@@ -61,7 +61,7 @@ class BodyRequest:
     device: tuple[Mapping[str, Any], ...]
     endpoints: tuple[str, ...]
     keys: Keys
-    clock: Clock = MACHINE
+    clock: Clock = field(default_factory=Clock)
 
     def of(self, rows: Index) -> BodyRequest:
         """The same for some of the rows."""

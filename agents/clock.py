@@ -1,13 +1,29 @@
-"""The clock of an experiment as one process reads it: that of its machine, set right by what it is known to lack."""
+"""The clock of an experiment as one process reads it: that of its machine, set right by what it is known to lack.
+
+Clocks drift. Whoever started the process on another machine measures again during the run and says so on its lifeline,
+`clock -0.200131`; the process follows by going a little faster or slower, never back: stamps tell which of two
+samples is the newer one.
+"""
 
 from __future__ import annotations
 
+import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from math import isfinite
 from typing import Final
 
+SLEW: Final = 0.005  # seconds per second; a hundred times what quartz drifts, and no body notices
+STEP_S: Final = 0.5  # more is no drift: somebody was suspended, or is mistaken
+_WORD: Final = b"clock "
 
-@dataclass(frozen=True)
+
+def said(correction_s: float) -> bytes:
+    """The line by which a process is told its correction."""
+    return _WORD + f"{correction_s:.6f}\n".encode()
+
+
+@dataclass
 class Clock:
     """UTC as everybody in the experiment reads it.
 
@@ -17,10 +33,34 @@ class Clock:
     """
 
     correction_s: float = 0.0
+    _wanted: float = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._wanted = self.correction_s
 
     def utc(self) -> float:
         """Now, UTC [s]."""
         return time.time() + self.correction_s
 
+    def heed(self, line: bytes) -> None:
+        """Takes a line of `said` up, from any thread; what is none, or too far off to be drift, is refused."""
+        try:
+            wanted = float(line.removeprefix(_WORD))
+        except ValueError:
+            wanted = float("nan")
+        if not line.startswith(_WORD) or not isfinite(wanted):
+            print(f"clock: {line[:40]!r} is no correction; ignored", file=sys.stderr, flush=True)
+        elif abs(wanted - self.correction_s) > STEP_S:
+            far = wanted - self.correction_s
+            print(f"clock: {far:+.3f} s at once is no drift; not followed", file=sys.stderr, flush=True)
+        else:
+            self._wanted = wanted
 
-MACHINE: Final = Clock()  # of a process whose machine is right
+    def slew(self, dt: float) -> float:
+        """Goes on towards what was told, for a step of `dt` [s]; returns by how much the clock was moved [s]."""
+        lacks = self._wanted - self.correction_s
+        if lacks == 0.0:
+            return 0.0
+        change = min(max(lacks, -SLEW * dt), SLEW * dt)
+        self.correction_s = self._wanted if change == lacks else self.correction_s + change
+        return change

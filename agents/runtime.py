@@ -9,7 +9,7 @@ import gc
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import floor, nan
 from typing import Final, Literal
 
@@ -23,7 +23,7 @@ from agents.agent import Actions, Agent, links_by_speaker
 from agents.assignment import Assignment
 from agents.body import Body
 from agents.channel import Channel, Conditions, Samples
-from agents.clock import MACHINE, Clock
+from agents.clock import Clock
 from agents.goals import HeardGoals
 from agents.keys import Keys
 from agents.lifecycle import Phase
@@ -71,7 +71,7 @@ class Setup:
     ranging: Sequence[Ranging] = ()
     conditions: Conditions | None = None
     goal_conditions: Conditions | None = None
-    clock: Clock = MACHINE
+    clock: Clock = field(default_factory=Clock)
     once: bool = False
     rights: Rights | None = None
 
@@ -125,7 +125,7 @@ class Runtime:
             network.Unreachable: If no router answers.
         """
         lost = threading.Event()
-        rope = Lifeline(lost)
+        rope = Lifeline(lost, told=self._setup.clock.heed)
         if self._setup.lifeline:
             rope.start()
         asked = threading.Event()
@@ -370,6 +370,7 @@ class Runtime:
             t = self._now = self._next
             self._counts.late_s = max(self._counts.late_s, time.monotonic() - zero - t)
             self._next = t + self._dt
+            zero -= self._setup.clock.slew(self._dt)
             self._tick(t)
             if farewell == np.inf and (reason := stopping()) is not None:
                 farewell = t + FAREWELL_S

@@ -303,8 +303,9 @@ class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class HostClock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How a host's clock lies to the conductor's at `stamp` (the conductor's, UTC [s]).
 
-    `offset` is the host's reading less the conductor's [s], within `uncertainty` [s]. `robots` run there; what they say
-    is stamped on the clock of the first such message of a run, taken off by its `offset`.
+    `offset` is the host's reading less the conductor's [s], within `uncertainty` [s]. `robots` run there; from then on
+    they take `applied` [s] off what they stamp, going there by `agents.clock.SLEW` from what they took off before.
+    None: the offset of the first such message of a run.
     """
 
     host: str
@@ -312,6 +313,7 @@ class HostClock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offset: float
     uncertainty: float
     robots: list[str]
+    applied: float | None = None
 
 
 Message = (

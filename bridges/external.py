@@ -73,6 +73,7 @@ class ExternalBody:
         self._endpoints, self._addresses = request.endpoints, request.addresses
         self._flies = np.array([kind.flies for kind in request.kinds])
         self._zero = time.monotonic()
+        self._clock, self._corrected = request.clock, request.clock.correction_s
         self._utc = request.clock.utc()  # one reading, as in the runtime: a step of the wall clock moves nothing
         self._shift = np.inf  # from the caller's clock to this one
         self._seen = External(rows)
@@ -182,7 +183,7 @@ class ExternalBody:
     # ------------------------------------------------------------------ what the far end says
 
     def _now(self) -> float:
-        return time.monotonic() - self._zero
+        return time.monotonic() - self._zero + self._clock.correction_s - self._corrected
 
     def _stamp(self) -> float:
         return round(self._utc + self._now(), 6)

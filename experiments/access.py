@@ -37,7 +37,8 @@ def rights(cases: Iterable[Experiment]) -> Rights:
 def needed(experiment: Experiment) -> list[str]:
     """The identities whose certificates a run of this experiment needs on the machine that starts it."""
     robots = experiment.robots.values()
-    found = ["router", "operator", "recorder", *experiment.robots]
+    abroad = {robot for host in experiment.hosts.values() for robot in host.robots}
+    found = ["router", "operator", "recorder", *(name for name in experiment.robots if name not in abroad)]
     if any(assign.WORLD in (robot.body, robot.ranges) for robot in robots):
         found.append("world")
     if any(robot.body in plugins.names(plugins.DEVICES) for robot in robots) or experiment.positioning == VICON_TWIN:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from msgspec.structs import replace
 
+from agents.clock import SLEW
 from agents.rows import Array
 from agents.wire import HostClock, State, Status
 
@@ -41,6 +42,8 @@ class Lie:
         robots: That ran there.
         first: Offset at the beginning [s], which was taken off every stamp where it was made.
         last: Offset at the end [s].
+        worst: The largest error that was left in stamps when it was measured [s]; as much as `last` less `first`
+            if they had not been corrected during the run.
         uncertainty: The larger of both measurements' [s].
         over: Time between them [s].
     """
@@ -51,6 +54,7 @@ class Lie:
     last: float
     uncertainty: float
     over: float
+    worst: float = 0.0
 
     @property
     def drift(self) -> float | None:
@@ -58,27 +62,40 @@ class Lie:
         return (self.last - self.first) / self.over if self.over > 0.0 else None
 
 
+def taken_off(said: Sequence[HostClock]) -> tuple[Array, Array]:
+    """When [s], and what [s], robots of a host took off its reading, to be interpolated: they went from each to the
+    next as fast as their clock does."""
+    now = said[0].offset if said[0].applied is None else said[0].applied
+    points = [(said[0].stamp, now)]
+    for each in said[1:]:
+        if each.applied is not None and each.applied != now:
+            points += [(each.stamp, now), (each.stamp + abs(each.applied - now) / SLEW, each.applied)]
+            now = each.applied
+    stamps, values = zip(*points, strict=True)
+    return np.array(stamps), np.array(values)
+
+
 class Correction:
     """What drift has added to the stamps of robots on other machines, so that it can be taken off again."""
 
     def __init__(self, said: Iterable[HostClock]) -> None:
         """`said` is all that was measured in a run, in order of time for each host."""
-        self._of: dict[str, tuple[Array, Array]] = {}
+        self._of: dict[str, tuple[Array, Array, Array, Array]] = {}
         self._lies: dict[str, list[HostClock]] = {}
         for each in said:
             self._lies.setdefault(each.host, []).append(each)
         for measured in self._lies.values():
             stamps = np.array([each.stamp for each in measured])
-            added = np.array([each.offset for each in measured]) - measured[0].offset
+            offsets = np.array([each.offset for each in measured])
             for robot in measured[-1].robots:
-                self._of[robot] = stamps, added
+                self._of[robot] = stamps, offsets, *taken_off(measured)
 
     def __call__(self, robot: str, stamp: float) -> float:
         """A stamp [s] that a robot's process made, on the conductor's clock."""
         if robot not in self._of:
             return stamp
-        stamps, added = self._of[robot]
-        return stamp - float(np.interp(stamp, stamps, added))
+        stamps, offsets, when, what = self._of[robot]
+        return stamp - float(np.interp(stamp, stamps, offsets) - np.interp(stamp, when, what))
 
     def state(self, said: State) -> State:
         """Telemetry with every stamp set right: its own, and those of poses and goals that were heard.
@@ -109,6 +126,14 @@ class Correction:
                 measured[-1].offset,
                 max(each.uncertainty for each in measured),
                 measured[-1].stamp - measured[0].stamp,
+                _worst(measured),
             )
             for host, measured in self._lies.items()
         )
+
+
+def _worst(said: Sequence[HostClock]) -> float:
+    """The largest difference between a measured offset and what robots took off just then [s]."""
+    stamps = np.array([each.stamp for each in said])
+    offsets = np.array([each.offset for each in said])
+    return float(np.abs(offsets - np.interp(stamps, *taken_off(said))).max())

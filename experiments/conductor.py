@@ -21,6 +21,7 @@ from experiments import hosts as machines
 from experiments import mesh, orders
 from experiments.assign import guided
 from experiments.crew import Crew
+from experiments.drift import Drift
 from experiments.experiment import Experiment
 from experiments.hosts import Hosts
 from experiments.launcher import LAND_S, Launcher
@@ -179,6 +180,7 @@ class Conductor:
                 if self._until("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
                     self._tell_clocks(clocks)
+                    self._drift = stack.enter_context(Drift(self._hosts.followed()))
                     self._say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
                     self._order(wire.Order("takeoff"))
                     if self._until("airborne", CLIMB_S):
@@ -186,6 +188,8 @@ class Conductor:
                         self._walk(start)
                 self._land()
                 if start is not None:
+                    self._drift.close()
+                    self._tell_drift()
                     clocks, trouble = self._hosts.clocks()
                     self._tell_clocks(clocks)
                     for each in trouble:
@@ -232,6 +236,14 @@ class Conductor:
         for each in clocks:
             self._clock.put(wire.encode(each))
             self._say("clock", each.host, f"{each.offset * 1e3:+.2f} ms ± {each.uncertainty * 1e3:.2f} ms against ours")
+
+    def _tell_drift(self) -> None:
+        """Says, for the recording, how the hosts' clocks have drifted and what their robots do about it."""
+        measured, trouble = self._drift.news()
+        for each in measured:
+            self._clock.put(wire.encode(each))
+        for text in trouble:
+            self._say("clock", "conductor", text)
 
     # ------------------------------------------------------------------ phases
 
@@ -287,6 +299,7 @@ class Conductor:
         self._progress.phase = "starting together"
         while (now := time.time()) < end + LAND_S and not self._interrupted():
             self._look()
+            self._tell_drift()
             self._progress.elapsed = now - start
             while reached + 1 < len(times) and now - start >= times[reached + 1]:
                 reached += 1

@@ -316,6 +316,9 @@ class Host(Part, frozen=True):
     zenpark: Annotated[str, Meta(description="the command there; a path counts from the home folder")] = (
         "zenpark/zenpark"
     )
+    lab: Annotated[
+        str, Meta(description="folder there for the certificates of its robots, in a lab; counts from the home folder")
+    ] = "zenpark-lab"
     robots: Annotated[list[Name], Meta(description="who runs there; robots that no host names run here")] = []
     tags: Annotated[list[Name], Meta(description="by which `zenpark hosts` chooses among hosts")] = []
 

@@ -12,10 +12,11 @@ from agents.plugins import did_you_mean
 from experiments.experiment import Experiment
 from experiments.problem import Fault, shown
 
-_WHAT: Final = {"address": "address that ssh takes", "zenpark": "path of a command"}
+_WHAT: Final = {"address": "address that ssh takes", "zenpark": "path of a command", "lab": "path of a folder"}
 _WRITE: Final = {
     "address": "write it like lab1, pi@192.0.2.7 or ssh://pi@192.0.2.7:2222; all else belongs in ~/.ssh/config",
     "zenpark": "write it like zenpark/zenpark, without blanks or options",
+    "lab": "write it like zenpark-lab, without blanks",
 }
 
 
@@ -23,7 +24,7 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
     """Robots that nobody or two hosts have, processes and bodies that cannot be divided, endpoints that clash."""
     where: dict[str, str] = {}
     for host, each in experiment.hosts.items():
-        for name, value in (("address", each.address), ("zenpark", each.zenpark)):
+        for name, value in (("address", each.address), ("zenpark", each.zenpark), ("lab", each.lab)):
             if value is not None and not re.fullmatch(r"[^\s\x00-\x1f-][^\s\x00-\x1f]*", value):
                 message = f"{shown(value)} is no {_WHAT[name]}"
                 yield Fault(("hosts", host, name), message, _WRITE[name])

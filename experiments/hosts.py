@@ -18,9 +18,10 @@ from typing import Final
 
 import msgspec
 
+from agents import clock, lab
 from agents.endpoint import Endpoint
 from agents.wire import HostClock
-from experiments import clocks, ssh, version
+from experiments import certificates, clocks, ssh, version
 from experiments.experiment import Experiment, Host
 from experiments.launcher import Launcher, Process
 from experiments.station import RUN, Answer, Question
@@ -47,6 +48,8 @@ class Station:
         hello: What the station said of itself.
         endpoints: Routers as the host reaches them.
         clock: Its clock, as it was measured last.
+        applied: What robots there take off its reading [s].
+        lab: The folder of the lab, on this machine; None without one.
     """
 
     def __init__(self, name: str, host: Host, *, launcher: Launcher, routers: Sequence[str], run: str) -> None:
@@ -56,7 +59,7 @@ class Station:
             name: Of the host.
             host: Has an address.
             launcher: Starts the ssh, and keeps its lifeline.
-            routers: As this machine reaches them; those on loopback go through this connection.
+            routers: As this machine reaches them; those on loopback go through this connection. Of a lab, if any is.
             run: By which the station finds the run's processes.
 
         Raises:
@@ -65,7 +68,8 @@ class Station:
         assert host.address is not None
         self.name, self.host, self.address = name, host, host.address
         self.clock: HostClock | None = None
-        self._routers = [Endpoint.parse(router) for router in routers]
+        self.lab = lab.of(routers)
+        self._routers = [Endpoint.parse(router) for router in lab.bare(routers)]
         self._run = f"{run}.{name}"  # two hosts may be one machine
         try:
             carried = [("-R", ssh.forwarded(router)) for router in self._routers if router.is_loopback]
@@ -84,6 +88,14 @@ class Station:
         self._waiting.register(stdout.fileno(), select.POLLIN)
         self._rest = b""
         self._starting: list[Process] = []
+        self._robots: list[tuple[Process, Launcher]] = []
+        self._silent = False
+        self.set_out()
+
+    def set_out(self) -> None:
+        """Takes the wall clock as it is now: a step of it in mid-run is no drift of the host's."""
+        self._zero = time.time() - time.monotonic()
+        self.applied, self._robots = 0.0, []
 
     def words(self, *arguments: str) -> list[str]:
         """A zenpark command as it is spelled there, of this run."""
@@ -97,6 +109,7 @@ class Station:
 
         Raises:
             HostError: If the host cannot be reached, or zenpark does not run there.
+            LabError: If the register of the lab cannot be read.
         """
         self.hello, _, _ = self.ask(Question("hello"), HELLO_S)
         ports = iter(ssh.allocated(self.process.log.read_text(errors="replace")))
@@ -105,6 +118,20 @@ class Station:
             self.endpoints = [str(self._abroad(router, ports, here)) for router in self._routers]
         except StopIteration:
             raise HostError(f"{self.name}: ssh does not say which port it forwards; use listen in [network]") from None
+        self._recognise()
+
+    def _recognise(self) -> None:
+        """Robots there believe a router only under a name that stands in its certificate."""
+        if self.lab is None:
+            return
+        named = {name for each in lab.register(self.lab).identities.values() if each.role == "router"
+                 for name in each.hosts}  # fmt: skip
+        for endpoint in map(Endpoint.parse, self.endpoints):
+            if endpoint.host not in named:
+                raise HostError(
+                    f"{self.name}: reaches the router at {endpoint.host}, which stands in no router's certificate; "
+                    f"`zenpark keys renew {self.lab} router --host {endpoint.host}` adds it"
+                )
 
     @staticmethod
     def _abroad(router: Endpoint, ports: Iterator[int], here: str) -> Endpoint:
@@ -119,22 +146,23 @@ class Station:
         Raises:
             HostError: If none comes in time.
         """
-        if self._out.closed or self._in.closed:
+        if self._silent or self._out.closed or self._in.closed:
             raise HostError(self._broken())  # its end was noticed before
         deadline = time.monotonic() + limit_s
         text = msgspec.json.encode(question) + b"\n"
-        left = time.time()
+        left = self._zero + time.monotonic()
         with suppress(BrokenPipeError):  # what was said on the other channel tells why
             os.write(self._out.fileno(), text)
         while self._waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
             data = os.read(self._in.fileno(), 65536)
-            back = time.time()
+            back = self._zero + time.monotonic()
             if not data:
                 raise HostError(self._broken())
             *lines, self._rest = (self._rest + data).split(b"\n")
             for line in lines:
                 with suppress(msgspec.MsgspecError):  # a greeting of the shell
                     return msgspec.json.decode(line, type=Answer), left, back
+        self._silent = True  # a late answer would be taken for that to the next question
         raise HostError(f"{self.name}: its station says nothing for {limit_s:g} s; is that machine overloaded?")
 
     def _broken(self) -> str:
@@ -148,19 +176,53 @@ class Station:
         """Whether its zenpark is this one."""
         return self.hello.zenpark == version.digest()
 
-    def measure(self, robots: Sequence[str] = ()) -> HostClock:
-        """Measures its clock; `robots` run there.
+    def measure(self, robots: Sequence[str] = (), samples: int = SAMPLES) -> HostClock:
+        """Measures its clock, by some round trips; `robots` run there.
 
         Raises:
             HostError: If it does not answer.
         """
-        samples = []
-        for _ in range(SAMPLES):
+        trips = []
+        for _ in range(samples):
             answer, left, back = self.ask(Question("clock"))
-            samples.append(clocks.Sample(left, answer.clock, back))
-        offset, uncertainty = clocks.offset(samples)
-        self.clock = HostClock(self.name, samples[-1].back, offset, uncertainty, list(robots))
+            trips.append(clocks.Sample(left, answer.clock, back))
+        offset, uncertainty = clocks.offset(trips)
+        self.clock = HostClock(self.name, trips[-1].back, offset, uncertainty, list(robots), self.applied)
         return self.clock
+
+    def follow(self, applied: float) -> HostClock:
+        """Has its robots take so much off its reading from now on [s], those that are started later too."""
+        assert self.clock is not None
+        self.applied = applied
+        for process, launcher in self._robots:
+            launcher.tell(process, clock.said(-applied))
+        self.clock = msgspec.structs.replace(self.clock, applied=applied)
+        return self.clock
+
+    def holds(self, names: Sequence[str]) -> certificates.Holding:
+        """What its folder holds of the certificates of some robots.
+
+        Raises:
+            HostError: If it does not answer.
+        """
+        return self.ask(Question("certificates", lab=self.folder, names=list(names)))[0].holds
+
+    def distrusted(self, names: Sequence[str]) -> list[str]:
+        """What is the matter with the certificates of its robots there, in a lab, each with its remedy.
+
+        Raises:
+            HostError: If it does not answer.
+            LabError: If the register of the lab cannot be read.
+        """
+        if self.lab is None:
+            return []
+        answer = self.ask(Question("certificates", lab=self.folder, names=list(names)))[0]
+        return [f"{self.name}: {fault}" for fault in certificates.faults(answer.holds, self.lab, answer.clock)]
+
+    @property
+    def folder(self) -> str:
+        """Of certificates, there."""
+        return self.host.lab.removeprefix("~/")
 
     def start(self, name: str, robots: Sequence[str], document: bytes, launcher: Launcher) -> Process:
         """Starts the process of some robots there.
@@ -173,12 +235,13 @@ class Station:
         """
         while len(self._under_way()) >= HANDSHAKES:
             time.sleep(POLL_S)
-        assert self.clock is not None
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
-        correction = f"{-self.clock.offset:.6f}"
+        connect += [] if self.lab is None else ["--lab", self.folder]
+        correction = f"{-self.applied:.6f}"
         words = self.words("agent", "-", *robots, *connect, f"--clock-correction={correction}", "--lifeline")
         process = launcher.spawn(name, ssh.command(self.address, words), told=document + b"\n")
         self._starting.append(process)
+        self._robots.append((process, launcher))
         return process
 
     def _under_way(self) -> list[Process]:
@@ -227,6 +290,8 @@ class Hosts:
                 station.greet(experiment.network.address)
                 if not station.same_version:
                     trouble.append(_other_version(station))
+                else:
+                    trouble += station.distrusted(station.host.robots)
             except HostError as error:
                 trouble.append(str(error))
         if trouble:
@@ -234,7 +299,17 @@ class Hosts:
                 del self._stations[station.name]
             raise HostError("\n".join(trouble))
         self._robots = {robot: self._stations[name] for name, host in wanted.items() for robot in host.robots}
-        return [self._stations[name].measure(host.robots) for name, host in wanted.items()]
+        return [self._begin(self._stations[name], host.robots) for name, host in wanted.items()]
+
+    @staticmethod
+    def _begin(station: Station, robots: Sequence[str]) -> HostClock:
+        station.set_out()
+        return station.follow(station.measure(robots).offset)
+
+    def followed(self) -> list[tuple[Station, list[str]]]:
+        """Hosts of the case, and who runs there."""
+        stations = dict.fromkeys(self._robots.values())
+        return [(each, [name for name, place in self._robots.items() if place is each]) for each in stations]
 
     def of(self, robot: str) -> Station | None:
         """Where a robot runs; None: here."""
@@ -243,8 +318,7 @@ class Hosts:
     def clocks(self) -> tuple[list[HostClock], list[str]]:
         """The clocks of all hosts of the case now, and what is in the way of reading the others."""
         measured, trouble = [], []
-        for station in dict.fromkeys(self._robots.values()):
-            robots = [robot for robot, place in self._robots.items() if place is station]
+        for station, robots in self.followed():
             try:
                 measured.append(station.measure(robots))
             except HostError as error:

@@ -131,6 +131,13 @@ class Launcher:
             self._tell(process)
         return process
 
+    def tell(self, process: Process, line: bytes) -> None:
+        """Says a line on the lifeline of a process; one that has not read the last gets it no more."""
+        with self._lock:
+            if not process.untold:
+                process.untold += line
+                self._tell(process)
+
     def get(self, name: str) -> Process:
         """The process of that name."""
         return self._processes[name]

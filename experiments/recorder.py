@@ -143,7 +143,7 @@ class Recorder:
 
     def _clock(self, sample: zenoh.Sample) -> None:
         said = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.HostClock)
-        self._finite(sample, said.stamp, said.offset, said.uncertainty)
+        self._finite(sample, said.stamp, said.offset, said.uncertainty, said.applied or 0.0)
         self._recording.clock(said)
 
     @staticmethod

@@ -45,8 +45,8 @@ PROOF: Final = (
 )
 CLOCKS: Final = (
     "What a host's clock read more than the conductor's, by the shortest of many round trips. The offset before the "
-    "run was taken off wherever robots there made a stamp or obeyed the start; what drift added since, is taken off "
-    "here."
+    "run was taken off wherever robots there made a stamp or obeyed the start. What drift added since, they followed; "
+    "the largest error that was left in stamps until they did is taken off here."
 )
 SEEN: Final = "Contacts are those that the world saw begin; distances are between surfaces, on true positions."
 WORKED_OUT: Final = (

@@ -278,13 +278,23 @@ def clocks_table(traces: Sequence[Trace]) -> Table:
                 *(trace.case, lie.host, ", ".join(lie.robots)),
                 *(f"{1e3 * lie.first:+.3f}", f"{1e3 * lie.last:+.3f}", f"{1e3 * lie.uncertainty:.3f}"),
                 "" if lie.drift is None else f"{1e6 * lie.drift:+.1f} ± {2e6 * lie.uncertainty / lie.over:.1f}",
-                f"{1e3 * (lie.last - lie.first):+.3f}",
+                *(f"{1e3 * (lie.last - lie.first):+.3f}", f"{1e3 * lie.worst:.3f}"),
             )
         )
         for trace in traces
         for lie in trace.clocks
     ]
-    heading = ("Case", "Host", "Robots", "Offset before [ms]", "after [ms]", "± [ms]", "Drift [ppm]", "Added [ms]")
+    heading = (
+        "Case",
+        "Host",
+        "Robots",
+        "Offset before [ms]",
+        "after [ms]",
+        "± [ms]",
+        "Drift [ppm]",
+        "Added [ms]",
+        "Left [ms]",
+    )
     return Table(heading, tuple(rows), words=True)
 
 

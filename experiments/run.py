@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
@@ -204,20 +204,19 @@ def fly(
     results: dict[str, Result] = {}
     read.keep(folder / SOURCE)
     embodied = {name: choose_bodies(case, bodies) for name, case in chosen(read, cases).items()}
+    if local:
+        embodied = {name: msgspec.structs.replace(case, hosts={}) for name, case in embodied.items()}
     network = read.experiment.network
     meshed = network.topology == "mesh"
     own_router = network.connect is None and not meshed
     of_lab = reach.folder(read.experiment, read.path, lab)
     secure = of_lab is not None
-    if secure and read.experiment.hosts and not local:
-        hint = "leave the lab out (what goes to hosts goes through ssh), or add --here"
-        raise DocumentError([Problem(read.path.name, 0, 0, "hosts have no certificates of a lab", hint)])
     own = network.listen or free_endpoints(network.routers, protocol="tls" if secure else "tcp")
     listening = reach.routers(read.experiment, read.path, own if own_router else [], lab)
     endpoints = list(map(from_here, listening)) if own_router else listening
     if meshed:
         endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)
-    rights = _rights(embodied, endpoints, folder)
+    rights = enforced(embodied.values(), endpoints, folder)
     (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
     with Launcher(folder / "logs") as launcher:
         for router in divided(listening, network.routers) if own_router else ():
@@ -227,8 +226,6 @@ def fly(
             for name, experiment in embodied.items():
                 if interrupted():
                     break
-                if local:
-                    experiment = msgspec.structs.replace(experiment, hosts={})  # noqa: PLW2901
                 file = folder / f"{name}.json"
                 file.write_bytes(document.write_json(experiment))
                 results[name] = Conductor(
@@ -250,8 +247,10 @@ def fly(
     return _read_back(folder, begun, notes)
 
 
-def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: Path) -> Path | None:
+def enforced(cases: Collection[Experiment], endpoints: Sequence[str], folder: Path) -> Path | None:
     """Who may do what, as a file for the router; None without a lab.
+
+    Robots on hosts have their certificates there, and need none here.
 
     Raises:
         LabError: If a certificate is missing, or somebody else's.
@@ -259,8 +258,8 @@ def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: P
     of = lab_of(endpoints)
     if of is None:
         return None
-    require(of, list(dict.fromkeys(name for case in cases.values() for name in access.needed(case))))
-    made = access.rights(cases.values())
+    require(of, list(dict.fromkeys(name for case in cases for name in access.needed(case))))
+    made = access.rights(cases)
     rules(made, register(of))  # what is wrong with it is said now, and not by a router that does not start
     file = folder / "rights.json"
     file.write_bytes(msgspec.json.format(msgspec.json.encode(made), indent=1))

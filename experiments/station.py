@@ -23,10 +23,10 @@ from typing import Final, Literal
 
 import msgspec
 
-from agents import plugins
+from agents import lab, plugins
 from agents import session as network
 from agents.lifeline import SILENCE_S
-from experiments import version
+from experiments import certificates, version
 from experiments.launcher import LAND_S
 
 RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run on a host: how they are found again
@@ -38,11 +38,16 @@ UDEV: Final = "add a udev rule for it and plug it in again (docs/crazyflie.md)"
 
 
 class Question(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What a launcher wants to know: who is there, what the clock says, whether routers and devices can be had."""
+    """What a launcher wants to know: who is there, what the clock says, whether routers and devices can be had.
 
-    ask: Literal["hello", "clock", "reach", "devices", "sweep"]
+    `lab` is a folder of certificates, and `names` those that are asked about, or shown to routers.
+    """
+
+    ask: Literal["hello", "clock", "reach", "devices", "certificates", "sweep"]
     endpoints: list[str] = []
     bodies: list[str] = []
+    lab: str | None = None
+    names: list[str] = []
 
 
 class Found(msgspec.Struct, frozen=True):
@@ -63,6 +68,7 @@ class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
     machine: str = ""
     seen_from: str = ""
     found: list[Found] = []
+    holds: certificates.Holding = certificates.Holding()
 
 
 def answer(question: Question, clock: float) -> Answer:
@@ -72,7 +78,9 @@ def answer(question: Question, clock: float) -> Answer:
         case "clock":
             return Answer(code, clock)
         case "reach":
-            return Answer(code, clock, found=[_reach(endpoint) for endpoint in question.endpoints])
+            return Answer(code, clock, found=[_reach(endpoint, question) for endpoint in question.endpoints])
+        case "certificates":
+            return Answer(code, clock, holds=certificates.held(Path(question.lab or "."), question.names))
         case "devices":
             return Answer(code, clock, found=list(devices(question.bodies)))
         case "sweep":
@@ -88,12 +96,14 @@ def answer(question: Question, clock: float) -> Answer:
             )
 
 
-def _reach(endpoint: str) -> Found:
+def _reach(endpoint: str, question: Question) -> Found:
     began = time.monotonic()
+    identity = question.names[0] if question.names else None
     try:
-        with network.open_session([endpoint], name="zenpark hosts", wait_s=REACH_S):
+        routers = lab.secured([endpoint], question.lab)
+        with network.open_session(routers, name="zenpark hosts", wait_s=REACH_S, identity=identity):
             return Found(endpoint, True, f"{(time.monotonic() - began) * 1e3:.0f} ms")
-    except (network.Unreachable, network.EndpointError) as error:
+    except (network.Unreachable, network.EndpointError, lab.LabError) as error:
         return Found(endpoint, False, str(error))
 
 

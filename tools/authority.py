@@ -90,12 +90,20 @@ def issue(folder: Path, identities: Mapping[str, Role], *, hosts: Sequence[str] 
                    hosts=hosts, days=days)  # fmt: skip
 
 
-def renew(folder: Path, names: Sequence[str] = (), *, days: float = DAYS, authority: bool = False) -> Register:
+def renew(
+    folder: Path,
+    names: Sequence[str] = (),
+    *,
+    hosts: Sequence[str] = (),
+    days: float = DAYS,
+    authority: bool = False,
+) -> Register:
     """Makes new keys and certificates on the same names; those before stay valid until they end.
 
     Args:
         folder: Of the lab.
         names: Whose; everybody's if none is named.
+        hosts: Names and addresses at which those named may listen from now on, beside those from before.
         days: For which they are valid.
         authority: Whether the authority is a new one, whose certificates alone count from now on: everybody's.
 
@@ -105,8 +113,10 @@ def renew(folder: Path, names: Sequence[str] = (), *, days: float = DAYS, author
     known = register(folder)
     if authority and names:
         raise LabError("a new authority signs everybody's certificate anew: name nobody behind --authority")
+    if hosts and not names:
+        raise LabError("only routers need --host: name them, as in `zenpark keys renew LAB router --host ADDRESS`")
     signing = _found(folder, AUTHORITY_DAYS) if authority else _opened(folder)
-    return _issued(signing, known, _named(known, names or list(known.identities)), days=days)
+    return _issued(signing, known, _named(known, names or list(known.identities)), hosts=hosts, days=days)
 
 
 def revoke(folder: Path, names: Sequence[str], *, days: float = DAYS) -> Register:

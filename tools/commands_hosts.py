@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.options import File, Settings
+from tools.options import File, Lab, Settings
 
 app: Final = typer.Typer(help="Other machines of an experiment.", no_args_is_help=True, rich_markup_mode=None)
 On = Annotated[
@@ -15,16 +15,16 @@ On = Annotated[
 
 
 @app.command(name="check")
-def check(file: File, settings: Settings = None, on: On = None) -> None:
-    """Say whether each host can take part: version, clock, devices, router."""
+def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None) -> None:
+    """Say whether each host can take part: version, clock, devices, certificates, router."""
     from tools.hosts import check as command  # noqa: PLC0415
 
-    raise typer.Exit(command(file, settings=settings or [], only=on or []))
+    raise typer.Exit(command(file, settings=settings or [], only=on or [], lab=lab))
 
 
 @app.command(name="install")
-def install(file: File, settings: Settings = None, on: On = None) -> None:
-    """Put this zenpark on every host that has another or none."""
+def install(file: File, settings: Settings = None, on: On = None, lab: Lab = None) -> None:
+    """Put this zenpark on every host that has another or none, and in a lab the certificates of its robots."""
     from tools.hosts import install as command  # noqa: PLC0415
 
-    raise typer.Exit(command(file, settings=settings or [], only=on or []))
+    raise typer.Exit(command(file, settings=settings or [], only=on or [], lab=lab))

@@ -7,23 +7,31 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Final
 
+from msgspec.structs import replace
+
 from agents.session import free_endpoint
-from experiments import document, ssh, version
+from experiments import certificates, document, reach, ssh, version
+from experiments.document import Document
 from experiments.experiment import Experiment, Host
 from experiments.hosts import HostError, Station
 from experiments.launcher import Launcher
 from experiments.problem import DocumentError, Problem
+from experiments.run import enforced
 from experiments.servants import start_router
 from experiments.station import Question
+from tools.host_keys import send
 
 YES, NO, DOUBTFUL, NOTHING = "✓", "✗", "!", "–"
 HEADING: Final = ("host", "reachable", "zenpark", "Python", "clock", "devices", "router")
+SECURED: Final = (*HEADING[:-1], "certificates", HEADING[-1])  # in a lab
+SOON_DAYS: Final = 14.0
 VAGUE_S: Final = 0.02  # a clock that cannot be told within this lets robots start apart
 REACH_S: Final = 15.0
 INSTALL_S: Final = 900.0
@@ -65,14 +73,16 @@ class Row:
         return not any(cell.startswith(NO) for cell in self.cells)
 
 
-def check(file: str, *, settings: Sequence[str], only: Sequence[str]) -> int:
+def check(file: str, *, settings: Sequence[str], only: Sequence[str], lab: str | None = None) -> int:
     """`zenpark hosts check`: a table; returns 1 if something stands in the way of a run, else 0."""
-    experiment = document.read(file, settings).experiment
+    read = document.read(file, settings)
+    experiment = read.experiment
     chosen = choose(experiment.hosts, only)
-    rows = [looked_at(name, experiment) for name, host in chosen.items() if host.address is None]
-    with stations(experiment, {name: host for name, host in chosen.items() if host.address is not None}) as found:
-        rows += [_row(each, experiment) for each in found]
-    for line in table(rows):
+    heading = HEADING if reach.folder(experiment, read.path, lab) is None else SECURED
+    rows = [looked_at(name, experiment, heading) for name, host in chosen.items() if host.address is None]
+    with stations(read, {name: host for name, host in chosen.items() if host.address is not None}, lab) as found:
+        rows += [_row(each, experiment, heading) for each in found]
+    for line in table(rows, heading):
         print(line)
     for row in rows:
         for each in row.trouble:
@@ -80,18 +90,26 @@ def check(file: str, *, settings: Sequence[str], only: Sequence[str]) -> int:
     return 0 if all(row.well for row in rows) else 1
 
 
-def install(file: str, *, settings: Sequence[str], only: Sequence[str]) -> int:
-    """`zenpark hosts install`: puts this zenpark on every host that has another or none; returns 1 if one fails."""
-    experiment = document.read(file, settings).experiment
+def install(file: str, *, settings: Sequence[str], only: Sequence[str], lab: str | None = None) -> int:
+    """`zenpark hosts install`: puts this zenpark on every host that has another or none; returns 1 if one fails.
+
+    In a lab, puts the certificates of its robots there as well, wherever they are not what counts.
+    """
+    read = document.read(file, settings)
+    experiment = read.experiment
+    folder = reach.folder(experiment, read.path, lab)
     chosen = {name: host for name, host in choose(experiment.hosts, only).items() if host.address is not None}
     code = 0
-    with stations(experiment, chosen) as found:
+    with stations(read, chosen, lab, routed=False) as found:
         for (name, host), there in zip(chosen.items(), found, strict=True):
-            if not isinstance(there, HostError) and there.same_version:
-                print(f"{name}: has it already ({version.digest()[: version.SHOWN]})")
-                continue
+            same = not isinstance(there, HostError) and there.same_version
             try:
-                print(f"{name}: {put(name, host)}", flush=True)
+                done = f"has it already ({version.digest()[: version.SHOWN]})" if same else put(name, host)
+                print(f"{name}: {done}", flush=True)
+                if folder is not None and host.robots:
+                    robots = certificates.of_host(name, experiment.hosts)
+                    right = not isinstance(there, HostError) and same and _trusted(there, folder, robots)
+                    print(f"{name}: {'has its certificates' if right else send(name, host, folder, robots)}")
             except HostError as error:
                 print(error, file=sys.stderr)
                 code = 1
@@ -115,14 +133,33 @@ def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:
     return {name: host for name, host in hosts.items() if not only or {name, *host.tags} & set(only)}
 
 
+def _trusted(there: Station, folder: Path, robots: Sequence[str]) -> bool:
+    """Whether a host holds the certificates of its robots, and no others."""
+    holds = there.holds(robots)
+    return not (holds.others or [*certificates.faults(holds, folder, time.time()), *certificates.ended(folder, robots)])
+
+
 @contextmanager
-def stations(experiment: Experiment, hosts: Mapping[str, Host]) -> Iterator[list[Station | HostError]]:
-    """A connection to each host, or why there is none, and a router as a run would have it."""
+def stations(
+    read: Document, hosts: Mapping[str, Host], lab: str | None, *, routed: bool = True
+) -> Iterator[list[Station | HostError]]:
+    """A connection to each host, or why there is none, and, if `routed`, a router as a run would have it.
+
+    Raises:
+        LabError: If a certificate is missing here.
+    """
+    experiment = read.experiment
     with tempfile.TemporaryDirectory() as folder, Launcher(Path(folder)) as launcher:
-        routers = experiment.network.connect
-        if routers is None:
-            routers = experiment.network.listen or [free_endpoint()]
-            start_router(launcher, routers)
+        network, own = experiment.network, []
+        secure = reach.folder(experiment, read.path, lab) is not None
+        if not routed:
+            routers = []
+        elif network.connect is None:
+            own = network.listen or [free_endpoint(protocol="tls" if secure else "tcp")]
+            routers = reach.routers(experiment, read.path, own, lab)
+            start_router(launcher, routers, enforced(read.cases().values(), routers, Path(folder)))
+        else:
+            routers = reach.routers(experiment, read.path, network.connect, lab)
         begun: list[Station | HostError] = []
         for name, host in hosts.items():
             try:
@@ -140,22 +177,22 @@ def stations(experiment: Experiment, hosts: Mapping[str, Host]) -> Iterator[list
         yield found
 
 
-def looked_at(name: str, experiment: Experiment) -> Row:
+def looked_at(name: str, experiment: Experiment, heading: Sequence[str] = HEADING) -> Row:
     """A host that nobody here can reach: its robots come by themselves."""
     robots = ", ".join(experiment.hosts[name].robots) or "no robots"
-    return Row([name, f"{NOTHING} no address: {robots} started there", *[NOTHING] * 5])
+    return Row([name, f"{NOTHING} no address: {robots} started there", *[NOTHING] * (len(heading) - 2)])
 
 
-def _row(there: Station | HostError, experiment: Experiment) -> Row:
+def _row(there: Station | HostError, experiment: Experiment, heading: Sequence[str]) -> Row:
     """Everything about one host."""
     if isinstance(there, HostError):
         name = str(there).partition(":")[0]
-        return Row([name, NO, *[NOTHING] * 5], [str(there)])
+        return Row([name, NO, *[NOTHING] * (len(heading) - 2)], [str(there)])
     row = Row([there.name])
     try:
         _fill(row, there, experiment)
     except HostError as error:
-        row.cells += [NO] * (len(HEADING) - len(row.cells))
+        row.cells += [NO] * (len(heading) - len(row.cells))
         row.trouble.append(str(error))
     return row
 
@@ -180,7 +217,15 @@ def _fill(row: Row, there: Station, experiment: Experiment) -> None:
     words = ", ".join(each.what for each in devices) or "none needed"
     row.cells.append(f"{NO if wrong else YES} {words}")
     row.trouble += [f"{there.name}: {each.what} {each.text}" for each in wrong]
-    routers = there.ask(Question("reach", endpoints=there.endpoints), REACH_S)[0].found
+    if there.lab is not None and not _recognised(
+        row, there, there.lab, certificates.of_host(there.name, experiment.hosts)
+    ):
+        row.cells.append(f"{NOTHING} needs its certificates")
+        return
+    shown = Question("reach", endpoints=there.endpoints)
+    if there.lab is not None:
+        shown = replace(shown, lab=there.folder, names=there.host.robots)
+    routers = there.ask(shown, REACH_S)[0].found
     unreached = [each for each in routers if not each.well]
     row.cells.append(f"{NO if unreached else YES} {', '.join(each.text for each in routers if each.well)}".rstrip())
     row.trouble += [
@@ -190,10 +235,26 @@ def _fill(row: Row, there: Station, experiment: Experiment) -> None:
     ]
 
 
-def table(rows: Sequence[Row]) -> list[str]:
+def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -> bool:
+    """Adds what a host holds of the lab's certificates to its row; whether its robots would be let in."""
+    wrong = there.distrusted(there.host.robots)
+    holds = there.holds(robots)
+    strays = [f"{there.name}: {each}" for each in certificates.strays(holds, there.name)]
+    left = certificates.days_left(folder, there.host.robots)
+    soon = not wrong and left < SOON_DAYS
+    mark = NO if wrong or strays else DOUBTFUL if soon else YES
+    row.cells.append(f"{mark} {len(holds.held)}, {left:.0f} days left" if not wrong else mark)
+    row.trouble += [*wrong, *strays]
+    if soon:
+        remedy = f"`zenpark keys renew {folder} {' '.join(there.host.robots)}`, then `zenpark hosts install FILE`"
+        row.trouble.append(f"{there.name}: its certificates end in {left:.0f} days; {remedy}")
+    return not wrong
+
+
+def table(rows: Sequence[Row], heading: Sequence[str] = HEADING) -> list[str]:
     """The lines of the table, columns as wide as they must be."""
-    lines = [list(HEADING), *(row.cells for row in rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(HEADING))]
+    lines = [list(heading), *(row.cells for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(heading))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
 
 

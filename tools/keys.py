@@ -93,6 +93,7 @@ def issue(
 def renew(
     folder: Folder,
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME...]", help="All, if none is named.")] = None,
+    host: Hosts = None,
     days: Days = 90.0,
     authority: Annotated[
         bool, typer.Option("--authority", help="A new authority too: every file from before is refused.")
@@ -103,7 +104,7 @@ def renew(
 
     from tools.authority import renew as made  # noqa: PLC0415
 
-    known = made(Path(folder), names or [], days=days, authority=authority)
+    known = made(Path(folder), names or [], hosts=host or [], days=days, authority=authority)
     _tell(Path(folder), known, names or list(known.identities))
 
 

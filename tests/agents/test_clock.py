@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from agents.clock import MACHINE, Clock
+from agents.clock import SLEW, Clock, said
 from agents.graph import links
 from agents.hearing import Hearing
 from agents.prediction import HOLD, ConstantVelocity, Predictor
@@ -39,6 +39,31 @@ def test_a_wrong_clock_moves_the_neighbours_of_those_who_predict():
 def test_corrected_where_stamps_are_made_it_moves_nobody(monkeypatch):
     now = time.time()
     monkeypatch.setattr(time, "time", lambda: now + AHEAD_S)
-    assert MACHINE.utc() == now + AHEAD_S
+    assert Clock().utc() == now + AHEAD_S
     clock = Clock(-AHEAD_S)
     assert misbelieved(T + clock.utc() - now, ConstantVelocity()) < 1e-6
+
+
+def test_a_clock_follows_what_it_is_told_smoothly_and_never_back():
+    clock, now, stamps = Clock(-0.2), 0.0, []
+    clock.heed(said(-0.23).strip())
+    for _ in range(1000):
+        now += 0.01
+        clock.slew(0.01)
+        stamps.append(now + clock.correction_s)
+    steps = np.diff(stamps)
+    assert clock.correction_s == -0.23
+    assert steps.min() == pytest.approx(0.01 * (1 - SLEW))
+    assert steps.max() == pytest.approx(0.01)
+    assert (steps < 0.009999).sum() == pytest.approx(0.03 / SLEW / 0.01, abs=2), "6 s for 30 ms"
+    assert clock.slew(0.01) == 0.0
+
+
+@pytest.mark.parametrize(
+    "line", [b"clock", b"clock nan", b"clock inf", b"clock 0.8", b"0.1", b"clock 0.1 0.2", b"\xff" * 80]
+)
+def test_nonsense_and_jumps_are_not_followed(line, capsys):
+    clock = Clock(0.1)
+    clock.heed(line)
+    assert clock.slew(1.0) == 0.0
+    assert capsys.readouterr().err.startswith("clock: ")

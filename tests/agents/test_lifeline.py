@@ -75,3 +75,14 @@ def test_router_ends_with_its_starter():
     _, said = process.communicate(timeout=10)
     assert process.returncode == 0
     assert said == "router: the starter is gone\n"
+
+
+def test_lines_are_passed_on_whole_and_heartbeats_are_not(pipe):
+    lines = []
+    line = Lifeline(threading.Event(), timeout_s=60.0, fd=pipe[0], told=lines.append)
+    line.start()
+    for part in (b"\n\nclock -0.", b"2001\n", b"\n\nclock 1\nx", b"x" * 10_000):
+        os.write(pipe[1], part)
+    os.close(pipe.pop())
+    line.join(10.0)
+    assert lines == [b"clock -0.2001", b"clock 1"]

@@ -1,0 +1,145 @@
+"""A lab on several machines: three robots on two of them, over mutual TLS, started from a third with one command."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import stat
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from agents.lab import register
+from experiments import document, playback
+from tests.system.lab import until
+from tests.system.machines import Machines, machines, why_not
+from tests.system.test_machines import busy, zenpark
+from tools import authority
+
+LACKING = why_not()
+pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(LACKING), reason=LACKING)]
+
+ROBOTS = {"lab1": ["KH01", "CF01"], "lab2": ["KH02"]}
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
+    with machines(tmp_path_factory.mktemp("machines"), ["desk", *ROBOTS]) as made:
+        yield made
+
+
+class Laboratory:
+    """The file of an experiment with hosts, its lab beside it, and what each host was sent."""
+
+    def __init__(self, lab: Machines, folder: Path, network: str = "") -> None:
+        self.lab, self.keys, self.file, self.out = lab, folder / "lab", folder / "triangle.toml", folder / "run"
+        text = document.catalogue_path("triangle").read_text("utf-8")
+        text += f'\n[network]\nlab = "lab"\n{network}\n'
+        self.there = {host: folder / "there" / host for host in ROBOTS}
+        for host, robots in ROBOTS.items():
+            text += f'\n[hosts.{host}]\naddress = "{host}"\nzenpark = "{lab[host].zenpark()}"\n'
+            text += f'lab = "{self.there[host]}"\nrobots = {json.dumps(robots)}\n'
+        self.file.write_text(text, "utf-8")
+        robots = [robot for each in ROBOTS.values() for robot in each]
+        authority.create(self.keys, {**{role: role for role in authority.SERVICES}, **dict.fromkeys(robots, "robot")})
+
+    def zenpark(self, *arguments: str, limit_s: float = 60.0) -> tuple[int, str]:
+        """Exit code and all that it said."""
+        command, *rest = arguments
+        process = zenpark(self.lab, command, *rest[: command != "run"], str(self.file), *rest[command != "run" :])
+        try:
+            out, _ = process.communicate(timeout=limit_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            out, _ = process.communicate()
+        return process.returncode, out
+
+    def fly(self) -> tuple[int, str]:
+        more = ["--case", "event", "--set", "duration_s=2", "--anyway", "--no-report", "--out", str(self.out)]
+        return self.zenpark("run", *more)
+
+    def flew(self) -> None:
+        code, out = self.fly()
+        assert code == 0, out
+        until(lambda: not busy(self.lab), "nothing is left", 5.0)
+        trace = playback.read(self.out / "event.mcap").trace
+        assert not trace.lost.any()
+        for robot in trace.robots:
+            log = (self.out / "logs" / f"event-{robot}.log").read_text()
+            assert f"{robot}: done (finished)" in log, log
+
+
+def test_each_machine_gets_its_own_keys_and_all_fly_through_ssh(lab: Machines, tmp_path: Path) -> None:
+    made = Laboratory(lab, tmp_path)
+    code, out = made.zenpark("hosts", "check")
+    assert code == 1, out
+    assert "lab1: has no certificates of KH01, CF01; `zenpark hosts install FILE`" in out
+    code, out = made.fly()
+    assert code == 2, out
+    assert "lab2: has no certificates of KH02; `zenpark hosts install FILE`" in out
+    shutil.rmtree(made.out)
+    with contextlib.suppress(FileNotFoundError):
+        made.there["lab1"].mkdir(parents=True)
+        shutil.copy(made.keys / "KH02.key", made.there["lab1"])  # it ran there yesterday
+
+    code, out = made.zenpark("hosts", "install")
+    assert code == 0, out
+    assert "lab1: certificates of KH01, CF01 put into" in out
+    assert "removed KH02.key" in out
+    for host, robots in ROBOTS.items():
+        there = made.there[host]
+        assert stat.S_IMODE(there.stat().st_mode) == 0o700
+        wanted = {"ca.pem", *(f"{robot}.{end}" for robot in robots for end in ("pem", "key"))}
+        assert {file.name for file in there.iterdir()} == wanted, "neither the authority's key nor others'"
+        assert {stat.S_IMODE(file.stat().st_mode) for file in there.iterdir()} == {0o600}
+    code, out = made.zenpark("hosts", "install")
+    assert (code, out.count("has its certificates")) == (0, 2), out
+    for robot in ("KH01", "KH02", "CF01"):
+        (made.keys / f"{robot}.key").unlink()  # they are where they are needed
+    code, out = made.zenpark("hosts", "check")
+    assert code == 0, out
+    assert out.count("✓") == 14, out
+    made.flew()
+
+
+def test_robots_elsewhere_reach_a_router_that_listens_for_them(lab: Machines, tmp_path: Path) -> None:
+    made = Laboratory(lab, tmp_path, 'listen = ["tls/0.0.0.0:7447"]')
+    assert made.zenpark("hosts", "install")[0] == 0
+    code, out = made.fly()
+    assert code == 2, out
+    here = lab["desk"].address
+    assert f"lab1: reaches the router at {here}, which stands in no router's certificate" in out
+    assert f"`zenpark keys renew {made.keys} router --host {here}`" in out
+    shutil.rmtree(made.out)
+    authority.renew(made.keys, ["router"], hosts=[here])
+    made.flew()
+
+
+def test_what_is_wrong_with_certificates_is_told_with_a_remedy(lab: Machines, tmp_path: Path) -> None:
+    made = Laboratory(lab, tmp_path)
+    assert made.zenpark("hosts", "install")[0] == 0
+    authority.revoke(made.keys, ["KH01"])
+    authority.renew(made.keys, ["CF01"])
+    foreign = tmp_path / "foreign"
+    authority.create(foreign, {"KH02": "robot"})
+    for name in ("ca.pem", "KH02.pem", "KH02.key"):
+        shutil.copy(foreign / name, made.there["lab2"])
+    for code, out in (made.zenpark("hosts", "check"), made.fly()):
+        assert code != 0
+        assert "lab1: the certificate of KH01 there has been revoked since; `zenpark hosts install FILE`" in out
+        assert "lab1: the certificate of CF01 there has been renewed since" in out
+        assert "lab2: its certificates are of another lab" in out
+        assert "Traceback" not in out
+    assert made.zenpark("hosts", "install")[0] == 0
+    assert made.zenpark("hosts", "check")[0] == 0
+    authority.renew(made.keys, ["KH02"], days=1e-6)
+    (made.there["lab1"] / "CF01.key").chmod(0o640)
+    until(lambda: register(made.keys), "a moment passes")
+    code, out = made.zenpark("hosts", "install")
+    assert code == 1
+    assert f"`zenpark keys renew {made.keys} KH02`" in out
+    code, out = made.zenpark("hosts", "check")
+    assert "the certificate of KH02" in out
