@@ -157,11 +157,15 @@ class Agent:
         self._ordered[row] = True
         return ""
 
+    def resume(self, row: int) -> None:
+        """Order to go on after a hold."""
+        self._ordered[row] = False
+
     def start(self, row: int, at: float) -> str:
         """Order to begin at `at` [s], or to go on after a hold."""
         refusal = self.life.start(row, at)
         if not refusal:
-            self._ordered[row] = False
+            self.resume(row)
         return refusal
 
     def missing(self, row: int) -> list[str]:
@@ -237,7 +241,10 @@ class Agent:
             return self._nobody  # nobody asks any more
         seen = np.isfinite(state.position).all(axis=1) & (t - state.time <= self.assignment.limits.own_silence_s)
         lacks = np.zeros(len(seen), dtype=bool)
-        lacks[self.assignment.links.listener[~np.isfinite(self.heard.stamp)]] = True
+        unheard = ~np.isfinite(self.heard.stamp)
+        if self.assignment.waited_for is not None:
+            unheard &= self.assignment.waited_for
+        lacks[self.assignment.links.listener[unheard]] = True
         if self.guidance is not None:
             lacks |= self.guidance.unheard()
         patience = self.assignment.patience_s

@@ -49,6 +49,7 @@ class Assignment:
         decide_every: A goal is decided on every so many ticks.
         duration: Of the experiment [s].
         patience_s: A row that misses a neighbour for this long is ready without it; None: never.
+        waited_for: (E,) links without which a row is not ready; None: all.
     """
 
     names: tuple[str, ...]
@@ -67,6 +68,7 @@ class Assignment:
     decide_every: int
     duration: float
     patience_s: float | None = None
+    waited_for: Mask | None = None
     predictor: Predictor = HOLD
     update: Trigger | None = None
     avoidance: Avoidance | None = None

@@ -102,6 +102,11 @@ class Keys:
         return f"{self.realm}/run/conductor"
 
     @property
+    def run_order(self) -> str:
+        """Queryable of the conductor: pause, resume, remove, restart, replace, add robots of a run under way."""
+        return f"{self.realm}/run/order"
+
+    @property
     def clock(self) -> str:
         """How the clocks of other machines lie to the conductor's."""
         return f"{self.realm}/run/clock"

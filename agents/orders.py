@@ -12,6 +12,7 @@ from agents.wire import Order
 
 SOON_S: Final = 3600.0  # a common start further ahead than this is a mistake of somebody's clock
 OWN: Final = ("clamp", "tracking_gain")
+PAUSED: Final = "told to hold"
 
 Answer = tuple[str, float | None]  # why it is refused (empty: it is not), and the value of a parameter
 
@@ -35,7 +36,11 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
         case "start":
             return _start(agent, row, order.at, t, utc), None
         case "hold":
-            return agent.hold(row), None
+            return _hold(agent, row), None
+        case "resume":
+            return _resume(agent, row), None
+        case "leave":
+            agent.life.land(row, "told to leave")
         case "land":
             agent.life.land(row, "ordered to land")
         case "stop":
@@ -45,12 +50,27 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
     return "", None
 
 
+def _hold(agent: Agent, row: int) -> str:
+    refusal = agent.hold(row)
+    if not refusal:
+        agent.life.reason[row] = PAUSED
+    return refusal
+
+
+def _resume(agent: Agent, row: int) -> str:
+    agent.resume(row)
+    if agent.life.reason[row] == PAUSED:
+        agent.life.reason[row] = ""
+    return ""
+
+
 def _start(agent: Agent, row: int, at: float | None, t: float, utc: float) -> str:
     if at is None or not isfinite(at):
         return "a start needs `at`, a UTC time in seconds"
     if not t - agent.assignment.duration < at - utc < t + SOON_S:
         return f"start at {at} is not within this experiment; are the clocks set?"
-    return agent.start(row, at - utc)
+    refusal = agent.start(row, at - utc)
+    return refusal or _resume(agent, row)
 
 
 def _parameter(agent: Agent, order: Order) -> Answer:

@@ -113,6 +113,7 @@ class Runtime:
         self._channel = Channel(setup.conditions or Conditions.ideal(len(assignment.links)))
         self._state_slot = 0
         self._stopping: str | None = None
+        self._leaving: set[int] = set()  # rows that were told to go while the run goes on
         self._news = False  # somebody came or went since the last report
         self._utc = self._now = self._next = 0.0
         self._reach = reach_of(assignment.limits)
@@ -144,11 +145,16 @@ class Runtime:
                 ) as session:
                     self._refuse_doubles(session)
                     self._join(session)
-                    self._loop(lambda: rope.reason if lost.is_set() else ("told to end" if asked.is_set() else None))
+                    self._loop(lambda: rope.reason if lost.is_set() else self._told_to_end(asked.is_set()))
             finally:
                 self._come_down()
                 self._body.close()
         return 0
+
+    def _told_to_end(self, asked: bool) -> str | None:
+        if asked:
+            return "told to end"
+        return "told to leave" if len(self._leaving) == len(self._names) else None
 
     def _come_down(self) -> None:
         """Motors off; what is still in the air, because something broke on the way, lands first."""
@@ -215,7 +221,7 @@ class Runtime:
             ranged=[source == "body" for source in ranging],
             followed=None if self._goals is None else self._goals.news,
         )
-        self._tokens = [network.alive_token(session, keys.alive(name)) for name in names]
+        self._tokens = {row: network.alive_token(session, keys.alive(name)) for row, name in enumerate(names)}
 
     def _listen(self, t: float) -> None:
         """Takes in what has arrived since the last tick."""
@@ -338,6 +344,8 @@ class Runtime:
                 return
             refusal, value = carry_out(self.agent, row, order, t, self._utc)
             self._counts.refused += bool(refusal)
+            if order.order == "leave":
+                self._leaving.add(row)
             if order.order == "start" and order.at is not None and not refusal:
                 self._align(order.at - self._utc)
                 self._telemetry.due = t  # whoever decides for it must know in time when it begins
@@ -401,7 +409,7 @@ class Runtime:
             state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))
             self._counts.malformed += self._ranges.malformed - refused
         said = self.agent.speak(t, state)
-        for row in said.rows:
+        for row in said.rows if not self._leaving else self._still_heard(said.rows):
             self._say(int(row), said, float(state.yaw[row]), t)
         actions = self.agent.act(t, state, said)
         self._act(actions)
@@ -418,6 +426,14 @@ class Runtime:
             telemetry.scan(state)
         telemetry.report(t, everything=t >= telemetry.due, state=state, changed=self._news)
         self._news = False
+
+    def _still_heard(self, rows: Index) -> list[int]:
+        """Those of `rows` that have not left; who has is down, and no neighbour must find it by a pose or a token."""
+        left = [row for row in self._leaving if self.agent.life.phase[row] == Phase.DONE]
+        for row in left:
+            if (token := self._tokens.pop(row, None)) is not None:
+                token.undeclare()  # type: ignore[no-untyped-call]
+        return [row for row in rows.tolist() if row not in left]
 
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""

@@ -14,7 +14,8 @@ import msgspec
 Vector = tuple[float, float, float]
 Setpoint = tuple[float, float, float, float]
 Encoding = Literal["json", "msgpack"]
-OrderKind = Literal["takeoff", "start", "hold", "land", "stop", "get", "set"]
+OrderKind = Literal["takeoff", "start", "hold", "resume", "leave", "land", "stop", "get", "set"]
+ChangeKind = Literal["pause", "resume", "remove", "restart", "replace", "add"]
 
 JSON: Final = "application/json"  # plain, without a schema suffix: REST and command-line tools then print it
 MSGPACK: Final = "application/msgpack"
@@ -266,7 +267,10 @@ class WorldReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What an operator asks of a robot: `at` is a UTC start time [s]; `name` and `value` belong to get and set."""
+    """What an operator asks of a robot: `at` is a UTC start time [s]; `name` and `value` belong to get and set.
+
+    A robot that is told to leave lands and takes its token back; its process ends with the last of its robots.
+    """
 
     order: OrderKind
     at: float | None = None
@@ -282,6 +286,30 @@ class Reply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     phase: str
     reason: str = ""
     value: float | None = None
+
+
+class RunOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What an operator asks of the conductor of a run under way; `who` is what the operator goes by.
+
+    The others belong to replace: the `spare` of the experiment file that takes over, or the address of a `body`; `at`
+    is where it starts, x, y [m], with `yaw` [rad].
+    """
+
+    order: ChangeKind
+    robots: list[str]
+    who: str = ""
+    spare: str | None = None
+    body: str | None = None
+    at: tuple[float, float] | None = None
+    yaw: float = 0.0
+
+
+class RunReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A conductor's answer, when all is done: by robot what was done, and why not; `reason` refuses the whole order."""
+
+    done: dict[str, str] = {}
+    refused: dict[str, str] = {}
+    reason: str = ""
 
 
 class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -334,6 +362,8 @@ Message = (
     | WorldState
     | WorldOrder
     | WorldReply
+    | RunOrder
+    | RunReply
 )
 M = TypeVar(
     "M",
@@ -354,6 +384,8 @@ M = TypeVar(
     WorldState,
     WorldOrder,
     WorldReply,
+    RunOrder,
+    RunReply,
 )
 
 _json = msgspec.json.Encoder()

@@ -92,7 +92,8 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
         "operator": Grant(
             say=[keys.estop, keys.below("run")],
             hear=everything,
-            ask=[keys.order("*"), keys.world_order, *look.ask],
+            ask=[keys.order("*"), keys.world_order, keys.run_order, *look.ask],
+            answer=[keys.run_order],
             be=[keys.below("run")],
             watch=everything,
         ),

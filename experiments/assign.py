@@ -17,7 +17,7 @@ from agents.keys import Keys
 from agents.kinds import KINDS, Kind
 from agents.planning import Leg
 from agents.prediction import HOLD, Predictor
-from agents.rows import Array, Index
+from agents.rows import Array, Index, Mask
 from agents.safety import Limits
 from experiments import outlines
 from experiments.experiment import Experiment, Hybrid
@@ -300,7 +300,14 @@ def _assign(experiment: Experiment, names: Sequence[str], copies: int, *, centra
         duration=experiment.duration_s,
         patience_s=experiment.start.deadline_s if experiment.start.missing == "go-on" else None,
         guided=np.array([name in steered for name in names] * copies) if steered else None,
+        waited_for=_waited_for(experiment, pattern.links, copies),
     )
+
+
+def _waited_for(experiment: Experiment, links: Links, copies: int) -> Mask | None:
+    """Links (E,) from robots that are not on standby; None if nobody is."""
+    standby = np.array([robot.standby for robot in experiment.robots.values()] * copies)
+    return ~standby[links.speaker] if standby.any() else None
 
 
 def disturbance(experiment: Experiment, name: str) -> Disturbance:

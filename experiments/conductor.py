@@ -6,31 +6,26 @@ It decides nothing that a robot needs: if it dies, the robots land by themselves
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
-import zenoh
-
-from agents import lab, topology, wire
-from agents import session as network
+from agents import wire
 from agents.keys import Keys
-from experiments import hosts as machines
-from experiments import mesh, orders
 from experiments.assign import guided
+from experiments.changes import CLIMB_S, HotChanges
 from experiments.crew import Crew
 from experiments.drift import Drift
 from experiments.experiment import Experiment
 from experiments.hosts import Hosts
 from experiments.launcher import LAND_S, Launcher
+from experiments.overview import Overview
+from experiments.seen import Progress, Seen, Show
 
 POLL_S: Final = 0.05
 LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then
-CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
-ROUTER_S: Final = 10.0
-FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
 GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
 
 ADOPT_S: Final = 0.5
@@ -40,60 +35,9 @@ BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behin
 LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
 OUTPUT: Final = "says"  # kind of the events that are a line of a process's output
 
-M = TypeVar("M", wire.Status, wire.State)
-
-ORDER: Final = ("idle", "ready", "airborne", "running", "landing", "done")
-
 
 class RunFailed(RuntimeError):
     """A run that could not begin, with what is missing and what to do."""
-
-
-@dataclass
-class Seen:
-    """What the conductor knows of a robot.
-
-    Attributes:
-        status: Its last status.
-        error: Formation error as the robot itself sees it [m]; None of one that is guided, and sees none.
-        sent: Poses that it sent, and `rate` of them over the last second [1/s].
-        alive: Whether its liveliness token stands.
-        gone: Whether its process has ended or its token has vanished in mid-run.
-        vanished: Since when the token of one that is adopted is missing [s, monotonic].
-        behind: The least time from a stamp of it to its arrival [s]: small, if its clock is right.
-    """
-
-    status: wire.Status | None = None
-    error: float | None = 0.0
-    rate: float = 0.0
-    alive: bool = False
-    gone: bool = False
-    counted: tuple[float, int] = (0.0, 0)
-    behind: float = float("inf")
-    vanished: float = float("inf")
-
-    @property
-    def phase(self) -> str:
-        return self.status.phase if self.status is not None else "starting"
-
-    def reached(self, phase: str) -> bool:
-        """Whether it is in this phase or beyond."""
-        return self.status is not None and ORDER.index(self.status.phase) >= ORDER.index(phase)
-
-
-@dataclass
-class Progress:
-    """What there is to show of a run."""
-
-    case: str
-    phase: str
-    elapsed: float | None
-    duration: float
-    robots: dict[str, Seen]
-    events: list[wire.Event] = field(default_factory=list)
-
-
-Show = Callable[[Progress], None]
 
 
 @dataclass(frozen=True)
@@ -147,7 +91,10 @@ class Conductor:
         self._hosts, self._show, self._interrupted = hosts, show, interrupted
         self._keys = Keys(experiment.network.realm)
         steered = guided(experiment)
-        self._robots = {name: Seen(error=None if name in steered else 0.0) for name in experiment.robots}
+        self._robots = {
+            name: Seen(error=None if name in steered else 0.0, out="standby" if robot.standby else "")
+            for name, robot in experiment.robots.items()
+        }
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
         self._crew = Crew(
             experiment,
@@ -179,9 +126,9 @@ class Conductor:
                 self._crew.start()
                 if self._until("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
-                    self._tell_clocks(clocks)
+                    self._view.tell_clocks(clocks)
                     self._drift = stack.enter_context(Drift(self._hosts.followed()))
-                    self._say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
+                    self._view.say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
                     self._order(wire.Order("takeoff"))
                     if self._until("airborne", CLIMB_S):
                         start = self._start()
@@ -189,11 +136,11 @@ class Conductor:
                 self._land()
                 if start is not None:
                     self._drift.close()
-                    self._tell_drift()
+                    self._view.tell_drift(*self._drift.news())
                     clocks, trouble = self._hosts.clocks()
-                    self._tell_clocks(clocks)
+                    self._view.tell_clocks(clocks)
                     for each in trouble:
-                        self._say("clock", "conductor", each)
+                        self._view.say("clock", "conductor", each)
         except RunFailed as failure:
             self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: say it now
             self._progress.events.append(wire.Event(time.time(), "failed", "conductor", self._progress.phase))
@@ -201,8 +148,8 @@ class Conductor:
             raise
         finally:
             self._crew.end()
-        gone = tuple(name for name, seen in self._robots.items() if seen.gone)
-        return Result(self._recording, self._interrupted(), start, ready, gone)
+        lost = tuple(name for name, seen in self._robots.items() if seen.out == "lost")
+        return Result(self._recording, self._interrupted(), start, ready, lost)
 
     def _adopt(self) -> None:
         """Finds robots that were started by hand or at boot, which nobody needs to start.
@@ -225,25 +172,11 @@ class Conductor:
         there = {name for name, seen in self._robots.items() if seen.alive}
         for name in self._crew.adopt(there):
             said = f"is there already, {self._robots[name].phase}" if name in there else f"is started on {away[name]}"
-            self._say("adopted", name, f"{said}; not started from here")
+            self._view.say("adopted", name, f"{said}; not started from here")
 
     def _flown(self) -> list[str]:
         """Robots that are there and have flown, or do."""
         return [name for name, seen in self._robots.items() if seen.alive and seen.reached("airborne")]
-
-    def _tell_clocks(self, clocks: Sequence[wire.HostClock]) -> None:
-        """Says how the hosts' clocks lie, for the recording."""
-        for each in clocks:
-            self._clock.put(wire.encode(each))
-            self._say("clock", each.host, f"{each.offset * 1e3:+.2f} ms ± {each.uncertainty * 1e3:.2f} ms against ours")
-
-    def _tell_drift(self) -> None:
-        """Says, for the recording, how the hosts' clocks have drifted and what their robots do about it."""
-        measured, trouble = self._drift.news()
-        for each in measured:
-            self._clock.put(wire.encode(each))
-        for text in trouble:
-            self._say("clock", "conductor", text)
 
     # ------------------------------------------------------------------ phases
 
@@ -260,16 +193,16 @@ class Conductor:
             if self._interrupted():
                 return False
             late = [name for name, seen in self._robots.items() if not (seen.reached(phase) or seen.gone)]
-            gone = [name for name, seen in self._robots.items() if seen.gone]
+            gone = [name for name, seen in self._robots.items() if seen.out == "lost"]
             if gone and self._experiment.start.missing == "abort":
                 raise RunFailed(self._excuse(gone, "could not start"))
-            if not late and (not recorder or self._recording_begun):
+            if not late and (not recorder or self._view.recording_begun):
                 return True
             if time.monotonic() > deadline:
                 if late and self._experiment.start.missing == "abort":
                     raise RunFailed(self._excuse(late, f"not {phase} after {limit_s:g} s"))
                 for name in late:
-                    self._say("late", name, f"not {phase} after {limit_s:g} s: {self._why(name)}")
+                    self._view.say("late", name, f"not {phase} after {limit_s:g} s: {self._why(name)}")
                 return True
             time.sleep(POLL_S)
 
@@ -283,9 +216,9 @@ class Conductor:
         for name, seen in self._robots.items():
             if not (seen.gone or AHEAD_S < seen.behind < BEHIND_S):
                 remedy = "set it (NTP), or let zenpark start the robot: [hosts]"
-                self._say("clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}")
+                self._view.say("clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}")
         at = time.time() + LEAD_S
-        self._say("start", "conductor", "common start", stamp=at)
+        self._view.say("start", "conductor", "common start", stamp=at)
         self._order(wire.Order("start", at=at), only="airborne")
         return at
 
@@ -296,25 +229,28 @@ class Conductor:
         times = [0.0, *(leg.at_s for leg in legs)]
         reached = -1
         end = start + self._experiment.duration_s
+        self._changes.begin(start)
         self._progress.phase = "starting together"
         while (now := time.time()) < end + LAND_S and not self._interrupted():
             self._look()
-            self._tell_drift()
+            self._view.tell_drift(*self._drift.news())
             self._progress.elapsed = now - start
             while reached + 1 < len(times) and now - start >= times[reached + 1]:
                 reached += 1
                 self._progress.phase = names[reached]
-                self._say("phase", "conductor", names[reached], stamp=start + times[reached])
-            left = [seen for seen in self._robots.values() if not seen.gone]
-            if all(seen.reached("landing") for seen in left):
+                self._view.say("phase", "conductor", names[reached], stamp=start + times[reached])
+            busy = self._changes.under_way
+            left = [seen for name, seen in self._robots.items() if not seen.gone and name not in busy]
+            if all(seen.reached("landing") for seen in left) and (left or not busy):
                 return
             time.sleep(POLL_S)
 
     def _land(self) -> None:
         """Everybody down."""
-        self._told.undeclare()  # type: ignore[no-untyped-call]  # who joins from now on waits for the next
+        self._view.close_doors()
+        self._changes.close()
         self._progress.phase = "landing"
-        self._say("phase", "conductor", "landing" + (" (interrupted)" if self._interrupted() else ""))
+        self._view.say("phase", "conductor", "landing" + (" (interrupted)" if self._interrupted() else ""))
         if any(not (seen.gone or seen.reached("landing")) for seen in self._robots.values()):
             self._order(wire.Order("land"))
         deadline = time.monotonic() + LAND_S
@@ -329,115 +265,57 @@ class Conductor:
         self._progress.phase = "done"
         self._show(self._progress)
 
-    # ------------------------------------------------------------------ the network
+    # ------------------------------------------------------------------ what happens meanwhile
 
     def _join(self, stack: ExitStack) -> None:
-        keys = self._keys
-        self._session = stack.enter_context(
-            network.open_session(
-                self._endpoints,
-                name="conductor",
-                wait_s=ROUTER_S,
-                identity="operator",
-                rights=mesh.rights(self._experiment, self._endpoints),
-            )
-        )
-        self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
-        if self._endpoints != [network.DEFAULT_ENDPOINT]:
-            there = self._endpoints[0]
-            file = self._recording.parent / mesh.ENDPOINTS
-            options = lab.options(there) if len(self._endpoints) == 1 else f"--connect @{file}"
-            where = "a mesh" if topology.is_mesh(self._endpoints) else ", ".join(lab.bare(self._endpoints))
-            self._say("router", "conductor", f"{where}: look with `zenpark keys {options}`")
-        self._clock = network.publisher(self._session, keys.clock, wire.JSON)
-        self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
-        self._told.put(machines.document(self._experiment))
-        self._token = network.alive_token(self._session, keys.conductor)
-        self._statuses = network.pose_subscriber(self._session, keys.status("*"), 4096)
-        self._states = network.subscriber(self._session, keys.state("*"), 4096)
-        self._watch = network.alive_watch(self._session, keys.alive("*"))
-        self._recorder_watch = network.alive_watch(self._session, keys.recorder)
-        self._recording_begun = False
-        self._cut_off = float("-inf")
+        self._view = Overview(stack, self._experiment, self._endpoints, self._progress, self._recording.parent)
+        self._changes = HotChanges(self._experiment, self._crew, self._view, self._keys)
 
     def _look(self) -> None:
         """Takes in what has happened since the last look."""
-        now = time.time()
-        for sample in network.received(self._recorder_watch.handler):
-            self._recording_begun |= sample.kind == zenoh.SampleKind.PUT
-        for status in self._messages(self._statuses.handler, wire.Status):
-            self._heed(status)
-        for state in self._messages(self._states.handler, wire.State):
-            if self._robots[state.robot].error is not None:
-                self._robots[state.robot].error = state.error
-        for sample in network.received(self._watch.handler):
-            name = self._keys.whose(str(sample.key_expr))
-            if name is not None and (seen := self._robots.get(name)) is not None:
-                seen.alive = sample.kind == zenoh.SampleKind.PUT
-                seen.vanished = float("inf") if seen.alive else time.monotonic()
-        self._miss()
+        view, now = self._view, time.time()
+        for name in view.look():
+            self._miss(name)
         for death in self._crew.deaths():
-            self._say(death.kind, death.source, death.text)
+            if death.kind == "lost" and self._changes.expects(death.source, death.text):
+                continue
+            view.say(death.kind, death.source, death.text)
             if death.kind == "recorder":
-                self._recording_begun = True  # nothing to wait for
+                view.recording_begun = True  # nothing to wait for
             elif death.kind == "lost":
-                self._robots[death.source].gone, self._robots[death.source].alive = True, False
+                self._robots[death.source].alive = False
+                self._changes.lose(death.source)
         self._progress.events += [wire.Event(now, OUTPUT, place, line) for place, line in self._crew.output()]
         for name, seen in self._robots.items():
-            if seen.gone and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
-                seen.gone = False  # somebody started it again
-                self._say("back", name, "alive again")
+            if seen.out == "lost" and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
+                self._come_back(name, seen)
+        self._changes.go_on()
         self._show(self._progress)
 
-    def _messages(self, handler: network.Polled[zenoh.Sample], kind: type[M]) -> Iterator[M]:
-        for sample in network.received(handler):
-            try:
-                message = wire.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
-            except wire.Malformed:
-                continue
-            if message.robot in self._robots and self._keys.whose(str(sample.key_expr)) == message.robot:
-                yield message
+    def _miss(self, name: str) -> None:
+        """The token of an adopted robot has vanished for good: all that is known of its end."""
+        if name in self._crew.adopted and not self._changes.expects(name, "it is gone"):
+            self._view.say("lost", name, "is not on the network any more")
+            self._changes.lose(name)
 
-    def _heed(self, status: wire.Status) -> None:
-        seen = self._robots[status.robot]
-        if status.phase not in ORDER:
+    def _come_back(self, name: str, seen: Seen) -> None:
+        """It was only away, or somebody started it again."""
+        if name in self._changes.under_way:
             return
-        if seen.status is not None and (seen.status.phase, seen.status.reason) != (status.phase, status.reason):
-            self._say("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
-        since, sent = seen.counted
-        if status.stamp - since >= 0.9:
-            seen.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0
-            seen.counted = (status.stamp, status.sent)
-        seen.status = status
-        seen.behind = min(seen.behind, time.time() - status.stamp)
-
-    def _miss(self) -> None:
-        """The tokens of adopted robots that have vanished are all that is known of their end.
-
-        Without a router all vanish, and come back one by one where there is another.
-        """
-        now = time.monotonic()
-        if not network.connected(self._session):
-            self._cut_off = now
-        for name in self._crew.adopted:
-            seen = self._robots[name]
-            if not seen.gone and now - max(seen.vanished, self._cut_off) > MISSED_S:
-                seen.gone = True
-                self._say("lost", name, "is not on the network any more")
+        seen.out = ""
+        joins = "" if seen.reached("running") else f"; `zenpark robot add {name}` lets it join the run"
+        self._view.say("back", name, f"alive again{joins}")
+        if not self._crew.runs(name):
+            self._crew.adopted.add(name)
 
     def _order(self, order: wire.Order, only: str | None = None) -> None:
         """Gives an order to every robot that is left; what is refused is said."""
         for name, seen in self._robots.items():
             if seen.gone or seen.status is None or (only is not None and not seen.reached(only)):
                 continue
-            reply = orders.give(self._session, self._keys, name, order)
+            reply = self._view.order(name, order)
             if not reply.ok:
-                self._say("refused", name, f"{order.order}: {reply.reason}")
-
-    def _say(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
-        event = wire.Event(time.time() if stamp is None else stamp, kind, source, text)
-        self._progress.events.append(event)
-        self._events.put(wire.encode(event))
+                self._view.say("refused", name, f"{order.order}: {reply.reason}")
 
     # ------------------------------------------------------------------ words
 

@@ -6,17 +6,24 @@ one of the experiment.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
+import msgspec
+import numpy as np
+
+from agents.rows import Array
+from experiments import assign, standins
 from experiments import hosts as machines
-from experiments import standins
 from experiments.document import write_json
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, Robot
 from experiments.hosts import STATION, Hosts
 from experiments.launcher import LAND_S, Launcher, Process
 from experiments.servants import Servants
+
+ALONE_S: Final = 3.0  # a robot that joins a run under way does not wait longer for neighbours that say nothing
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,7 @@ class Crew:
         self._file, self._source, self._recording = file, source, recording
         self._launcher, self._hosts = launcher, hosts
         self._connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
-        self._groups: dict[str, list[str]] = {}
+        self._groups: dict[str, list[str]] = {}  # by process, without the case
         for name, robot in experiment.robots.items():
             self._groups.setdefault(robot.process or name, []).append(name)
         self._recorder = f"{case}-recorder"
@@ -87,6 +94,7 @@ class Crew:
         self.adopted: set[str] = set()
         self.away = machines.absent(experiment)
         self._addressed, self._reached = file, experiment
+        self._joining = file.with_name(f"{case}-joining.json")
         self._abroad: dict[str, Process] = {}  # by host and group
 
     def prepare(self, interrupted: Callable[[], bool]) -> None:
@@ -110,17 +118,72 @@ class Crew:
         return sorted(self.adopted)
 
     def start(self) -> None:
-        """Starts all robots that are not adopted, on their machines."""
-        document = machines.document(self._reached)
-        for group, names in self._groups.items():
-            missing = [name for name in names if name not in self.adopted]
-            station = self._hosts.of(names[0])
-            process = self._process(group)
-            if station is not None and missing:
-                self._abroad[f"{station.name}/{group}"] = station.start(process, missing, document, self._launcher)
-            elif missing:
-                arguments = [str(self._addressed), *missing, *self._connect, "--lifeline"]
-                self._launcher.start(process, "experiments.robot", *arguments)
+        """Starts all robots that are neither adopted nor on standby, on their machines."""
+        robots = self._experiment.robots
+        for names in self._groups.values():
+            if missing := [name for name in names if not (name in self.adopted or robots[name].standby)]:
+                self._start(missing, self._addressed, self._reached)
+
+    def start_again(self, names: Sequence[str], bodies: Mapping[str, Robot] | None = None) -> None:
+        """Starts the process of some robots while the run is under way.
+
+        They are told to be ready without neighbours that say nothing, which may be out of the run as well.
+
+        Args:
+            names: All robots of a process, of which none runs.
+            bodies: What has become of them: other robots, which have these names from now on.
+        """
+        robots = {**self._reached.robots, **(bodies or {})}
+        for name in bodies or {}:
+            self._groups[self._group(name)].remove(name)
+            self._groups[name] = [name]
+        self._groups = {group: members for group, members in self._groups.items() if members}
+        self._reached = msgspec.structs.replace(self._reached, robots=robots)
+        begin = msgspec.structs.replace(self._reached.start, missing="go-on", deadline_s=ALONE_S)
+        told = msgspec.structs.replace(self._reached, start=begin)
+        fresh = self._joining.with_suffix(".new")  # who is just being started reads the one or the other
+        fresh.write_bytes(write_json(told))
+        fresh.replace(self._joining)
+        self.adopted -= {*names}
+        self._start(names, self._joining, told)
+
+    def _start(self, names: Sequence[str], file: Path, told: Experiment) -> None:
+        group = self._group(names[0])
+        station, process = self._hosts.of(names[0]), self._process(group)
+        if station is not None:
+            document = machines.document(told)
+            self._abroad[f"{station.name}/{group}"] = station.start(process, names, document, self._launcher)
+        else:
+            arguments = [str(file), *names, *self._connect, "--lifeline"]
+            self._launcher.start(process, "experiments.robot", *arguments)
+
+    def robot(self, name: str) -> Robot:
+        """A robot as it is now: another one may have its name, and its body an address that the file does not know."""
+        return self._reached.robots[name]
+
+    def place(self, name: str, robot: Robot | None = None) -> Array:
+        """Where a robot is put (2,) [m], or where `robot` would be under its name."""
+        robots = self._reached.robots if robot is None else {**self._reached.robots, name: robot}
+        position, _ = assign.scattered(
+            msgspec.structs.replace(self._reached, robots=robots), [name], self._experiment.seed
+        )
+        return np.asarray(position[0, :2])
+
+    def companions(self, name: str) -> list[str]:
+        """The robots of the same process, itself among them."""
+        return list(self._groups[self._group(name)])
+
+    def runs(self, name: str) -> bool:
+        """Whether the process of a robot was started from here, and has not ended."""
+        return self._launcher.running(self._process(self._group(name)))
+
+    def release(self, name: str) -> None:
+        """Cuts the lifeline of a robot's process: it lands by itself, and ends."""
+        self._launcher.release(self._process(self._group(name)))
+
+    def kill(self, name: str) -> None:
+        """Ends the process of a robot that follows nothing else."""
+        self._launcher.kill(self._process(self._group(name)))
 
     def end(self) -> None:
         """Ends all but the router: robots land first, and the recorder sees it."""
@@ -152,9 +215,12 @@ class Crew:
 
     def last_line(self, robot: str) -> str:
         """The last line that the process of a robot wrote; empty if it wrote none."""
-        group = next(group for group, members in self._groups.items() if robot in members)
+        group = self._group(robot)
         log = self._recording.parent / "logs" / f"{self._process(group)}.log"
         return "".join(log.read_text(errors="replace").strip().splitlines()[-1:]) if log.exists() else ""
+
+    def _group(self, robot: str) -> str:
+        return next(group for group, members in self._groups.items() if robot in members)
 
     def _process(self, group: str) -> str:
         return f"{self._case}-{group}"

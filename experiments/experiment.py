@@ -91,6 +91,9 @@ class Robot(Part, frozen=True):
     avoids: Annotated[
         bool, Meta(description="whether it keeps clear of others where the experiment has an avoidance")
     ] = True
+    standby: Annotated[
+        bool, Meta(description="not started, and nobody waits for it, until `zenpark robot add` lets it join the run")
+    ] = False
 
 
 class Target(Part, frozen=True):
@@ -370,6 +373,13 @@ class Experiment(Part, frozen=True):
     title: str
     robots: Annotated[dict[Name, Robot], Meta(min_length=1)]
     duration_s: Annotated[Positive, Meta(description="from the common start [s]", le=86400)]
+    spares: Annotated[
+        dict[Name, Robot], Meta(description="robots that wait to take over the name of another one of their kind")
+    ] = {}
+    on_loss: Annotated[
+        Literal["none", "restart", "replace"],
+        Meta(description="when a robot is lost in mid-run: go on without it, start it again, or let a spare take over"),
+    ] = "none"
     source: Annotated[str, Meta(description="where it was published")] = ""
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 1
     tolerance: Annotated[Positive, Meta(description="a link is acquired when its error stays below [m]")] = 0.05

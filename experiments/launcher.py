@@ -142,6 +142,23 @@ class Launcher:
         """The process of that name."""
         return self._processes[name]
 
+    def running(self, name: str) -> bool:
+        """Whether a process of that name runs."""
+        with self._lock:
+            return name in self._processes and self._processes[name].alive
+
+    def release(self, name: str) -> None:
+        """Cuts the lifeline of a process: robots land by themselves, then it ends, which `died` tells."""
+        with self._lock:
+            if name in self._processes:
+                self._close(self._processes[name])
+
+    def kill(self, name: str) -> None:
+        """Ends a process that does not even follow its lifeline, at once; `died` tells when it is gone."""
+        with self._lock:
+            if name in self._processes and self._processes[name].alive:
+                os.killpg(self._processes[name].handle.pid, signal.SIGKILL)
+
     def died(self) -> list[Process]:
         """Processes that have ended by themselves since the last call; they are forgotten."""
         with self._lock:

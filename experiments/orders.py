@@ -1,4 +1,4 @@
-"""Orders to robots, and to the world, from outside of them."""
+"""Orders to robots, to the world and to the conductor of a run, from outside of them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from agents import wire
 from agents.keys import Keys
 
 REPLY_S: Final = 1.0
+CHANGE_S: Final = 90.0  # a robot lands, its process ends, another starts, is ready, and climbs
 
-R = TypeVar("R", wire.Reply, wire.WorldReply)
+R = TypeVar("R", wire.Reply, wire.WorldReply, wire.RunReply)
 
 
 def give(session: zenoh.Session, keys: Keys, robot: str, order: wire.Order, wait_s: float = REPLY_S) -> wire.Reply:
@@ -25,6 +26,13 @@ def give_world(session: zenoh.Session, keys: Keys, order: wire.WorldOrder, wait_
     reply, why = _ask(session, keys.world_order, wire.encode(order), wire.WorldReply, wait_s)
     nobody = "no world answers: is `zenpark world` running in this realm?"
     return reply or wire.WorldReply(ok=False, paused=False, time=0.0, reason=why or nobody)
+
+
+def give_run(session: zenoh.Session, keys: Keys, order: wire.RunOrder, wait_s: float = CHANGE_S) -> wire.RunReply:
+    """Gives an order to the conductor and returns its reply when all is done, or that no conductor answers."""
+    reply, why = _ask(session, keys.run_order, wire.encode(order), wire.RunReply, wait_s)
+    nobody = "no conductor answers: is `zenpark run` running in this realm?"
+    return reply or wire.RunReply(reason=why or nobody)
 
 
 def _ask(session: zenoh.Session, key: str, payload: bytes, kind: type[R], wait_s: float) -> tuple[R | None, str]:

@@ -6,7 +6,8 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final, Protocol, Self
 
-from experiments.conductor import FROZEN_S, OUTPUT, Progress, Seen
+from experiments.conductor import OUTPUT
+from experiments.seen import FROZEN_S, Progress, Seen
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -112,10 +113,11 @@ def _table(progress: Progress) -> RenderableType:
 
 def _cells(seen: Seen, now: float) -> tuple[str, ...]:
     status = seen.status
+    out = f"[{'red' if seen.out == 'lost' else 'dim'}]{seen.out}[/]"
     if status is None:
-        return ("[red]gone[/]" if seen.gone else "starting", *[""] * 8)
+        return (out if seen.gone else "starting", *[""] * 8)
     silent = now - status.stamp > FROZEN_S
-    phase = "[red]gone[/]" if seen.gone else ("[yellow]silent[/]" if silent else status.phase)
+    phase = out if seen.gone else ("[yellow]silent[/]" if silent else status.phase)
     note = status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
     if status.malformed:
         note += f" {status.malformed} malformed"

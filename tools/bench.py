@@ -88,7 +88,8 @@ def process() -> Iterator[Figure]:
     from agents import wire  # noqa: PLC0415
     from agents.session import free_endpoint  # noqa: PLC0415
     from experiments import document  # noqa: PLC0415
-    from experiments.conductor import Conductor, Progress  # noqa: PLC0415
+    from experiments.conductor import Conductor  # noqa: PLC0415
+    from experiments.seen import Progress  # noqa: PLC0415
     from experiments.hosts import Hosts  # noqa: PLC0415
     from experiments.launcher import Launcher  # noqa: PLC0415
     from experiments.run import SOURCE, load  # noqa: PLC0415

@@ -23,7 +23,7 @@ from tools.figure import Figure
 
 if TYPE_CHECKING:
     from agents.lab import Role
-    from experiments.conductor import Progress
+    from experiments.seen import Progress
 
 SPAN_S: Final = 6.0
 SETTLE_S: Final = 1.5  # a status speaks of the second before it

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools import commands_hosts, commands_network, commands_processes, commands_runs, keys
+from tools import commands_hosts, commands_network, commands_processes, commands_runs, keys, robot
 
 app: Final = typer.Typer(
     name="zenpark",
@@ -21,6 +21,7 @@ for _group in (commands_runs, commands_processes, commands_network):
     app.add_typer(_group.app)
 app.add_typer(commands_hosts.app, name="hosts")
 app.add_typer(keys.app, name="keys")
+app.add_typer(robot.app, name="robot", help="Change the robots of a run that is under way.")
 
 # The errors that explain themselves, by the module that defines them: one that was raised has its module loaded,
 # so that nothing needs to be imported to recognise it.

@@ -1,0 +1,166 @@
+"""What the conductor hears of a run, and what it says: its session, and what becomes of each robot by what arrives."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from math import inf, isfinite
+from pathlib import Path
+from typing import Final, TypeVar
+
+import zenoh
+
+from agents import lab, topology, wire
+from agents import session as network
+from agents.keys import Keys
+from experiments import hosts as machines
+from experiments import mesh, orders
+from experiments.experiment import Experiment
+from experiments.seen import ORDER, Progress
+
+ROUTER_S: Final = 10.0
+MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
+
+M = TypeVar("M", wire.Status, wire.State)
+
+
+class Overview:
+    """The network as the conductor of a case sees it.
+
+    Attributes:
+        robots: What is known of each.
+        recording_begun: Whether the recorder is there.
+        connected: Whether there is a router.
+        orders: Asked of the conductor.
+    """
+
+    def __init__(
+        self,
+        stack: ExitStack,
+        experiment: Experiment,
+        endpoints: Sequence[str],
+        progress: Progress,
+        folder: Path,
+    ) -> None:
+        """Joins the network.
+
+        Args:
+            stack: Closes the session.
+            experiment: The case.
+            endpoints: Routers.
+            progress: Takes in what is said, and has the robots.
+            folder: Of the run, where the endpoints are written down.
+
+        Raises:
+            Unreachable: If no router answers.
+        """
+        self.robots, self._progress = progress.robots, progress
+        self._keys = keys = Keys(experiment.network.realm)
+        self._session = stack.enter_context(
+            network.open_session(
+                endpoints,
+                name="conductor",
+                wait_s=ROUTER_S,
+                identity="operator",
+                rights=mesh.rights(experiment, endpoints),
+            )
+        )
+        self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
+        if list(endpoints) != [network.DEFAULT_ENDPOINT]:
+            options = lab.options(endpoints[0]) if len(endpoints) == 1 else f"--connect @{folder / mesh.ENDPOINTS}"
+            where = "a mesh" if topology.is_mesh(endpoints) else ", ".join(lab.bare(endpoints))
+            self.say("router", "conductor", f"{where}: look with `zenpark keys {options}`")
+        self._clock = network.publisher(self._session, keys.clock, wire.JSON)
+        self._told = network.pose_publisher(self._session, keys.experiment, wire.JSON)
+        self._told.put(machines.document(experiment))
+        self.orders = network.orders(self._session, keys.run_order)
+        self._token = network.alive_token(self._session, keys.conductor)
+        self._statuses = network.pose_subscriber(self._session, keys.status("*"), 4096)
+        self._states = network.subscriber(self._session, keys.state("*"), 4096)
+        self._watch = network.alive_watch(self._session, keys.alive("*"))
+        self._recorder_watch = network.alive_watch(self._session, keys.recorder)
+        self.recording_begun = False
+        self._cut_off = -inf
+
+    @property
+    def connected(self) -> bool:
+        return network.connected(self._session)
+
+    def close_doors(self) -> None:
+        """Who joins from now on waits for the next run."""
+        self._told.undeclare()  # type: ignore[no-untyped-call]
+
+    def look(self) -> list[str]:
+        """Takes in what has arrived since the last look; gives the robots whose token has vanished for good."""
+        for sample in network.received(self._recorder_watch.handler):
+            self.recording_begun |= sample.kind == zenoh.SampleKind.PUT
+        for status in self._messages(self._statuses.handler, wire.Status):
+            self._heed(status)
+        for state in self._messages(self._states.handler, wire.State):
+            seen = self.robots[state.robot]
+            if seen.error is not None:
+                seen.error = state.error
+            place = state.true_position or state.position
+            seen.place = place if all(map(isfinite, place)) else seen.place
+        for sample in network.received(self._watch.handler):
+            name = self._keys.whose(str(sample.key_expr))
+            if name is not None and (known := self.robots.get(name)) is not None:
+                known.alive = sample.kind == zenoh.SampleKind.PUT
+                known.vanished = inf if known.alive else time.monotonic()
+        return self._missed()
+
+    def order(self, name: str, order: wire.Order) -> wire.Reply:
+        """Gives an order to a robot; a refusal, with why, if it does not answer."""
+        return orders.give(self._session, self._keys, name, order)
+
+    def say(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
+        """An event of the run, now or at `stamp` [s, UTC]."""
+        event = wire.Event(time.time() if stamp is None else stamp, kind, source, text)
+        self._progress.events.append(event)
+        self._events.put(wire.encode(event))
+
+    def tell_clocks(self, clocks: Sequence[wire.HostClock]) -> None:
+        """Says how the hosts' clocks lie, for the recording."""
+        for each in clocks:
+            self._clock.put(wire.encode(each))
+            self.say("clock", each.host, f"{each.offset * 1e3:+.2f} ms ± {each.uncertainty * 1e3:.2f} ms against ours")
+
+    def tell_drift(self, measured: Iterable[wire.HostClock], trouble: Iterable[str]) -> None:
+        """Says, for the recording, how the hosts' clocks have drifted and what their robots do about it."""
+        for each in measured:
+            self._clock.put(wire.encode(each))
+        for text in trouble:
+            self.say("clock", "conductor", text)
+
+    def _missed(self) -> list[str]:
+        """Robots whose token has been missing for long: where there is another router, it comes back at once."""
+        now = time.monotonic()
+        if not self.connected:
+            self._cut_off = now
+        missed = [name for name, seen in self.robots.items() if now - max(seen.vanished, self._cut_off) > MISSED_S]
+        for name in missed:
+            self.robots[name].vanished = inf
+        return missed
+
+    def _messages(self, handler: network.Polled[zenoh.Sample], kind: type[M]) -> Iterator[M]:
+        for sample in network.received(handler):
+            try:
+                message = wire.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
+            except wire.Malformed:
+                continue
+            if message.robot in self.robots and self._keys.whose(str(sample.key_expr)) == message.robot:
+                yield message
+
+    def _heed(self, status: wire.Status) -> None:
+        seen = self.robots[status.robot]
+        if status.phase not in ORDER or status.pid == seen.former:
+            return
+        if seen.status is not None and (seen.status.phase, seen.status.reason) != (status.phase, status.reason):
+            self.say("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
+        since, sent = seen.counted
+        if status.stamp - since >= 0.9:
+            seen.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0
+            seen.counted = (status.stamp, status.sent)
+        seen.status = status
+        seen.behind = min(seen.behind, time.time() - status.stamp)

@@ -1,0 +1,97 @@
+"""`zenpark robot`: pause, resume, remove, restart, replace and add robots of a run that is under way."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+import typer
+
+from tools.options import As, Connect, Lab, Realm, routers
+
+app: Final = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False, no_args_is_help=True)
+
+Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Robots of the run.")]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="A robot of the run.")]
+
+
+@app.command()
+def pause(
+    names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
+) -> None:
+    """Let robots hold where they are; the others go on."""
+    from tools.change import command  # noqa: PLC0415
+
+    raise typer.Exit(command("pause", names, connect=routers(connect, lab), realm=realm, identity=identity))
+
+
+@app.command()
+def resume(
+    names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
+) -> None:
+    """Let robots go on that were paused."""
+    from tools.change import command  # noqa: PLC0415
+
+    raise typer.Exit(command("resume", names, connect=routers(connect, lab), realm=realm, identity=identity))
+
+
+@app.command()
+def remove(
+    names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
+) -> None:
+    """Land robots and end their processes; the others go on without them."""
+    from tools.change import command  # noqa: PLC0415
+
+    raise typer.Exit(command("remove", names, connect=routers(connect, lab), realm=realm, identity=identity))
+
+
+@app.command()
+def restart(
+    names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
+) -> None:
+    """Start robots again, whether they fly, were removed or crashed; they join the run under way."""
+    from tools.change import command  # noqa: PLC0415
+
+    raise typer.Exit(command("restart", names, connect=routers(connect, lab), realm=realm, identity=identity))
+
+
+@app.command()
+def add(
+    names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
+) -> None:
+    """Let robots join that are on standby, were missing at the start, or were started by hand."""
+    from tools.change import command  # noqa: PLC0415
+
+    raise typer.Exit(command("add", names, connect=routers(connect, lab), realm=realm, identity=identity))
+
+
+@app.command()
+def replace(
+    name: Name,
+    *,
+    spare: Annotated[str | None, typer.Option("--with", metavar="SPARE", help="A spare of the file.")] = None,
+    body: Annotated[str | None, typer.Option(metavar="URI", help="Address of another body.")] = None,
+    at: Annotated[
+        tuple[float, float] | None, typer.Option(metavar="X Y", help="Where a twin starts [m]; else as the file says.")
+    ] = None,
+    yaw: Annotated[float, typer.Option(help="Of a twin that is put somewhere [rad].")] = 0.0,
+    connect: Connect = None,
+    realm: Realm = "park",
+    lab: Lab = None,
+    identity: As = "operator",
+) -> None:
+    """Let another body take over a robot's name, links and plan; a spare of its kind if nothing else is said."""
+    from tools.change import command  # noqa: PLC0415
+
+    raise typer.Exit(
+        command(
+            "replace",
+            [name],
+            spare=spare,
+            body=body,
+            at=at,
+            yaw=yaw,
+            connect=routers(connect, lab),
+            realm=realm,
+            identity=identity,
+        )
+    )
