@@ -179,6 +179,7 @@ class Runtime:
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]
         self._estop = network.Alarm(session, keys.estop)
+        self._conductor = network.alive_watch(session, keys.conductor)
         self._located = [
             (row, network.subscriber(session, keys.position(name), 32))
             for row, name in enumerate(names)
@@ -218,6 +219,10 @@ class Runtime:
         agent = self.agent
         outside = agent.outside
         outside.offline_since = np.inf if network.connected(self._session) else min(outside.offline_since, t)
+        for sample in network.received(self._conductor.handler):
+            if str(sample.key_expr) == self._setup.keys.conductor:
+                gone = sample.kind == zenoh.SampleKind.DELETE
+                outside.unattended_since = min(outside.unattended_since, t) if gone else np.inf
         self._listen_to_neighbours(t)
         if self._goals is not None:
             refused = self._goals.malformed

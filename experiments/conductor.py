@@ -58,6 +58,7 @@ class Seen:
         alive: Whether its liveliness token stands.
         gone: Whether its process has ended or its token has vanished in mid-run.
         behind: The least time from a stamp of it to its arrival [s]: small, if its clock is right.
+        told: Number of the last incident that was said.
     """
 
     status: wire.Status | None = None
@@ -67,6 +68,7 @@ class Seen:
     gone: bool = False
     counted: tuple[float, int] = (0.0, 0)
     behind: float = float("inf")
+    told: int = 0
 
     @property
     def phase(self) -> str:
@@ -378,6 +380,12 @@ class Conductor:
             return
         if seen.status is not None and (seen.status.phase, seen.status.reason) != (status.phase, status.reason):
             self._say("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
+        if seen.status is not None and seen.status.pid != status.pid:
+            seen.told = 0
+        for incident in status.incidents:
+            if incident.seq > seen.told:
+                seen.told = incident.seq
+                self._say("hazard", status.robot, incident.text)
         since, sent = seen.counted
         if status.stamp - since >= 0.9:
             seen.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0

@@ -116,7 +116,7 @@ def _cells(seen: Seen, now: float) -> tuple[str, ...]:
         return ("[red]gone[/]" if seen.gone else "starting", *[""] * 8)
     silent = now - status.stamp > FROZEN_S
     phase = "[red]gone[/]" if seen.gone else ("[yellow]silent[/]" if silent else status.phase)
-    note = status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
+    note = status.hazard or status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
     if status.malformed:
         note += f" {status.malformed} malformed"
     return (
