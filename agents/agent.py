@@ -17,14 +17,17 @@ from agents.assignment import Assignment
 from agents.avoidance import Avoidance, Nearby, Self
 from agents.body import BodyState
 from agents.deciding import Deciding, Holding
+from agents.detection import Detector, Outside, Standing
 from agents.graph import Links
 from agents.guidance import Guidance
+from agents.hazards import Hazards, Outcome
 from agents.hearing import Heard, Hearing
 from agents.individual import Individual
-from agents.lifecycle import AIRBORNE, RUNNING, Duties, Lifecycle, Phase
+from agents.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, Duties, Lifecycle, Phase
 from agents.plugins import FAILURES, PluginError
+from agents.preflight import Preflight
 from agents.rows import Array, Index, Mask, some
-from agents.safety import Safety, Verdict
+from agents.safety import Safety, Whereabouts
 from agents.sight import Sight
 from agents.speaking import Said, Voice
 from agents.triggers import Told, Trigger
@@ -73,6 +76,8 @@ class Agent:
         deciding: Computes the goals of rows that are not guided.
         guidance: What the others were told; None if there are none, and `all_guided` if there are only such.
         life: Phases.
+        hazards: What is wrong with the rows, and what is done about it.
+        outside: What only the process around the decision knows: told by it.
     """
 
     def __init__(self, assignment: Assignment) -> None:
@@ -95,7 +100,8 @@ class Agent:
         self._holding = Holding(self.deciding.ground)
         self.life = Lifecycle(flies, assignment.hover, assignment.duration)
         self._voice = Voice(assignment.trigger, rows, assignment.predictor)
-        self.offline_since = np.inf
+        self.outside, self.hazards = Outside(), Hazards(flies, assignment.limits)
+        self._detector, self._preflight = Detector(assignment), Preflight(assignment)
         self.begun = False
         self._decided = self._asked = -1
         self._duties: Duties | None = None
@@ -104,7 +110,9 @@ class Agent:
         self._safety = Safety(assignment.kinds, assignment.limits)
         self._sight = _sight(assignment)
         self._nobody: Mask = np.zeros(rows, dtype=bool)
-        self._blind_since, self._any_blind = np.full(rows, np.inf), False
+        self._everybody: Mask = np.ones(rows, dtype=bool)
+        self._wild = self._nobody
+        self._where: Whereabouts
 
     # ------------------------------------------------------------------ what the outside tells
 
@@ -176,6 +184,11 @@ class Agent:
             names.append(CENTRE)
         return names
 
+    def skip(self, ticks: int) -> None:
+        """So many ticks come too late to be made: called before each tick, mostly with 0."""
+        self.tick += ticks
+        self.outside.ticked(ticks, 1.0 / self.assignment.body_hz)
+
     # ------------------------------------------------------------------ the decision
 
     def step(self, t: float, state: BodyState) -> Actions:
@@ -186,6 +199,7 @@ class Agent:
         """The first half of a tick: phases move on, and it is decided who speaks. What is said was measured."""
         self.deciding.settle(t)
         life = self.life
+        self._where = self._safety.where(state.position, state.yaw, t - state.time)
         self._duties = life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
         assignment = self.assignment
         if life.moved and not self.begun and (life.phase == RUNNING).any():
@@ -206,27 +220,31 @@ class Agent:
 
     def act(self, t: float, state: BodyState, said: Said) -> Actions:
         """The second half: goals, and what bodies do."""
+        held = self.hazards.held
+        self._heed(t, state)
         if self.decides:
             self._decide(t, state)
-        elif self.life.moved:  # a row that has just arrived at its height needs a place to stay until the next decision
-            self._stay(self._holding.held | (self.life.phase == AIRBORNE), state.position)
+        elif self.life.moved or held is not self.hazards.held:
+            # a row that has just arrived at its height, or must stop, needs a place to stay until the next decision
+            held = (self.life.phase == RUNNING) & self.hazards.held
+            self._stay(self._holding.held | held | (self.life.phase == AIRBORNE), state.position)
         if self.guidance is not None:
-            self._follow(self.guidance, t, state.position)
+            self._follow(self.guidance, state.position)
         goal, avoided = self.goal, self._nobody
-        age = t - state.time
+        age, where = t - state.time, self._where
         avoidance = self.assignment.avoidance
         if avoidance is None or self._sight is None:
             setpoint = self._individual.setpoint(goal, self.toward, state.position, state.yaw)
-            verdict = self._safety.check(setpoint, state.position, state.yaw, age)
+            verdict = self._safety.check(setpoint, state.position, state.yaw, age, where=where)
         else:
             own, near = self._sight.see(t, state, self.heard)
             goal = self._deviate(avoidance, own, near)
             setpoint = self._individual.setpoint(goal, self.toward, state.position, state.yaw)
-            verdict = self._safety.check(setpoint, state.position, state.yaw, age, avoidance, own, near)
+            verdict = self._safety.check(setpoint, state.position, state.yaw, age, avoidance, own, near, where)
             avoided = verdict.avoided
             if goal is not self.goal:
                 avoided = avoided | (np.abs(goal - self.goal) > 0.0).any(axis=1)
-        self._escalate(t, state, verdict)
+        self._wild = verdict.wild & ~verdict.blind if some(verdict.wild) else self._nobody
         setpoint, changed = verdict.setpoint, verdict.changed
         if not self.life.all_running:
             phase = self.life.phase
@@ -237,22 +255,52 @@ class Agent:
         return Actions(said.rows, setpoint, self._duties, changed, avoided, said.position, said.velocity)
 
     def _ready(self, t: float, state: BodyState) -> Mask:
-        if not self.life.waiting:
+        life, assignment = self.life, self.assignment
+        if not life.waiting:
             return self._nobody  # nobody asks any more
-        seen = np.isfinite(state.position).all(axis=1) & (t - state.time <= self.assignment.limits.own_silence_s)
-        lacks = np.zeros(len(seen), dtype=bool)
-        unheard = ~np.isfinite(self.heard.stamp)
-        if self.assignment.waited_for is not None:
-            unheard &= self.assignment.waited_for
-        lacks[self.assignment.links.listener[unheard]] = True
-        if self.guidance is not None:
-            lacks |= self.guidance.unheard()
-        patience = self.assignment.patience_s
-        ready = seen & (~lacks | (patience is not None and t > patience))
-        for row in np.flatnonzero(~ready).tolist():
-            lacking = "never heard " + ", ".join(self.missing(row)) if seen[row] else "no position of its own"
-            self.life.wait(row, lacking)
+        lacks = np.zeros(len(life.phase), dtype=bool)
+        if assignment.patience_s is None or t <= assignment.patience_s:
+            unheard = ~np.isfinite(self.heard.stamp)
+            if assignment.waited_for is not None:
+                unheard &= assignment.waited_for
+            lacks[assignment.links.listener[unheard]] = True
+            if self.guidance is not None:
+                lacks |= self.guidance.unheard()
+        failing = self._preflight.check(t, state, self._where, self.hearing, self.outside, (lacks, self.missing))
+        lost = self._preflight.lost(t, failing)
+        ready = np.ones(len(lacks), dtype=bool)
+        for row, reason in failing.items():
+            ready[row] = life.phase[row] == READY and row not in lost
+            life.wait(row, reason)
+        if some(news := ready & (life.phase == IDLE)):
+            with np.errstate(all="ignore"):
+                lawless = news & ~np.isfinite(self.deciding.law_offset(t, state.position)).all(axis=1)
+            for row in np.flatnonzero(lawless).tolist():
+                ready[row] = False
+                life.wait(row, "its law wants something that is not finite")
         return ready
+
+    def _heed(self, t: float, state: BodyState) -> None:
+        """What is wrong is noticed, and has its consequences: rows hold, land, or have their motors cut."""
+        life, hearing, guidance = self.life, self.hearing, self.guidance
+        if life.all_running:
+            active = cruising = running = self._everybody
+            landing = self._nobody
+        else:
+            running, landing, active = life.phase == RUNNING, life.phase == LANDING, life.active
+            cruising = running | (life.phase == AIRBORNE)
+        rows = Standing(
+            self._ordered,
+            cruising,
+            landing,
+            self.deciding.alone() if hearing.unsettled else None,
+            None if guidance is None else running & guidance.lacking(t),
+            self._wild,
+        )
+        seen = self._detector.look(t, state, self._where, hearing, rows, self.outside)
+        for incident in self.hazards.assess(t, seen, active, landing):
+            end = life.stop if incident.outcome == Outcome.CUT else life.land
+            end(incident.row, self.hazards.words(incident.cause))
 
     def _decide(self, t: float, state: BodyState) -> None:
         """A new goal for every row that decides for itself and is under way; all others may have to stay."""
@@ -262,6 +310,7 @@ class Agent:
             self.decisions += 1
             if not self.all_guided:
                 own = running if self.guidance is None else running & ~self._guided
+                own = own if self._where.sure else own & ~self._where.blind
                 new = self.deciding.decide(
                     t, state.position, state.velocity, state.yaw, start=self.life.start_at, running=own
                 )
@@ -269,7 +318,7 @@ class Agent:
                 self.offset = np.where(new.due[:, None], new.offset, self.offset)
                 self.toward = np.where(new.due, new.toward, self.toward)
                 self.updates += new.due
-        self._stay(self._holds(t, running) | (phase == AIRBORNE), state.position)
+        self._stay(self._holds(running) | (phase == AIRBORNE), state.position)
         if some(away := self._holding.held | ~running):
             self.deciding.forget(np.flatnonzero(away))  # whoever comes back has an old goal
 
@@ -277,22 +326,18 @@ class Agent:
         """Rows that are held keep the place where that began."""
         self.goal, self.toward = self._holding.stay(held, position, self.goal, self.toward)
 
-    def _holds(self, t: float, running: Mask) -> Mask:
-        """Which running rows must stay: told to, cut off, all their neighbours are gone, or nobody guides them."""
-        held = running & self._ordered
-        if t - self.offline_since > self.assignment.limits.link_silence_s:
-            held = held | running
+    def _holds(self, running: Mask) -> Mask:
+        """Which running rows must stay: for their safety, or because no link is there that the law could listen to."""
+        held = running & self.hazards.held
         if len(self.hearing.live) < len(self.assignment.links):
             held = held | (running & self.deciding.alone())
-        if self.guidance is not None:
-            held = held | (running & self.guidance.lacking(t))
         return held
 
-    def _follow(self, guidance: Guidance, t: float, position: Array) -> None:
+    def _follow(self, guidance: Guidance, position: Array) -> None:
         """Guided rows go where they were told, from the moment on that they were."""
         phase = self.life.phase
         running = phase == RUNNING
-        held = np.where(self._guided, self._holds(t, running) | (phase == AIRBORNE), self._holding.held)
+        held = np.where(self._guided, self._holds(running) | (phase == AIRBORNE), self._holding.held)
         if (held != self._holding.held).any():
             self._stay(held, position)
         follows = self._guided & running & ~held
@@ -314,27 +359,6 @@ class Agent:
                 f"`deviate` of the avoidance {name} must give a goal per row, {self.goal.shape}, not {np.shape(goal)}"
             )
         return goal
-
-    def _escalate(self, t: float, state: BodyState, verdict: Verdict) -> None:
-        """A flying robot that does not know where it is holds, then lands; one that left the arena lands or halts.
-
-        One whose motors are off in mid-run has come down by itself: it must not be commanded as if it flew.
-        """
-        blind, escaped, grounded = verdict.blind, verdict.escaped, self._flies & ~state.flying
-        if not (some(blind) or some(escaped) or some(grounded)):
-            if self._any_blind:
-                self._blind_since, self._any_blind = np.full(len(self._flies), np.inf), False
-            return
-        self._any_blind = True
-        self._blind_since = np.where(blind, np.minimum(self._blind_since, t), np.inf)
-        blind = blind & (t - self._blind_since >= self.assignment.limits.blind_s - 1e-9)
-        active, phase = self.life.active, self.life.phase
-        for row in np.flatnonzero(grounded & (phase >= AIRBORNE) & (phase <= RUNNING)).tolist():
-            self.life.land(row, "it came down by itself")
-        for row in np.flatnonzero(active & blind & self._flies).tolist():
-            self.life.land(row, "its own position is lost")
-        for row in np.flatnonzero(active & escaped).tolist():
-            self.life.land(row, "it left the arena")
 
 
 def _what(error: Exception) -> str:

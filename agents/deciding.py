@@ -213,8 +213,11 @@ class Holding:
             return goal, toward
         entered = held & ~before
         if some(entered):
-            self._at[entered] = position[entered]
-            self._at[entered, 2] = self._ground[entered]
+            self._at[entered] = np.nan
+        nowhere = held & np.isnan(self._at[:, 0])  # who does not know where it is stays where it finds itself
+        if some(nowhere):
+            self._at[nowhere] = position[nowhere]
+            self._at[nowhere, 2] = self._ground[nowhere]
         return np.where(held[:, None], self._at, goal), np.where(held, np.nan, toward)
 
 

@@ -17,7 +17,7 @@ class Phase(IntEnum):
     """Where in its life a robot is; the numbers grow with time."""
 
     IDLE = 0  # process alive, something missing: position or a neighbour
-    READY = 1  # body open, own position fresh, every neighbour heard
+    READY = 1  # body open, own position fresh, every neighbour heard, and whatever else `agents.preflight` asks for
     AIRBORNE = 2  # at its hover height (a ground robot: at once), waiting for the common start
     RUNNING = 3  # the experiment
     LANDING = 4  # going down, or rolling out
@@ -53,7 +53,7 @@ class Lifecycle:
         rows = len(flies)
         self.phase = np.full(rows, IDLE)
         self.start_at = np.full(rows, np.inf)
-        self.reason = [""] * rows
+        self.reason, self._waits = [""] * rows, [""] * rows
         self.moved = False
         self._before = self.phase.tobytes()
         self._flies, self._hover, self._duration = flies, hover, duration
@@ -103,7 +103,8 @@ class Lifecycle:
             self._due[what].remove(row)
 
     def wait(self, row: int, reason: str) -> None:
-        """Says why an idle row is not ready."""
+        """Says why an idle row is not ready, or why a ready one will not be any more on this tick."""
+        self._waits[row] = reason
         if self.phase[row] == IDLE:
             self.reason[row] = reason
 
@@ -114,8 +115,8 @@ class Lifecycle:
 
     @property
     def waiting(self) -> bool:
-        """Whether a row is still idle."""
-        return self._settled_until == -np.inf and bool(self.phase.min() == IDLE)
+        """Whether a row has yet to take off."""
+        return self._settled_until == -np.inf and bool(self.phase.min() <= READY)
 
     @property
     def all_running(self) -> bool:
@@ -127,7 +128,7 @@ class Lifecycle:
 
         Args:
             t: Now, on the process's clock [s].
-            ready: (N,) nothing is missing.
+            ready: (N,) nothing is missing; who was ready and is not is idle again, unless it climbs already.
             position: (N, 3) [m].
             velocity: (N, 3) [m/s].
             flying: (N,) motors on.
@@ -137,9 +138,11 @@ class Lifecycle:
             return None
         phase = self.phase
         lowest, highest = phase.min(), phase.max()
-        if lowest == IDLE:
+        if lowest <= READY:
             for row in np.flatnonzero((phase == IDLE) & ready):
                 phase[row], self.reason[row] = READY, ""
+            for row in np.flatnonzero((phase == READY) & ~ready & ~self._climbing):
+                phase[row], self.reason[row] = IDLE, self._waits[row]
         if self._climbing.any():
             there = ~self._flies | (
                 (np.abs(position[:, 2] - self._hover) < AT_HEIGHT) & (np.abs(velocity[:, 2]) < SETTLED)

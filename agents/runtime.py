@@ -189,6 +189,7 @@ class Runtime:
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]
         self._estop = network.Alarm(session, keys.estop)
+        self._conductor = network.alive_watch(session, keys.conductor)
         self._located = [
             (row, network.subscriber(session, keys.position(name), 32))
             for row, name in enumerate(names)
@@ -226,7 +227,12 @@ class Runtime:
     def _listen(self, t: float) -> None:
         """Takes in what has arrived since the last tick."""
         agent = self.agent
-        agent.offline_since = np.inf if network.connected(self._session) else min(agent.offline_since, t)
+        outside = agent.outside
+        outside.offline_since = np.inf if network.connected(self._session) else min(outside.offline_since, t)
+        for sample in network.received(self._conductor.handler):
+            if str(sample.key_expr) == self._setup.keys.conductor:
+                gone = sample.kind == zenoh.SampleKind.DELETE
+                outside.unattended_since = min(outside.unattended_since, t) if gone else np.inf
         self._listen_to_neighbours(t)
         if self._goals is not None:
             refused = self._goals.malformed
@@ -368,13 +374,12 @@ class Runtime:
         farewell = np.inf
         while True:
             wait = zero + self._next - time.monotonic()
+            behind = max(0, int(-wait / self._dt))
             if wait > 0.0:
                 self._sleep(zero + self._next)
-            else:
-                behind = int(-wait / self._dt)
-                self._counts.missed += behind
-                self._next += behind * self._dt
-                self.agent.tick += behind
+            self._counts.missed += behind
+            self._next += behind * self._dt
+            self.agent.skip(behind)
             t = self._now = self._next
             self._counts.late_s = max(self._counts.late_s, time.monotonic() - zero - t)
             self._next = t + self._dt

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -30,6 +31,16 @@ class Limits:
         own_silence_s: Own position older than this is none.
         blind_s: A flying row that has no position of its own for this long lands; one number, or one for each row.
         link_silence_s: A neighbour gone for this long is left out.
+        cut_outside: A flying row this far outside the arena has its motors cut [m].
+        separation: Nearer than this to another robot a row holds, nearer than half of it it lands [m]; None: never.
+        overspeed: A row that moves faster than this times what its kind can is out of control.
+        tilt: A flying row that leans more than this has tipped over [rad].
+        battery_low: A row with less charge than this lands; a share.
+        battery_min: A row with less charge than this does not take off; a share.
+        offline_s: A row without a router for this long lands.
+        landing_s: A flying row that takes longer to land has its motors cut.
+        lost_neighbour: What is done without a neighbour: "drop" it, "hold" or "land".
+        lost_conductor: What is done without the conductor: "finish" or "land".
     """
 
     low: Array
@@ -40,6 +51,37 @@ class Limits:
     own_silence_s: float = 0.5
     blind_s: float | Array = 0.3
     link_silence_s: float = 1.0
+    cut_outside: float = 0.75
+    separation: float | None = None
+    overspeed: float = 2.5
+    tilt: float = 1.2
+    battery_low: float = 0.1
+    battery_min: float = 0.2
+    offline_s: float = 10.0
+    landing_s: float = 20.0
+    lost_neighbour: Literal["drop", "hold", "land"] = "drop"
+    lost_conductor: Literal["finish", "land"] = "finish"
+
+
+@dataclass(frozen=True)
+class Whereabouts:
+    """What the measured poses of N rows are worth.
+
+    Attributes:
+        sure: Every row knows where it is, and is inside the arena.
+        blind: (N,) own position missing, stale or not finite: no closed loop is possible.
+        beyond: (N,) outside a wall, or above the ceiling.
+        escaped: (N,) outside the arena beyond any doubt.
+        flown: (N,) so far outside that a flying row must be stopped there.
+        outside: (N,) how far from the arena [m], along the worst axis; 0 inside.
+    """
+
+    sure: bool
+    blind: Mask
+    beyond: Mask
+    escaped: Mask
+    flown: Mask
+    outside: Array
 
 
 @dataclass(frozen=True)
@@ -50,14 +92,14 @@ class Verdict:
         setpoint: (N, 4) safe.
         changed: (N,) the setpoint was not what had been decided.
         blind: (N,) own position missing, stale or not finite: no closed loop is possible.
-        escaped: (N,) outside the arena beyond any doubt.
+        wild: (N,) it was not made of finite numbers; what is sent instead keeps the row where it is.
         avoided: (N,) avoidance changed the setpoint.
     """
 
     setpoint: Array
     changed: Mask
     blind: Mask
-    escaped: Mask
+    wild: Mask
     avoided: Mask
 
 
@@ -81,7 +123,22 @@ class Safety:
         self._low = limits.low + inside - np.where(flies, 0.0, floor)  # ground robots have no business with heights
         self._high = limits.high - inside - np.where(flies, ceiling, -floor)
         self._centre = 0.5 * (limits.low + limits.high)
-        self._lost = 0.5 * (limits.high - limits.low) + ESCAPED
+        self._half = 0.5 * (limits.high - limits.low)
+        self._nobody: Mask = np.zeros(len(kinds), dtype=bool)
+        self._sure = Whereabouts(True, *(self._nobody,) * 4, np.zeros(len(kinds)))
+
+    def where(self, position: Array, yaw: Array, age: Array) -> Whereabouts:
+        """What poses are worth: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s]."""
+        off = np.abs(position - self._centre)
+        known = (np.abs(yaw) < ABSURD) & (age <= self.limits.own_silence_s)
+        if every(off <= self._half) and every(known):
+            return self._sure
+        blind = ~np.asarray(known & (np.abs(position) < ABSURD).all(axis=1))
+        off = np.where(blind[:, None], 0.0, off)  # what is not known is not outside
+        outside = np.maximum((off - self._half).max(axis=1), 0.0)
+        walls = (off[:, :2] > self._half[:2]).any(axis=1) | (~blind & (position[:, 2] > self.limits.high[2]))
+        escaped = np.asarray((off > self._half + ESCAPED).any(axis=1))
+        return Whereabouts(False, blind, np.asarray(walls), escaped, outside > self.limits.cut_outside, outside)
 
     def check(  # noqa: PLR0917 - the four that always are, and those of avoidance
         self,
@@ -92,6 +149,7 @@ class Safety:
         avoidance: Avoidance | None = None,
         own: Self | None = None,
         nearby: Nearby | None = None,
+        where: Whereabouts | None = None,
     ) -> Verdict:
         """The last word.
 
@@ -103,18 +161,16 @@ class Safety:
             avoidance: Has its say after all limits.
             own: For it.
             nearby: For it.
+            where: What the pose is worth, if it has been asked already.
         """
-        limits = self.limits
-        near = np.abs(position - self._centre) <= self._lost
-        known = (np.abs(yaw) < ABSURD) & (age <= limits.own_silence_s)
+        where = self.where(position, yaw, age) if where is None else where
         sane = np.abs(setpoint) < ABSURD
-        nobody: Mask = np.zeros(len(yaw), dtype=bool)
-        blind, wild, escaped = nobody, nobody, nobody
+        nobody = self._nobody
+        blind, wild = where.blind, nobody
         safe, here = setpoint.copy(), position
-        troubled = not (every(near) and every(known) and every(sane))
+        troubled = not (where.sure and every(sane))
         if troubled:
-            blind = ~np.asarray(known & (np.abs(position) < ABSURD).all(axis=1))
-            wild, escaped = ~np.asarray(sane.all(axis=1)), ~np.asarray(near.all(axis=1) | blind)
+            wild = ~np.asarray(sane.all(axis=1))
             here, yaw = np.where(blind[:, None], self._centre, position), np.where(blind, 0.0, yaw)
             safe[blind | wild] = 0.0
             stay = wild & self._takes_position
@@ -132,7 +188,7 @@ class Safety:
             changed = (changed | wild) & ~blind
             # a body that controls its position on board keeps its last setpoint while the position is not known here
             safe[blind & self._takes_position] = np.nan
-        return Verdict(safe, changed, blind, escaped, avoided)
+        return Verdict(safe, changed, blind, wild, avoided)
 
     def _limit(self, setpoint: Array, here: Array, yaw: Array) -> None:
         """Brings setpoints (N, 4) within all limits, in place."""

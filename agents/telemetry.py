@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import resource
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
@@ -25,6 +26,7 @@ from agents.lifecycle import Phase
 from agents.rows import Array, Index
 
 STATUS_S: Final = 1.0
+INCIDENTS: Final = 16  # so many are told again
 
 
 class Speaker(Protocol):
@@ -125,6 +127,8 @@ class Telemetry:
         self._scanned = [-inf] * len(names)
         self._origin: list[wire.Setpoint | None] = [None] * len(names)
         self._reported: list[tuple[object, ...]] = [()] * len(names)
+        self._incidents: list[deque[wire.Incident]] = [deque(maxlen=INCIDENTS) for _ in names]
+        self._numbers = [0] * len(names)
 
     def tell(self, state: BodyState, actions: Actions, t: float) -> None:
         """Sends the telemetry of every row that knows where it is."""
@@ -172,20 +176,21 @@ class Telemetry:
                 publisher.put(wire.encode(ranges, self._encoding))
 
     def report(self, t: float, *, everything: bool, state: BodyState | None = None, changed: bool = False) -> None:
-        """Sends statuses: of all rows when asked for everything, else of those whose phase, reason or missing changed.
+        """Sends statuses: of all rows when asked for everything, else of those of which something has changed.
 
         `changed` says that neighbours came or went: what the phases alone would not tell.
         """
         agent, counts = self._agent, self._counts
-        if not (everything or changed or agent.life.moved):
+        if not (everything or changed or agent.life.moved or agent.hazards.incidents):
             return
+        self._note_incidents()
         if everything:
             self.due = t + STATUS_S
         life = agent.life
         listener = agent.assignment.links.listener
         for row, name in enumerate(self._names):
             missing = agent.missing(row)
-            news = (life.phase[row], life.reason[row], tuple(missing))
+            news = (life.phase[row], life.reason[row], tuple(missing), self._numbers[row])
             if not everything and news == self._reported[row]:
                 continue
             if news[:2] != self._reported[row][:2]:
@@ -222,10 +227,24 @@ class Telemetry:
                 cpu_s=time.process_time(),
                 rss_mb=resident_mb(),
                 origin=self._origin[row],
+                hazard=agent.hazards.worst(row),
+                incidents=list(self._incidents[row]),
             )
             self._statuses[row].put(wire.encode(status, self._encoding))
         if everything:
             counts.late_s = 0.0
+
+    def _note_incidents(self) -> None:
+        """Takes what happened out of the decision, and prints it: the log of a process outlives the network."""
+        happened = self._agent.hazards.incidents
+        for incident in happened:
+            row = incident.row
+            self._numbers[row] += 1
+            self._incidents[row].append(
+                wire.Incident(self._numbers[row], round(self.utc + incident.time, 6), incident.text)
+            )
+            print(f"{self._names[row]}: {incident.text}", flush=True)
+        happened.clear()
 
     def _dropped_of(self, row: int) -> dict[str, int]:
         """How many samples of whom a row did not get because the modelled network dropped them."""

@@ -89,6 +89,14 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     followed: list[Followed] = []
 
 
+class Incident(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Something was found wrong with a robot, has become worse, or is over; numbered since its process began."""
+
+    seq: int
+    stamp: float
+    text: str
+
+
 class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How a robot is: lifecycle phase, what holds it, what its body says, its counters since the process began.
 
@@ -99,7 +107,9 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `started` is the UTC time at which the robot began to run the experiment (0 before). From there `ticks` count, and
     `decisions`, at which it computed its goal (or was told one). `interventions` are ticks on which safety changed what
     had been decided, `avoided` those of them, and of changed goals, that kept clear of something. `origin` is where it
-    began: x, y, z [m] and yaw [rad].
+    began: x, y, z [m] and yaw [rad]. `hazard` is the worst of what is wrong with it now and what is done about that,
+    such as "hold: minimum separation: 0.18 m from CF03 (limit 0.25 m)"; `incidents` are the last few beginnings and
+    ends of such, again in every status, so that none is lost with one.
     """
 
     robot: str
@@ -126,6 +136,8 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cpu_s: float
     rss_mb: float
     origin: Setpoint | None = None
+    hazard: str = ""
+    incidents: list[Incident] = []
 
 
 class Position(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -186,12 +186,13 @@ def velocity(types: Types, state: wire.State) -> Message:
 
 
 def diagnosis(types: Types, status: wire.Status) -> Message:
-    """A DiagnosticStatus: a warning while the body or the network has something to complain of."""
-    level = WARN if status.body or status.missing else OK
-    said = "; ".join(part for part in (status.phase, status.reason, status.body) if part)
+    """A DiagnosticStatus: a warning while the robot, its body or the network has something to complain of."""
+    level = WARN if status.body or status.missing or status.hazard else OK
+    said = "; ".join(part for part in (status.phase, status.reason, status.hazard, status.body) if part)
     values = {
         "phase": status.phase,
         "reason": status.reason,
+        "hazard": status.hazard,
         "body": status.body,
         "battery": "" if status.battery is None else f"{status.battery:.3f}",
         "missing": " ".join(status.missing),

@@ -214,6 +214,16 @@ def limits(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Lim
         own_silence_s=safety.own_silence_s,
         blind_s=np.array([_patience(experiment, name) for name in names] * copies),
         link_silence_s=safety.link_silence_s,
+        cut_outside=safety.cut_outside,
+        separation=safety.separation,
+        overspeed=safety.overspeed,
+        tilt=safety.tilt,
+        battery_low=safety.battery_low,
+        battery_min=safety.battery_min,
+        offline_s=safety.offline_s,
+        landing_s=safety.landing_s,
+        lost_neighbour=safety.lost_neighbour,
+        lost_conductor=safety.lost_conductor,
     )
 
 

@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from experiments import architecture, assign, document, motion, surroundings, theory
+from experiments import architecture, assign, document, motion, safety_checks, surroundings, theory
 from experiments.analysis import Analysis, analyse
 from experiments.claim import FORGIVEN, Claim, Severity, few, listed
 from experiments.document import Document
@@ -33,6 +33,7 @@ SUBJECTS: Final = (
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
     *(motion.starts, motion.formation, motion.walls, motion.encounters, motion.speeds, motion.rates, motion.ends),
     architecture.architecture,
+    safety_checks.safety,
 )
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
 ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")

@@ -337,6 +337,36 @@ class Safety(Part, frozen=True):
         NotNegative, Meta(description="a flying robot that has no position of its own for this long lands [s]")
     ] = 0.3
     link_silence_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
+    lost_neighbour: Annotated[
+        Literal["drop", "hold", "land"], Meta(description="what a robot does then: go on without it, hold, or land")
+    ] = "drop"
+    lost_conductor: Annotated[
+        Literal["finish", "land"], Meta(description="what robots do when the conductor is gone in mid-run")
+    ] = "finish"
+    offline_s: Annotated[
+        Positive, Meta(description="a robot without a router holds, and after this lands: no stop reaches it [s]")
+    ] = 10.0
+    separation: Annotated[
+        Positive | None,
+        Meta(
+            description="nearer than this to another robot that it hears, from middle to middle, a robot holds; nearer "
+            "than half of it, or touching, it lands [m]; left out: not watched"
+        ),
+    ] = None
+    cut_outside: Annotated[Positive, Meta(description="a drone this far outside the arena has its motors cut [m]")] = (
+        0.75
+    )
+    overspeed: Annotated[
+        float, Meta(gt=1, description="a robot that moves faster than this times what its kind can holds, then lands")
+    ] = 2.5
+    tilt: Annotated[
+        float, Meta(gt=0, lt=4, description="a drone that leans more than this has its motors cut [rad]")
+    ] = 1.2
+    battery_low: Annotated[Share, Meta(description="with less charge than this a robot lands; 0: never")] = 0.1
+    battery_min: Annotated[Share, Meta(description="with less charge than this it does not take off; 0: always")] = 0.2
+    landing_s: Annotated[
+        Positive, Meta(description="a drone that takes longer than this to land has its motors cut [s]")
+    ] = 20.0
 
 
 class World(Part, frozen=True):

@@ -12,6 +12,7 @@ import numpy as np
 
 from agents import plugins, wire
 from agents.graph import Links
+from agents.hazards import Incident, Outcome
 from agents.lifecycle import Phase
 from agents.rows import Array, Index, Mask
 from experiments import assign, goals
@@ -220,6 +221,7 @@ class Logbook:
         log = self._log
         sent = self._counts(self._sent[1], self._sent[0])
         heard = self._counts(self._links.listener[self._heard[1]], self._heard[0])
+        unsafe = {each.row - self._mine.start: each.text for each in self._incidents() if each.outcome >= Outcome.LAND}
         for end, phase, done in ((self._experiment.duration_s, "landing", 0), (log.ended, "done", 1)):
             for row, name in enumerate(log.names):
                 mine = self._links.listener == row
@@ -228,7 +230,7 @@ class Logbook:
                     robot=name,
                     stamp=EPOCH + end,
                     phase=phase,
-                    reason="finished",
+                    reason=unsafe.get(row, "finished"),
                     body="",
                     battery=None,
                     sent=int(sent[done][row]),
@@ -298,6 +300,18 @@ class Logbook:
         return np.bincount(row[within], minlength=rows), np.bincount(row, minlength=rows)
 
     def _events(self) -> Iterator[tuple[float, str, str, str]]:
+        """What the conductor says, and what went wrong, in order of time."""
+        yield from sorted([*self._conducted(), *self._hazards()], key=lambda event: event[0])
+
+    def _hazards(self) -> Iterator[tuple[float, str, str, str]]:
+        for each in self._incidents():
+            yield each.time, "hazard", self._log.names[each.row - self._mine.start], each.text
+
+    def _incidents(self) -> Iterator[Incident]:
+        """What was wrong with the robots of this repetition."""
+        return (each for each in self._log.incidents if self._mine.start <= each.row < self._mine.stop)
+
+    def _conducted(self) -> Iterator[tuple[float, str, str, str]]:
         yield self._log.airborne, "phase", "conductor", "airborne"
         yield 0.0, "start", "conductor", "common start"
         yield 0.0, "phase", "conductor", "formation"

@@ -158,6 +158,12 @@ class Overview:
             return
         if seen.status is not None and (seen.status.phase, seen.status.reason) != (status.phase, status.reason):
             self.say("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
+        if seen.status is not None and seen.status.pid != status.pid:
+            seen.told = 0
+        for incident in status.incidents:
+            if incident.seq > seen.told:
+                seen.told = incident.seq
+                self.say("hazard", status.robot, incident.text)
         since, sent = seen.counted
         if status.stamp - since >= 0.9:
             seen.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0

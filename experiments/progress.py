@@ -118,7 +118,7 @@ def _cells(seen: Seen, now: float) -> tuple[str, ...]:
         return (out if seen.gone else "starting", *[""] * 8)
     silent = now - status.stamp > FROZEN_S
     phase = out if seen.gone else ("[yellow]silent[/]" if silent else status.phase)
-    note = status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
+    note = status.hazard or status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
     if status.malformed:
         note += f" {status.malformed} malformed"
     return (

@@ -28,6 +28,7 @@ class Seen:
             taken out ("removed"), or nobody asked for it yet ("standby").
         vanished: Since when its token is missing [s, monotonic]; infinity while it is not, and when that was told.
         behind: The least time from a stamp of it to its arrival [s]: small, if its clock is right.
+        told: Number of the last incident that was said.
         place: Where it last said that it was [m].
         former: The process whose statuses are of the past: the robot has a new one, or will have.
     """
@@ -40,6 +41,7 @@ class Seen:
     counted: tuple[float, int] = (0.0, 0)
     vanished: float = float("inf")
     behind: float = float("inf")
+    told: int = 0
     place: wire.Vector | None = None
     former: int | None = None
 
@@ -60,7 +62,7 @@ class Seen:
         """The process that it had is over: what it said last holds no more, but for where it was."""
         self.former = self.status.pid if self.status is not None else self.former
         self.status, self.alive, self.vanished = None, False, float("inf")
-        self.rate, self.counted, self.behind = 0.0, (0.0, 0), float("inf")
+        self.rate, self.counted, self.behind, self.told = 0.0, (0.0, 0), float("inf"), 0
 
 
 @dataclass

@@ -16,6 +16,7 @@ import numpy as np
 
 from agents.agent import Agent
 from agents.body import BodyState
+from agents.hazards import Incident
 from agents.lifecycle import Phase
 from agents.rows import Array, Index, Mask, some
 from agents.shadow import shadowed
@@ -64,6 +65,7 @@ class Log:
         shadow_yaw: (K, R) of those twins.
         waited: (repetitions,) that got an order later than they would have got it alone, because another one was late.
         steered: What went between the robots and the centre; None if every robot decides for itself.
+        incidents: What was wrong with robots, at times since the common start.
     """
 
     names: tuple[str, ...]
@@ -95,6 +97,7 @@ class Log:
     shadow_yaw: Array | None
     waited: Mask
     steered: Steered | None = None
+    incidents: tuple[Incident, ...] = ()
 
 
 class _Samples:
@@ -207,6 +210,7 @@ def simulate(
         shadow_yaw=extra[2],
         waited=conductor.waited,
         steered=network.steered(begin),
+        incidents=tuple(each._replace(time=each.time - begin) for each in agent.hazards.incidents),
     )
 
 

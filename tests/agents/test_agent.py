@@ -294,7 +294,7 @@ def test_who_is_alone_holds_where_it_was_then():
 def test_who_is_cut_off_holds_and_goes_on():
     swarm = Swarm(pair(), [["A"], ["B"]]).running().run(0.5)
     agent = swarm.agent("A")
-    agent.offline_since = swarm.t
+    agent.outside.offline_since = swarm.t
     swarm.run(1.0)
     busy = swarm.row("A", "goal")
     swarm.run(0.2)
@@ -302,7 +302,7 @@ def test_who_is_cut_off_holds_and_goes_on():
     assert not np.array_equal(held, busy)
     swarm.run(0.5)
     np.testing.assert_array_equal(swarm.row("A", "goal"), held)
-    agent.offline_since = np.inf
+    agent.outside.offline_since = np.inf
     swarm.run(0.2)
     assert not np.array_equal(swarm.row("A", "goal"), held)
 

@@ -179,11 +179,11 @@ def test_orders_are_obeyed_whatever_the_centre_says():
 
 def test_cut_off_from_the_network_it_holds():
     bench = Bench(pair()).running()
-    bench.agent.offline_since = bench.t - 0.5
+    bench.agent.outside.offline_since = bench.t - 0.5
     bench.told([0, 1], [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])
     bench.step()
     np.testing.assert_array_equal(bench.agent.goal[0], [-0.3, 0.1, 0.0])
-    bench.agent.offline_since = bench.t - 1.1
+    bench.agent.outside.offline_since = bench.t - 1.1
     bench.step()
     np.testing.assert_array_equal(bench.agent.goal, bench.position)
 

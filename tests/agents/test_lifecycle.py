@@ -111,7 +111,7 @@ def test_a_whole_life():
     assert life.takeoff(0) == "cannot take off while idle"
     robots.step()
     assert life.phase.tolist() == [READY, READY]
-    assert not life.waiting
+    assert life.waiting  # what makes it ready may be lost again
     assert life.start(0, 1.0) == "cannot start while ready"
     assert [life.takeoff(row) for row in (0, 1)] == ["", ""]
     assert life.takeoff(0) == ""  # an order may be repeated when its reply was lost
@@ -127,6 +127,7 @@ def test_a_whole_life():
     robots.until(RUNNING)
     assert robots.tick - 1 == round(begin / DT)
     assert life.all_running
+    assert not life.waiting
     robots.until(LANDING)
     assert robots.tick - 1 == round((begin + 2.0) / DT)
     assert life.reason == ["finished", "finished"]
@@ -244,3 +245,21 @@ def test_an_idle_robot_says_what_it_waits_for():
 def test_phases_have_words():
     assert [phase.word for phase in Phase] == ["idle", "ready", "airborne", "running", "landing", "done"]
     assert (IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE) == (0, 1, 2, 3, 4, 5)
+
+
+def test_who_was_ready_and_is_not_is_idle_again_unless_it_climbs():
+    robots = Robots([True, True, False])
+    robots.step()
+    assert robots.life.takeoff(1) == ""
+    robots.ready[:] = False
+    for row in range(3):
+        robots.life.wait(row, "its battery is low")
+    robots.step()
+    assert robots.life.phase.tolist() == [IDLE, READY, IDLE]
+    assert robots.life.reason == ["its battery is low", "", "its battery is low"]
+    assert robots.life.moved
+    assert robots.life.takeoff(0) == "cannot take off while idle: its battery is low"
+    robots.until(AIRBORNE, row=1)
+    robots.ready[:] = True
+    robots.step()
+    assert robots.life.phase.tolist() == [READY, AIRBORNE, READY]

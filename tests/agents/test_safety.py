@@ -104,12 +104,16 @@ def test_rows_are_checked_as_if_each_were_alone(setpoint, position):
     for row in range(ROWS):
         one = slice(row, row + 1)
         alone = Safety(ALL[one], LIMITS).check(setpoint[one], position[one], yaw[one], age[one])
-        for field in ("setpoint", "changed", "blind", "escaped"):
+        for field in ("setpoint", "changed", "blind", "wild"):
             np.testing.assert_array_equal(getattr(alone, field)[0], getattr(whole, field)[row])
 
 
 def check(kind, setpoint, position, *, yaw=0.0, age=0.0, limits=LIMITS):
     return Safety((kind,), limits).check(np.array([setpoint]), np.array([position]), np.array([yaw]), np.array([age]))
+
+
+def whereabouts(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
+    return Safety((kind,), limits).where(np.array([position]), np.array([yaw]), np.array([age]))
 
 
 def test_lawful_setpoints_pass_untouched():
@@ -120,7 +124,7 @@ def test_lawful_setpoints_pass_untouched():
     ):
         verdict = check(kind, setpoint, [0.0, 0.0, 0.8])
         np.testing.assert_array_equal(verdict.setpoint, [setpoint])
-        assert (verdict.changed[0], verdict.blind[0], verdict.escaped[0]) == (False, False, False)
+        assert (verdict.changed[0], verdict.blind[0], verdict.wild[0]) == (False, False, False)
 
 
 def test_goals_are_pulled_into_the_arena_and_near_the_robot():
@@ -157,8 +161,10 @@ def test_escaped_is_far_outside(axis, side):
     for beyond, escaped in ((ESCAPED - 0.01, False), (ESCAPED + 0.01, True)):
         place = edge.copy()
         place[axis] += side * beyond
-        verdict = check(CRAZYFLIE, [0, 0, 1.0, 0], place.tolist())
-        assert (bool(verdict.escaped[0]), bool(verdict.blind[0])) == (escaped, False)
+        where = whereabouts(CRAZYFLIE, place.tolist())
+        assert (bool(where.escaped[0]), bool(where.blind[0]), where.sure) == (escaped, False, False)
+        assert where.outside[0] == pytest.approx(beyond)
+        assert bool(where.beyond[0]) == (axis < 2 or side > 0)  # floors are measured a little below themselves
 
 
 @pytest.mark.parametrize(("age", "blind"), [(0.0, False), (0.5, False), (0.51, True), (np.inf, True), (np.nan, True)])

@@ -1,0 +1,205 @@
+"""What is wrong with robots now: the causes of `agents.hazards`, as one tick shows them. Pure and row-wise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import acos, degrees, expm1
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from agents.assignment import Assignment
+from agents.body import BodyState
+from agents.hazards import Cause, Sighting
+from agents.hearing import Hearing
+from agents.rows import Array, Mask, norm, some
+from agents.safety import ESCAPED, Whereabouts
+from agents.separation import Separation
+
+LATE_WINDOW_S: Final = 1.0  # over so long it is counted how many ticks were missed,
+LATE_SHARE: Final = 0.9  # and with a larger share of them a control loop is none
+
+
+@dataclass
+class Outside:
+    """What the process around a decision knows and the decision cannot see.
+
+    Attributes:
+        offline_since: When the connection to the router was lost [s]; infinity while there is one.
+        unattended_since: When the conductor was lost [s]; infinity while it is there, or never was.
+        late: Share of the last ticks that were missed, 0 to 1.
+    """
+
+    offline_since: float = np.inf
+    unattended_since: float = np.inf
+    late: float = 0.0
+
+    def ticked(self, missed: int, period: float) -> None:
+        """A tick has come after `missed` ones that did not; they are `period` apart [s]."""
+        if missed or self.late > 0.0:
+            forget = -expm1(-period * (1 + missed) / LATE_WINDOW_S)
+            self.late += forget * (missed / (1 + missed) - self.late)
+            if self.late < 1e-3:
+                self.late = 0.0
+
+
+class Standing(NamedTuple):
+    """How rows (N,) stand in the experiment on a tick, for `Detector.look`.
+
+    Attributes:
+        ordered: Told to hold.
+        cruising: At their height or running: their setpoints are followed.
+        landing: On their way down.
+        alone: Nobody is left that the law could listen to; None: nobody is alone.
+        lacking: Run and are guided by nobody; None: nobody is guided.
+        wild: The last setpoint was not made of finite numbers.
+    """
+
+    ordered: Mask
+    cruising: Mask
+    landing: Mask
+    alone: Mask | None
+    lacking: Mask | None
+    wild: Mask
+
+
+class Detector:
+    """Looks for causes on N rows."""
+
+    def __init__(self, assignment: Assignment) -> None:
+        """Of the rows of an assignment."""
+        self._assignment, self._limits = assignment, assignment.limits
+        self._flies = np.array([kind.flies for kind in assignment.kinds])
+        speed = np.array([kind.speed for kind in assignment.kinds])
+        # the speed of flying kinds is per axis
+        self._fastest = assignment.limits.overspeed * np.where(self._flies, np.sqrt(3.0), 1.0) * speed
+        self._fastest_squared = self._fastest**2
+        links, watched = assignment.links, assignment.watched
+        self._lawful = np.ones(len(links), dtype=bool) if watched is None else ~watched
+        self._separation = Separation(assignment)
+
+    def look(  # noqa: PLR0917 - what there is to look at
+        self, t: float, state: BodyState, where: Whereabouts, hearing: Hearing, rows: Standing, outside: Outside
+    ) -> list[Sighting]:  # fmt: skip
+        """What is wrong at `t` [s]."""
+        seen: list[Sighting] = []
+        if not where.sure:
+            self._lost(t, state, where, seen)
+        if some(rows.ordered):
+            seen.append(Sighting(Cause.ORDERED, rows.ordered, lambda _: "by an operator"))
+        if some(rows.wild):
+            seen.append(Sighting(Cause.SETPOINT, rows.wild & rows.cruising, lambda _: "not made of finite numbers"))
+        self._measured(state, rows, seen)
+        if self._limits.separation is not None:
+            self._near(t, state, hearing, seen)
+        if hearing.unsettled:
+            self._missed(t, hearing, rows, seen)
+        if rows.lacking is not None and some(rows.lacking):
+            seen.append(Sighting(Cause.CENTRE, rows.lacking, lambda _: "its centre is gone, or its goals are old"))
+        self._surroundings(t, outside, seen)
+        return seen
+
+    def _lost(self, t: float, state: BodyState, where: Whereabouts, seen: list[Sighting]) -> None:
+        """Position, and the arena."""
+
+        def age(row: int) -> str:
+            return f"the last is {t - state.time[row]:.2f} s old" if np.isfinite(state.position[row]).all() else "none"
+
+        def out(limit: float, row: int) -> str:
+            return f"{where.outside[row]:.2f} m outside (limit {limit:g} m)"
+
+        cut = self._limits.cut_outside
+        seen += [
+            Sighting(Cause.POSITION, where.blind, age),
+            Sighting(Cause.MARGIN, where.beyond & ~where.escaped, lambda row: out(0.0, row)),
+            Sighting(Cause.OUTSIDE, where.escaped, lambda row: out(ESCAPED, row)),
+            Sighting(Cause.FAR_OUTSIDE, where.flown & self._flies, lambda row: out(cut, row)),
+        ]
+
+    def _measured(self, state: BodyState, rows: Standing, seen: list[Sighting]) -> None:
+        """What the body itself says."""
+        limits = self._limits
+        fast = np.vecdot(state.velocity, state.velocity) > self._fastest_squared
+        if some(fast):
+            speed = norm(state.velocity)
+            seen.append(
+                Sighting(
+                    Cause.OVERSPEED, fast, lambda row: f"{speed[row]:.2f} m/s (limit {self._fastest[row]:.2f} m/s)"
+                )
+            )
+        low = state.battery < limits.battery_low
+        if some(low):
+            seen.append(
+                Sighting(Cause.BATTERY, low, lambda row: f"{state.battery[row]:.0%} (limit {limits.battery_low:.0%})")
+            )
+        fallen = self._flies & ~state.flying & rows.cruising
+        if some(fallen):
+            seen.append(Sighting(Cause.FALLEN, fallen, lambda _: "its motors are off"))
+        if state.attitude is not None:
+            leans = leaning(state.attitude, limits.tilt) & self._flies & state.flying
+            if some(leans):
+                attitude = state.attitude
+                seen.append(
+                    Sighting(
+                        Cause.TILT,
+                        leans,
+                        lambda row: f"it leans {degrees(lean(attitude, row)):.0f}° (limit {degrees(limits.tilt):.0f}°)",
+                    )
+                )
+        if some(rows.landing):
+            late = rows.landing & self._flies & state.flying
+            seen.append(Sighting(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s"))
+
+    def _near(self, t: float, state: BodyState, hearing: Hearing, seen: list[Sighting]) -> None:
+        """Other robots, where they are believed to be."""
+        limit = self._limits.separation
+        assert limit is not None
+        apart = self._separation.distances(t, state.position, hearing)
+        near = apart < limit
+        if not some(near):
+            return
+
+        def say(row: int) -> str:
+            distance, other = self._separation.nearest(row, apart)
+            return f"{distance:.2f} m from {other} (limit {limit:g} m)"
+
+        inner = apart < np.maximum(0.5 * limit, self._separation.touching)
+        seen.append(Sighting(Cause.SEPARATION, self._separation.rows(near), say))
+        seen.append(Sighting(Cause.TOUCHING, self._separation.rows(inner), say))
+
+    def _missed(self, t: float, hearing: Hearing, rows: Standing, seen: list[Sighting]) -> None:
+        """Neighbours that are gone."""
+        links, assignment = self._assignment.links, self._assignment
+        gone = self._lawful & (t - hearing.heard.gone > self._limits.link_silence_s)
+
+        def names(row: int) -> str:
+            return ", ".join(assignment.speakers[s] for s in links.speaker[gone & (links.listener == row)].tolist())
+
+        if some(gone):
+            without = np.zeros(len(self._flies), dtype=bool)
+            without[links.listener[gone]] = True
+            seen.append(Sighting(Cause.NEIGHBOUR, without & rows.cruising, names))
+        if rows.alone is not None and some(rows.alone):
+            seen.append(Sighting(Cause.ALONE, rows.alone & rows.cruising, lambda row: names(row) or "none was heard"))
+
+    def _surroundings(self, t: float, outside: Outside, seen: list[Sighting]) -> None:
+        """The process, and who is on the network."""
+        everybody = np.ones(len(self._flies), dtype=bool)
+        if outside.offline_since < np.inf:
+            gone = t - outside.offline_since
+            seen.append(Sighting(Cause.ROUTER, everybody, lambda _: f"for {gone:.1f} s"))
+        elif outside.unattended_since < np.inf:
+            since = t - outside.unattended_since
+            seen.append(Sighting(Cause.CONDUCTOR, everybody, lambda _: f"for {since:.1f} s"))
+        if outside.late > LATE_SHARE:
+            seen.append(Sighting(Cause.LATE, everybody, lambda _: f"{outside.late:.0%} of the last second's"))
+
+
+def leaning(attitude: Array, limit: float) -> Mask:
+    """Rows that lean more than `limit` [rad]; `attitude` (N, 4) as in `BodyState`, unknown ones do not."""
+    return np.asarray(1.0 - 2.0 * (attitude[:, 1] ** 2 + attitude[:, 2] ** 2) < np.cos(limit))
+
+
+def lean(attitude: Array, row: int) -> float:
+    """How far a row leans [rad]: the angle between its own upward axis and the room's."""
+    return acos(float(np.clip(1.0 - 2.0 * (attitude[row, 1] ** 2 + attitude[row, 2] ** 2), -1.0, 1.0)))
