@@ -178,6 +178,28 @@ def fly(
     local: bool = False,
     lab: str | None = None,
 ) -> Run:
+    """Runs an experiment in real time, see `conduct`, and reads back what was recorded.
+
+    Raises:
+        RecordingError: If a recording cannot be read.
+    """
+    begun, notes = conduct(
+        read, folder, cases=cases, show=show, interrupted=interrupted, bodies=bodies, local=local, lab=lab
+    )
+    return _read_back(folder, begun, notes)
+
+
+def conduct(
+    read: Document,
+    folder: Path,
+    *,
+    cases: Sequence[str] = (),
+    show: Shown,
+    interrupted: Callable[[], bool] = lambda: False,
+    bodies: str | None = None,
+    local: bool = False,
+    lab: str | None = None,
+) -> tuple[dict[str, Path], list[str]]:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
     Args:
@@ -190,6 +212,9 @@ def fly(
             "protocol" for its real bridge and a protocol twin.
         local: Whether all robots run on this machine, whatever the file says of hosts.
         lab: Folder of certificates, instead of the file's.
+
+    Returns:
+        The recordings of the cases that have begun, and what the reader should know.
 
     Raises:
         LabError: If a certificate is missing.
@@ -240,8 +265,7 @@ def fly(
                 ).run()
         left = hosts.sweep()
     notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
-    begun = {case: result.recording for case, result in results.items() if result.start is not None}
-    return _read_back(folder, begun, notes)
+    return {case: result.recording for case, result in results.items() if result.start is not None}, notes
 
 
 def here(router: Endpoint) -> Endpoint:
