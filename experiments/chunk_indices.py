@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from tempfile import SpooledTemporaryFile
+from tempfile import TemporaryFile
 from typing import Final
 
 from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
-SPOOL_BYTES: Final = 256 * 1024  # short recordings need no second file
 BLOCK_BYTES: Final = 1024 * 1024
 PRIVATE: Final = "_Writer__chunk_indices"  # as of mcap 1.6; the library has no public place for it
 
@@ -35,7 +34,7 @@ class ChunkIndices:
 
     def __init__(self, folder: Path) -> None:
         """The file without a name is in `folder`, and gone with the process."""
-        self._kept = SpooledTemporaryFile(SPOOL_BYTES, dir=str(folder))  # noqa: SIM115 - closed by `close`
+        self._kept = TemporaryFile(dir=folder)  # noqa: SIM115 - closed by `close`
 
     def stand_in(self, writer: Writer) -> None:
         """Takes the place of a new writer's list.

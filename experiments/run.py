@@ -199,6 +199,7 @@ def conduct(
     bodies: str | None = None,
     local: bool = False,
     lab: str | None = None,
+    launching: Callable[[Path], Launcher] = Launcher,
 ) -> tuple[dict[str, Path], list[str]]:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
@@ -212,6 +213,7 @@ def conduct(
             "protocol" for its real bridge and a protocol twin.
         local: Whether all robots run on this machine, whatever the file says of hosts.
         lab: Folder of certificates, instead of the file's.
+        launching: Makes the launcher of the processes, given the folder of their logs.
 
     Returns:
         The recordings of the cases that have begun, and what the reader should know.
@@ -238,7 +240,7 @@ def conduct(
     listening = reach.routers(read.experiment, read.path, own if own_router else [], lab)
     endpoints = [str(here(Endpoint.parse(router))) for router in listening] if own_router else listening
     rights = _rights(embodied, endpoints, folder)
-    with Launcher(folder / "logs") as launcher:
+    with launching(folder / "logs") as launcher:
         if own_router:
             start_router(launcher, listening, rights)
         hosts = Hosts(launcher, listening)

@@ -7,9 +7,11 @@ everybody lands.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -19,9 +21,27 @@ from agents.lifeline import Lifeline
 from agents.process import told_to_end
 from experiments.conductor import Progress, RunFailed
 from experiments.hosts import HostError
+from experiments.launcher import Launcher, Process
 from experiments.problem import DocumentError
+from experiments.processes import ROBOT
 from experiments.run import conduct, load
 from experiments.standins import BODIES, StandInError
+
+
+class Cabled(Launcher):
+    """Starts robots so that each finds its routers at the ends of cables of its own."""
+
+    def __init__(self, cables: Mapping[str, Mapping[str, str]], logs: Path) -> None:
+        """`cables` has, for each process of robots, the endpoint to use instead of each router's."""
+        super().__init__(logs)
+        self._cables = cables
+
+    def start(self, name: str, module: str, *arguments: str) -> Process:
+        """See `Launcher.start`."""
+        own = next((ends for process, ends in self._cables.items() if name.endswith(f"-{process}")), {})
+        if module == ROBOT:
+            arguments = tuple(own.get(word, word) for word in arguments)
+        return super().start(name, module, *arguments)
 
 
 class Told:
@@ -56,7 +76,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--case", action="append", default=[], metavar="NAME", help="only this case")
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", dest="changes")
     parser.add_argument("--bodies", choices=BODIES, help="what every robot is put into")
+    parser.add_argument("--cables", type=Path, help="JSON: for each process of robots, where it finds each router")
     chosen = parser.parse_args(arguments)
+    cables: dict[str, dict[str, str]] = json.loads(chosen.cables.read_text("utf-8")) if chosen.cables else {}
     over = threading.Event()
     Lifeline(over).start()
     try:
@@ -70,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 interrupted=over.is_set,
                 bodies=chosen.bodies,
                 local=True,
+                launching=partial(Cabled, cables),
             )
     except (
         DocumentError,

@@ -34,6 +34,7 @@ class Watched:
         changes: Sequence[str] = (),
         bodies: str | None = None,
         environment: Sequence[str] = (),
+        cables: Path | None = None,
     ) -> None:
         """Starts it.
 
@@ -45,6 +46,7 @@ class Watched:
             changes: As behind `--set`.
             bodies: As behind `--bodies`.
             environment: NAME=VALUE each, for all of its processes.
+            cables: Where robots find their routers (`experiments.unattended`).
         """
         self._launcher = launcher
         self.run = secrets.token_hex(8)
@@ -52,6 +54,7 @@ class Watched:
         words += [part for case in cases for part in ("--case", case)]
         words += [part for change in changes for part in ("--set", change)]
         words += ["--bodies", bodies] if bodies is not None else []
+        words += ["--cables", str(cables)] if cables is not None else []
         variables = [f"{name}={value}" for name, value in processes.tag(self.run).items()]
         self.process: Process = launcher.spawn(NAME, ["env", *variables, *environment, *words])
         self.said: list[str] = []
