@@ -32,6 +32,7 @@ FLUSH_S: Final = 1.0
 AFTER_S: Final = 12.0  # how long robots may take to land after the conductor is gone
 FRESH_S: Final = 0.05  # a truth that is older does not belong to a state
 DEPTH: Final = 20_000  # samples that may wait while the disk does
+RARE: Final = 1_000  # of those that come once a second, or now and then: a ring takes its memory as it first goes round
 
 
 class Recorder:
@@ -44,14 +45,14 @@ class Recorder:
         self.malformed = 0
         self._alive: set[str] = set()
         self._poses = network.pose_subscriber(session, keys.pose("*"), DEPTH)
-        self._statuses = network.pose_subscriber(session, keys.status("*"), DEPTH)
+        self._statuses = network.pose_subscriber(session, keys.status("*"), RARE)
         self._states = network.subscriber(session, keys.state("*"), DEPTH)
-        self._events = network.subscriber(session, keys.event, DEPTH)
-        self._contacts = network.subscriber(session, keys.contact, DEPTH)
-        self._world = network.subscriber(session, keys.world, DEPTH)
+        self._events = network.subscriber(session, keys.event, RARE)
+        self._contacts = network.subscriber(session, keys.contact, RARE)
+        self._world = network.subscriber(session, keys.world, RARE)
         self._goals = network.subscriber(session, keys.goal("*"), DEPTH)
-        self._centre = network.subscriber(session, keys.centre, DEPTH)
-        self._clocks = network.pose_subscriber(session, keys.clock, DEPTH)
+        self._centre = network.subscriber(session, keys.centre, RARE)
+        self._clocks = network.pose_subscriber(session, keys.clock, RARE)
         self._truths = network.subscriber(session, keys.truth("*"), DEPTH)
         self._truth: dict[str, wire.Position] = {}
         self._watch = network.alive_watch(session, keys.alive("*"))

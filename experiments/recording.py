@@ -29,6 +29,7 @@ from mcap.writer import CompressionType, Writer
 
 from agents.wire import CentreState, Contact, Event, Goal, HostClock, Pose, State, Status, Vector, WorldState
 from experiments.cdr import POSE_STAMPED, POSE_STAMPED_SCHEMA, Unencodable, codec, pose_stamped
+from experiments.chunk_indices import ChunkIndices
 from experiments.experiment import Experiment
 from experiments.records import RecordingError
 
@@ -123,13 +124,15 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"{path}: cannot be created: {error.strerror}; record somewhere else") from error
         self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._index = ChunkIndices(path.parent)
+        self._index.stand_in(self._writer)
         about = {"case": case, "seed": str(seed), "clock": clock, "version": _version()}
         if started is not None:
             about["started"] = repr(started)
         try:
             self._guarded(self._begin, experiment, document, about)
         except RecordingError:
-            self._file.close()
+            self._let_go()
             raise
 
     def pose(self, pose: Pose, received: float, size: int) -> None:
@@ -232,7 +235,11 @@ class Recording:
                 self._guarded(self._writer.finish)
                 self._over = f"{self.path}: the recording is closed"
         finally:
-            self._file.close()
+            self._let_go()
+
+    def _let_go(self) -> None:
+        self._file.close()
+        self._index.close()
 
     def __enter__(self) -> Self:
         return self

@@ -178,6 +178,29 @@ def fly(
     local: bool = False,
     lab: str | None = None,
 ) -> Run:
+    """Runs an experiment in real time, see `conduct`, and reads back what was recorded.
+
+    Raises:
+        RecordingError: If a recording cannot be read.
+    """
+    begun, notes = conduct(
+        read, folder, cases=cases, show=show, interrupted=interrupted, bodies=bodies, local=local, lab=lab
+    )
+    return _read_back(folder, begun, notes)
+
+
+def conduct(
+    read: Document,
+    folder: Path,
+    *,
+    cases: Sequence[str] = (),
+    show: Shown,
+    interrupted: Callable[[], bool] = lambda: False,
+    bodies: str | None = None,
+    local: bool = False,
+    lab: str | None = None,
+    launching: Callable[[Path], Launcher] = Launcher,
+) -> tuple[dict[str, Path], list[str]]:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
     Args:
@@ -190,6 +213,10 @@ def fly(
             "protocol" for its real bridge and a protocol twin.
         local: Whether all robots run on this machine, whatever the file says of hosts.
         lab: Folder of certificates, instead of the file's.
+        launching: Makes the launcher of the processes, given the folder of their logs.
+
+    Returns:
+        The recordings of the cases that have begun, and what the reader should know.
 
     Raises:
         LabError: If a certificate is missing.
@@ -218,7 +245,7 @@ def fly(
         endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)
     rights = enforced(embodied.values(), endpoints, folder)
     (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
-    with Launcher(folder / "logs") as launcher:
+    with launching(folder / "logs") as launcher:
         for router in divided(listening, network.routers) if own_router else ():
             router.start(launcher, rights)
         hosts = Hosts(launcher, endpoints if meshed else listening)
@@ -243,8 +270,7 @@ def fly(
                 ).run()
         left = hosts.sweep()
     notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
-    begun = {case: result.recording for case, result in results.items() if result.start is not None}
-    return _read_back(folder, begun, notes)
+    return {case: result.recording for case, result in results.items() if result.start is not None}, notes
 
 
 def enforced(cases: Collection[Experiment], endpoints: Sequence[str], folder: Path) -> Path | None:

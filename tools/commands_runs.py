@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.options import Anyway, AsJson, Cases, File, Lab, OpenReport, Settings
+from tools.options import Anyway, AsJson, Case, Cases, File, Lab, OpenReport, Settings
 
 app: Final = typer.Typer()
 
@@ -111,6 +111,37 @@ def sweep(
                 report=report,
                 open_report=open_report,
             )
+        )
+    )
+
+
+@app.command()
+def soak(
+    file: Annotated[
+        str | None, typer.Argument(metavar="[FILE]", help="Experiment file. [robots that move for ever]")
+    ] = None,
+    *,
+    minutes: Annotated[float, typer.Option(min=0.1, max=1440.0, help="How long.")] = 60.0,
+    robots: Annotated[int, typer.Option(min=2, help="Of the ready-made experiment.")] = 20,
+    case: Case = None,
+    out: Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")] = None,
+    settings: Settings = None,
+    bodies: Annotated[str | None, typer.Option(metavar="twin|world|protocol", help="As behind `run`.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run an experiment for long and say whether anything grows, is lost, slows down or dies."""
+    from experiments.soak import command  # noqa: PLC0415
+
+    raise typer.Exit(
+        command(
+            file,
+            minutes=minutes,
+            robots=robots,
+            case=case,
+            out=out,
+            settings=settings or [],
+            bodies=bodies,
+            as_json=as_json,
         )
     )
 

@@ -42,6 +42,7 @@ def test_commands():
                 "schema",
                 "bench",
                 "sweep",
+                "soak",
                 "import",
                 "keys",
                 "echo",
