@@ -244,13 +244,12 @@ class Agent:
             avoided = verdict.avoided
             if goal is not self.goal:
                 avoided = avoided | (np.abs(goal - self.goal) > 0.0).any(axis=1)
-        self._wild = verdict.wild & ~verdict.blind if some(verdict.wild) else self._nobody
-        setpoint, changed = verdict.setpoint, verdict.changed
+        setpoint, changed, self._wild = verdict.setpoint, verdict.changed, verdict.wild & ~verdict.blind
         if not self.life.all_running:
             phase = self.life.phase
             passive = (phase < AIRBORNE) | (phase > RUNNING)
             setpoint = np.where(passive[:, None], np.where(self._flies, np.nan, 0.0)[:, None], setpoint)
-            changed, avoided = changed & ~passive, avoided & ~passive
+            changed, avoided, self._wild = changed & ~passive, avoided & ~passive, self._wild & ~passive
         self.tick += 1
         return Actions(said.rows, setpoint, self._duties, changed, avoided, said.position, said.velocity)
 

@@ -53,7 +53,7 @@ def predict(assignment: Assignment, start: Array, yaw: Array, leads: Index, hz: 
         hz: Decisions per second.
     """
     count = min(DECISIONS, max(1, round(assignment.duration * hz)))
-    limits = replace(assignment.limits, low=np.full(3, -FAR), high=np.full(3, FAR))
+    limits = replace(assignment.limits, low=np.full(3, -FAR), high=np.full(3, FAR), separation=None)
     agent = Agent(
         replace(
             assignment,
@@ -89,7 +89,7 @@ def predict(assignment: Assignment, start: Array, yaw: Array, leads: Index, hz: 
 def _made_ready(agent: Agent, position: Array, yaw: Array, hz: float) -> None:
     """Through the life of a robot to the common start at time 0."""
     rows = range(len(position))
-    _step(agent, -4.0 / hz, position, yaw)
+    _step(agent, -4.0 / hz, position * [1.0, 1.0, 0.0], yaw)  # nobody takes off who does not stand on the floor
     for row in rows:
         agent.life.takeoff(row)
     _step(agent, -3.0 / hz, position, yaw)

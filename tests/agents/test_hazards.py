@@ -1,0 +1,441 @@
+"""Hazards: each cause has its outcome in its time, and whatever happens a robot ends up stopped or landed."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.detection import LATE_SHARE, Outside, lean, leaning
+from agents.hazards import RULES, Cause, Hazards, Outcome, Sighting, rules
+from agents.lifecycle import AIRBORNE, DONE, LANDING, READY, RUNNING
+from agents.safety import Limits
+from experiments.experiment import Formation, Robot, Safety
+from tests.agents.swarm import Swarm
+from tests.agents.test_agent import drone, pair, triangle
+
+LIMITS = Limits(np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5]))
+DT = 0.01
+ALL = np.ones(2, dtype=bool)
+NONE = ~ALL
+
+
+class Bench:
+    """A state machine of a drone and a ground robot, and what it said."""
+
+    def __init__(self, **chosen):
+        limits = Limits(LIMITS.low, LIMITS.high, **chosen)
+        self.hazards = Hazards(np.array([True, False]), limits)
+        self.tick = 0
+        self.acts = []
+
+    @property
+    def t(self):
+        return self.tick * DT
+
+    def see(self, seconds, *causes, rows=ALL, active=ALL, landing=NONE):
+        for _ in range(round(seconds / DT)):
+            seen = [Sighting(cause, rows, lambda row: f"number {row}") for cause in causes]
+            self.acts += self.hazards.assess(self.t, seen, active, landing)
+            self.tick += 1
+        return self
+
+    def changes(self, row=0):
+        """When which outcome began, in whole ticks."""
+        return [(round(each.time / DT), each.outcome.name) for each in self.hazards.incidents if each.row == row]
+
+
+EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while the cause lasts
+    Cause.ORDERED: [(0, "HOLD")],
+    Cause.POSITION: [(0, "HOLD"), (30, "LAND")],
+    Cause.MARGIN: [(0, "WARN")],
+    Cause.OUTSIDE: [(0, "LAND")],
+    Cause.FAR_OUTSIDE: [(10, "CUT")],
+    Cause.SEPARATION: [(0, "HOLD")],
+    Cause.TOUCHING: [(0, "LAND")],
+    Cause.OVERSPEED: [(20, "HOLD"), (100, "LAND")],
+    Cause.TILT: [(10, "CUT")],
+    Cause.NEIGHBOUR: [(0, "WARN")],
+    Cause.ALONE: [(0, "HOLD")],
+    Cause.CENTRE: [(0, "HOLD")],
+    Cause.BATTERY: [(100, "LAND")],
+    Cause.ROUTER: [(100, "HOLD"), (1000, "LAND")],
+    Cause.CONDUCTOR: [(200, "WARN")],
+    Cause.FALLEN: [(0, "LAND")],
+    Cause.SETPOINT: [(0, "HOLD"), (50, "LAND")],
+    Cause.LATE: [(0, "HOLD"), (500, "LAND")],
+    Cause.LANDING: [(2000, "CUT")],
+}
+
+
+@pytest.mark.parametrize("cause", Cause, ids=lambda cause: cause.name.lower())
+def test_each_cause_has_its_outcomes_in_its_time(cause):
+    bench = Bench().see(25.0, cause)
+    assert bench.changes() == EXPECTED[cause]
+    first = bench.hazards.incidents[0]
+    assert first.text == f"{first.outcome.name.lower()}: {RULES[cause].words}: number {first.row}"
+    assert bench.hazards.outcome(0).name == EXPECTED[cause][-1][1]
+    places = RULES[cause].place and EXPECTED[cause][-1][1] == "HOLD"
+    assert bench.hazards.held[0] == places
+
+
+def test_a_ground_robot_without_a_position_stands_for_ever():
+    bench = Bench().see(20.0, Cause.POSITION)
+    assert bench.changes(row=1) == [(0, "HOLD")]
+
+
+def test_choices_of_an_experiment():
+    for lost, outcome in (("drop", "WARN"), ("hold", "HOLD"), ("land", "LAND")):
+        assert Bench(lost_neighbour=lost).see(0.1, Cause.NEIGHBOUR).changes() == [(0, outcome)]
+    assert Bench(lost_conductor="land").see(3.0, Cause.CONDUCTOR).changes() == [(200, "LAND")]
+    assert Bench(offline_s=3.0, link_silence_s=0.5).see(4.0, Cause.ROUTER).changes() == [(50, "HOLD"), (300, "LAND")]
+    assert Bench(landing_s=5.0).see(6.0, Cause.LANDING).changes() == [(500, "CUT")]
+    assert Bench(blind_s=np.array([1.0, 2.0])).see(3.0, Cause.POSITION).changes() == [(0, "HOLD"), (100, "LAND")]
+
+
+@pytest.mark.parametrize("cause", [cause for cause in Cause if EXPECTED[cause][0][1] == "HOLD"])
+def test_a_hold_ends_after_its_time_and_is_over_after_a_quiet_second(cause):
+    before = EXPECTED[cause][0][0] * DT
+    bench = Bench().see(before + 0.1, cause)
+    clears = rules(LIMITS)[cause].clears_s
+    if RULES[cause].place:
+        for _ in range(round(clears / DT) - 1):
+            bench.see(DT)
+            assert bench.hazards.held.all()
+    bench.see(2 * DT)
+    assert not bench.hazards.held.any()
+    assert bench.hazards.worst(0).startswith("hold: ")
+    bench.see(1.1 - clears)
+    assert bench.hazards.incidents[-1].text.startswith(f"over: {RULES[cause].words}, after ")
+    assert bench.hazards.worst(0) == ""
+    assert bench.acts == []
+
+
+def test_what_lands_never_ends():
+    bench = Bench().see(0.1, Cause.OUTSIDE).see(60.0)
+    assert bench.changes() == [(0, "LAND")]
+    assert bench.hazards.outcome(0) == Outcome.LAND
+    assert [each.row for each in bench.acts] == [0, 1]
+
+
+def test_what_flickers_is_told_once():
+    bench = Bench()
+    for _ in range(20):
+        bench.see(0.05, Cause.SEPARATION).see(0.3)
+    assert bench.changes() == [(0, "HOLD")]
+
+
+def test_setpoints_that_are_wrong_again_and_again_land_positions_that_come_back_do_not():
+    wild, blind = Bench(), Bench()
+    for _ in range(10):
+        wild.see(0.02, Cause.SETPOINT).see(0.08)
+        blind.see(0.02, Cause.POSITION).see(0.08)
+    assert wild.changes()[-1] == (50, "LAND")
+    assert blind.changes() == [(0, "HOLD")]
+
+
+def test_the_worst_is_shown_and_acted_on():
+    bench = Bench().see(0.1, Cause.MARGIN)
+    assert bench.hazards.worst(0) == "warn: it is beyond a wall of the arena: number 0"
+    bench.see(0.1, Cause.SEPARATION, Cause.MARGIN)
+    assert bench.hazards.worst(0) == "hold: minimum separation: number 0"
+    bench.see(0.2, Cause.TILT, Cause.MARGIN)
+    assert bench.hazards.worst(0) == "cut: it has tipped over: number 0"
+    assert [each.outcome for each in bench.acts] == [Outcome.CUT] * 2
+
+
+def test_who_is_on_the_ground_has_no_hazards_and_who_lands_only_those_of_landing():
+    bench = Bench().see(5.0, *Cause, active=NONE)
+    assert bench.hazards.incidents == []
+    bench.see(30.0, *Cause, active=NONE, landing=ALL)
+    assert {each.cause for each in bench.hazards.incidents} == {Cause.FAR_OUTSIDE, Cause.TILT, Cause.LANDING}
+    assert {each.outcome for each in bench.hazards.incidents} == {Outcome.CUT}
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.sets(st.sampled_from(Cause)), st.integers(1, 300), st.sampled_from(["both", "0", "1"]))),
+    st.sampled_from(["drop", "hold", "land"]),
+)
+def test_outcomes_only_become_harder_while_a_cause_lasts(story, lost):
+    bench = Bench(lost_neighbour=lost)
+    hardest = np.zeros(2, dtype=int)
+    for causes, ticks, who in story:
+        rows = {"both": ALL, "0": np.array([True, False]), "1": np.array([False, True])}[who]
+        bench.see(ticks * DT, *causes, rows=rows)
+        for row in range(2):
+            now = bench.hazards.outcome(row)
+            if hardest[row] >= Outcome.LAND:
+                assert now >= hardest[row]
+            hardest[row] = max(hardest[row], now)
+            assert (bench.hazards.worst(row) == "") == (now == Outcome.NONE)
+    ended = [(each.row, each.cause) for each in bench.acts if each.outcome >= Outcome.LAND]
+    assert {row for row, _ in ended} == set(np.flatnonzero(hardest >= Outcome.LAND).tolist())
+    bench.see(2.0)
+    assert all(bench.hazards.outcome(row) in (Outcome.NONE, Outcome.LAND, Outcome.CUT) for row in range(2))
+
+
+# ---------------------------------------------------------------- causes, as robots see them
+
+
+def happened(swarm):
+    """What was said of hazards, by robot."""
+    return {
+        name: [each.text for each in group.agent.hazards.incidents if each.row == row]
+        for name, (group, row) in swarm.where.items()
+    }
+
+
+def spoiled(swarm, **values):
+    """From now on the bodies of the first group say this."""
+    group = swarm.groups[0]
+
+    def spoil(t, state):
+        for name, value in values.items():
+            was = getattr(state, name)
+            if was is None:
+                setattr(state, name, np.tile(np.asarray(value, dtype=float), (len(state.yaw), 1)))
+            else:
+                was = was.copy()
+                was[:] = value
+                setattr(state, name, was)
+        return state
+
+    group.spoil = spoil
+
+
+def leant(angle):
+    return [math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]
+
+
+UNSAFE = {
+    "tipped": ({"attitude": leant(1.3)}, "cut: it has tipped over: it leans 74° (limit 69°)", DONE, 12),
+    "level enough": ({"attitude": leant(1.1)}, None, RUNNING, 300),
+    "unknown": ({"attitude": [np.nan] * 4}, None, RUNNING, 300),
+    "empty": ({"battery": 0.09}, "land: its battery is low: 9% (limit 10%)", LANDING, 102),
+    "no gauge": ({"battery": np.nan}, None, RUNNING, 300),
+    "too fast": ({"velocity": [0.0, 4.4, 0.0]}, "hold: it moves faster than it can: 4.40 m/s", LANDING, 102),
+    "fast": ({"velocity": [0.0, 4.2, 0.0]}, None, RUNNING, 300),
+    "outside": ({"position": [2.3, 0.0, 0.5]}, "land: it left the arena: 0.30 m outside (limit 0.25 m)", LANDING, 2),
+    "flown": ({"position": [2.8, 0.0, 0.5]}, "cut: it flies away: 0.80 m outside (limit 0.75 m)", DONE, 13),
+    "beyond": ({"position": [2.1, 0.0, 0.5]}, "warn: it is beyond a wall of the arena: 0.10 m outside", RUNNING, 50),
+    "down": ({"flying": False}, "land: it came down by itself: its motors are off", LANDING, 2),
+}
+
+
+@pytest.mark.parametrize("what", UNSAFE)
+def test_a_drone_that(what):
+    values, text, phase, ticks = UNSAFE[what]
+    swarm = drone().running().run(0.3)
+    spoiled(swarm, **values)
+    swarm.run(0.01)
+    assert swarm.phase("F") in (RUNNING, LANDING, phase)
+    for _ in range(ticks - 1):
+        swarm.step()
+        if swarm.phase("F") >= phase > RUNNING:
+            break
+    assert swarm.phase("F") == phase
+    told = happened(swarm)["F"]
+    assert any(each.startswith(text) for each in told) if text else told == []
+
+
+def test_two_that_come_too_near_hold_and_go_on_when_one_is_taken_away():
+    experiment = pair(formation=Formation(links={"A - B": 0.3}), safety=Safety(separation=0.5))
+    swarm = Swarm(experiment, [["A"], ["B"]]).running().run(12.0)
+    place = swarm.column("truth")
+    apart = np.linalg.norm(place[:, 0] - place[:, 1], axis=1)
+    assert apart[-1] > 0.45
+    assert np.ptp(place[-200:], axis=0).max() < 1e-3  # they stand
+    told = happened(swarm)
+    assert told["A"][0].startswith("hold: minimum separation: 0.50 m from B (limit 0.5 m)")
+    assert len(told["A"]) == len(told["B"]) == 1
+    agent = swarm.agent("A")
+    for k in range(80):  # B is somewhere else now
+        agent.hear(np.array([0]), np.array([[1.5, 0.0, 0.0]]), np.zeros((1, 3)), *np.full((2, 1), 99.0 + k))
+        swarm.groups[0].by_speaker.clear()
+        swarm.step()
+    assert swarm.row("A", "setpoint").any()
+
+
+def test_two_that_nearly_touch_land():
+    experiment = pair(safety=Safety(separation=0.3))
+    swarm = Swarm(experiment, [["A"], ["B"]]).running().run(0.5)
+    here = swarm.row("A", "position") + np.array([0.14, 0.0, 0.0])
+    swarm.agent("A").hear(np.array([0]), here[None], np.zeros((1, 3)), np.array([99.0]), np.array([99.0]))
+    swarm.step()
+    swarm.step()
+    assert swarm.phase("A") >= LANDING
+    assert swarm.agent("A").life.reason == ["far too near to another robot"]
+    assert swarm.phase("B") == RUNNING  # it knows better where it is itself
+
+
+@pytest.mark.parametrize(
+    ("choice", "phase", "moves"), [("drop", RUNNING, True), ("hold", RUNNING, False), ("land", LANDING, False)]
+)
+def test_a_neighbour_that_is_lost(choice, phase, moves):
+    experiment = triangle(safety=Safety(lost_neighbour=choice))
+    swarm = Swarm(experiment, [["A"], ["B"], ["C"]]).running().run(0.5)
+    swarm.agent("A").lose(np.array([0]), swarm.t)
+    swarm.groups[0].by_speaker.pop("B")
+    swarm.run(1.0)
+    assert happened(swarm)["A"] == []
+    swarm.run(0.03)
+    assert happened(swarm)["A"] == [f"{'warn' if choice == 'drop' else choice}: a neighbour is lost: B"]
+    before = swarm.row("A", "truth")
+    swarm.run(1.0)
+    assert min(swarm.phase("A"), LANDING) == phase
+    assert (np.linalg.norm(swarm.row("A", "truth") - before) > 0.01) == moves
+    if choice == "hold":
+        swarm.agent("A").find(np.array([0]))
+        swarm.run(1.2)
+        assert happened(swarm)["A"][-1].startswith("over: a neighbour is lost, after ")
+
+
+def test_without_a_router_it_holds_and_then_lands():
+    swarm = drone(safety=Safety(offline_s=3.0)).running().run(0.2)
+    swarm.agent("F").outside.offline_since = swarm.t
+    swarm.run(2.9)
+    assert happened(swarm)["F"] == ["hold: no connection to a router: for 1.0 s"]
+    assert swarm.phase("F") == RUNNING
+    swarm.run(0.15)
+    assert (swarm.phase("F"), swarm.agent("F").life.reason) == (LANDING, ["no connection to a router"])
+
+
+@pytest.mark.parametrize(("choice", "phase"), [("finish", RUNNING), ("land", LANDING)])
+def test_without_a_conductor(choice, phase):
+    swarm = drone(safety=Safety(lost_conductor=choice)).running().run(0.2)
+    swarm.agent("F").outside.unattended_since = swarm.t
+    swarm.run(1.9)
+    assert happened(swarm)["F"] == []
+    swarm.run(0.2)
+    assert swarm.phase("F") == phase
+    assert "the conductor is gone: for 2.0 s" in happened(swarm)["F"][0]
+
+
+def test_a_control_loop_that_hardly_runs_holds_and_then_lands():
+    outside = Outside()
+    for _ in range(500):
+        outside.ticked(4, DT)
+    assert outside.late == pytest.approx(0.8)  # 20 Hz is slow, not hopeless
+    outside.ticked(500, DT)  # 5 s of nothing
+    assert outside.late > LATE_SHARE
+    for _ in range(20):
+        outside.ticked(0, DT)
+    assert outside.late < LATE_SHARE
+    for _ in range(2000):
+        outside.ticked(0, DT)
+    assert outside.late == 0.0
+    swarm = drone().running().run(0.2)
+    agent = swarm.agent("F")
+    for _ in range(30):
+        agent.outside.ticked(30, DT)
+        swarm.tick += 30
+        swarm.step()
+    assert swarm.phase("F") >= LANDING
+    assert agent.life.reason == ["its control loop misses its ticks"]
+
+
+def test_a_law_that_wants_nonsense_lands():
+    swarm = drone().running().run(0.2)
+    group = swarm.groups[0]
+    group.agent.deciding.decide = lambda *_, **__: pytest.fail("not asked")  # the goal stays what it is
+    group.agent._decide = lambda *_: group.agent.goal.__setitem__(slice(None), np.nan)
+    swarm.run(1.0)
+    assert happened(swarm)["F"][0] == "hold: what it wants is not a setpoint: not made of finite numbers"
+    assert swarm.agent("F").life.reason == ["what it wants is not a setpoint"]
+    assert swarm.phase("F") >= LANDING
+
+
+def test_a_drone_that_does_not_come_down_is_cut():
+    swarm = drone(safety=Safety(landing_s=2.0)).running().run(0.2)
+    swarm.agent("F").life.land(0, "ordered to land")
+    spoiled(swarm, flying=True)
+    swarm.run(1.9)
+    assert swarm.phase("F") == LANDING
+    swarm.run(0.2)
+    assert (swarm.phase("F"), swarm.agent("F").life.reason) == (DONE, ["its landing takes too long"])
+
+
+def test_leaning_is_an_angle_to_the_vertical():
+    attitude = np.array([leant(0.5), [math.cos(0.6), 0.0, 0.0, math.sin(0.6)], [0.0, 1.0, 0.0, 0.0], [np.nan] * 4])
+    assert [round(lean(attitude, row), 6) for row in range(3)] == [0.5, 0.0, round(math.pi, 6)]
+    assert leaning(attitude, 0.49).tolist() == [True, False, True, False]
+
+
+# ---------------------------------------------------------------- whatever happens
+
+number = st.one_of(st.floats(-3.0, 3.0), st.sampled_from([np.nan, 0.0, 9.0, 1e9]))
+SPOILT = st.fixed_dictionaries(
+    {},
+    optional={
+        "position": st.tuples(number, number, number),
+        "velocity": st.tuples(number, number, number),
+        "yaw": number,
+        "battery": st.one_of(st.floats(0.0, 1.0), st.just(np.nan)),
+        "attitude": st.sampled_from([leant(a) for a in (0.0, 1.0, 2.0)] + [[np.nan] * 4]),
+        "flying": st.booleans(),
+    },
+)
+EVENTS = st.sampled_from(["lose", "find", "offline", "online", "unattended", "skip", "hold", "start", "nothing"])
+
+
+def occur(agent, event, t):
+    """Something happens around a decision."""
+    outside = agent.outside
+    match event:
+        case "lose":
+            agent.lose(np.arange(2), t)
+        case "find":
+            agent.find(np.arange(2))
+        case "offline" | "online":
+            outside.offline_since = t if event == "offline" else np.inf
+        case "unattended":
+            outside.unattended_since = t
+        case "skip":
+            agent.skip(200)
+        case "hold":
+            agent.hold(0)
+        case "start":
+            agent.start(0, t)
+
+
+@pytest.mark.slow
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(st.tuples(SPOILT, EVENTS, st.integers(1, 80)), max_size=8),
+    st.sampled_from(["drop", "hold", "land"]),
+    st.booleans(),
+)
+def test_whatever_happens_nobody_comes_up_again(story, lost, early):
+    robots = {"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5), "G": Robot(kind="khepera4", start=[0.9, 0.1])}
+    safety = Safety(lost_neighbour=lost, separation=0.4, offline_s=2.0)
+    swarm = Swarm(pair(robots=robots, formation=Formation(links={"F - G": 0.8}), safety=safety, duration_s=20.0))
+    swarm.until(READY if early else RUNNING)
+    (group,) = swarm.groups
+    agent = group.agent
+    if early:
+        agent.life.takeoff(0), agent.life.takeoff(1)
+    before = agent.life.phase.copy()
+    for values, event, ticks in story:
+        spoiled(swarm, **values)
+        occur(agent, event, swarm.t)
+        for _ in range(ticks):
+            swarm.step()
+            phase, setpoint = agent.life.phase, group.actions.setpoint
+            down = before >= LANDING
+            assert (phase[down] >= before[down]).all()
+            assert np.isnan(setpoint[0]).all() or np.isfinite(setpoint[0]).all()
+            assert np.isfinite(setpoint[1]).all()
+            for row in range(2):
+                if agent.hazards.outcome(row) >= Outcome.LAND:
+                    assert phase[row] >= LANDING
+                    assert agent.life.reason[row]
+            ended = (phase < AIRBORNE) | (phase >= LANDING)
+            assert not setpoint[1].any() or not ended[1]
+            assert np.isnan(setpoint[0]).all() or not ended[0]
+            before = phase.copy()
+    spoiled(swarm, position=np.nan)  # and now nothing is known any more
+    swarm.run(3.0)
+    assert agent.life.phase[0] in (LANDING, DONE) or agent.life.phase[0] <= READY
+    assert not group.actions.setpoint[1].any()

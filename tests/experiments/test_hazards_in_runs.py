@@ -1,0 +1,76 @@
+"""What goes wrong in a virtual run is in its trace and in its recording, and nothing is where nothing does."""
+
+import numpy as np
+import pytest
+
+from agents.lifecycle import DONE
+from experiments import document, playback
+from experiments.check import check
+from experiments.experiment import Formation, Robot, Safety
+from experiments.logbook import Logbook
+from experiments.virtual import simulate
+from tests.agents.swarm import changed
+from tests.agents.test_agent import pair
+
+
+def events(log, experiment, copy=0):
+    trace = Logbook(log, experiment, "case", copy).trace()
+    return [(event.source, event.text) for event in trace.events if event.kind == "hazard"]
+
+
+def test_a_run_without_trouble_has_no_incidents():
+    experiment = changed(document.read("robotic-park").cases()["event"], duration_s=3.0, timeline=[])
+    assert simulate(experiment, [1]).incidents == ()
+
+
+def test_who_comes_too_near_holds_in_every_repetition(tmp_path):
+    experiment = pair(formation=Formation(links={"A - B": 0.3}), safety=Safety(separation=0.6), duration_s=8.0)
+    log = simulate(experiment, [1, 2])
+    last = log.true_position[-1].reshape(2, 2, 3)
+    assert (np.linalg.norm(last[:, 0] - last[:, 1], axis=1) > 0.55).all()
+    for copy in (0, 1):
+        found = events(log, experiment, copy)
+        assert {source for source, _ in found} == {"A", "B"}
+        assert ("A", "hold: minimum separation: 0.60 m from B (limit 0.6 m)") in found
+    book = Logbook(log, experiment, "case", 1)
+    book.record(tmp_path / "case.mcap", 'title = "A pair"')
+    read = [event for event in playback.read(tmp_path / "case.mcap").trace.events if event.kind == "hazard"]
+    assert {(event.source, event.text) for event in read} == set(events(log, experiment, 1))
+    assert all(0.0 < event.stamp < 8.0 for event in read)
+
+
+def test_a_drone_lands_when_its_battery_is_low_and_says_so():
+    robots = {
+        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.5), "G": Robot(kind="khepera4", start=[0.9, 0.1])
+    }  # fmt: skip
+    experiment = pair(
+        robots=robots, formation=Formation(links={"F > G": 0.8}), safety=Safety(battery_low=0.985), duration_s=12.0
+    )
+    log = simulate(experiment, [1])
+    during = np.flatnonzero((log.time > 10.0) & (log.time < 12.0))
+    assert (log.phase[during, 0] == DONE).all()
+    assert (log.phase[during, 1] < DONE).all()
+    assert [text for _, text in events(log, experiment)] == ["land: its battery is low: 98% (limit 98%)"]
+    reasons = [status.reason for status in Logbook(log, experiment, "case")._statuses()]
+    assert reasons[:2] == ["land: its battery is low: 98% (limit 98%)", "finished"]
+
+
+FINDINGS = {
+    "battery": ({"battery_low": 0.5}, "battery"),
+    "cut": ({"cut_outside": 0.2}, "cut-outside"),
+    "start": ({"separation": 0.9}, "separation-start"),
+    "link": ({"separation": 0.6}, "separation-link"),
+}
+
+
+@pytest.mark.parametrize("what", FINDINGS)
+def test_check_finds_settings_that_make_no_sense(what, tmp_path):
+    chosen, code = FINDINGS[what]
+    settings = "\n".join(f"{name} = {value}" for name, value in chosen.items())
+    file = tmp_path / "pair.toml"
+    file.write_text(
+        'title = "A pair"\nduration_s = 20.0\n[robots]\nA = { kind = "khepera4", start = [-0.4, 0.0] }\n'
+        'B = { kind = "khepera4", start = [0.4, 0.0] }\n[formation]\nlinks = { "A - B" = 0.5 }\n'
+        f"[safety]\n{settings}\n"
+    )
+    assert code in {finding.code for finding in check(document.read(file))}

@@ -1,0 +1,96 @@
+"""Hazards of real processes: what robots notice lands them, and becomes events of the run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from agents import session as network
+from agents import wire
+from experiments import playback
+from tests.conftest import RouterProcess
+from tests.system.lab import Flight, RobotProcess, Watcher, typed
+
+pytestmark = pytest.mark.system
+
+PAIR = """
+title = "Two that want to be nearer than they may"
+duration_s = 6.0
+trigger = "periodic"
+[robots]
+A = {{ kind = "khepera4", start = [-0.3, 0.0] }}
+B = {{ kind = "khepera4", start = [0.3, 0.0] }}
+[formation]
+links = {{ "A - B" = 0.3 }}
+[safety]
+{safety}
+"""
+
+
+def written(folder: Path, safety: str) -> Path:
+    file = folder / "pair.toml"
+    file.write_text(PAIR.format(safety=safety))
+    return file
+
+
+def test_who_comes_too_near_holds_and_the_run_says_so(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    flight = Flight(folder, str(written(tmp_path, "separation = 0.5")), "--no-report")
+    flight.until_said(r"hazard [AB]: hold: minimum separation: 0\.\d\d m from [AB] \(limit 0\.5 m\)")
+    assert flight.finish()[0] == 0
+    (file,) = folder.glob("*.mcap")
+    trace = playback.read(file).trace
+    hazards = {event.source: event.text for event in trace.events if event.kind == "hazard"}
+    assert set(hazards) == {"A", "B"}
+    assert all(text.startswith("hold: minimum separation: ") for text in hazards.values())
+    last = trace.true_position[-1]
+    assert 0.4 < abs(last[0, 0] - last[1, 0]) < 0.51
+    status = typed(file, "/A/status")[-1]
+    assert [incident.text[:5] for incident in status.incidents] == ["hold:"]
+
+
+def test_a_drone_whose_battery_is_low_lands_and_the_others_go_on(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    low = ("--set", "safety.battery_low=0.985", "--set", "duration_s=8")  # it flies for 7 minutes on a charge
+    flight = Flight(folder, "triangle", "--case", "event", "--no-report", *low)
+    flight.until_said(r"hazard CF01: land: its battery is low: 98% \(limit 98%\)")
+    assert flight.finish()[0] == 0
+    trace = playback.read(folder / "event.mcap").trace
+    ends = {event.source: event.text for event in trace.events if event.kind == "robot"}
+    assert ends["CF01"] == "done: its battery is low"
+    assert ends["KH01"] == "done: finished"
+
+
+def test_nobody_takes_off_without_charge_and_the_reason_is_shown(router: RouterProcess, tmp_path: Path) -> None:
+    watcher = Watcher(router.endpoint)
+    robots = RobotProcess(router.endpoint, written(tmp_path, "battery_min = 1.0"), "A", "B")
+    try:
+        wanted = "its battery is at 100%, less than 100%"  # it uses some while it waits
+        watcher.until(lambda: "A" in watcher.status and watcher.status["A"].reason == wanted, "it says why")
+        reply = watcher.order("A", wire.Order("takeoff"))
+        assert (reply.ok, reply.reason) == (False, f"cannot take off while idle: {wanted}")
+    finally:
+        watcher.close()
+        assert robots.end() == 0
+
+
+def test_without_the_conductor_robots_end_if_the_file_says_so(router: RouterProcess, tmp_path: Path) -> None:
+    watcher = Watcher(router.endpoint)
+    token = network.alive_token(watcher.session, watcher.keys.conductor)
+    file = written(tmp_path, 'lost_conductor = "land"')
+    robots = RobotProcess(router.endpoint, file, "A", "B")
+    try:
+        watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["ready"] * 2, "ready")
+        for name in "AB":
+            assert watcher.order(name, wire.Order("takeoff")).ok
+        watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["airborne"] * 2, "waiting for the start")
+        token.undeclare()  # type: ignore[no-untyped-call]
+        watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["done"] * 2, "down", 8.0)
+        status = watcher.status["A"]
+        assert status.reason == "the conductor is gone"
+        assert status.hazard.startswith("land: the conductor is gone: for 2.")
+        assert [incident.text for incident in status.incidents] == [status.hazard]
+    finally:
+        watcher.close()
+        assert robots.end() == 0
