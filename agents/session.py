@@ -43,6 +43,7 @@ DEFAULT_ENDPOINT: Final = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
 GATHER_S: Final = 1.0
 LINK_S: Final = 0.01
+FREED_S: Final = 3.0  # so long may an endpoint of a mesh stay taken by a robot that is started again
 GHOST_S: Final = 2.5  # so long may the token of somebody who hangs stand after his end
 LEASE_S: Final = 2.0  # whoever is silent for so long is held for dead
 ROBOT_LEASE_S: Final = 1.2  # the same for robots: neighbours of one that hangs must know within 1.5 s
@@ -227,7 +228,7 @@ def open_session(
         rights=rights if ends.listen else None,
     )
     gone = stop or threading.Event()
-    deadline = time.monotonic() + wait_s
+    deadline = time.monotonic() + (min(wait_s, FREED_S) if ends.listen else wait_s)
     while True:
         try:
             session = zenoh.open(settings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import psutil
@@ -10,10 +11,10 @@ import pytest
 import zenoh
 
 from agents import session as network
-from agents import topology
+from agents import topology, wire
 from experiments import access
 from experiments.run import load, reopen
-from tests.system.lab import Flight, Watcher
+from tests.system.lab import Flight, Started, Watcher
 from tools import estop
 from tools.network import members
 
@@ -97,17 +98,42 @@ def test_a_robot_that_is_cut_off_from_everybody_holds(tmp_path: Path) -> None:
     assert code == 0
 
 
-def test_a_silent_missing_link_is_named(tmp_path: Path) -> None:
-    """Somebody else listens where KH01 should: whoever hears it says so, and nothing moves."""
+def test_an_endpoint_that_somebody_else_has_is_named(tmp_path: Path) -> None:
     taken = network.free_endpoint(0)
-    addresses = f'{{KH01 = "{taken}"}}'
     with zenoh.open(network.config("router", listen=[taken], name="stranger")):
         flight = Flight(
             tmp_path / "run", "triangle", "--case", "periodic", "--no-report", "--set", "network.topology=mesh",
-            "--set", f"network.addresses={addresses}", "--set", "start.deadline_s=12",
+            "--set", f'network.addresses={{KH01 = "{taken}"}}',
         )  # fmt: skip
         code, _ = flight.finish()
     assert code == 2
-    said = "".join(file.read_text() for file in (tmp_path).glob("*.stderr"))
+    said = "".join(file.read_text() for file in tmp_path.glob("*.stderr"))
     assert "KH01 cannot listen on" in said
     assert "network.addresses" in said
+
+
+def test_a_silent_missing_link_is_named() -> None:
+    robots = ("KH01", "KH02", "CF01")
+    right = [topology.owned(endpoint, name) for endpoint, name in zip(free(3), robots, strict=True)]
+    wrong = [topology.owned(network.free_endpoint(0), "KH01"), *right[1:]]  # where KH02 seeks it
+    with ExitStack() as stack:
+        for name in robots:
+            connect = [part for each in (wrong if name == "KH02" else right) for part in ("--connect", each)]
+            robot = Started("experiments.robot", "triangle", name, *connect)
+            stack.callback(robot.end)
+        watcher = Watcher(*right)
+        stack.callback(watcher.close)
+        watcher.until(lambda: watcher.phase("CF01") == "ready", "it hears both")
+        watcher.until(
+            lambda: watcher.status["KH02"].reason == "never heard KH01", "and KH02 says whom it does not", 5.0
+        )
+        assert watcher.phase("KH02") == watcher.phase("KH01") == "idle"
+        assert not watcher.order("KH02", wire.Order("takeoff")).ok
+
+
+def free(count: int) -> list[str]:
+    """So many endpoints at which nobody listens."""
+    found: set[str] = set()
+    while len(found) < count:
+        found.add(network.free_endpoint(0))
+    return sorted(found)
