@@ -53,11 +53,19 @@ class Grant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class Rights(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Who may do what in an experiment: each robot by its name, everybody else by its role."""
+    """Who may do what in an experiment: each robot by its name, everybody else by its role.
+
+    Attributes:
+        realm: First chunk of every key.
+        robots: By name.
+        roles: By role.
+        linked: Whether routers pass on to each other what they have let in; else a router may say nothing.
+    """
 
     realm: str
     robots: dict[str, Grant]
     roles: dict[str, Grant]
+    linked: bool = False
 
     def joined(self, other: Rights) -> Rights:
         """The rights of two experiments that share a router.
@@ -69,7 +77,8 @@ class Rights(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise LabError(
                 f"cases in the realms {self.realm} and {other.realm} share no router: give them one network.realm"
             )
-        return Rights(self.realm, _joined(self.robots, other.robots), _joined(self.roles, other.roles))
+        robots, roles = _joined(self.robots, other.robots), _joined(self.roles, other.roles)
+        return Rights(self.realm, robots, roles, self.linked or other.linked)
 
 
 def _joined(one: Mapping[str, Grant], other: Mapping[str, Grant]) -> dict[str, Grant]:
@@ -127,7 +136,7 @@ def rules(rights: Rights, register: Register) -> dict[str, Any]:
                 raise LabError(
                     f"'{name}' is a robot of the experiment and {identity.role} of the lab: rename the robot"
                 )
-        if identity.role == "router":
+        if identity.role == "router" and rights.linked:
             own = list(_passed(name, rights))
         elif grant is None:
             continue

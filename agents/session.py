@@ -41,8 +41,9 @@ DEFAULT_PORT: Final = 7447
 DEFAULT_ENDPOINT: Final = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 
 RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
-GATHER_S: Final = 1.0  # so long are members of a mesh waited for that do not answer while others do
+GATHER_S: Final = 1.0
 LINK_S: Final = 0.01
+FREED_S: Final = 3.0  # so long may an endpoint of a mesh stay taken by a robot that is started again
 GHOST_S: Final = 2.5  # so long may the token of somebody who hangs stand after his end
 LEASE_S: Final = 2.0  # whoever is silent for so long is held for dead
 ROBOT_LEASE_S: Final = 1.2  # the same for robots: neighbours of one that hangs must know within 1.5 s
@@ -195,6 +196,7 @@ def open_session(
     lease_s: float = LEASE_S,
     identity: str | None = None,
     rights: access.Rights | None = None,
+    gather_s: float = GATHER_S,
 ) -> zenoh.Session:
     """A session on the network that some endpoints make; use it in a `with`.
 
@@ -208,6 +210,7 @@ def open_session(
         stop: Ends the wait when it is set.
         lease_s: See `config`.
         identity: Whose certificate is shown, where the endpoints are of a lab; `name` if left out.
+        gather_s: How long members of a mesh that do not answer are waited for when others do [s].
         rights: Who may do what; a member of a mesh needs them in a lab, for nobody else enforces them.
 
     Raises:
@@ -225,7 +228,7 @@ def open_session(
         rights=rights if ends.listen else None,
     )
     gone = stop or threading.Event()
-    deadline = time.monotonic() + wait_s
+    deadline = time.monotonic() + (min(wait_s, FREED_S) if ends.listen else wait_s)
     while True:
         try:
             session = zenoh.open(settings)
@@ -238,18 +241,18 @@ def open_session(
                     "the network already, end it first; or give it another endpoint in network.addresses"
                 ) from None
         else:
-            if not ends.visits or _gathered(session, len(ends.connect), gone, deadline):
+            if not ends.visits or _gathered(session, len(ends.connect), gather_s, gone, deadline):
                 return session
             session.close()  # type: ignore[no-untyped-call]
         raise Unreachable(_silence(endpoints, identity or name)) from None
 
 
-def _gathered(session: zenoh.Session, members: int, gone: threading.Event, deadline: float) -> bool:
+def _gathered(session: zenoh.Session, members: int, gather_s: float, gone: threading.Event, deadline: float) -> bool:
     """Waits until a visitor is linked with all members of a mesh, or after a while with those that are there."""
     begun = time.monotonic()
     while (linked := len(session.info.transports())) < members:
         now = time.monotonic()
-        if linked and now - begun > GATHER_S:
+        if linked and now - begun > gather_s:
             return True
         if now > deadline or gone.wait(LINK_S):
             return linked > 0
@@ -294,6 +297,11 @@ def free_endpoints(count: int, protocol: str = "tcp") -> list[str]:
 def connected(session: zenoh.Session) -> bool:
     """Whether the session has a router now, or a neighbour in a mesh. Costs 0.6 µs: poll it in the control loop."""
     return bool(session.info.routers_zid() or session.info.peers_zid())
+
+
+def links(session: zenoh.Session) -> int:
+    """With how many others it is linked."""
+    return len(session.info.transports())
 
 
 def deserted(session: zenoh.Session) -> bool:

@@ -71,7 +71,9 @@ def _rights(experiment: Experiment) -> Rights:
             watch=[*own, *map(keys.alive, others), keys.conductor, *([keys.centre_alive] if led else []), *tokens],
         )
         robots |= dict.fromkeys(group, grant)
-    return Rights(keys.realm, robots, _roles(experiment, keys))
+    network = experiment.network
+    linked = network.routers > 1 or len(network.connect or ()) > 1
+    return Rights(keys.realm, robots, _roles(experiment, keys), linked)
 
 
 def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:

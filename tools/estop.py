@@ -10,7 +10,7 @@ from typing import Final
 import zenoh
 
 from agents import session as network
-from agents import wire
+from agents import topology, wire
 from agents.keys import Keys
 
 ANSWER_S: Final = 2.0
@@ -28,9 +28,9 @@ def command(*, connect: Sequence[str], realm: str, reason: str, who: str) -> int
         EndpointError, Unreachable: If no router can be reached.
     """
     keys = Keys(realm)
-    with network.open_session(
-        list(connect) or [network.DEFAULT_ENDPOINT], name="estop", wait_s=2.0, identity=who
-    ) as session:
+    endpoints = list(connect) or [network.DEFAULT_ENDPOINT]
+    # who does not answer must not keep it from those who do
+    with network.open_session(endpoints, name="estop", wait_s=2.0, identity=who, gather_s=0.0) as session:
         stop = wire.encode(wire.Stop(who, reason))
         urgent = session.declare_publisher(
             keys.estop,
@@ -48,9 +48,15 @@ def command(*, connect: Sequence[str], realm: str, reason: str, who: str) -> int
             if reply.ok is not None
         }
         left = set(there)
-        while left and time.monotonic() < begun + ANSWER_S:
+        watch = network.alive_watch(session, keys.alive("*"))
+        while (left or _awaited(session, endpoints, begun)) and time.monotonic() < begun + ANSWER_S:
             urgent.put(stop)
             time.sleep(AGAIN_S)
+            for token in network.received(watch.handler):
+                robot = keys.whose(str(token.key_expr))
+                if robot is not None and token.kind == zenoh.SampleKind.PUT and robot not in there:
+                    there.add(robot)
+                    left.add(robot)
             for sample in network.received(statuses.handler):
                 try:
                     status = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Status)
@@ -66,3 +72,9 @@ def command(*, connect: Sequence[str], realm: str, reason: str, who: str) -> int
         return 1
     print(f"stopped: {', '.join(sorted(there))}")
     return 0
+
+
+def _awaited(session: zenoh.Session, endpoints: Sequence[str], begun: float) -> bool:
+    """Whether members of a mesh may yet be linked."""
+    late = time.monotonic() > begun + network.GATHER_S
+    return topology.is_mesh(endpoints) and not late and network.links(session) < len(endpoints)

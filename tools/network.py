@@ -60,16 +60,19 @@ def key_expression(text: str) -> str:
 
 
 def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[Member]:
-    """Who is on the network, by name, from the admin space of the routers; `session` itself is left out.
+    """Who is on the network, by name, from the admin space of routers and members of a mesh, without `session` itself.
 
     A frozen process is still listed, for its router knows it; only its name is then unknown.
     """
     held: dict[str, dict[str, list[str]]] = {}
-    for place, value in _admin(session, "@/*/router/**", timeout_s):
-        _, _, _, kind, key = (*place.split("/", 4), *[""] * 4)[:5]
+    places = [*_admin(session, "@/*/router/**", timeout_s), *_admin(session, "@/*/peer/**", timeout_s)]
+    for place, value in places:
+        _, _, mode, kind, key = (*place.split("/", 4), *[""] * 4)[:5]
         if kind not in _KINDS or not isinstance(value, dict):
             continue
-        for owner in {*_words(value.get("clients")), *_words(value.get("peers"))}:
+        # a member of a mesh tells of its neighbours too, but not all of it; its own it calls those of a client
+        of_peers = _words(value.get("peers")) if mode == "router" else []
+        for owner in {*_words(value.get("clients")), *of_peers}:
             held.setdefault(owner, {}).setdefault(_KINDS[kind], []).append(key)
     names = {
         place.split("/")[1]: _name(value)

@@ -65,9 +65,9 @@ class Looking:
 class Watcher(Looking):
     """Everything that robots say, from a session of the test's own; poll with `look`."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, *endpoints: str) -> None:
         self.keys = Keys()
-        self.session = network.open_session([endpoint], name="test", identity="operator")
+        self.session = network.open_session(endpoints, name="test", identity="operator")
         self._statuses = network.pose_subscriber(self.session, self.keys.status("*"), 4096)
         self._states = network.subscriber(self.session, self.keys.state("*"), 8192)
         self._alive = network.alive_watch(self.session, self.keys.alive("*"))

@@ -28,13 +28,14 @@ FLOWN = ("KH01", "KH02", "CF01")
 class Laboratory:
     """Three robots in flight on a router that asks for certificates; `KH03`, who hears `KH01`, has not been started."""
 
-    def __init__(self, folder: Path, protocol: str = "tls") -> None:
+    def __init__(self, folder: Path, protocol: str = "tls", *, linked: bool = False) -> None:
         self.folder = folder / "lab"
         cases = load(FILE).cases()
         robots = dict.fromkeys(next(iter(cases.values())).robots, "robot")
         authority.create(self.folder, {**{role: role for role in authority.SERVICES}, **robots})
         self.rights = folder / "rights.json"
-        self.rights.write_bytes(msgspec.json.encode(access.rights(cases.values())))
+        rights = msgspec.structs.replace(access.rights(cases.values()), linked=linked)
+        self.rights.write_bytes(msgspec.json.encode(rights))
         self.plain = network.free_endpoint(preferred_port=0, protocol=protocol)
         (self.endpoint,) = lab.secured([self.plain], self.folder)
         self.robots: list[RobotProcess] = []

@@ -1,0 +1,139 @@
+"""A mesh: the reference experiment without any router; each robot is linked with exactly its neighbours."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import psutil
+import pytest
+import zenoh
+
+from agents import session as network
+from agents import topology, wire
+from experiments import access
+from experiments.run import load, reopen
+from tests.system.lab import Flight, Started, Watcher
+from tools import estop
+from tools.network import members
+
+pytestmark = pytest.mark.system
+
+
+def peers(process: psutil.Process, ports: dict[int, str]) -> set[str]:
+    """Members that a process is linked with by a connection of its own, by the ports at which they listen."""
+    return {
+        ports[each.raddr.port]
+        for each in process.net_connections("inet")
+        if each.status == "ESTABLISHED" and each.raddr and each.raddr.port in ports
+    }
+
+
+def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flight = Flight(
+        tmp_path / "run", "robotic-park", "--case", "event", "--no-report", "--set", "network.topology=mesh"
+    )
+    flight.until_said("phase conductor: formation")
+    endpoints = (flight.folder / "network.txt").read_text().split()
+    ports = {int(topology.bare([each])[0].rpartition(":")[2]): topology.owner(each) for each in endpoints}
+    children = flight.children()
+    assert "router" not in children
+
+    hears = access.heard(load("robotic-park").experiment)
+    robots = list(hears)
+    linked: dict[str, set[str]] = {name: set() for name in robots}
+    for name in robots:
+        for other in peers(children[name], ports):
+            linked[name].add(other)
+            linked[other].add(name)
+    for name, heard in hears.items():
+        assert linked[name] == heard | {other for other in robots if name in hears[other]}, name
+
+    watcher = Watcher(*endpoints)
+    try:
+        watcher.until(lambda: len(watcher.alive) == len(robots) == len(watcher.state), "everybody is seen", 10.0)
+        assert {"conductor", "recorder", *robots} <= {member.name for member in members(watcher.session)}
+        children["CF02"].kill()
+        near = linked["CF02"]
+        watcher.until(
+            lambda: all((watcher.status[name].missing == ["CF02"]) == ("CF02" in hears[name]) for name in near),
+            "its neighbours miss it",
+            5.0,
+        )
+        begun = {name: watcher.status[name].decisions for name in robots if name != "CF02"}
+        watcher.until(
+            lambda: all(watcher.status[n].decisions > count for n, count in begun.items()), "the others go on"
+        )
+        assert all(not watcher.status[name].missing for name in begun if "CF02" not in hears[name])
+    finally:
+        watcher.close()
+    said = time.monotonic()
+    assert estop.command(connect=endpoints, realm="park", reason="a test", who="operator") == 0
+    assert time.monotonic() - said < 5.0
+    assert capsys.readouterr().out == f"stopped: {', '.join(sorted(begun))}\n"
+    flight.finish()
+    run = reopen(flight.folder)
+    assert run.notes == ("event: lost CF02",) or "event" in run.traces
+
+
+def test_a_robot_that_is_cut_off_from_everybody_holds(tmp_path: Path) -> None:
+    flight = Flight(
+        tmp_path / "run", "triangle", "--case", "periodic", "--no-report",
+        "--set", "network.topology=mesh", "--set", "duration_s=8",
+    )  # fmt: skip
+    flight.until_said("phase conductor: formation")
+    endpoints = (flight.folder / "network.txt").read_text().split()
+    children = flight.children()
+    watcher = Watcher(*endpoints)
+    try:
+        watcher.until(lambda: "CF01" in watcher.state, "it is seen")
+        for name in ("KH01", "KH02"):
+            children[name].kill()
+        watcher.until(lambda: sorted(watcher.status["CF01"].missing) == ["KH01", "KH02"], "it misses them", 5.0)
+        watcher.until(lambda: abs(watcher.state["CF01"].velocity[0]) < 0.05, "it holds", 5.0)
+    finally:
+        watcher.close()
+    code, _ = flight.finish()
+    assert code == 0
+
+
+def test_an_endpoint_that_somebody_else_has_is_named(tmp_path: Path) -> None:
+    taken = network.free_endpoint(0)
+    with zenoh.open(network.config("router", listen=[taken], name="stranger")):
+        flight = Flight(
+            tmp_path / "run", "triangle", "--case", "periodic", "--no-report", "--set", "network.topology=mesh",
+            "--set", f'network.addresses={{KH01 = "{taken}"}}',
+        )  # fmt: skip
+        code, _ = flight.finish()
+    assert code == 2
+    said = "".join(file.read_text() for file in tmp_path.glob("*.stderr"))
+    assert "KH01 cannot listen on" in said
+    assert "network.addresses" in said
+
+
+def test_a_silent_missing_link_is_named() -> None:
+    robots = ("KH01", "KH02", "CF01")
+    right = [topology.owned(endpoint, name) for endpoint, name in zip(free(3), robots, strict=True)]
+    wrong = [topology.owned(network.free_endpoint(0), "KH01"), *right[1:]]  # where KH02 seeks it
+    with ExitStack() as stack:
+        for name in robots:
+            connect = [part for each in (wrong if name == "KH02" else right) for part in ("--connect", each)]
+            robot = Started("experiments.robot", "triangle", name, *connect)
+            stack.callback(robot.end)
+        watcher = Watcher(*right)
+        stack.callback(watcher.close)
+        watcher.until(lambda: watcher.phase("CF01") == "ready", "it hears both")
+        watcher.until(
+            lambda: watcher.status["KH02"].reason == "never heard KH01", "and KH02 says whom it does not", 5.0
+        )
+        assert watcher.phase("KH02") == watcher.phase("KH01") == "idle"
+        assert not watcher.order("KH02", wire.Order("takeoff")).ok
+
+
+def free(count: int) -> list[str]:
+    """So many endpoints at which nobody listens."""
+    found: set[str] = set()
+    while len(found) < count:
+        found.add(network.free_endpoint(0))
+    return sorted(found)

@@ -1,0 +1,126 @@
+"""Two routers: who loses one goes on at the other, the first comes back, and a newcomer sees everybody at either."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import psutil
+import pytest
+import zenoh
+
+from agents import lab, wire
+from agents import session as network
+from agents.access import Rights
+from experiments.run import reopen
+from tests.system.lab import ENVIRONMENT, ROOT, Flight, Watcher
+from tests.system.secured import FLOWN, Laboratory
+
+pytestmark = pytest.mark.system
+
+
+def routers(flight: Flight) -> list[tuple[psutil.Process, str]]:
+    """Those of a run, and where each listens."""
+    found = []
+    for child in psutil.Process(flight.process.pid).children():
+        line = child.cmdline()
+        if "agents.router" in line:
+            found.append((child, line[line.index("--listen") + 1]))
+    endpoints = (flight.folder / "network.txt").read_text().split()
+    return sorted(found, key=lambda pair: endpoints.index(pair[1]))
+
+
+def test_a_killed_router_holds_nobody_up(tmp_path: Path) -> None:
+    changes = ("--set", "network.routers=2", "--set", "duration_s=8", "--case", "periodic", "--no-report")
+    flight = Flight(tmp_path / "run", "triangle", *changes)
+    flight.until_said("phase conductor: formation")
+    (first, one), (_, other) = routers(flight)
+    watcher = Watcher(other)
+    try:
+        watcher.until(lambda: len(watcher.state) == 3 == len(watcher.alive), "robots at one are seen at the other", 5.0)
+        first.kill()
+        told = {name: state.seq for name, state in watcher.state.items()}
+        watcher.until(lambda: all(watcher.state[name].seq > told[name] + 10 for name in told), "all go on", 3.0)
+        flight.until_said(r"the router ended \(killed by SIGKILL\); started again: all go on at another meanwhile")
+        late = Watcher(one)
+        try:
+            late.until(lambda: len(late.state) == 3 == len(late.alive), "a newcomer at the first sees all", 10.0)
+        finally:
+            late.close()
+        watcher.until(lambda: all(not status.missing for status in watcher.status.values()), "nobody is missed")
+    finally:
+        watcher.close()
+    code, _ = flight.finish()
+    assert code == 0, flight.logs()
+    run = reopen(flight.folder)
+    assert not run.notes, "nobody was held for lost, and the recording is whole"
+    trace = run.traces["periodic"]
+    holds = [event.text for event in trace.events if "hold" in event.text and "started again" not in event.text]
+    assert not holds
+
+
+@pytest.fixture
+def laboratory(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
+    """Robots in flight at one router of a lab, and the endpoint of another that is linked with it."""
+    made = Laboratory(tmp_path, linked=True)
+    plain = network.free_endpoint(preferred_port=0, protocol="tls")
+    (other,) = lab.secured([plain], made.folder)
+    second = subprocess.Popen(
+        [sys.executable, "-m", "agents.router", "--listen", other, "--connect", made.endpoint,
+         "--rights", str(made.rights)],
+        cwd=ROOT,
+        env=ENVIRONMENT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    try:
+        assert second.stdout is not None
+        assert second.stdout.readline() == f"router ready on {other}\n"
+        made.fly()
+        yield made, other
+    finally:
+        made.close()
+        second.terminate()
+        second.wait(10)
+        second.stdout.close()  # type: ignore[union-attr]
+
+
+def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[Laboratory, str]) -> None:
+    made, other = laboratory
+    keys = made.watcher.keys
+    assert msgspec.json.decode(made.rights.read_bytes(), type=Rights).linked
+    looker = Watcher(other)  # as operator: through the link everything is seen, and orders are carried
+    try:
+        looker.until(lambda: all(looker.phase(name) == "running" for name in FLOWN), "seen through the link", 10.0)
+        assert looker.order("KH01", wire.Order("get", name="speed")).robot == "KH01"
+    finally:
+        looker.close()
+    before = made.statuses()
+    forged = wire.encode(wire.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
+    stop = wire.encode(wire.Stop("mallory", "because"))
+    for mode in ("client", "router"):  # the latter would be a link, were it a router's certificate
+        settings = network.config("client", connect=[other], name="intruder", identity="KH03")
+        settings.insert_json5("mode", f'"{mode}"')
+        with zenoh.open(settings) as intruder:
+            states = network.subscriber(intruder, keys.state("*"))
+            for _ in range(20):
+                intruder.put(keys.pose("KH01"), forged, encoding=wire.JSON)
+                intruder.put(keys.estop, stop, encoding=wire.JSON)
+                intruder.put("park/**", stop, encoding=wire.JSON)
+                time.sleep(0.01)
+            order = wire.encode(wire.Order("land"))
+            assert not [reply for reply in intruder.get(keys.order("KH01"), payload=order, timeout=1.0) if reply.ok]
+            heard = {str(sample.key_expr) for sample in network.received(states.handler)}
+            assert heard <= {"park/**"}, "its own words, and nobody else's"
+    with pytest.raises(zenoh.ZError, match="Unable to connect"):
+        zenoh.open(network.config("client", connect=[other.partition("#")[0]], name="intruder"))
+    after = made.statuses()
+    for name in FLOWN:
+        assert after[name].phase == "running"
+        assert (after[name].malformed, after[name].refused) == (before[name].malformed, before[name].refused)
+        assert after[name].lost == before[name].lost
