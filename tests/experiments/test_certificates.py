@@ -6,7 +6,7 @@ import time
 import pytest
 
 from agents.lab import register
-from experiments.certificates import Holding, days_left, ended, faults, fingerprint, held, of_host, strays
+from experiments.certificates import Holding, days_left, ended, faults, fingerprint, held, of_host, strays, unnamed
 from experiments.experiment import Host
 from tools import authority
 
@@ -103,7 +103,15 @@ def test_keys_of_others_do_not_belong_there(lab, there):
     for name in ("KH02.key", "ca.key"):
         shutil.copy(lab / name, there)
     (only,) = strays(held(there, ROBOTS), "lab1")
-    assert only.startswith("holds KH02.key, ca.key, of nobody who runs on lab1; `zenpark hosts install FILE` removes")
+    assert only.startswith("holds KH02.key, ca.key, which do not belong on lab1; `zenpark hosts install FILE` removes")
+
+
+def test_a_router_is_believed_under_the_names_in_its_certificate(lab):
+    assert list(unnamed(["tls/127.0.0.1:7447", "quic/localhost:1"], lab)) == []
+    (only,) = unnamed(["tls/192.0.2.7:7447", "quic/192.0.2.7:7448"], lab)
+    assert f"`zenpark keys renew {lab} router --host 192.0.2.7`" in only
+    authority.renew(lab, ["router"], hosts=["192.0.2.7"])
+    assert list(unnamed(["tls/192.0.2.7:7447"], lab)) == []
 
 
 def test_two_hosts_that_are_one_folder_share_it():
