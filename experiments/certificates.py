@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from agents.endpoint import Endpoint
 from agents.lab import AUTHORITY, LabError, files, register
 
 if TYPE_CHECKING:
@@ -160,11 +161,27 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
             yield f"its clock says {now:%Y-%m-%d %H:%M} UTC, when {each.name} has no valid certificate; set it (NTP)"
 
 
+def unnamed(endpoints: Sequence[str], folder: Path) -> Iterator[str]:
+    """Why robots would not believe a router: the name by which they reach it must stand in its certificate.
+
+    Raises:
+        LabError: If the register cannot be read.
+    """
+    routers = [each for each in register(folder).identities.values() if each.role == "router"]
+    named = {host for router in routers for host in router.hosts}
+    for reached in dict.fromkeys(Endpoint.parse(endpoint).host for endpoint in endpoints):
+        if reached not in named:
+            yield (
+                f"reaches the router at {reached}, which stands in no router's certificate; "
+                f"`zenpark keys renew {folder} router --host {reached}` adds it"
+            )
+
+
 def strays(found: Holding, host: str) -> Iterator[str]:
     """Keys that do not belong to a machine, with the remedy."""
     if found.others:
         keys = ", ".join(f"{name}.key" for name in found.others)
-        yield f"holds {keys}, of nobody who runs on {host}; `zenpark hosts install FILE` removes what is not its own"
+        yield f"holds {keys}, which do not belong on {host}; `zenpark hosts install FILE` removes them"
 
 
 def _common_name(certificate: x509.Certificate) -> str:

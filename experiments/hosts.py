@@ -109,7 +109,6 @@ class Station:
 
         Raises:
             HostError: If the host cannot be reached, or zenpark does not run there.
-            LabError: If the register of the lab cannot be read.
         """
         self.hello, _, _ = self.ask(Question("hello"), HELLO_S)
         ports = iter(ssh.allocated(self.process.log.read_text(errors="replace")))
@@ -118,20 +117,6 @@ class Station:
             self.endpoints = [str(self._abroad(router, ports, here)) for router in self._routers]
         except StopIteration:
             raise HostError(f"{self.name}: ssh does not say which port it forwards; use listen in [network]") from None
-        self._recognise()
-
-    def _recognise(self) -> None:
-        """Robots there believe a router only under a name that stands in its certificate."""
-        if self.lab is None:
-            return
-        named = {name for each in lab.register(self.lab).identities.values() if each.role == "router"
-                 for name in each.hosts}  # fmt: skip
-        for endpoint in map(Endpoint.parse, self.endpoints):
-            if endpoint.host not in named:
-                raise HostError(
-                    f"{self.name}: reaches the router at {endpoint.host}, which stands in no router's certificate; "
-                    f"`zenpark keys renew {self.lab} router --host {endpoint.host}` adds it"
-                )
 
     @staticmethod
     def _abroad(router: Endpoint, ports: Iterator[int], here: str) -> Endpoint:
@@ -208,7 +193,7 @@ class Station:
         return self.ask(Question("certificates", lab=self.folder, names=list(names)))[0].holds
 
     def distrusted(self, names: Sequence[str]) -> list[str]:
-        """What is the matter with the certificates of its robots there, in a lab, each with its remedy.
+        """Why its robots and a router would not believe each other, in a lab, each with its remedy.
 
         Raises:
             HostError: If it does not answer.
@@ -217,7 +202,11 @@ class Station:
         if self.lab is None:
             return []
         answer = self.ask(Question("certificates", lab=self.folder, names=list(names)))[0]
-        return [f"{self.name}: {fault}" for fault in certificates.faults(answer.holds, self.lab, answer.clock)]
+        found = [
+            *certificates.faults(answer.holds, self.lab, answer.clock),
+            *certificates.unnamed(self.endpoints, self.lab),
+        ]
+        return [f"{self.name}: {fault}" for fault in found]
 
     @property
     def folder(self) -> str:

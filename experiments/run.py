@@ -284,9 +284,10 @@ def enforced(cases: Collection[Experiment], endpoints: Sequence[str], folder: Pa
     of = lab_of(endpoints)
     if of is None:
         return None
+    known = register(of)
     require(of, list(dict.fromkeys(name for case in cases for name in access.needed(case))))
     made = access.rights(cases)
-    rules(made, register(of))  # what is wrong with it is said now, and not by a router that does not start
+    rules(made, known)  # what is wrong with it is said now, and not by a router that does not start
     file = folder / "rights.json"
     file.write_bytes(msgspec.json.format(msgspec.json.encode(made), indent=1))
     return file

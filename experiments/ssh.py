@@ -72,7 +72,7 @@ def explained(address: str, zenpark: str, said: str) -> str:
         if re.search(pattern, said, re.IGNORECASE | re.MULTILINE):
             return f"{cause}; {remedy}".format(address=address, zenpark=zenpark)
     last = said.strip().splitlines()[-1:] or ["it said nothing"]
-    return f"ssh {address} failed: {last[0]}"
+    return f"ssh failed: {last[0]}; try it by hand, which must ask nothing: ssh {address} true"
 
 
 def forwarded(endpoint: Endpoint) -> str:

@@ -115,7 +115,9 @@ def devices(bodies: Sequence[str]) -> Iterator[Found]:
             yield Found(library, False, "is missing: `./zenpark hardware` there adds it")
     if words & {"radio", "usb"}:
         radios = list(_radios())
-        yield from radios or [Found("Crazyradio", False, "none is plugged in")]
+        yield from radios or [
+            Found("Crazyradio", False, "none is plugged in: plug one in there, or let its robots run on another host")
+        ]
     for port in sorted({match[0] for body in bodies if (match := re.search(r"/dev/[\w./-]+", body))}):
         if not Path(port).exists():
             yield Found(port, False, "is not there: is it plugged in?")

@@ -16,6 +16,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from agents.endpoint import Endpoint
 from agents.session import free_endpoint
 from experiments import certificates, document, reach, ssh, version
 from experiments.document import Document
@@ -25,7 +26,7 @@ from experiments.launcher import Launcher
 from experiments.problem import DocumentError, Problem
 from experiments.run import enforced
 from experiments.servants import start_router
-from experiments.station import Question
+from experiments.station import Found, Question
 from tools.host_keys import send
 
 YES, NO, DOUBTFUL, NOTHING = "✓", "✗", "!", "–"
@@ -210,7 +211,10 @@ def _fill(row: Row, there: Station, experiment: Experiment) -> None:
     vague = clock.uncertainty > VAGUE_S
     row.cells.append(f"{DOUBTFUL if vague else YES} {clock.offset * 1e3:+.2f} ± {clock.uncertainty * 1e3:.2f} ms")
     if vague:
-        row.trouble.append(f"{there.name}: the connection is slow; robots may start up to that much apart")
+        row.trouble.append(
+            f"{there.name}: the connection is slow, so robots there may start ± {clock.uncertainty * 1e3:.0f} ms apart "
+            "from the others; use a cable, or a network with less on it"
+        )
     bodies = [experiment.robots[robot].body for robot in there.host.robots]
     devices = there.ask(Question("devices", bodies=bodies), REACH_S)[0].found
     wrong = [each for each in devices if not each.well]
@@ -229,10 +233,20 @@ def _fill(row: Row, there: Station, experiment: Experiment) -> None:
     unreached = [each for each in routers if not each.well]
     row.cells.append(f"{NO if unreached else YES} {', '.join(each.text for each in routers if each.well)}".rstrip())
     row.trouble += [
-        f"{there.name}: {each.what} does not answer there; mend address or listen in [network], or leave both out: "
-        "then ssh carries it"
+        f"{there.name}: {each.what} cannot be reached from there; {_mended(there, each, experiment)}"
         for each in unreached
     ]
+
+
+def _mended(there: Station, router: Found, experiment: Experiment) -> str:
+    """What to do about a router that a host does not reach."""
+    if "refuses the certificate" in router.text and Endpoint.parse(router.what).is_loopback:
+        return f"ssh carries it, so look at the certificates: `zenpark keys show {there.lab}`"
+    if experiment.network.connect is not None:
+        return "is it on (`zenpark router` starts one)? Else mend connect in [network]"
+    if experiment.network.listen is not None:
+        return "mend address or listen in [network], or leave both out: then ssh carries it; is there a firewall here?"
+    return "ssh carries it: does sshd there allow that (AllowTcpForwarding yes)? Else add listen to [network]"
 
 
 def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -> bool:

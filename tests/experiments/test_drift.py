@@ -38,7 +38,7 @@ def simulated(ppm, seconds, *, follows):
 
 @pytest.mark.parametrize(("ppm", "most"), [(50, 0.9e-3), (-50, 0.9e-3), (500, 2.5e-3), (2000, 3.5e-3)])
 def test_what_is_left_stays_small_however_long_the_run(ppm, most):
-    true, offset, left, measured = simulated(ppm, 600.0, follows=True)
+    true, _, left, measured = simulated(ppm, 600.0, follows=True)
     assert np.abs(left).max() < most
     _, _, without, _ = simulated(ppm, 600.0, follows=False)
     assert np.abs(without).max() == pytest.approx(abs(ppm) * 6e-4, abs=1e-3)

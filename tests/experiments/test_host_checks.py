@@ -31,7 +31,7 @@ def problems(tmp_path, text):
 
 
 def test_a_good_one(tmp_path):
-    text = HEAD + LAB + 'zenpark = "~/lab/zenpark"\ntags = ["radio"]\n[hosts.board]\nrobots = ["B"]\n'
+    text = HEAD + LAB + 'zenpark = "~/lab/zenpark"\nlab = "~/keys"\ntags = ["radio"]\n[hosts.board]\nrobots = ["B"]\n'
     assert problems(tmp_path, text) == []
     (tmp_path / "x.toml").write_text(text)
     experiment = document.read(tmp_path / "x.toml").experiment

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from pathlib import Path
 
 import pytest
 
+from agents import session as network
 from agents import wire
+from agents.lab import Role
 from experiments import document, playback
 from tests.conftest import RouterProcess
-from tests.system.lab import Flight, RobotProcess, Watcher
+from tests.system.lab import Flight, RobotProcess, Started, Watcher
+from tools import authority
 
 pytestmark = pytest.mark.system
+
+SHORT = ("--json", "--set", "duration_s=2", "--no-report")
 
 
 def experiment(folder: Path, endpoint: str) -> str:
@@ -26,7 +32,7 @@ def experiment(folder: Path, endpoint: str) -> str:
 
 def test_who_is_there_is_adopted_and_who_has_flown_is_not(router: RouterProcess, tmp_path: Path) -> None:
     file = experiment(tmp_path, router.endpoint)
-    short = ("--case", "event", "--json", "--set", "duration_s=2", "--no-report")
+    short = ("--case", "event", *SHORT)
     at_boot = RobotProcess(router.endpoint, "join", "KH02", "--once")
     by_hand = RobotProcess(router.endpoint, "triangle", "CF01", "--case", "event")
     watcher = Watcher(router.endpoint)
@@ -52,6 +58,32 @@ def test_who_is_there_is_adopted_and_who_has_flown_is_not(router: RouterProcess,
     again.until_said("CF01: on the network already, and done; a robot that was started by hand flies once")
     assert again.finish()[0] == 2
     assert by_hand.end() == 0
+
+
+def test_who_joins_in_a_lab_needs_its_own_files_alone(tmp_path: Path) -> None:
+    lab, own = tmp_path / "lab", tmp_path / "robot" / "zenpark-lab"
+    robots: dict[str, Role] = dict.fromkeys(("KH01", "KH02", "CF01"), "robot")
+    authority.create(lab, {**{role: role for role in authority.SERVICES}, **robots})
+    own.mkdir(parents=True)
+    for name in ("ca.pem", "KH02.pem", "KH02.key"):
+        (lab / name).rename(own / name) if name.startswith("KH02") else shutil.copy(lab / name, own)
+    endpoint = network.free_endpoint(preferred_port=0, protocol="tls")
+    file = experiment(tmp_path, endpoint)
+    reach = ("--connect", endpoint, "--lab", str(own))
+    router = Started("tools.guard", "router", file, "--lab", str(lab), "--listen", endpoint)
+    joined = Started("tools.guard", "agent", "join", "KH02", *reach, "--once")
+    try:
+        assert router.process.stdout is not None
+        assert router.process.stdout.readline().startswith("router ready on tls/")
+        flight = Flight(tmp_path / "run", file, "--case", "event", "--lab", str(lab), *SHORT)
+        flight.until_said("adopted KH02: is ")
+        assert flight.finish()[0] == 0
+        assert joined.wait() == 0
+    finally:
+        joined.process.kill()
+        router.end()
+    trace = playback.read(tmp_path / "run" / "event.mcap").trace
+    assert not trace.lost.any()
 
 
 def test_who_joined_lands_when_the_conductor_is_dead(router: RouterProcess, tmp_path: Path) -> None:

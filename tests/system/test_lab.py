@@ -70,7 +70,7 @@ def test_what_is_missing_is_said_before_anything_starts(tmp_path: Path) -> None:
     authority.create(lab, {"router": "router", "operator": "operator", "recorder": "recorder", "KH01": "robot"})
     for arguments, said in (
         (("run", "triangle", "--lab", lab, "--out", tmp_path / "a"), f"`zenpark keys issue {lab} KH02 CF01`"),
-        (("run", "triangle", "--lab", tmp_path / "no", "--out", tmp_path / "b"), "zenpark keys issue"),
+        (("run", "triangle", "--lab", tmp_path / "no", "--out", tmp_path / "b"), "zenpark keys init"),
         (("router", "--listen", "tls/0.0.0.0:0"), "zenpark keys init LAB FILE"),
         (("router", "--listen", "tcp/0.0.0.0:0"), "zenpark keys init LAB FILE"),
         (("router", "--lab", lab), "name the experiment too"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import shutil
 import stat
@@ -14,7 +15,7 @@ import pytest
 
 from agents.lab import register
 from experiments import document, playback
-from tests.system.lab import until
+from tests.system.lab import typed, until
 from tests.system.machines import Machines, machines, why_not
 from tests.system.test_machines import busy, zenpark
 from tools import authority
@@ -34,13 +35,13 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
 class Laboratory:
     """The file of an experiment with hosts, its lab beside it, and what each host was sent."""
 
-    def __init__(self, lab: Machines, folder: Path, network: str = "") -> None:
+    def __init__(self, lab: Machines, folder: Path, network: str = "", *, drift: float = 0.0) -> None:
         self.lab, self.keys, self.file, self.out = lab, folder / "lab", folder / "triangle.toml", folder / "run"
         text = document.catalogue_path("triangle").read_text("utf-8")
         text += f'\n[network]\nlab = "lab"\n{network}\n'
         self.there = {host: folder / "there" / host for host in ROBOTS}
         for host, robots in ROBOTS.items():
-            text += f'\n[hosts.{host}]\naddress = "{host}"\nzenpark = "{lab[host].zenpark()}"\n'
+            text += f'\n[hosts.{host}]\naddress = "{host}"\nzenpark = "{lab[host].zenpark(drift=drift)}"\n'
             text += f'lab = "{self.there[host]}"\nrobots = {json.dumps(robots)}\n'
         self.file.write_text(text, "utf-8")
         robots = [robot for each in ROBOTS.values() for robot in each]
@@ -57,12 +58,21 @@ class Laboratory:
             out, _ = process.communicate()
         return process.returncode, out
 
-    def fly(self) -> tuple[int, str]:
-        more = ["--case", "event", "--set", "duration_s=2", "--anyway", "--no-report", "--out", str(self.out)]
+    def fly(self, duration_s: float = 2.0) -> tuple[int, str]:
+        more = [
+            "--case",
+            "event",
+            "--set",
+            f"duration_s={duration_s}",
+            "--anyway",
+            "--no-report",
+            "--out",
+            str(self.out),
+        ]
         return self.zenpark("run", *more)
 
-    def flew(self) -> None:
-        code, out = self.fly()
+    def flew(self, duration_s: float = 2.0) -> None:
+        code, out = self.fly(duration_s)
         assert code == 0, out
         until(lambda: not busy(self.lab), "nothing is left", 5.0)
         trace = playback.read(self.out / "event.mcap").trace
@@ -105,8 +115,9 @@ def test_each_machine_gets_its_own_keys_and_all_fly_through_ssh(lab: Machines, t
     made.flew()
 
 
-def test_robots_elsewhere_reach_a_router_that_listens_for_them(lab: Machines, tmp_path: Path) -> None:
-    made = Laboratory(lab, tmp_path, 'listen = ["tls/0.0.0.0:7447"]')
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_robots_elsewhere_reach_a_router_that_listens_for_them(lab: Machines, tmp_path: Path, protocol: str) -> None:
+    made = Laboratory(lab, tmp_path, f'listen = ["{protocol}/0.0.0.0:7447"]')
     assert made.zenpark("hosts", "install")[0] == 0
     code, out = made.fly()
     assert code == 2, out
@@ -135,7 +146,7 @@ def test_what_is_wrong_with_certificates_is_told_with_a_remedy(lab: Machines, tm
         assert "Traceback" not in out
     assert made.zenpark("hosts", "install")[0] == 0
     assert made.zenpark("hosts", "check")[0] == 0
-    authority.renew(made.keys, ["KH02"], days=1e-6)
+    authority.renew(made.keys, ["KH02"], days=-0.01)
     (made.there["lab1"] / "CF01.key").chmod(0o640)
     until(lambda: register(made.keys), "a moment passes")
     code, out = made.zenpark("hosts", "install")
@@ -143,3 +154,26 @@ def test_what_is_wrong_with_certificates_is_told_with_a_remedy(lab: Machines, tm
     assert f"`zenpark keys renew {made.keys} KH02`" in out
     code, out = made.zenpark("hosts", "check")
     assert "the certificate of KH02" in out
+
+
+def test_robots_follow_a_clock_that_drifts_during_the_run(lab: Machines, tmp_path: Path) -> None:
+    drift = 2e-3  # forty times what is bad, so that seconds show it
+    made = Laboratory(lab, tmp_path, drift=drift)
+    assert made.zenpark("hosts", "install")[0] == 0
+    made.flew(8.0)
+    file = made.out / "event.mcap"
+    lies = {lie.host: lie for lie in playback.read(file).trace.clocks}
+    for host, robots in ROBOTS.items():
+        lie = lies[host]
+        assert lie.drift == pytest.approx(drift, abs=2 * lie.uncertainty / lie.over + 1e-4)
+        gained, doubt = lie.last - lie.first, lie.uncertainty
+        assert gained > 0.015
+        assert lie.worst < 0.5 * gained + 2 * doubt
+        for robot in robots:
+            states = typed(file, f"/{robot}/state")
+            assert all(later.stamp > earlier.stamp for earlier, later in itertools.pairwise(states))
+            status = typed(file, f"/{robot}/status")
+            assert len({each.started for each in status if each.phase == "running"}) == 1, "the start stays"
+            poses = typed(file, f"/{robot}/pose")
+            late = [pose.received - pose.stamp for pose in poses if pose.stamp > poses[-1].stamp - 3.0]
+            assert min(late) > -0.5 * gained - doubt, "a stamp of tomorrow, if nobody had followed"

@@ -90,6 +90,13 @@ def test_renewing_keeps_the_name(folder):
     assert "192.0.2.7" in authority.renew(folder).identities["router"].hosts
 
 
+def test_a_router_can_be_given_another_address(folder):
+    authority.renew(folder, ["router"], hosts=["192.0.2.99"])
+    assert {"192.0.2.7", "192.0.2.99", "127.0.0.1"} <= set(register(folder).identities["router"].hosts)
+    with pytest.raises(LabError, match="only routers need --host"):
+        authority.renew(folder, hosts=["192.0.2.99"])
+
+
 def test_a_new_authority_signs_everybody_anew(folder):
     before = certificate(folder, "ca")
     authority.renew(folder, authority=True)

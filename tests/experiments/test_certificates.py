@@ -1,0 +1,124 @@
+"""What a machine holds of a lab's certificates, and what is said of it."""
+
+import shutil
+import time
+
+import pytest
+
+from agents.lab import register
+from experiments.certificates import Holding, days_left, ended, faults, fingerprint, held, of_host, strays, unnamed
+from experiments.experiment import Host
+from tools import authority
+
+ROBOTS = ["KH01", "CF01"]
+
+
+@pytest.fixture
+def lab(tmp_path):
+    folder = tmp_path / "lab"
+    authority.create(folder, {"router": "router", **dict.fromkeys([*ROBOTS, "KH02"], "robot")})
+    return folder
+
+
+@pytest.fixture
+def there(lab, tmp_path):
+    """A machine's folder with what belongs there."""
+    folder = tmp_path / "there"
+    folder.mkdir(mode=0o700)
+    for name in ("ca.pem", *(f"{robot}.{end}" for robot in ROBOTS for end in ("pem", "key"))):
+        shutil.copy(lab / name, folder)
+    return folder
+
+
+def said(there, lab, clock=None):
+    return list(faults(held(there, ROBOTS), lab, time.time() if clock is None else clock))
+
+
+def test_nothing_is_said_of_what_counts(lab, there):
+    found = held(there, ROBOTS)
+    assert said(there, lab) == list(strays(found, "lab1")) == list(ended(lab, ROBOTS)) == []
+    assert days_left(lab, ROBOTS) == pytest.approx(90.0, abs=0.1)
+    assert not any("PRIVATE" in text for text in (found.authority, *(each.certificate for each in found.held)))
+
+
+def test_each_fault_has_its_remedy(lab, there, tmp_path):
+    assert said(tmp_path / "nowhere", lab)[0].startswith("has no certificates of KH01, CF01; `zenpark hosts install")
+    (there / "KH01.key").chmod(0o644)
+    assert said(there, lab)[0].startswith("others can read KH01.key; revoke it if somebody has; `zenpark hosts install")
+    (there / "KH01.key").unlink()
+    assert said(there, lab)[0].startswith("KH01.key is missing; `zenpark hosts install")
+    shutil.copy(lab / "CF01.key", there / "KH01.key")
+    assert said(there, lab)[0].startswith("KH01.key is not the key of KH01.pem; `zenpark hosts install")
+    shutil.copy(lab / "KH01.key", there)
+    (there / "CF01.pem").write_text("nonsense")
+    assert said(there, lab)[0].startswith("CF01.key is not the key of CF01.pem")
+
+
+def test_what_no_longer_counts_is_told_apart(lab, there, tmp_path):
+    authority.renew(lab, ["KH01"])
+    authority.revoke(lab, ["CF01"])
+    first, second = said(there, lab)
+    assert first.startswith("the certificate of KH01 there has been renewed since; `zenpark hosts install")
+    assert second.startswith("the certificate of CF01 there has been revoked since; `zenpark hosts install")
+    before = fingerprint((lab / "ca.pem").read_text())
+    authority.renew(lab, authority=True)
+    now = fingerprint((lab / "ca.pem").read_text())
+    (only,) = said(there, lab)
+    assert f"(ca.pem {before[:12]}, here {now[:12]})" in only
+    other = tmp_path / "other"
+    authority.create(other, {"router": "router"})
+    shutil.copy(other / "ca.pem", there)
+    assert "of another lab" in said(there, lab)[0]
+    shutil.copy(lab / "ca.pem", there)
+    shutil.copy(lab / "lab.json", other)
+    assert said(there, other)[0].startswith("its certificates are of another lab")
+
+
+def test_what_has_ended_and_clocks_for_which_it_has(lab, there):
+    authority.renew(lab, ["KH01"], days=-0.01)
+    for end in ("pem", "key"):
+        shutil.copy(lab / f"KH01.{end}", there)
+    (only,) = said(there, lab)
+    assert only.startswith("the certificate of KH01 ended at ")
+    assert f"`zenpark keys renew {lab} KH01`, then `zenpark hosts install FILE`" in only
+    assert f"`zenpark keys renew {lab} KH01`" in next(ended(lab, ROBOTS))
+    authority.renew(lab, ["KH01"])
+    for end in ("pem", "key"):
+        shutil.copy(lab / f"KH01.{end}", there)
+    (first, second) = said(there, lab, 0.0)
+    assert first.startswith("its clock says 1970-01-01 00:00 UTC, when KH01 has no valid certificate; set it (NTP)")
+    assert "CF01" in second
+
+
+def test_who_is_not_in_the_lab_cannot_be_sent(lab, there):
+    found = Holding(held(there, ROBOTS).authority, held(there, ["TB01"]).held)
+    assert next(faults(found, lab, time.time())).startswith(f"TB01 is not in the lab {lab}; `zenpark keys issue")
+    assert next(ended(lab, ["TB01"])).startswith("TB01 is not in the lab")
+    (lab / "CF01.key").unlink()
+    assert "CF01.key is missing" in next(ended(lab, ["CF01"]))
+    assert "TB01" not in register(lab).identities
+
+
+def test_keys_of_others_do_not_belong_there(lab, there):
+    for name in ("KH02.key", "ca.key"):
+        shutil.copy(lab / name, there)
+    (only,) = strays(held(there, ROBOTS), "lab1")
+    assert only.startswith("holds KH02.key, ca.key, which do not belong on lab1; `zenpark hosts install FILE` removes")
+
+
+def test_a_router_is_believed_under_the_names_in_its_certificate(lab):
+    assert list(unnamed(["tls/127.0.0.1:7447", "quic/localhost:1"], lab)) == []
+    (only,) = unnamed(["tls/192.0.2.7:7447", "quic/192.0.2.7:7448"], lab)
+    assert f"`zenpark keys renew {lab} router --host 192.0.2.7`" in only
+    authority.renew(lab, ["router"], hosts=["192.0.2.7"])
+    assert list(unnamed(["tls/192.0.2.7:7447"], lab)) == []
+
+
+def test_two_hosts_that_are_one_folder_share_it():
+    hosts = {
+        "a": Host(address="pi@x", robots=["KH01"]),
+        "b": Host(address="pi@x", robots=["CF01"]),
+        "c": Host(address="pi@x", robots=["KH02"], lab="other"),
+    }
+    assert of_host("a", hosts) == of_host("b", hosts) == ["KH01", "CF01"]
+    assert of_host("c", hosts) == ["KH02"]
