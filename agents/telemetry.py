@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Any, Final, Protocol
 
+import msgspec
 import numpy as np
 import zenoh
 
@@ -25,6 +26,7 @@ from agents.lifecycle import Phase
 from agents.rows import Array, Index
 
 STATUS_S: Final = 1.0
+UNDER_WAY: Final = ("airborne", "running")
 
 
 class Speaker(Protocol):
@@ -124,6 +126,7 @@ class Telemetry:
         self._told = 0
         self._scanned = [-inf] * len(names)
         self._origin: list[wire.Setpoint | None] = [None] * len(names)
+        self._said: list[wire.Status | None] = [None] * len(names)
         self._reported: list[tuple[object, ...]] = [()] * len(names)
 
     def tell(self, state: BodyState, actions: Actions, t: float) -> None:
@@ -223,9 +226,18 @@ class Telemetry:
                 rss_mb=resident_mb(),
                 origin=self._origin[row],
             )
+            self._said[row] = status
             self._statuses[row].put(wire.encode(status, self._encoding))
         if everything:
             counts.late_s = 0.0
+
+    def alarm(self, why: str, stamp: float) -> None:
+        """Says the last statuses again, with what has happened since; from any thread, while the loop hangs."""
+        for publisher, status in zip(self._statuses, self._said, strict=True):
+            if status is not None:
+                phase = "landing" if status.phase in UNDER_WAY else status.phase
+                said = msgspec.structs.replace(status, stamp=stamp, phase=phase, reason=why)
+                publisher.put(wire.encode(said, self._encoding))
 
     def _dropped_of(self, row: int) -> dict[str, int]:
         """How many samples of whom a row did not get because the modelled network dropped them."""

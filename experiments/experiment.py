@@ -315,6 +315,9 @@ class Safety(Part, frozen=True):
         NotNegative, Meta(description="a flying robot that has no position of its own for this long lands [s]")
     ] = 0.3
     link_silence_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
+    loop_silence_s: Annotated[
+        Positive, Meta(description="a robot whose control loop hangs for this long is landed from outside of it [s]")
+    ] = 0.5
 
 
 class World(Part, frozen=True):

@@ -22,6 +22,7 @@ from agents.body import BodyError
 from agents.clock import Clock
 from agents.fleet import assemble
 from agents.keys import Keys
+from agents.leaving import end
 from agents.runtime import NameTaken, Ranging, Runtime, Setup
 from agents.session import DEFAULT_ENDPOINT, EndpointError, Unreachable
 from agents.shadow import shadowed
@@ -115,6 +116,7 @@ def _run(
         goal_conditions=conditions.from_centre(experiment, names),
         clock=clock,
         once=once,
+        loop_silence_s=experiment.safety.loop_silence_s,
     )
     return Runtime(assignment, body, setup).run()
 
@@ -192,4 +194,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())
