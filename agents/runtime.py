@@ -9,6 +9,7 @@ import gc
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import floor, nan
 from typing import Final, Literal
@@ -26,6 +27,7 @@ from agents.channel import Channel, Conditions, Samples
 from agents.clock import Clock
 from agents.goals import HeardGoals
 from agents.keys import Keys
+from agents.leaving import leave
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
 from agents.orders import carry_out
@@ -35,10 +37,13 @@ from agents.rows import Index
 from agents.safety import Limits
 from agents.speaking import Said
 from agents.telemetry import Counts, Telemetry
+from agents.watchdog import SILENCE_S, Watchdog
 
 Ranging = Literal["body", "world", "far"]
 
 FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its launcher was lost has its motors cut
+HUSH_S: Final = 0.05  # after an emergency stop nothing is reported for so long: others' motors come first
+DOUBT_S: Final = 1.0  # a robot whose process stood still holds for so long: what it knows is old
 REACH_M: Final = 1.0  # a neighbour said to be farther outside the arena than this is not believed
 
 
@@ -60,6 +65,7 @@ class Setup:
         clock: Of the experiment.
         once: Whether the process ends when its robots are down after an experiment.
         rights: Who may do what, which robots enforce themselves in the mesh of a lab.
+        loop_silence_s: A loop without a tick for so long hangs: its robots are landed from outside of it [s].
     """
 
     keys: Keys
@@ -74,6 +80,7 @@ class Setup:
     clock: Clock = field(default_factory=Clock)
     once: bool = False
     rights: Rights | None = None
+    loop_silence_s: float = SILENCE_S
 
 
 @dataclass
@@ -114,9 +121,14 @@ class Runtime:
         self._state_slot = 0
         self._stopping: str | None = None
         self._leaving: set[int] = set()  # rows that were told to go while the run goes on
+        self._hush_until = self._doubt_until = -np.inf
+        self._slept, self._joined = 0.0, False
         self._news = False  # somebody came or went since the last report
         self._utc = self._now = self._next = 0.0
         self._reach = reach_of(assignment.limits)
+        self._everyone = np.arange(len(self._names))
+        self._tokens: dict[int, zenoh.LivelinessToken] = {}
+        self._watchdog = Watchdog(body, self._everyone, alarm=self._call_for_help, silence_s=setup.loop_silence_s)
 
     def run(self) -> int:
         """Opens the body, joins the network, drives until all is done; returns the exit code of the process.
@@ -135,19 +147,23 @@ class Runtime:
             self._body.open()
             try:
                 name = "+".join(self._names)
-                with network.open_session(
+                session = network.open_session(
                     self._setup.endpoints,
                     name=name,
                     stop=asked,
                     lease_s=network.ROBOT_LEASE_S,
                     identity=self._names[0],
                     rights=self._setup.rights,
-                ) as session:
+                )
+                try:
                     self._refuse_doubles(session)
                     self._join(session)
                     self._loop(lambda: rope.reason if lost.is_set() else self._told_to_end(asked.is_set()))
+                finally:
+                    leave(session, self)
             finally:
-                self._come_down()
+                with self._watchdog:
+                    self._come_down()
                 self._body.close()
         return 0
 
@@ -158,14 +174,14 @@ class Runtime:
 
     def _come_down(self) -> None:
         """Motors off; what is still in the air, because something broke on the way, lands first."""
-        everyone = np.arange(len(self._names))
         if self._body.read(self._now).flying.any():
-            self._body.land(everyone)
+            self._body.land(self._everyone)
             zero, begin = time.monotonic(), self._now
             while self._body.read(self._now).flying.any() and self._now < begin + FAREWELL_S:
                 time.sleep(self._dt)
+                self._watchdog.beat()
                 self._now = begin + time.monotonic() - zero
-        self._body.stop(everyone)
+        self._body.stop(self._everyone)
 
     # ------------------------------------------------------------------ the network
 
@@ -188,7 +204,7 @@ class Runtime:
         self._poses = [network.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]
-        self._estop = network.Alarm(session, keys.estop)
+        self._estop = network.Alarm(session, keys.estop, self._cut)
         self._conductor = network.alive_watch(session, keys.conductor)
         self._located = [
             (row, network.subscriber(session, keys.position(name), 32))
@@ -222,13 +238,42 @@ class Runtime:
             ranged=[source == "body" for source in ranging],
             followed=None if self._goals is None else self._goals.news,
         )
-        self._tokens = {row: network.alive_token(session, keys.alive(name)) for row, name in enumerate(names)}
+        self._be_there()
+
+    def _be_there(self) -> None:
+        """Neighbours count on these robots from now on."""
+        keys = self._setup.keys
+        self._tokens = {
+            row: network.alive_token(self._session, keys.alive(name))
+            for row, name in enumerate(self._names)
+            if row not in self._leaving
+        }
+
+    def _call_for_help(self, why: str) -> None:
+        """From the watchdog's thread: neighbours must not count on robots whose loop hangs."""
+        print(f"{', '.join(self._names)}: {why}; the watchdog lands it", flush=True)
+        if self._joined:
+            self._telemetry.alarm(why, self._setup.clock.utc())
+            for token in list(self._tokens.values()):
+                token.undeclare()  # type: ignore[no-untyped-call]
+
+    def _recover(self, why: str) -> None:
+        """The loop runs again after the watchdog had its robots land: they do, whatever was decided before."""
+        for row in np.flatnonzero(self.agent.life.active).tolist():
+            self.agent.life.land(row, why)
+        self._be_there()
+
+    def _doubt(self, slept: float) -> None:
+        """The process stood still for so long [s]: until it has heard the others again, it holds."""
+        self._slept = slept
+        self._doubt_until = self._next + DOUBT_S
+        print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
     def _listen(self, t: float) -> None:
         """Takes in what has arrived since the last tick."""
         agent = self.agent
         outside = agent.outside
-        outside.offline_since = np.inf if network.connected(self._session) else min(outside.offline_since, t)
+        outside.offline_since = self._cut_off_since(t, outside.offline_since)
         for sample in network.received(self._conductor.handler):
             if str(sample.key_expr) == self._setup.keys.conductor:
                 gone = sample.kind == zenoh.SampleKind.DELETE
@@ -247,6 +292,12 @@ class Runtime:
                 self._obey(row, query, t)
         for last in self._last:
             last.answer()
+
+    def _cut_off_since(self, t: float, before: float) -> float:
+        """Since when nobody can be believed: the routers are gone, or this process has just stood still."""
+        if t < self._doubt_until:  # long enough ago to hold, and not long enough to land
+            return min(before, t - self._assignment.limits.link_silence_s - self._dt)
+        return np.inf if network.connected(self._session) else min(before, t)
 
     def _listen_to_neighbours(self, t: float) -> None:
         """Poses, as the modelled network lets them through, and who is there."""
@@ -277,20 +328,23 @@ class Runtime:
         yaw = nan if measured.yaw is None else measured.yaw
         self._body.locate(row, measured.stamp - self._utc, np.array(measured.position), yaw)
 
-    def _heed_stops(self) -> bool:
-        """Emergency stops of everybody; whether there was one."""
-        self._estop.rung.clear()
-        stopped = False
+    def _cut(self, sample: zenoh.Sample) -> None:
+        """Motors off as soon as an emergency stop is heard, in the thread that receives; the loop does the rest."""
+        with suppress(wire.Malformed):  # counted by the loop
+            wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
+            self._body.stop(self._everyone)
+
+    def _heed_stops(self) -> None:
+        """Emergency stops of everybody, after `_cut`."""
         for sample in network.received(self._estop):
             try:
                 stop = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
             except wire.Malformed:
                 self._counts.malformed += 1
                 continue
-            stopped = True
+            self._hush_until = self._now + HUSH_S
             for row in range(len(self._names)):
                 self.agent.life.stop(row, f"emergency stop by {stop.who}: {stop.reason}")
-        return stopped
 
     def _hear(self, neighbour: _Neighbour, sample: zenoh.Sample, t: float) -> None:
         """One pose of a neighbour has come: checked, counted, and given to the modelled network."""
@@ -348,7 +402,10 @@ class Runtime:
                 self._counts.malformed += 1
                 query.reply_err(str(error).encode(), encoding="text/plain")
                 return
-            refusal, value = carry_out(self.agent, row, order, t, self._utc)
+            if order.order == "takeoff" and self._slept > network.ASK_S and t < self._doubt_until:
+                refusal, value = f"the process stood still for {self._slept:.1f} s; ask again", None  # he left long ago
+            else:
+                refusal, value = carry_out(self.agent, row, order, t, self._utc)
             self._counts.refused += bool(refusal)
             if order.order == "leave":
                 self._leaving.add(row)
@@ -371,15 +428,28 @@ class Runtime:
         zero = time.monotonic()
         # one reading: a step of the wall clock in mid-run does not move the experiment
         self._utc = self._telemetry.utc = self._setup.clock.utc()
+        self._joined = True
+        try:
+            with self._watchdog:
+                self._go_round(zero, stopping)
+        finally:
+            self._joined = False
+
+    def _go_round(self, zero: float, stopping: Callable[[], str | None]) -> None:
         farewell = np.inf
         while True:
+            self._watchdog.beat()
+            if self._watchdog.tripped:
+                self._recover(self._watchdog.forgive())
             wait = zero + self._next - time.monotonic()
             behind = max(0, int(-wait / self._dt))
             if wait > 0.0:
-                self._sleep(zero + self._next)
+                time.sleep(wait)
             self._counts.missed += behind
             self._next += behind * self._dt
             self.agent.skip(behind)
+            if behind * self._dt > self._setup.loop_silence_s:
+                self._doubt(behind * self._dt)
             t = self._now = self._next
             self._counts.late_s = max(self._counts.late_s, time.monotonic() - zero - t)
             self._next = t + self._dt
@@ -395,15 +465,6 @@ class Runtime:
             ):
                 self._telemetry.report(t, everything=True)
                 return
-
-    def _sleep(self, until: float) -> None:
-        """Until the next tick [s, monotonic]; motors are cut on an emergency stop without waiting for it.
-
-        Once only: whoever floods the key with nonsense must not keep the loop awake.
-        """
-        if self._estop.rung.wait(max(0.0, until - time.monotonic())) and self._heed_stops():
-            self._body.stop(np.arange(len(self._names)))
-        time.sleep(max(0.0, until - time.monotonic()))
 
     def _tick(self, t: float) -> None:
         begun = self.agent.decisions > 0
@@ -424,6 +485,9 @@ class Runtime:
         counts.ticks += 1
         counts.interventions += actions.changed
         counts.avoided += actions.avoided
+        if t < self._hush_until:
+            self._news |= self.agent.life.moved  # said as soon as others' motors are off too
+            return
         slot = (self.agent.tick - 1) // self._state_every
         if slot != self._state_slot:
             self._state_slot = slot
@@ -448,9 +512,10 @@ class Runtime:
                 self._body.stop(duties.stop)
             if len(duties.land):
                 self._body.land(duties.land)
-            if len(duties.takeoff):
+            if len(duties.takeoff) and not self._watchdog.tripped:
                 self._body.takeoff(duties.takeoff, self._assignment.hover[duties.takeoff])
-        self._body.command(actions.setpoint)
+        if not self._watchdog.tripped:  # else it was decided before the robots were told to land
+            self._body.command(actions.setpoint)
 
     def _say(self, row: int, said: Said, yaw: float, t: float) -> None:
         """Sends a row's pose to its neighbours."""

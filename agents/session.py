@@ -15,7 +15,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, Protocol, Self, TypeVar
 
@@ -47,6 +47,7 @@ FREED_S: Final = 3.0  # so long may an endpoint of a mesh stay taken by a robot 
 GHOST_S: Final = 2.5  # so long may the token of somebody who hangs stand after his end
 LEASE_S: Final = 2.0  # whoever is silent for so long is held for dead
 ROBOT_LEASE_S: Final = 1.2  # the same for robots: neighbours of one that hangs must know within 1.5 s
+ASK_S: Final = 2.0  # whoever asks waits no longer for an answer
 OPEN_S: Final = 3.0  # a router that answers nothing for so long is passed over for the next one
 MOST_BYTES: Final = 4 * 1024 * 1024  # of a message that a router of a lab puts together; the largest is an experiment
 HEARTBEAT_S: Final = 0.5  # how long the loss of the last pose before a silence goes unnoticed
@@ -126,7 +127,7 @@ def config(
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": round(lease_s * 1000),
         "transport/shared_memory/enabled": False,
-        "queries_default_timeout": 2000,
+        "queries_default_timeout": round(ASK_S * 1000),
         "adminspace/enabled": True,  # read-only; how `zenpark keys` learns who is there
     }
     if name is not None:
@@ -348,23 +349,34 @@ def publisher(session: zenoh.Session, key: str, mime: str) -> zenoh.Publisher:
     )
 
 
+def urgent_publisher(session: zenoh.Session, key: str, mime: str) -> zenoh.Publisher:
+    """A publisher for what must overtake all else, and is said again: orders to a body elsewhere.
+
+    Not express: then each sample fills a batch, a link has two of a priority, and a router drops what twenty robots
+    say to one world at once.
+    """
+    return session.declare_publisher(
+        key, encoding=mime, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.REAL_TIME
+    )
+
+
 def subscriber(session: zenoh.Session, key: str, depth: int = 256) -> zenoh.Subscriber[Handler[zenoh.Sample]]:
     """The other end of `publisher`: the newest `depth` samples wait in `.handler`."""
     return session.declare_subscriber(key, RingChannel(depth))
 
 
 class Alarm:
-    """Samples for which a control loop interrupts its sleep; polled like those of any other handler.
+    """Samples that are obeyed as they come, without waiting for a control loop that may hang; it polls them later.
 
-    The callback runs in the thread that receives, without one of its own, and does no more than fill a slot.
-
-    Attributes:
-        rung: Set when something has arrived; whoever looks clears it.
+    The callback runs in the thread that receives, without one of its own: what it calls must be quick, and must not
+    ask this session anything.
     """
 
-    def __init__(self, session: zenoh.Session, key: str, depth: int = 256) -> None:
-        """Listens on a key; the newest `depth` samples wait."""
-        self.rung = threading.Event()
+    def __init__(
+        self, session: zenoh.Session, key: str, obey: Callable[[zenoh.Sample], object], depth: int = 256
+    ) -> None:
+        """Listens on a key: each sample is given to `obey`; the newest `depth` wait besides."""
+        self._obey = obey
         self._waiting: deque[zenoh.Sample] = deque(maxlen=depth)
         self._subscriber = session.declare_subscriber(key, Callback(self._take, indirect=False))
 
@@ -374,7 +386,7 @@ class Alarm:
 
     def _take(self, sample: zenoh.Sample) -> None:
         self._waiting.append(sample)
-        self.rung.set()
+        self._obey(sample)
 
 
 class LastValue:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Any, Final, Protocol
 
+import msgspec
 import numpy as np
 import zenoh
 
@@ -27,6 +28,7 @@ from agents.rows import Array, Index
 
 STATUS_S: Final = 1.0
 INCIDENTS: Final = 16  # so many are told again
+UNDER_WAY: Final = ("airborne", "running")
 
 
 class Speaker(Protocol):
@@ -126,6 +128,7 @@ class Telemetry:
         self._told = 0
         self._scanned = [-inf] * len(names)
         self._origin: list[wire.Setpoint | None] = [None] * len(names)
+        self._said: list[wire.Status | None] = [None] * len(names)
         self._reported: list[tuple[object, ...]] = [()] * len(names)
         self._incidents: list[deque[wire.Incident]] = [deque(maxlen=INCIDENTS) for _ in names]
         self._numbers = [0] * len(names)
@@ -230,6 +233,7 @@ class Telemetry:
                 hazard=agent.hazards.worst(row),
                 incidents=list(self._incidents[row]),
             )
+            self._said[row] = status
             self._statuses[row].put(wire.encode(status, self._encoding))
         if everything:
             counts.late_s = 0.0
@@ -245,6 +249,14 @@ class Telemetry:
             )
             print(f"{self._names[row]}: {incident.text}", flush=True)
         happened.clear()
+
+    def alarm(self, why: str, stamp: float) -> None:
+        """Says the last statuses again, with what has happened since; from any thread, while the loop hangs."""
+        for publisher, status in zip(self._statuses, self._said, strict=True):
+            if status is not None:
+                phase = "landing" if status.phase in UNDER_WAY else status.phase
+                said = msgspec.structs.replace(status, stamp=stamp, phase=phase, reason=why)
+                publisher.put(wire.encode(said, self._encoding))
 
     def _dropped_of(self, row: int) -> dict[str, int]:
         """How many samples of whom a row did not get because the modelled network dropped them."""

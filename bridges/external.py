@@ -18,6 +18,7 @@ import zenoh
 from agents import plausibility, wire
 from agents import session as network
 from agents.body import BodyError, BodyRequest, BodyState
+from agents.leaving import leave
 from agents.positioning import External
 from agents.ranging import HeardRanges
 from agents.rows import Array, Index, some
@@ -88,6 +89,7 @@ class ExternalBody:
         self._repeat = 0.0
         self._trouble = [""] * rows
         self._malformed = [0] * rows
+        self._lock = threading.Lock()  # of the numbers: `land` and `stop` come from other threads too
         self._session: zenoh.Session | None = None
 
     # ------------------------------------------------------------------ Body
@@ -104,6 +106,7 @@ class ExternalBody:
         self._positions = [network.subscriber(session, keys.position(name), 32) for name in self._names]
         self._ranges = HeardRanges(session, keys, self._names, range(len(self._names)))
         self._setpoints = [network.publisher(session, keys.setpoint(name), mime) for name in self._names]
+        self._orders = [network.urgent_publisher(session, keys.setpoint(name), mime) for name in self._names]
         pause = threading.Event()
         while (missing := self._missing()) and time.monotonic() < deadline:
             pause.wait(LOOK_S)
@@ -122,7 +125,7 @@ class ExternalBody:
         return BodyState(
             time=self._seen.time - self._shift,
             position=self._seen.position.copy(),
-            velocity=self._seen.velocity.copy(),
+            velocity=self._velocity(),
             yaw=np.where(np.isfinite(self._seen.yaw), self._seen.yaw, self._yaw),
             true_position=nothing,
             true_yaw=nothing[:, 0],
@@ -138,17 +141,16 @@ class ExternalBody:
         values = setpoint.tolist()
         for row in np.flatnonzero(given).tolist():
             x, y, z, w = values[row]
-            self._say(row, "drive", setpoint=(x, y, z, w))
-            if (standing := self._standing.get(row)) is not None and standing.order.action == "takeoff":
-                del self._standing[row]  # who is steered need not climb
+            self._drive(row, (x, y, z, w))
         now = self._now()
         if self._standing and now >= self._repeat:
             self._repeat = now + REPEAT_S
-            for row, standing in list(self._standing.items()):
-                if now > standing.until:
-                    del self._standing[row]
-                else:
-                    self._put(row, msgspec.structs.replace(standing.order, stamp=self._stamp()))
+            with self._lock:
+                for row, standing in list(self._standing.items()):
+                    if now > standing.until:
+                        del self._standing[row]
+                    else:
+                        self._put(row, msgspec.structs.replace(standing.order, stamp=self._stamp()))
 
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Body.takeoff`; ground robots have nothing to do."""
@@ -157,19 +159,20 @@ class ExternalBody:
                 z = self._seen.position[row, 2]
                 self._ground[row] = z if isfinite(z) else 0.0
                 self._flying[row], self._landing[row], self._stopped[row] = True, np.inf, False
-                self._stand(row, self._say(row, "takeoff", height=up), np.inf)
+                self._order(row, "takeoff", np.inf, up)
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
         for row in rows.tolist():
             self._landing[row] = self._now()
-            self._stand(row, self._say(row, "land"), LANDING_S if self._flying[row] else HALT_S)
+            self._order(row, "land", LANDING_S if self._flying[row] else HALT_S)
 
     def stop(self, rows: Index) -> None:
         """See `Body.stop`; said again for as long as this process lives."""
-        self._flying[rows], self._stopped[rows] = False, True
         for row in rows.tolist():
-            self._stand(row, self._say(row, "stop"), np.inf)
+            if not self._stopped[row]:
+                self._flying[row], self._stopped[row] = False, True
+                self._order(row, "stop", np.inf)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
         """Nothing: what the runtime heard on the key `position` has been heard here."""
@@ -177,7 +180,7 @@ class ExternalBody:
     def close(self) -> None:
         """See `Body.close`."""
         if self._session is not None:
-            self._session.close()  # type: ignore[no-untyped-call]
+            leave(self._session, self)
             self._session = None
 
     # ------------------------------------------------------------------ what the far end says
@@ -231,6 +234,12 @@ class ExternalBody:
     def _far_end(self, row: int) -> str:
         return "`zenpark world` with this experiment" if self._addresses[row] == WORLD else "the simulator"
 
+    def _velocity(self) -> Array:
+        """Of all rows (n, 3) [m/s]; one on wheels that was told to halt long ago, and cannot be seen, stands."""
+        now = self._now()
+        stands = ~self._flies & (now - self._landing > HALT_S) & (now - self._seen.time > STALE_S)
+        return np.where(stands[:, None], 0.0, self._seen.velocity)
+
     def _settle(self) -> None:
         """Ends the landings that have come to their end."""
         landing = self._flying & np.isfinite(self._landing)
@@ -242,8 +251,10 @@ class ExternalBody:
         aged = now - self._seen.time > STALE_S
         down = landing & np.where(aged, now - self._landing > LANDING_S, ~high & slow)
         self._flying &= ~down
-        for row in np.flatnonzero(down).tolist():
-            self._standing.pop(row, None)
+        with self._lock:
+            for row in np.flatnonzero(down).tolist():
+                if not self._stopped[row]:
+                    self._standing.pop(row, None)
 
     def _notes(self) -> tuple[str, ...]:
         age = self._now() - self._seen.time
@@ -261,27 +272,33 @@ class ExternalBody:
 
     # ------------------------------------------------------------------ what the far end is told
 
-    def _say(
-        self,
-        row: int,
-        action: Action,
-        *,
-        setpoint: wire.Setpoint | None = None,
-        height: float | None = None,
+    def _drive(self, row: int, setpoint: wire.Setpoint) -> None:
+        with self._lock:
+            if self._stopped[row]:
+                return  # while the setpoint was decided
+            self._put(row, self._command(row, "drive", setpoint))
+            if (standing := self._standing.get(row)) is not None and standing.order.action == "takeoff":
+                del self._standing[row]  # who is steered need not climb
+
+    def _order(self, row: int, action: Action, seconds: float, height: float | None = None) -> None:
+        """Says an order now, and again for so long."""
+        with self._lock:
+            order = self._command(row, action, height=height)
+            self._standing[row] = _Standing(order, self._now() + seconds)
+            self._put(row, order)
+
+    def _command(
+        self, row: int, action: Action, setpoint: wire.Setpoint | None = None, height: float | None = None
     ) -> wire.Command:
         self._sent[row] += 1
-        command = wire.Command(self._names[row], self._sent[row], self._stamp(), action, setpoint, height)
-        self._put(row, command)
-        return command
-
-    def _stand(self, row: int, order: wire.Command, seconds: float) -> None:
-        self._standing[row] = _Standing(order, self._now() + seconds)
+        return wire.Command(self._names[row], self._sent[row], self._stamp(), action, setpoint, height)
 
     def _put(self, row: int, command: wire.Command) -> None:
         if self._session is None:
             return  # `stop` may come after `close`
         try:
-            self._setpoints[row].put(wire.encode(command))
+            publishers = self._setpoints if command.action == "drive" else self._orders
+            publishers[row].put(wire.encode(command))
         except zenoh.ZError as error:
             self._trouble[row] = f"cannot be told anything: {error}"
 

@@ -12,6 +12,7 @@ import zenoh
 
 from agents import session as network
 from agents.body import Body, BodyError, BodyRequest, BodyState, Rays
+from agents.leaving import leave
 from agents.positioning import External
 from agents.protocols import ros2, turtlebot3
 from agents.rosnode import Participant
@@ -187,7 +188,7 @@ class TurtleBot3:
 
     def _close(self) -> None:
         for session in self._sessions.values():
-            session.close()  # type: ignore[no-untyped-call]
+            leave(session, self)
         self._sessions.clear()
 
 

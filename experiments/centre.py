@@ -27,6 +27,7 @@ from agents import session as network
 from agents.centre import Centre, Told
 from agents.channel import Channel, Samples
 from agents.keys import Keys
+from agents.leaving import end, held
 from agents.lifecycle import IDLE, Phase
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
@@ -253,9 +254,8 @@ def serve(
     with told_to_end(over.set):
         if lifeline:
             Lifeline(over).start()
-        with network.open_session(
-            endpoints, name="centre", stop=over, rights=mesh.rights(experiment, endpoints)
-        ) as session:
+        opened = network.open_session(endpoints, name="centre", stop=over, rights=mesh.rights(experiment, endpoints))
+        with held(opened) as (session, declared):
             keys = Keys(experiment.network.realm)
             if network.taken(session, keys.centre_alive):
                 raise CentreTaken(
@@ -263,6 +263,7 @@ def serve(
                     "router with --connect, or another network.realm in the experiment file"
                 )
             process = CentreProcess(experiment, session, keys)
+            declared.append(process)
             heard = [name for name in experiment.robots if name not in steered]
             print(
                 f"centre ready: guides {', '.join(steered)} at {experiment.rates.coordination_hz:g} Hz"
@@ -290,4 +291,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())

@@ -25,6 +25,7 @@ from agents.body import BodyError
 from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.kinds import KINDS
+from agents.leaving import end, held
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
 from experiments import assign, document, json_text
@@ -159,14 +160,17 @@ def _serve(
     if lifeline:
         Lifeline(lost).start()
     with told_to_end(over.set), ExitStack() as stack:
-        session = None
+        session, declared = None, list[object]()
         if connect:
-            session = stack.enter_context(network.open_session(connect, name=word, stop=over, identity="twin"))
+            joined = held(network.open_session(connect, name=word, stop=over, identity="twin"))
+            session, declared = stack.enter_context(joined)
         device: Device = plugins.load(plugins.DEVICES, word)(request)
         stack.callback(device.close)
         for name, address in zip(names, device.addresses, strict=True):
             print(f"address {name} {address}", flush=True)
-        DeviceProcess(device, names, session, keys=keys, rate_hz=rate_hz, lost=lost).run(over)
+        process = DeviceProcess(device, names, session, keys=keys, rate_hz=rate_hz, lost=lost)
+        declared.append(process)
+        process.run(over)
     return 0
 
 
@@ -198,4 +202,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())

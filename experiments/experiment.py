@@ -367,6 +367,9 @@ class Safety(Part, frozen=True):
     landing_s: Annotated[
         Positive, Meta(description="a drone that takes longer than this to land has its motors cut [s]")
     ] = 20.0
+    loop_silence_s: Annotated[
+        Positive, Meta(description="a robot whose control loop hangs for this long is landed from outside of it [s]")
+    ] = 0.5
 
 
 class World(Part, frozen=True):

@@ -20,6 +20,7 @@ import zenoh
 from agents import session as network
 from agents import wire
 from agents.keys import Keys
+from agents.leaving import end, held
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
 from experiments import document, mesh
@@ -176,10 +177,14 @@ def record(file: str, target: Path, *, case: str, source: Path, connect: Sequenc
     text = source.read_text("utf-8")
     with (
         told_to_end(asked.set),
-        network.open_session(connect, name="recorder", stop=asked, rights=mesh.rights(experiment, connect)) as session,
+        held(network.open_session(connect, name="recorder", stop=asked, rights=mesh.rights(experiment, connect))) as (
+            session,
+            declared,
+        ),
         Recording(target, experiment, text, case=case, seed=experiment.seed, clock="real") as recording,
     ):
         recorder = Recorder(session, Keys(experiment.network.realm), recording)
+        declared.append(recorder)
         flush_at = time.monotonic() + FLUSH_S
         last = float("inf")
         while not asked.wait(POLL_S):
@@ -213,4 +218,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())

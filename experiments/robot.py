@@ -22,6 +22,7 @@ from agents.body import BodyError
 from agents.clock import Clock
 from agents.fleet import assemble
 from agents.keys import Keys
+from agents.leaving import end
 from agents.runtime import NameTaken, Ranging, Runtime, Setup
 from agents.session import DEFAULT_ENDPOINT, EndpointError, Unreachable
 from agents.shadow import shadowed
@@ -117,6 +118,7 @@ def _run(
         clock=clock,
         once=once,
         rights=mesh.rights(experiment, endpoints),
+        loop_silence_s=experiment.safety.loop_silence_s,
     )
     return Runtime(assignment, body, setup).run()
 
@@ -194,4 +196,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())

@@ -31,6 +31,7 @@ from experiments.launcher import LAND_S
 
 RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run on a host: how they are found again
 POLL_S: Final = 0.1
+FROZEN_S: Final = 2.0  # after the loss of the lifeline; who hangs for longer than that is killed
 REACH_S: Final = 3.0
 USB: Final = Path("/sys/bus/usb/devices")
 RADIO: Final = {"1915:7777": "Crazyradio", "0483:5740": "Crazyflie on USB"}
@@ -155,6 +156,14 @@ def _others() -> list[int]:
     return found
 
 
+def _frozen(pid: int) -> bool:
+    """Whether a process was stopped (SIGSTOP): it will not come down by itself."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
+    except OSError:
+        return False  # gone
+
+
 def kill(pids: Sequence[int]) -> list[int]:
     """Kills processes; returns those that were still there."""
     killed = []
@@ -193,8 +202,10 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
                     print(f"station: not understood: {error}", file=sys.stderr)
                     continue
                 os.write(1, msgspec.json.encode(answer(question, clock)) + b"\n")
-    deadline = time.monotonic() + patience_s
-    while _others() and time.monotonic() < deadline:
+    lost = time.monotonic()
+    while (left := _others()) and time.monotonic() < lost + patience_s:
+        if time.monotonic() > lost + FROZEN_S and all(_frozen(pid) for pid in left):
+            break  # nobody lands any more
         time.sleep(POLL_S)
     kill(_others())
     return 0

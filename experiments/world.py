@@ -23,6 +23,7 @@ from agents import session as network
 from agents.body import BodyError
 from agents.farewell import Farewell
 from agents.keys import Keys
+from agents.leaving import end, held
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
 from experiments import document, mesh
@@ -236,16 +237,15 @@ def serve(
     endpoints = routers(experiment, read.path, connect, lab) or [network.DEFAULT_ENDPOINT]
     over, lost = threading.Event(), threading.Event()
 
-    def end() -> None:
+    def leave() -> None:
         (over if lost.is_set() else lost).set()  # asked a second time it does not wait for robots to land
 
     if lifeline:
         Lifeline(lost).start()
-    with told_to_end(end):
+    with told_to_end(leave):
         population = Population(experiment)
-        with network.open_session(
-            endpoints, name="world", stop=lost, rights=mesh.rights(experiment, endpoints)
-        ) as session:
+        opened = network.open_session(endpoints, name="world", stop=lost, rights=mesh.rights(experiment, endpoints))
+        with held(opened) as (session, declared):
             keys = Keys(experiment.network.realm)
             if network.taken(session, keys.world_alive):
                 raise WorldTaken(
@@ -255,6 +255,7 @@ def serve(
             # before anything watches those tokens: a session that has begun to watch answers from what it has heard
             there = _alive(session, keys)
             world = WorldProcess(experiment, population, session, lost)
+            declared.append(world)
             back = world.find(there)
             print(_ready(experiment, population, endpoints, back), flush=True)
             world.run(over)
@@ -299,4 +300,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())

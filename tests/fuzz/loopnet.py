@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -64,14 +63,14 @@ class Channel:
         self.key, self.asked, self.expression = key, asked, zenoh.KeyExpr(key)
         self._waiting: deque[Sample] = deque(maxlen=depth)
         self.handler = self
-        self.rung = threading.Event()
+        self.obey: Callable[[Sample], object] = lambda _sample: None
 
     def try_recv(self) -> Sample | None:
         return self._waiting.popleft() if self._waiting else None
 
     def add(self, sample: Sample) -> None:
         self._waiting.append(sample)
-        self.rung.set()
+        self.obey(sample)
 
     def undeclare(self) -> None:
         self._waiting.clear()
@@ -186,6 +185,11 @@ class Net:
         def heard(_session: object, key: str, *_: object, **__: object) -> Channel:
             return self.listen(key)
 
+        def alarm(_session: object, key: str, obey: Callable[[Sample], object]) -> Channel:
+            made = self.listen(key)
+            made.obey = obey
+            return made
+
         def mute(*_: object, **__: object) -> Mute:
             return Mute()
 
@@ -193,10 +197,11 @@ class Net:
             "pose_subscriber": heard,
             "subscriber": heard,
             "alive_watch": heard,
-            "Alarm": heard,
+            "Alarm": alarm,
             "orders": lambda _session, key: self.listen(key, asked=True),
             "pose_publisher": mute,
             "publisher": mute,
+            "urgent_publisher": mute,
             "last_value": mute,
             "alive_token": mute,
             "connected": lambda _session: True,

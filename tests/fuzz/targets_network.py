@@ -75,8 +75,6 @@ def robot() -> Iterator[Target]:
         def tick() -> None:
             nonlocal t
             t += 0.01
-            if runtime._estop.rung.is_set():
-                runtime._heed_stops()
             runtime._tick(t)
 
         began = runtime._utc

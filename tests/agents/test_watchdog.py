@@ -1,0 +1,128 @@
+"""A loop that hangs is noticed from outside, its robots land, and one that hangs for good ends the process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from agents.rows import Index
+from agents.watchdog import HUNG, Watchdog
+from tests.conftest import ROOT
+
+SILENCE_S = 0.1
+
+
+class Told:
+    """A body that writes down what it is told, and hangs in what it was asked to hang in."""
+
+    def __init__(self) -> None:
+        self.orders: list[tuple[str, list[int]]] = []
+        self.never = threading.Event()
+        self.stuck = ""
+
+    def land(self, rows: Index) -> None:
+        self.take("land", rows)
+
+    def stop(self, rows: Index) -> None:
+        self.take("stop", rows)
+
+    def take(self, what: str, rows: Index) -> None:
+        self.orders.append((what, rows.tolist()))
+        if self.stuck == what:
+            self.never.wait(10.0)
+
+    def count(self, what: str) -> int:
+        return sum(order == (what, [0, 1]) for order in self.orders)
+
+
+class Kennel:
+    def __init__(self, down_s: float = 10.0) -> None:
+        self.body, self.alarms, self.ends = Told(), list[str](), list[int]()
+        self.dog = Watchdog(
+            self.body,  # type: ignore[arg-type]
+            np.arange(2),
+            alarm=self.alarms.append,
+            silence_s=SILENCE_S,
+            down_s=down_s,
+            end=self.ends.append,
+        )
+
+    def beat_for(self, seconds: float) -> None:
+        until, pause = time.monotonic() + seconds, threading.Event()
+        while time.monotonic() < until:
+            self.dog.beat()
+            pause.wait(0.01)
+
+
+def test_a_loop_that_goes_round_is_left_alone():
+    kennel = Kennel()
+    with kennel.dog:
+        kennel.beat_for(5 * SILENCE_S)
+    assert not kennel.body.orders
+    assert not kennel.alarms
+    assert not kennel.dog.tripped
+
+
+def test_a_loop_that_hangs_has_its_robots_landed_and_may_come_back(eventually: Callable[[Callable[[], object]], None]):
+    kennel = Kennel()
+    with kennel.dog:
+        kennel.beat_for(0.05)
+        eventually(lambda: kennel.body.count("land"))
+        eventually(lambda: kennel.alarms)
+        assert kennel.dog.tripped == kennel.alarms[0]
+        assert kennel.dog.tripped.startswith("its control loop hangs: no tick for 0.")
+        assert kennel.dog.forgive() == kennel.alarms[0]
+        assert not kennel.dog.tripped
+        kennel.beat_for(3 * SILENCE_S)
+    assert not kennel.body.count("stop")
+    assert len(kennel.alarms) == 1
+    assert not kennel.ends
+
+
+@pytest.mark.parametrize("stuck", ["", "land", "stop"])
+def test_one_that_hangs_for_good_is_told_again_cut_and_ended(stuck: str, eventually):
+    kennel = Kennel(down_s=0.8)
+    kennel.body.stuck = stuck
+    with kennel.dog:
+        eventually(lambda: kennel.ends)
+    kennel.body.never.set()
+    assert kennel.ends == [HUNG]
+    assert kennel.body.orders[-1] == ("stop", [0, 1])
+    assert kennel.body.count("stop") == 1
+    assert kennel.body.count("land") == 1 if stuck == "land" else kennel.body.count("land") >= 2
+
+
+FROZEN = """
+import sys, threading
+from agents.watchdog import Watchdog
+class Body:
+    def land(self, rows): print("landed", flush=True)
+    stop = land
+with Watchdog(Body(), None, alarm=print, silence_s=0.3) as dog:
+    print("runs", flush=True)
+    pause = threading.Event()
+    for _ in range(150):
+        dog.beat()
+        pause.wait(0.01)
+print("over", flush=True)
+"""
+
+
+@pytest.mark.system
+def test_a_process_that_was_frozen_is_not_a_loop_that_hangs():
+    process = subprocess.Popen([sys.executable, "-c", FROZEN], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "runs\n"
+    os.kill(process.pid, signal.SIGSTOP)
+    time.sleep(1.0)
+    os.kill(process.pid, signal.SIGCONT)
+    out, _ = process.communicate(timeout=20)
+    assert out == "over\n"
