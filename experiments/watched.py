@@ -71,6 +71,11 @@ class Watched:
         """All of it that runs now, and what each is."""
         return processes.of_run(self.run)
 
+    def close(self) -> None:
+        """Asks it to end, as the death of whoever holds the lifeline does, and does not wait."""
+        assert self.process.handle.stdin is not None
+        self.process.handle.stdin.close()
+
     def end(self) -> None:
         """Robots land, and everything ends."""
         self._launcher.end([NAME], grace_s=END_S)

@@ -147,6 +147,37 @@ def soak(
 
 
 @app.command()
+def chaos(
+    file: File,
+    *,
+    faults: Annotated[int, typer.Option(min=1, help="How many.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Of the script; the same seed gives the same.")] = 1,
+    kinds: Annotated[
+        list[str] | None, typer.Option(metavar="KIND,KIND", help="Only these: kill, freeze, partition, ... [all]")
+    ] = None,
+    case: Annotated[str | None, typer.Option(metavar="NAME", help="A case of the file. [the last]")] = None,
+    out: Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")] = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run an experiment again and again while faults befall it, and say what did not hold."""
+    from experiments.chaos_command import command  # noqa: PLC0415
+
+    raise typer.Exit(
+        command(
+            file,
+            faults=faults,
+            seed=seed,
+            kinds=kinds or [],
+            case=case,
+            out=out,
+            settings=settings or [],
+            as_json=as_json,
+        )
+    )
+
+
+@app.command()
 def check(file: File, settings: Settings = None, as_json: AsJson = False) -> None:
     """Check an experiment file and say what theory says of it."""
     from experiments.check import command  # noqa: PLC0415

@@ -43,6 +43,7 @@ def test_commands():
                 "bench",
                 "sweep",
                 "soak",
+                "chaos",
                 "import",
                 "keys",
                 "echo",

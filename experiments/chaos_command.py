@@ -1,0 +1,101 @@
+"""`zenpark chaos`: draws a script of faults, runs it, and says what did not hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, cast
+
+import msgspec
+
+from agents.plugins import did_you_mean
+from experiments import chaos, chaos_report
+from experiments.chaos_report import Result
+from experiments.experiment import Network
+from experiments.fault_script import KINDS, Kind, script
+from experiments.problem import DocumentError, Problem
+from experiments.run import SOURCE, Interrupts, chosen, load, new_folder
+
+ENGINE: Final = 'world.engine="pymunk"'  # which measures contacts
+BODIES: Final = "world"
+SCRIPT: Final = "script.json"
+
+
+def command(
+    file: str,
+    *,
+    faults: int,
+    seed: int,
+    kinds: Sequence[str],
+    case: str | None,
+    out: str | None,
+    settings: Sequence[str],
+    as_json: bool,
+) -> int:
+    """`zenpark chaos`; returns the exit code: 0 if everything held, 1 if not, 130 after Ctrl-C.
+
+    Raises:
+        DocumentError: If the file is wrong, or there is no such kind of fault.
+    """
+    changes = [ENGINE, *settings]
+    read = load(file, *changes)
+    name = case or list(read.cases())[-1]
+    experiment = chosen(read, [name])[name]
+    skipped = missing()
+    wanted = [kind for kind in _kinds(kinds) if kind not in skipped]
+    rounds = script(list(experiment.robots), experiment.duration_s, faults, seed, wanted)
+    folder = new_folder(dataclasses.replace(read, path=Path(f"{read.path.stem}-chaos")), out)
+    read.keep(folder / SOURCE)
+    (folder / SCRIPT).write_bytes(msgspec.json.format(msgspec.json.encode(rounds), indent=1))
+
+    def say(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    for kind, why in skipped.items():
+        say(f"{kind} is left out: {why}")
+    say(f"{faults} faults in {len(rounds)} rounds of {experiment.duration_s:g} s; script: {folder / SCRIPT}")
+    setting = chaos.Setting(folder / SOURCE, name, experiment, folder, changes, BODIES, seed)
+    with Interrupts() as interrupted:
+        outcomes, ends = chaos.run(setting, rounds, interrupted=interrupted, say=say)
+    result = Result(read.experiment.title, seed, rounds, skipped, outcomes, ends)
+    words = ["zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
+    words += [part for kind in kinds for part in ("--kinds", kind)]
+    page = chaos_report.write(folder, result, " ".join(words))
+    if as_json:
+        print(msgspec.json.encode(result).decode())
+    else:
+        _tell(result)
+        print(f"report: {page}")
+    if interrupted.asked:
+        return 130
+    return 1 if result.violations or len(outcomes) < faults else 0
+
+
+def missing() -> dict[str, str]:
+    """Kinds of faults that cannot be done here, and why."""
+    if "routers" not in {each.name for each in msgspec.structs.fields(Network)}:
+        return {"failover": "there is no [network] routers yet"}
+    return {}
+
+
+def _kinds(given: Sequence[str]) -> list[Kind]:
+    """The kinds that were asked for, all without any."""
+    words = [word for part in given for word in part.split(",") if word]
+    for word in words:
+        if word not in KINDS:
+            hint = did_you_mean(word, KINDS) or f"there are: {', '.join(KINDS)}"
+            raise DocumentError([Problem(f"--kinds {word}", 0, 0, "no such fault", hint)])
+    return cast(list[Kind], words) or list(KINDS)
+
+
+def _tell(result: Result) -> None:
+    made = chaos_report.table(result)
+    rows = [made.head, *(tuple(map(str, row.cells)) for row in made.rows)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(made.head))]
+    for row in rows:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    marks = {"good": "✓", "fair": "!", "bad": "✗", "plain": "·"}
+    for finding in chaos_report.findings(result):
+        print(f"{marks[finding.mark]} {finding.text}")

@@ -1,0 +1,150 @@
+"""What a fault laboratory found: a table of fault kinds, recovery times as a figure, and a page."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import matplotlib.pyplot as plt
+import msgspec
+
+from experiments import drawing
+from experiments.chaos import Ended, Outcome, line
+from experiments.fault_script import KINDS, Round
+from experiments.report import Section, date_of, numbered, render
+from experiments.report_tables import Row as Line
+from experiments.report_tables import Table
+from experiments.verdict import Finding
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PAGE: Final = "chaos.html"
+FILE: Final = "chaos.json"
+CAPTION: Final = (
+    "Time from the begin of each fault until all was well again, by kind; the bar is how long the fault itself lasted. "
+    "Crosses: not well in time. Hollow: the victim came down safely instead of coming back."
+)
+MEANT: Final = (
+    ("kill", "SIGKILL to a robot's process; its body stays in the room and must come down."),
+    ("freeze", "SIGSTOP for 5 s, then SIGCONT."),
+    ("partition", "Nothing passes between a robot and the router for 3 s; what was said meanwhile comes afterwards."),
+    ("router", "SIGKILL to the only router; the conductor starts it again."),
+    ("failover", "SIGKILL to the first of two routers."),
+    ("conductor", "SIGKILL to the launcher: robots land by themselves, and everything ends."),
+    ("loss", "20 % of the segments of every robot are lost for 3 s and sent again after TCP's timeouts."),
+    ("delay", "50 to 300 ms more in both directions for 3 s, for one robot."),
+    ("clock", "The wall clock of all processes steps by 0.5 to 5 s, forward or back."),
+    ("disk", "The recording can grow no more."),
+    ("corrupt", "Payloads of nonsense on every key that a robot believes, and on the emergency stop's."),
+    ("bits", "One bit is wrong in 5 % of a robot's segments for 1 s: its connection breaks."),
+)  # fmt: skip
+SMALL: Final = 20  # so many rows stand open
+
+
+class Result(msgspec.Struct, frozen=True):
+    """Everything of a laboratory, as `chaos.json` keeps it."""
+
+    experiment: str
+    seed: int
+    script: list[Round]
+    skipped: dict[str, str]
+    outcomes: list[Outcome]
+    rounds: list[Ended]
+
+    @property
+    def violations(self) -> int:
+        """How many things happened that must not."""
+        return sum(len(each.violations) for each in self.outcomes) + sum(len(each.violations) for each in self.rounds)
+
+
+def table(result: Result) -> Table:
+    """A row for each kind of fault."""
+    lines = []
+    for kind in KINDS:
+        mine = [each for each in result.outcomes if each.fault.kind == kind]
+        if kind in result.skipped:
+            lines.append(Line((kind, "–", "–", "–", "–", "–", "–", result.skipped[kind])))
+        elif mine:
+            well = [each.begin_s for each in mine if each.recovered]
+            lines.append(
+                Line(
+                    (
+                        kind,
+                        str(len(mine)),
+                        str(len(well)),
+                        str(sum(each.ended for each in mine)),
+                        f"{statistics.median(well):.1f} s" if well else "–",
+                        f"{max(well):.1f} s" if well else "–",
+                        str(sum(len(each.violations) for each in mine)),
+                        "",
+                    )
+                )
+            )
+    head = ("Fault", "Done", "Well again", "Came down", "Median", "Longest", "Violations", "")
+    return Table(head, tuple(lines), note="Times count from the begin of the fault.")
+
+
+def findings(result: Result) -> list[Finding]:
+    """The verdict."""
+    done, rounds = len(result.outcomes), result.rounds
+    wanted = sum(len(each.faults) for each in result.script)
+    found = [Finding("good" if done == wanted else "bad", f"{done} of {wanted} faults in {len(rounds)} rounds")]
+    nearest = min((each.nearest_m for each in rounds), default=float("inf"))
+    found.append(Finding("plain", f"robots came as near as {nearest:.3f} m to each other, surface to surface"))
+    late = max((each.gone_s for each in rounds), default=0.0)
+    found.append(Finding("plain", f"after the end of a round all of its processes were gone within {late:.1f} s"))
+    found += [Finding("fair", f"{kind} was left out: {why}") for kind, why in result.skipped.items()]
+    wrong = [line(each) for each in result.outcomes if each.violations]
+    wrong += [f"round {each.round}: {text}" for each in rounds for text in each.violations]
+    return [*found, *(Finding("bad", text) for text in wrong)] if wrong else [*found, Finding("good", "0 violations")]
+
+
+def write(folder: Path, result: Result, command: str) -> Path:
+    """Writes `chaos.json`, `chaos.html` and the figure into a folder."""
+    (folder / FILE).write_bytes(msgspec.json.format(msgspec.json.encode(result), indent=1))
+    drawn = figure(result)
+    drawing.save(drawn, folder / "figures", "recovery")
+    rows = tuple(Line((line(each),)) for each in result.outcomes)
+    return render(
+        folder / PAGE,
+        title=f"Faults: {result.experiment}",
+        source="",
+        facts=[("Date", date_of(time.time())), ("Seed", str(result.seed)), ("Rounds", str(len(result.rounds)))],
+        command=command,
+        verdict=findings(result),
+        sections=[
+            Section("By kind", tables=(table(result),), pictures=numbered([(drawn, CAPTION)])),
+            Section(
+                "Every fault",
+                tables=(Table(("What",), rows, words=True),),
+                folded="Show the list" if len(rows) > SMALL else "",
+            ),
+            Section("Definitions", terms=MEANT),
+        ],
+    )
+
+
+@drawing.styled
+def figure(result: Result) -> Figure:
+    """Recovery times by kind of fault."""
+    kinds = [kind for kind in KINDS if any(each.fault.kind == kind for each in result.outcomes)]
+    drawn, axes = plt.subplots(figsize=(6.3, 0.7 + 0.28 * max(1, len(kinds))), layout="constrained")
+    for place, kind in enumerate(kinds):
+        mine = [each for each in result.outcomes if each.fault.kind == kind]
+        axes.barh(place, max(each.fault.lasts_s for each in mine), height=0.7, color="#dddddd", zorder=0)
+        for number, each in enumerate(mine):
+            y = place + 0.5 * (number / max(1, len(mine) - 1) - 0.5)
+            face = "none" if each.ended else "#0072b2"
+            if each.recovered:
+                axes.plot(each.begin_s, y, "o", markersize=3, color="#0072b2", markerfacecolor=face)
+            else:
+                axes.plot(each.begin_s, y, "x", markersize=4, color="#d55e00")
+    axes.set_yticks(range(len(kinds)), list(kinds))
+    axes.invert_yaxis()
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("recovery [s]")
+    axes.grid(visible=True, axis="x")
+    return drawn
