@@ -59,9 +59,7 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
         track = analysis.prediction.position
         least = float(norm(track[:, first] - track[:, second]).min())
         if apart < limit - FORGIVEN:
-            message = (
-                f"{who} start {apart:.2f} m apart, nearer than the separation of {limit:g} m: neither takes off"
-            )
+            message = f"{who} start {apart:.2f} m apart, nearer than the separation of {limit:g} m: neither takes off"
             yield Claim("error", "separation-start", message, "start them farther apart, or reduce separation", path)
         elif wanted.get((first, second), np.inf) < limit - FORGIVEN:
             message = (
