@@ -244,7 +244,7 @@ class Agent:
             avoided = verdict.avoided
             if goal is not self.goal:
                 avoided = avoided | (np.abs(goal - self.goal) > 0.0).any(axis=1)
-        setpoint, changed, self._wild = verdict.setpoint, verdict.changed, verdict.wild & ~verdict.blind
+        setpoint, changed, self._wild = verdict.setpoint, verdict.changed, verdict.wild
         if not self.life.all_running:
             phase = self.life.phase
             passive = (phase < AIRBORNE) | (phase > RUNNING)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import acos, degrees, expm1
+from math import asin, degrees, expm1, hypot, sin
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -70,6 +70,7 @@ class Detector:
         """Of the rows of an assignment."""
         self._assignment, self._limits = assignment, assignment.limits
         self._flies = np.array([kind.flies for kind in assignment.kinds])
+        self._everybody: Mask = np.ones(len(self._flies), dtype=bool)
         speed = np.array([kind.speed for kind in assignment.kinds])
         # the speed of flying kinds is per axis
         self._fastest = assignment.limits.overspeed * np.where(self._flies, np.sqrt(3.0), 1.0) * speed
@@ -132,12 +133,12 @@ class Detector:
             seen.append(
                 Sighting(Cause.BATTERY, low, lambda row: f"{state.battery[row]:.0%} (limit {limits.battery_low:.0%})")
             )
-        fallen = self._flies & ~state.flying & rows.cruising
-        if some(fallen):
+        fallen = self._flies > state.flying
+        if some(fallen) and some(fallen := fallen & rows.cruising):
             seen.append(Sighting(Cause.FALLEN, fallen, lambda _: "its motors are off"))
         if state.attitude is not None:
-            leans = leaning(state.attitude, limits.tilt) & self._flies & state.flying
-            if some(leans):
+            leans = leaning(state.attitude, limits.tilt)
+            if some(leans) and some(leans := leans & self._flies & state.flying):
                 attitude = state.attitude
                 seen.append(
                     Sighting(
@@ -184,7 +185,7 @@ class Detector:
 
     def _surroundings(self, t: float, outside: Outside, seen: list[Sighting]) -> None:
         """The process, and who is on the network."""
-        everybody = np.ones(len(self._flies), dtype=bool)
+        everybody = self._everybody
         if outside.offline_since < np.inf:
             gone = t - outside.offline_since
             seen.append(Sighting(Cause.ROUTER, everybody, lambda _: f"for {gone:.1f} s"))
@@ -197,9 +198,11 @@ class Detector:
 
 def leaning(attitude: Array, limit: float) -> Mask:
     """Rows that lean more than `limit` [rad]; `attitude` (N, 4) as in `BodyState`, unknown ones do not."""
-    return np.asarray(1.0 - 2.0 * (attitude[:, 1] ** 2 + attitude[:, 2] ** 2) < np.cos(limit))
+    around = attitude[:, 1:3]  # a turn about the vertical has neither; sin² of half the angle, else
+    return np.asarray(np.vecdot(around, around) > sin(0.5 * limit) ** 2)
 
 
 def lean(attitude: Array, row: int) -> float:
     """How far a row leans [rad]: the angle between its own upward axis and the room's."""
-    return acos(float(np.clip(1.0 - 2.0 * (attitude[row, 1] ** 2 + attitude[row, 2] ** 2), -1.0, 1.0)))
+    _, x, y, _ = attitude[row].tolist()
+    return 2.0 * asin(min(1.0, hypot(x, y)))

@@ -92,7 +92,7 @@ class Verdict:
         setpoint: (N, 4) safe.
         changed: (N,) the setpoint was not what had been decided.
         blind: (N,) own position missing, stale or not finite: no closed loop is possible.
-        wild: (N,) it was not made of finite numbers; what is sent instead keeps the row where it is.
+        wild: (N,) it was not made of finite numbers although the row is not blind; what is sent instead keeps it there.
         avoided: (N,) avoidance changed the setpoint.
     """
 
@@ -170,7 +170,7 @@ class Safety:
         safe, here = setpoint.copy(), position
         troubled = not (where.sure and every(sane))
         if troubled:
-            wild = ~np.asarray(sane.all(axis=1))
+            wild = ~np.asarray(sane.all(axis=1) | blind)
             here, yaw = np.where(blind[:, None], self._centre, position), np.where(blind, 0.0, yaw)
             safe[blind | wild] = 0.0
             stay = wild & self._takes_position

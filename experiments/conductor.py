@@ -129,8 +129,7 @@ class Conductor:
                     self._view.tell_clocks(clocks)
                     self._drift = stack.enter_context(Drift(self._hosts.followed()))
                     self._view.say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
-                    self._order(wire.Order("takeoff"))
-                    if self._until("airborne", CLIMB_S):
+                    if self._take_off():
                         start = self._start()
                         self._walk(start)
                 self._land()
@@ -180,7 +179,9 @@ class Conductor:
 
     # ------------------------------------------------------------------ phases
 
-    def _until(self, phase: str, limit_s: float, *, recorder: bool = False) -> bool:
+    def _until(
+        self, phase: str, limit_s: float, *, recorder: bool = False, meanwhile: Callable[[], None] = lambda: None
+    ) -> bool:
         """Waits until every robot that is left has reached a phase; False if the user interrupted.
 
         Raises:
@@ -192,6 +193,7 @@ class Conductor:
             self._look()
             if self._interrupted():
                 return False
+            meanwhile()
             late = [name for name, seen in self._robots.items() if not (seen.reached(phase) or seen.gone)]
             gone = [name for name, seen in self._robots.items() if seen.out == "lost"]
             if gone and self._experiment.start.missing == "abort":
@@ -206,6 +208,21 @@ class Conductor:
                 return True
             time.sleep(POLL_S)
 
+    def _take_off(self) -> bool:
+        """Orders all to climb, those who were not ready just then again when they are; False if interrupted.
+
+        Raises:
+            RunFailed: As `_until`.
+        """
+        refused = self._order(wire.Order("takeoff"))
+
+        def again() -> None:
+            for name in [name for name in refused if self._robots[name].phase == "ready"]:
+                refused.remove(name)
+                refused.extend(self._order(wire.Order("takeoff"), [name]))
+
+        return self._until("airborne", CLIMB_S, meanwhile=again)
+
     def _patience(self) -> float:
         """How long to wait until all are ready [s]: robots that go on without a neighbour say so after the deadline."""
         begin = self._experiment.start
@@ -219,7 +236,9 @@ class Conductor:
                 self._view.say("clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}")
         at = time.time() + LEAD_S
         self._view.say("start", "conductor", "common start", stamp=at)
-        self._order(wire.Order("start", at=at), only="airborne")
+        self._order(
+            wire.Order("start", at=at), [name for name, seen in self._robots.items() if seen.reached("airborne")]
+        )
         return at
 
     def _walk(self, start: float) -> None:
@@ -308,14 +327,17 @@ class Conductor:
         if not self._crew.runs(name):
             self._crew.adopted.add(name)
 
-    def _order(self, order: wire.Order, only: str | None = None) -> None:
-        """Gives an order to every robot that is left; what is refused is said."""
+    def _order(self, order: wire.Order, to: Sequence[str] | None = None) -> list[str]:
+        """Gives an order to all robots that are left, or to some of them; says and returns who refused."""
+        refused = []
         for name, seen in self._robots.items():
-            if seen.gone or seen.status is None or (only is not None and not seen.reached(only)):
+            if seen.gone or seen.status is None or (to is not None and name not in to):
                 continue
             reply = self._view.order(name, order)
             if not reply.ok:
+                refused.append(name)
                 self._view.say("refused", name, f"{order.order}: {reply.reason}")
+        return refused
 
     # ------------------------------------------------------------------ words
 

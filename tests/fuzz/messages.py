@@ -19,7 +19,8 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
         robot=robot, stamp=now, phase="running", reason="", body="", battery=0.5, sent=seq, heard=2,
         lost={"KH01": 1}, dropped={"KH02": 1}, malformed=0, refused=0, ticks=5, missed=1,
         decisions=2, interventions=0, avoided=0, late_s=0.001, started=now - 1.0, missing=["KH02"],
-        pid=1, cpu_s=0.1, rss_mb=60.0,
+        pid=1, cpu_s=0.1, rss_mb=60.0, hazard="hold: ordered to hold",
+        incidents=[wire.Incident(seq, now, "hold: ordered to hold")],
     )  # fmt: skip
     commands = [
         wire.Command(robot, seq + 10, now, "drive", (0.1, 0.2, 0.0, 0.0)),
