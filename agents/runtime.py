@@ -26,8 +26,8 @@ from agents.channel import Channel, Conditions, Samples
 from agents.clock import MACHINE, Clock
 from agents.goals import HeardGoals
 from agents.keys import Keys
-from agents.lifecycle import Phase
 from agents.leaving import leave
+from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
 from agents.orders import carry_out
 from agents.process import told_to_end
@@ -194,6 +194,7 @@ class Runtime:
         self._poses = [network.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]
+        wire.decode(wire.encode(wire.Stop("", "")), wire.JSON, wire.Stop)  # or the first would wait for its decoder
         self._estop = network.Alarm(session, keys.estop, self._cut)
         self._located = [
             (row, network.subscriber(session, keys.position(name), 32))

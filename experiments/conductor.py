@@ -17,6 +17,7 @@ import zenoh
 from agents import lab, wire
 from agents import session as network
 from agents.keys import Keys
+from agents.leaving import held
 from experiments import hosts as machines
 from experiments import orders
 from experiments.assign import guided
@@ -317,9 +318,9 @@ class Conductor:
 
     def _join(self, stack: ExitStack) -> None:
         keys = self._keys
-        self._session = stack.enter_context(
-            network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S, identity="operator")
-        )
+        opened = network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S, identity="operator")
+        self._session, declared = stack.enter_context(held(opened))
+        declared.append(self)
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
         if self._endpoints != [network.DEFAULT_ENDPOINT]:
             there = self._endpoints[0]
