@@ -119,6 +119,8 @@ def config(
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": round(lease_s * 1000),
+        "transport/unicast/open_timeout": round(OPEN_S * 1000),
+        "transport/unicast/accept_timeout": round(OPEN_S * 1000),
         "transport/shared_memory/enabled": False,
         "queries_default_timeout": round(ASK_S * 1000),
         "adminspace/enabled": True,  # read-only; how `zenpark keys` learns who is there
@@ -149,7 +151,6 @@ def _of_lab(
     if folder is None:
         return {}, None
     settings = lab.settings(folder, identity, listens=listens)
-    settings["transport/unicast/open_timeout"] = settings["transport/unicast/accept_timeout"] = round(OPEN_S * 1000)
     if rights is not None:
         settings["access_control"] = access.rules(rights, lab.register(folder))
         settings["low_pass_filter"] = access.sizes(rights)

@@ -1,4 +1,4 @@
-"""Robots whose loop hangs, or whose whole process is frozen, come down; what was frozen does not act on what it knew."""
+"""Robots whose loop hangs, or whose whole process is frozen, come down, and do not act on what they knew before."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def test_an_estop_that_nobody_answers_ends(router: RouterProcess) -> None:
     router.process.send_signal(signal.SIGSTOP)
     try:
         done = subprocess.run(
-            command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=15, check=False
+            command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=9, check=False
         )
     finally:
         router.process.send_signal(signal.SIGCONT)
@@ -86,9 +86,7 @@ def test_a_frozen_robot_keeps_nobody_when_the_launcher_is_killed(tmp_path: Path,
         frozen.resume()
         until(lambda: gone([frozen]), "the frozen one too", 8.0)
     finally:
-        flight.process.wait(5)
-        assert flight.process.stdout is not None
-        flight.process.stdout.close()
+        flight.finish(5)
         for process in (frozen, *children.values()):
             try:
                 process.kill()
