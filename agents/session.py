@@ -33,6 +33,7 @@ from zenoh.ext import (
 from zenoh.handlers import Callback, Handler, RingChannel
 
 from agents import access, lab
+from agents.promptness import prompt_threads
 
 Mode = Literal["client", "peer", "router"]
 T_co = TypeVar("T_co", covariant=True)
@@ -210,7 +211,8 @@ def open_session(
     deadline = time.monotonic() + wait_s
     while True:
         try:
-            return zenoh.open(settings)
+            with prompt_threads():
+                return zenoh.open(settings)
         except zenoh.ZError:
             if time.monotonic() >= deadline or gone.wait(RETRY_S):
                 raise Unreachable(_silence(endpoints, identity or name)) from None
