@@ -17,6 +17,7 @@ from agents import lab
 from agents.access import Rights
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
+from agents.promptness import prompt_threads
 from agents.session import DEFAULT_ENDPOINT, EndpointError, config, deserted, reason
 
 EMPTY_S: Final = 1.0  # nobody connected for this long: whoever lost its connection would have it again
@@ -133,7 +134,8 @@ def _routing(settings: zenoh.Config, endpoints: Sequence[str], wait_s: float, st
     deadline = time.monotonic() + wait_s
     while True:
         try:
-            return zenoh.open(settings)
+            with prompt_threads():
+                return zenoh.open(settings)
         except zenoh.ZError as error:
             if time.monotonic() < deadline and not stop.wait(AGAIN_S):
                 continue

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from math import floor, nan
+from math import ceil, floor, nan
 from typing import Final, Literal
 
 import numpy as np
@@ -42,7 +42,7 @@ from agents.watchdog import SILENCE_S, Watchdog
 Ranging = Literal["body", "world", "far"]
 
 FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its launcher was lost has its motors cut
-HUSH_S: Final = 0.05  # after an emergency stop nothing is reported for so long: others' motors come first
+HUSH_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
 DOUBT_S: Final = 1.0  # a robot whose process stood still holds for so long: what it knows is old
 REACH_M: Final = 1.0  # a neighbour said to be farther outside the arena than this is not believed
 
@@ -121,7 +121,8 @@ class Runtime:
         self._state_slot = 0
         self._stopping: str | None = None
         self._leaving: set[int] = set()  # rows that were told to go while the run goes on
-        self._hush_until = self._doubt_until = -np.inf
+        self._doubt_until = -np.inf
+        self._cut_off = False  # motors were cut by a stop that the loop has not seen yet
         self._slept, self._joined = 0.0, False
         self._news = False  # somebody came or went since the last report
         self._utc = self._now = self._next = 0.0
@@ -204,6 +205,7 @@ class Runtime:
         self._poses = [network.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]
+        wire.decode(wire.encode(wire.Stop("", "")), wire.JSON, wire.Stop)  # or the first would wait for its decoder
         self._estop = network.Alarm(session, keys.estop, self._cut)
         self._conductor = network.alive_watch(session, keys.conductor)
         self._located = [
@@ -332,6 +334,7 @@ class Runtime:
         """Motors off as soon as an emergency stop is heard, in the thread that receives; the loop does the rest."""
         with suppress(wire.Malformed):  # counted by the loop
             wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
+            self._cut_off = True
             self._body.stop(self._everyone)
 
     def _heed_stops(self) -> None:
@@ -342,7 +345,7 @@ class Runtime:
             except wire.Malformed:
                 self._counts.malformed += 1
                 continue
-            self._hush_until = self._now + HUSH_S
+            self._cut_off = False  # the phases say it from now on
             for row in range(len(self._names)):
                 self.agent.life.stop(row, f"emergency stop by {stop.who}: {stop.reason}")
 
@@ -441,6 +444,8 @@ class Runtime:
             self._watchdog.beat()
             if self._watchdog.tripped:
                 self._recover(self._watchdog.forgive())
+            if self._cut_off:
+                self._rest()
             wait = zero + self._next - time.monotonic()
             behind = max(0, int(-wait / self._dt))
             if wait > 0.0:
@@ -466,6 +471,13 @@ class Runtime:
                 self._telemetry.report(t, everything=True)
                 return
 
+    def _rest(self) -> None:
+        """Leaves the processor to those whose motors still run."""
+        ticks = ceil(HUSH_S / self._dt)
+        self._next += ticks * self._dt
+        self.agent.tick += ticks
+        time.sleep(HUSH_S)
+
     def _tick(self, t: float) -> None:
         begun = self.agent.decisions > 0
         self._listen(t)
@@ -485,9 +497,6 @@ class Runtime:
         counts.ticks += 1
         counts.interventions += actions.changed
         counts.avoided += actions.avoided
-        if t < self._hush_until:
-            self._news |= self.agent.life.moved  # said as soon as others' motors are off too
-            return
         slot = (self.agent.tick - 1) // self._state_every
         if slot != self._state_slot:
             self._state_slot = slot
@@ -507,14 +516,15 @@ class Runtime:
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""
         duties = actions.duties
+        overruled = self._cut_off or self._watchdog.tripped  # another thread has told the body to stop or to land
         if duties is not None:
             if len(duties.stop):
                 self._body.stop(duties.stop)
             if len(duties.land):
                 self._body.land(duties.land)
-            if len(duties.takeoff) and not self._watchdog.tripped:
+            if len(duties.takeoff) and not overruled:
                 self._body.takeoff(duties.takeoff, self._assignment.hover[duties.takeoff])
-        if not self._watchdog.tripped:  # else it was decided before the robots were told to land
+        if not overruled:
             self._body.command(actions.setpoint)
 
     def _say(self, row: int, said: Said, yaw: float, t: float) -> None:

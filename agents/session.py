@@ -33,6 +33,7 @@ from zenoh.ext import (
 from zenoh.handlers import Callback, Handler, RingChannel
 
 from agents import access, lab, topology
+from agents.promptness import prompt_threads
 from agents.topology import Mode
 
 T_co = TypeVar("T_co", covariant=True)
@@ -126,6 +127,8 @@ def config(
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": round(lease_s * 1000),
+        "transport/unicast/open_timeout": round(OPEN_S * 1000),
+        "transport/unicast/accept_timeout": round(OPEN_S * 1000),
         "transport/shared_memory/enabled": False,
         "queries_default_timeout": round(ASK_S * 1000),
         "adminspace/enabled": True,  # read-only; how `zenpark keys` learns who is there
@@ -156,7 +159,6 @@ def _of_lab(
     if folder is None:
         return {}, None
     settings = lab.settings(folder, identity, listens=listens)
-    settings["transport/unicast/open_timeout"] = settings["transport/unicast/accept_timeout"] = round(OPEN_S * 1000)
     if rights is not None:
         settings["access_control"] = access.rules(rights, lab.register(folder))
         settings["low_pass_filter"] = access.sizes(rights)
@@ -232,7 +234,8 @@ def open_session(
     deadline = time.monotonic() + (min(wait_s, FREED_S) if ends.listen else wait_s)
     while True:
         try:
-            session = zenoh.open(settings)
+            with prompt_threads():
+                session = zenoh.open(settings)
         except zenoh.ZError as error:
             if time.monotonic() < deadline and not gone.wait(RETRY_S):
                 continue

@@ -32,6 +32,7 @@ WORLD: Final = "world"  # the address of robots that the twin service carries
 REPEAT_S: Final = 0.1  # an order is said again this often: the publisher drops what does not fit
 HALT_S: Final = 3.0  # a robot on wheels that was told to land is told so this long
 LANDING_S: Final = 10.0  # a robot that was told to land this long ago, and cannot be seen, is taken for down
+LAIN_S: Final = 1.0  # one that is seen on the ground for so long, though it was steered, has come down by itself
 AWAY_M: Final = 0.05  # higher above the place of take-off than this it is in the air, lower it is down
 SETTLED: Final = 0.1  # [m/s] slower than this it is down
 REACH: Final = (1e3, 1e3, 1e3)  # [m] any room
@@ -82,6 +83,7 @@ class ExternalBody:
         self._flying = np.zeros(rows, dtype=bool)
         self._landing = np.full(rows, np.inf)  # since when
         self._ground = np.zeros(rows)
+        self._lain = np.full(rows, np.inf)  # since when it is seen on the ground although it should fly
         self._stopped = np.zeros(rows, dtype=bool)
         # so that numbers grow over restarts: a simulator that outlives this process knows new orders from old
         self._sent = [round(1e3 * self._utc)] * rows
@@ -241,15 +243,19 @@ class ExternalBody:
         return np.where(stands[:, None], 0.0, self._seen.velocity)
 
     def _settle(self) -> None:
-        """Ends the landings that have come to their end."""
-        landing = self._flying & np.isfinite(self._landing)
-        if not some(landing):
+        """Ends the landings that have come to their end, and finds those that nobody here ordered."""
+        if not some(self._flying):
             return
         now = self._now()
+        landing = np.isfinite(self._landing)
         high = self._seen.position[:, 2] - self._ground > AWAY_M
         slow = np.abs(self._seen.velocity[:, 2]) < SETTLED
         aged = now - self._seen.time > STALE_S
-        down = landing & np.where(aged, now - self._landing > LANDING_S, ~high & slow)
+        seen = ~aged & ~high & slow
+        climbing = np.isin(np.arange(len(self._names)), list(self._standing))
+        self._lain = np.where(seen & self._flying & ~climbing, np.minimum(self._lain, now), np.inf)
+        alone = ~landing & (now - self._lain > LAIN_S)
+        down = self._flying & ((landing & np.where(aged, now - self._landing > LANDING_S, seen)) | alone)
         self._flying &= ~down
         with self._lock:
             for row in np.flatnonzero(down).tolist():

@@ -273,9 +273,9 @@ class Flight:
             self._judge(eyes, now)
             if self._now is not None:
                 self._heal(self._now, injector, eyes, t, now)
-            elif self._through(t, duration):
-                return
-            elif t >= self._left[0].at_s and not self._begin(injector, eyes, keys, t, now):
+            elif self._through(t, duration) or (
+                t >= self._left[0].at_s and not self._begin(injector, eyes, keys, t, now)
+            ):
                 return
             if t > duration + END_S:
                 self._wrong.append(f"it does not end {END_S:g} s after its time")

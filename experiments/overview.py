@@ -14,6 +14,7 @@ import zenoh
 from agents import lab, topology, wire
 from agents import session as network
 from agents.keys import Keys
+from agents.leaving import held
 from experiments import hosts as machines
 from experiments import mesh, orders
 from experiments.experiment import Experiment
@@ -57,15 +58,15 @@ class Overview:
         """
         self.robots, self._progress = progress.robots, progress
         self._keys = keys = Keys(experiment.network.realm)
-        self._session = stack.enter_context(
-            network.open_session(
-                endpoints,
-                name="conductor",
-                wait_s=ROUTER_S,
-                identity="operator",
-                rights=mesh.rights(experiment, endpoints),
-            )
+        opened = network.open_session(
+            endpoints,
+            name="conductor",
+            wait_s=ROUTER_S,
+            identity="operator",
+            rights=mesh.rights(experiment, endpoints),
         )
+        self._session, declared = stack.enter_context(held(opened))
+        declared.append(self)
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
         if list(endpoints) != [network.DEFAULT_ENDPOINT]:
             options = lab.options(endpoints[0]) if len(endpoints) == 1 else f"--connect @{folder / mesh.ENDPOINTS}"

@@ -12,6 +12,7 @@ import zenoh
 from agents import session as network
 from agents import topology, wire
 from agents.keys import Keys
+from agents.leaving import held
 
 ANSWER_S: Final = 2.0
 AGAIN_S: Final = 0.05
@@ -30,7 +31,8 @@ def command(*, connect: Sequence[str], realm: str, reason: str, who: str) -> int
     keys = Keys(realm)
     endpoints = list(connect) or [network.DEFAULT_ENDPOINT]
     # who does not answer must not keep it from those who do
-    with network.open_session(endpoints, name="estop", wait_s=2.0, identity=who, gather_s=0.0) as session:
+    opened = network.open_session(endpoints, name="estop", wait_s=2.0, identity=who, gather_s=0.0)
+    with held(opened) as (session, declared):
         stop = wire.encode(wire.Stop(who, reason))
         urgent = session.declare_publisher(
             keys.estop,
@@ -42,6 +44,7 @@ def command(*, connect: Sequence[str], realm: str, reason: str, who: str) -> int
         urgent.put(stop)
         begun = time.monotonic()
         statuses = network.pose_subscriber(session, keys.status("*"), 4096)
+        declared += [urgent, statuses]
         there = {
             keys.robot(str(reply.ok.key_expr))
             for reply in session.liveliness().get(keys.alive("*"), timeout=ANSWER_S)

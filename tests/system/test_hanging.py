@@ -1,0 +1,155 @@
+"""Robots whose loop hangs, or whose whole process is frozen, come down, and do not act on what they knew before."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from agents import session as network
+from agents import wire
+from agents.watchdog import HUNG
+from tests.conftest import RouterProcess
+from tests.system.lab import ENVIRONMENT, PATIENCE_S, ROOT, RobotProcess, Watcher, WorldProcess
+
+pytestmark = pytest.mark.system
+
+HANGS = """
+import threading
+from pathlib import Path
+from agents.triggers import Trigger
+
+class Hangs(Trigger, frozen=True):
+    file: str = ""
+    def fires(self, view, memory):
+        if Path(self.file).exists():
+            threading.Event().wait()
+        return view.error > 1e9
+"""
+
+
+class Truth(Watcher):
+    """Where the world has its robots as well."""
+
+    def __init__(self, endpoint: str) -> None:
+        super().__init__(endpoint)
+        self._truths = network.subscriber(self.session, self.keys.truth("*"), 4096)
+        self.place: dict[str, wire.Position] = {}
+
+    def look(self) -> None:
+        super().look()
+        for sample in network.received(self._truths.handler):
+            truth = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
+            self.place[truth.robot] = truth
+
+    def height(self, robot: str) -> float:
+        return self.place[robot].position[2] if robot in self.place else 0.0
+
+
+@pytest.fixture
+def watcher(router: RouterProcess) -> Iterator[Truth]:
+    made = Truth(router.endpoint)
+    yield made
+    made.close()
+
+
+def lonely(folder: Path, trigger: str = "") -> Path:
+    """One Tello in a world."""
+    file = folder / "lonely.toml"
+    file.write_text(
+        f'title = "lonely"\nduration_s = 60.0\n{trigger}\n[arena]\nsize = [2.0, 2.0, 2.0]\n'
+        '[robots.TE01]\nkind = "tello"\nbody = "world"\nstart = [0.0, 0.0]\nhover = 0.6\n'
+    )
+    return file
+
+
+def fly(watcher: Truth) -> None:
+    watcher.until(lambda: watcher.phase("TE01") == "ready", "it is ready")
+    assert watcher.order("TE01", wire.Order("takeoff")).ok
+    watcher.until(lambda: watcher.phase("TE01") == "airborne", "it is up")
+
+
+def test_a_loop_that_hangs_is_landed_said_and_ended(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
+    (tmp_path / "hangs.py").write_text(HANGS)
+    about = tmp_path / "hangs-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: hangs\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[zenpark.triggers]\nhangs = hangs:Hangs\n")
+    flag = tmp_path / "now"
+    file = lonely(tmp_path, f'trigger = {{ kind = "hangs", file = "{flag}" }}')
+    environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    here = ["--connect", router.endpoint]
+    started = []
+    try:
+        for module, *more in (["experiments.world"], ["experiments.robot", "TE01"]):
+            command = [sys.executable, "-m", module, str(file), *more, *here]
+            started.append(
+                subprocess.Popen(
+                    command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+                )
+            )
+            if module == "experiments.world":
+                watcher.until(lambda: "TE01" in watcher.place, "the world goes")
+        robot = started[1]
+        fly(watcher)
+        flag.touch()
+        watcher.until(lambda: watcher.status["TE01"].reason.startswith("its control loop hangs"), "it is said")
+        assert watcher.phase("TE01") == "landing"
+        watcher.until(lambda: "TE01" not in watcher.alive, "nobody counts on it")
+        watcher.until(lambda: watcher.height("TE01") < 0.02, "it is down")
+        assert robot.poll() is None  # landed, not fallen
+        assert robot.wait(PATIENCE_S) == HUNG
+    finally:
+        for process in reversed(started):
+            process.kill()
+            process.wait(5)
+
+
+def test_what_was_frozen_in_the_air_is_landed_and_knows_it(
+    router: RouterProcess, watcher: Truth, tmp_path: Path
+) -> None:
+    world = WorldProcess(router.endpoint, lonely(tmp_path))
+    robot = RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01")
+    try:
+        fly(watcher)
+        high = watcher.height("TE01")
+        robot.process.send_signal(signal.SIGSTOP)
+        threading.Event().wait(1.5)
+        watcher.look()
+        assert abs(watcher.height("TE01") - high) < 0.1  # the world holds it first,
+        watcher.until(lambda: watcher.height("TE01") < 0.02, "the world lands it")
+        asked = watcher.session.get(watcher.keys.order("TE01"), payload=wire.encode(wire.Order("takeoff")), timeout=0.1)
+        assert not [reply for reply in asked if reply.ok is not None]
+        robot.process.send_signal(signal.SIGCONT)
+        watcher.until(lambda: watcher.status["TE01"].reason == "it came down by itself", "it knows")
+        assert watcher.height("TE01") < 0.02
+        watcher.until(lambda: watcher.phase("TE01") == "done", "it is done")
+    finally:
+        robot.process.send_signal(signal.SIGCONT)
+        robot.end()
+        world.end()
+
+
+def test_a_stop_behind_a_flood_of_nonsense_is_obeyed(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
+    world = WorldProcess(router.endpoint, lonely(tmp_path))
+    robot = RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01")
+    try:
+        fly(watcher)
+        for _ in range(2000):
+            watcher.session.put(watcher.keys.estop, b"nonsense", encoding=wire.JSON)
+        said = wire.encode(wire.Stop("a test", "now"))
+        block = zenoh.CongestionControl.BLOCK
+        watcher.session.put(watcher.keys.estop, said, encoding=wire.JSON, congestion_control=block)
+        watcher.until(lambda: watcher.phase("TE01") == "done", "its motors are off")
+        watcher.until(lambda: watcher.height("TE01") < 0.02, "it fell")
+        assert watcher.status["TE01"].reason == "emergency stop by a test: now"
+    finally:
+        robot.end()
+        world.end()

@@ -1,0 +1,94 @@
+"""Whoever ends does so in time: when the router does not answer, and when a robot is frozen and the launcher dies."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from agents import session as network
+from agents.keys import Keys
+from agents.leaving import leave
+from tests.conftest import RouterProcess
+from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher, gone, until
+
+pytestmark = pytest.mark.system
+
+CUT_OFF_S = 3.0  # until the loss of the router is noticed: before that good-byes are still taken
+
+
+def test_a_robot_leaves_a_router_that_does_not_answer(router: RouterProcess) -> None:
+    watcher = Watcher(router.endpoint)
+    robot = RobotProcess(router.endpoint, "triangle", "KH01")
+    try:
+        watcher.until(lambda: watcher.phase("KH01") == "idle", "it is there")
+        router.process.send_signal(signal.SIGSTOP)
+        threading.Event().wait(CUT_OFF_S)
+        began = time.monotonic()
+        assert robot.end() == 0
+        assert time.monotonic() - began < 5.0  # Zenoh alone takes 13 s
+    finally:
+        router.process.send_signal(signal.SIGCONT)
+        watcher.close()
+        if robot.process.returncode is None:
+            robot.kill()
+
+
+def test_a_session_is_left_in_time_and_a_live_one_at_once(router: RouterProcess) -> None:
+    sessions = [network.open_session([router.endpoint], name="test", lease_s=1.0) for _ in range(2)]
+    declared = [network.pose_subscriber(sessions[1], Keys().status("*"))]
+    assert leave(sessions[0])
+    router.process.send_signal(signal.SIGSTOP)
+    try:
+        threading.Event().wait(CUT_OFF_S)
+        began = time.monotonic()
+        in_time = leave(sessions[1], declared, limit_s=0.5)
+        assert time.monotonic() - began < 1.5
+        assert not in_time
+    finally:
+        router.process.send_signal(signal.SIGCONT)
+        for thread in threading.enumerate():
+            if thread is not threading.main_thread() and thread.name == "leaving the network":
+                thread.join(15.0)
+
+
+def test_an_estop_that_nobody_answers_ends(router: RouterProcess) -> None:
+    command = [sys.executable, "-m", "tools.guard", "estop", "--connect", router.endpoint]
+    router.process.send_signal(signal.SIGSTOP)
+    try:
+        done = subprocess.run(
+            command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=9, check=False
+        )
+    finally:
+        router.process.send_signal(signal.SIGCONT)
+    assert done.returncode in {1, 2}
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("bodies", ["twin", "world"])
+def test_a_frozen_robot_keeps_nobody_when_the_launcher_is_killed(tmp_path: Path, bodies: str) -> None:
+    flight = Flight(tmp_path / "run", "triangle", "--bodies", bodies, "--set", "duration_s=60")
+    flight.until_said("formation")
+    children = flight.children()
+    frozen = children.pop("KH01")
+    frozen.suspend()
+    try:
+        threading.Event().wait(0.5)
+        flight.process.kill()
+        until(lambda: gone([children["CF01"], children["KH02"]]), "the robots have landed")
+        until(lambda: gone(list(children.values())), "everybody else is gone", 5.0)
+        frozen.resume()
+        until(lambda: gone([frozen]), "the frozen one too", 8.0)
+    finally:
+        flight.finish(5)
+        for process in (frozen, *children.values()):
+            try:
+                process.kill()
+            except psutil.NoSuchProcess:
+                continue
