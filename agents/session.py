@@ -33,6 +33,7 @@ from zenoh.ext import (
 from zenoh.handlers import Callback, Handler, RingChannel
 
 from agents import access, lab, topology
+from agents.endpoint import UNIX, refusal
 from agents.topology import Mode
 
 T_co = TypeVar("T_co", covariant=True)
@@ -167,12 +168,14 @@ def _check_form(endpoint: str) -> None:
     protocol, slash, address = endpoint.partition("/")
     if not (protocol and slash and address and endpoint.isprintable()):
         raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
+    if why := refusal(endpoint):
+        raise EndpointError(why)
 
 
 def _check_loopback(endpoint: str) -> None:
     """Refuses to listen where others could connect: without a lab there is no authentication."""
     protocol, _, address = endpoint.partition("/")
-    if protocol == "unixsock-stream":
+    if protocol == UNIX:
         return
     host = address.partition("#")[0].partition("?")[0].rpartition(":")[0].strip("[]")
     try:

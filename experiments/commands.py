@@ -36,6 +36,7 @@ def run(
     report: bool,
     open_report: bool,
     lab: str | None = None,
+    identity: str = "operator",
 ) -> int:
     """`zenpark run`; returns the exit code: 0, 2 if the check finds errors, or 130 after Ctrl-C."""
     changes = [*settings, *([] if seed is None else [f"seed={seed}"])]
@@ -72,6 +73,7 @@ def run(
                         bodies=bodies,
                         local=here,
                         lab=lab,
+                        identity=identity,
                     )
                 ]
             except KeyboardInterrupt:

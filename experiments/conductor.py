@@ -119,6 +119,7 @@ class Conductor:
         folder: Path,
         endpoints: Sequence[str],
         rights: Path | None = None,
+        identity: str = "operator",
         launcher: Launcher,
         hosts: Hosts,
         show: Show,
@@ -134,13 +135,14 @@ class Conductor:
             folder: Where the recording goes.
             endpoints: Routers.
             rights: Who may do what, for a router that is started again, in a lab.
+            identity: Whose certificate it shows, in a lab.
             launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
             hosts: Other machines, on which robots may be started.
             show: Called with the progress, about ten times a second.
             interrupted: Asked whether the user wants to end it.
         """
         self._experiment, self._case = experiment, case
-        self._file = file
+        self._file, self._identity = file, identity
         self._recording = folder / f"{case}.mcap"
         self._endpoints = list(endpoints)
         self._hosts, self._show, self._interrupted = hosts, show, interrupted
@@ -325,7 +327,7 @@ class Conductor:
                 self._endpoints,
                 name="conductor",
                 wait_s=ROUTER_S,
-                identity="operator",
+                identity=self._identity,
                 rights=mesh.rights(self._experiment, self._endpoints),
             )
         )

@@ -177,6 +177,7 @@ def fly(
     bodies: str | None = None,
     local: bool = False,
     lab: str | None = None,
+    identity: str = "operator",
 ) -> Run:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
@@ -190,6 +191,7 @@ def fly(
             "protocol" for its real bridge and a protocol twin.
         local: Whether all robots run on this machine, whatever the file says of hosts.
         lab: Folder of certificates, instead of the file's.
+        identity: Whose certificate the conductor shows, in a lab: an operator's.
 
     Raises:
         LabError: If a certificate is missing.
@@ -217,7 +219,7 @@ def fly(
     endpoints = list(map(from_here, listening)) if own_router else listening
     if meshed:
         endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)
-    rights = _rights(embodied, endpoints, folder)
+    rights = _rights(embodied, endpoints, folder, identity)
     (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
     with Launcher(folder / "logs") as launcher:
         for router in divided(listening, network.routers) if own_router else ():
@@ -239,6 +241,7 @@ def fly(
                     folder=folder,
                     endpoints=endpoints,
                     rights=rights,
+                    identity=identity,
                     launcher=launcher,
                     hosts=hosts,
                     show=show,
@@ -250,7 +253,7 @@ def fly(
     return _read_back(folder, begun, notes)
 
 
-def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: Path) -> Path | None:
+def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: Path, operator: str) -> Path | None:
     """Who may do what, as a file for the router; None without a lab.
 
     Raises:
@@ -259,7 +262,7 @@ def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: P
     of = lab_of(endpoints)
     if of is None:
         return None
-    require(of, list(dict.fromkeys(name for case in cases.values() for name in access.needed(case))))
+    require(of, list(dict.fromkeys(name for case in cases.values() for name in access.needed(case, operator))))
     made = access.rights(cases.values())
     rules(made, register(of))  # what is wrong with it is said now, and not by a router that does not start
     file = folder / "rights.json"

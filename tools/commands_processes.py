@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.options import Case, Connect, File, Lab, Lifeline
+from tools.options import As, Case, Connect, File, Lab, Lifeline, routers
 
 app: Final = typer.Typer()
 
@@ -124,11 +124,14 @@ def twin(
     connect: Connect = None,
     faults: Annotated[str, typer.Option(metavar="JSON", help="What goes wrong, such as '{\"loss\": 0.05}'.")] = "{}",
     device: Annotated[str, typer.Option(metavar="JSON", help="Settings of the device.")] = "{}",
+    lab: Lab = None,
+    identity: As = "twin",
 ) -> None:
     """Stand in for hardware: protocol twins, to which vendor libraries connect."""
     from experiments.device import command  # noqa: PLC0415
 
-    raise typer.Exit(command(kind, count, faults=faults, device=device, connect=connect or []))
+    endpoints = routers(connect, lab)
+    raise typer.Exit(command(kind, count, faults=faults, device=device, connect=endpoints, identity=identity))
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
