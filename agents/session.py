@@ -158,7 +158,13 @@ def _of_lab(
     settings = lab.settings(folder, identity, listens=listens)
     settings["transport/unicast/open_timeout"] = settings["transport/unicast/accept_timeout"] = round(OPEN_S * 1000)
     if rights is not None:
-        settings["access_control"] = access.rules(rights, lab.register(folder))
+        known = lab.register(folder)
+        if identity in known.identities and not known.identities[identity].hosts:
+            raise lab.LabError(
+                f"{identity} has a certificate with which one cannot listen, as in a mesh all do: `zenpark keys init` "
+                f"with the file of the mesh gives such, or `zenpark keys issue {folder} NAME --host ADDRESS`"
+            )
+        settings["access_control"] = access.rules(rights, known)
         settings["low_pass_filter"] = access.sizes(rights)
         settings["transport/link/rx/max_message_size"] = MOST_BYTES
     return settings, folder

@@ -84,7 +84,7 @@ def run(
         return 130
     again = _command(
         file, virtual=virtual, changes=changes, cases=cases, seeds=seeds, bodies=bodies,
-        here=here, anyway=anyway, lab=lab,
+        here=here, anyway=anyway, lab=lab, identity=identity,
     )  # fmt: skip
     page = _keep(runs, folder, again) if report else None
     summary: dict[str, Any] = runs[0].summary()
@@ -180,6 +180,7 @@ def _command(
     here: bool,
     anyway: bool,
     lab: str | None,
+    identity: str,
 ) -> str:
     parts = ["zenpark", "run", file, *(["--virtual"] if virtual else [])]
     parts += [part for case in cases for part in ("--case", case)]
@@ -188,6 +189,7 @@ def _command(
     parts += ["--bodies", bodies] if bodies is not None else []
     parts += ["--here"] if here else []
     parts += ["--lab", lab] if lab is not None else []
+    parts += ["--as", identity] if identity != "operator" else []
     return " ".join([*parts, *(["--anyway"] if anyway else [])])
 
 

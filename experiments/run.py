@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from agents.access import rules
+from agents.lab import LabError, register, require, secured
 from agents.lab import of as lab_of
-from agents.lab import register, require, secured
 from agents.session import free_endpoints
 from agents.topology import from_here
 from experiments import access, document, mesh, metrics, playback, reach, results, virtual
@@ -263,6 +263,9 @@ def _rights(cases: Mapping[str, Experiment], endpoints: Sequence[str], folder: P
     if of is None:
         return None
     require(of, list(dict.fromkeys(name for case in cases.values() for name in access.needed(case, operator))))
+    role = register(of).identities[operator].role
+    if role != "operator":
+        raise LabError(f"{operator} is {role} in the lab, and gives no orders: choose an operator with --as")
     made = access.rights(cases.values())
     rules(made, register(of))  # what is wrong with it is said now, and not by a router that does not start
     file = folder / "rights.json"

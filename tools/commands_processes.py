@@ -120,6 +120,7 @@ def world(
 @app.command()
 def twin(
     kind: Annotated[str, typer.Argument(metavar="KIND", help="crazyflie, tello, khepera4 or turtlebot3.")],
+    *,
     count: Annotated[int, typer.Option(min=1, max=99, help="How many.")] = 1,
     connect: Connect = None,
     faults: Annotated[str, typer.Option(metavar="JSON", help="What goes wrong, such as '{\"loss\": 0.05}'.")] = "{}",
