@@ -211,7 +211,8 @@ def fly(
     own_router = network.connect is None and not meshed
     of_lab = reach.folder(read.experiment, read.path, lab)
     secure = of_lab is not None
-    if secure and read.experiment.hosts and not local:
+    started = any(host.address is not None for host in read.experiment.hosts.values())
+    if secure and started and not local:
         hint = "leave the lab out (what goes to hosts goes through ssh), or add --here"
         raise DocumentError([Problem(read.path.name, 0, 0, "hosts have no certificates of a lab", hint)])
     own = network.listen or free_endpoints(network.routers, protocol="tls" if secure else "tcp")
