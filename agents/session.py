@@ -82,7 +82,36 @@ def config(
     identity: str | None = None,
     rights: access.Rights | None = None,
 ) -> zenoh.Config:
-    """The configuration of every session: no multicast, no gossip, no shared memory, listening on loopback only.
+    """The configuration of a session, of what `settings` says.
+
+    Raises:
+        EndpointError: As `settings`, and if Zenoh understands an endpoint in another way or not at all.
+    """
+    chosen = settings(
+        mode, connect=connect, listen=listen, name=name, lease_s=lease_s, identity=identity, rights=rights
+    )
+    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
+    made = zenoh.Config()
+    for key, value in chosen.items():
+        try:
+            made.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            there = ", ".join(topology.bare((*connect, *listen)))
+            raise EndpointError(f"{there}: {reason(error)}; write endpoints like {DEFAULT_ENDPOINT}") from None
+    return made
+
+
+def settings(
+    mode: Mode,
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    name: str | None = None,
+    lease_s: float = LEASE_S,
+    identity: str | None = None,
+    rights: access.Rights | None = None,
+) -> dict[str, object]:
+    """What every session sets of Zenoh: no multicast, no gossip, no shared memory, listening on loopback only.
 
     With a lab (`agents.lab`) both ends show certificates, and listening beyond loopback is allowed.
 
@@ -112,8 +141,7 @@ def config(
             _check_loopback(endpoint)
     elif listen and rights is None:
         raise EndpointError(f"who listens in the lab {folder} must know who may do what: name the experiment")
-    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
-    settings: dict[str, object] = {
+    made: dict[str, object] = {
         "mode": mode,
         "connect/endpoints": list(connect),
         # A client's open that waits inside Zenoh does not hear Ctrl-C: fail at once and try again in Python. Others
@@ -131,17 +159,8 @@ def config(
         "adminspace/enabled": True,  # read-only; how `zenpark keys` learns who is there
     }
     if name is not None:
-        settings["metadata"] = {"name": name}
-    settings |= of_lab
-    made = zenoh.Config()
-    for key, value in settings.items():
-        try:
-            made.insert_json5(key, json.dumps(value))
-        except zenoh.ZError as error:
-            raise EndpointError(
-                f"{', '.join((*connect, *listen))}: {reason(error)}; write endpoints like {DEFAULT_ENDPOINT}"
-            ) from None
-    return made
+        made["metadata"] = {"name": name}
+    return made | of_lab
 
 
 def _of_lab(

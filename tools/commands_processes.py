@@ -77,11 +77,24 @@ def router(
     bodies: Annotated[
         str | None, typer.Option(metavar="twin|world|protocol", help="As behind `zenpark run`, for the rights.")
     ] = None,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print the configuration for a zenohd that is to do the same.")
+    ] = False,
 ) -> None:
     """Run the Zenoh router that the robots meet at."""
     from tools.router import command  # noqa: PLC0415
 
-    raise typer.Exit(command(file, listen=listen or [], link=connect or [], lifeline=lifeline, lab=lab, bodies=bodies))
+    raise typer.Exit(
+        command(
+            file,
+            listen=listen or [],
+            link=connect or [],
+            lifeline=lifeline,
+            lab=lab,
+            bodies=bodies,
+            print_config=print_config,
+        )
+    )
 
 
 @app.command()
