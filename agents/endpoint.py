@@ -4,9 +4,25 @@ from __future__ import annotations
 
 import ipaddress
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Final, Self
 
-UNIX = "unixsock-stream"
+UNIX: Final = "unixsock-stream"
+PROTOCOLS: Final = ("tcp", "tls", "quic", UNIX)
+_WHY_NOT: Final = {
+    "udp": "what it loses nobody says again, and who was killed is noticed late",
+    "ws": "it shows no certificates",
+    "wss": "its certificates are not checked by name",
+    "serial": "two ends of a wire are no network",
+}
+
+
+def refusal(endpoint: str) -> str:
+    """Why the protocol of an endpoint is not used, and what is; empty if it is."""
+    protocol = endpoint.partition("/")[0]
+    if protocol in PROTOCOLS:
+        return ""
+    why = _WHY_NOT.get(protocol, "there is no such protocol here")
+    return f"'{endpoint}' cannot be used: {why}; write it like tcp/127.0.0.1:7447, or with tls, quic or {UNIX}/PATH"
 
 
 @dataclass(frozen=True)
@@ -33,6 +49,8 @@ class Endpoint:
             ValueError: If it is none; says how one is written.
         """
         protocol, _, whole = text.partition("/")
+        if protocol and whole and (why := refusal(text)):
+            raise ValueError(why)
         end = min((at for mark in "?#" if (at := whole.find(mark)) >= 0), default=len(whole))
         address, rest = whole[:end], whole[end:]
         if protocol == UNIX and address:

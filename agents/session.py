@@ -33,6 +33,7 @@ from zenoh.ext import (
 from zenoh.handlers import Callback, Handler, RingChannel
 
 from agents import access, lab, topology
+from agents.endpoint import UNIX, refusal
 from agents.promptness import prompt_threads
 from agents.topology import Mode
 
@@ -83,7 +84,36 @@ def config(
     identity: str | None = None,
     rights: access.Rights | None = None,
 ) -> zenoh.Config:
-    """The configuration of every session: no multicast, no gossip, no shared memory, listening on loopback only.
+    """The configuration of a session, of what `settings` says.
+
+    Raises:
+        EndpointError: As `settings`, and if Zenoh understands an endpoint in another way or not at all.
+    """
+    chosen = settings(
+        mode, connect=connect, listen=listen, name=name, lease_s=lease_s, identity=identity, rights=rights
+    )
+    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
+    made = zenoh.Config()
+    for key, value in chosen.items():
+        try:
+            made.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            there = ", ".join(topology.bare((*connect, *listen)))
+            raise EndpointError(f"{there}: {reason(error)}; write endpoints like {DEFAULT_ENDPOINT}") from None
+    return made
+
+
+def settings(
+    mode: Mode,
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    name: str | None = None,
+    lease_s: float = LEASE_S,
+    identity: str | None = None,
+    rights: access.Rights | None = None,
+) -> dict[str, object]:
+    """What every session sets of Zenoh: no multicast, no gossip, no shared memory, listening on loopback only.
 
     With a lab (`agents.lab`) both ends show certificates, and listening beyond loopback is allowed.
 
@@ -113,8 +143,7 @@ def config(
             _check_loopback(endpoint)
     elif listen and rights is None:
         raise EndpointError(f"who listens in the lab {folder} must know who may do what: name the experiment")
-    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
-    settings: dict[str, object] = {
+    made: dict[str, object] = {
         "mode": mode,
         "connect/endpoints": list(connect),
         # A client's open that waits inside Zenoh does not hear Ctrl-C: fail at once and try again in Python. Others
@@ -134,17 +163,8 @@ def config(
         "adminspace/enabled": True,  # read-only; how `zenpark keys` learns who is there
     }
     if name is not None:
-        settings["metadata"] = {"name": name}
-    settings |= of_lab
-    made = zenoh.Config()
-    for key, value in settings.items():
-        try:
-            made.insert_json5(key, json.dumps(value))
-        except zenoh.ZError as error:
-            raise EndpointError(
-                f"{', '.join((*connect, *listen))}: {reason(error)}; write endpoints like {DEFAULT_ENDPOINT}"
-            ) from None
-    return made
+        made["metadata"] = {"name": name}
+    return made | of_lab
 
 
 def _of_lab(
@@ -160,7 +180,13 @@ def _of_lab(
         return {}, None
     settings = lab.settings(folder, identity, listens=listens)
     if rights is not None:
-        settings["access_control"] = access.rules(rights, lab.register(folder))
+        known = lab.register(folder)
+        if identity in known.identities and not known.identities[identity].hosts:
+            raise lab.LabError(
+                f"{identity} has a certificate with which one cannot listen, as in a mesh all do: `zenpark keys init` "
+                f"with the file of the mesh gives such, or `zenpark keys issue {folder} NAME --host ADDRESS`"
+            )
+        settings["access_control"] = access.rules(rights, known)
         settings["low_pass_filter"] = access.sizes(rights)
         settings["transport/link/rx/max_message_size"] = MOST_BYTES
     return settings, folder
@@ -170,12 +196,14 @@ def _check_form(endpoint: str) -> None:
     protocol, slash, address = endpoint.partition("/")
     if not (protocol and slash and address and endpoint.isprintable()):
         raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
+    if why := refusal(endpoint):
+        raise EndpointError(why)
 
 
 def _check_loopback(endpoint: str) -> None:
     """Refuses to listen where others could connect: without a lab there is no authentication."""
     protocol, _, address = endpoint.partition("/")
-    if protocol == "unixsock-stream":
+    if protocol == UNIX:
         return
     host = address.partition("#")[0].partition("?")[0].rpartition(":")[0].strip("[]")
     try:

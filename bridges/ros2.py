@@ -23,7 +23,7 @@ from agents import session as network
 from agents.body import BodyError
 from agents.keys import Keys
 from agents.lifeline import Lifeline
-from agents.process import add_network, told_to_end
+from agents.process import add_network, reached, told_to_end
 from agents.protocols import ros2
 from agents.protocols.ros2 import Distro, Message, Types
 from agents.rosnode import Participant, Publisher, Subscriber
@@ -228,6 +228,7 @@ def serve(
     domain: int = 0,
     distro: Distro = "jazzy",
     stop: threading.Event,
+    identity: str = "ros2",
 ) -> None:
     """Runs the bridge until `stop` is set; prints a line when it is ready and whenever a robot comes or goes.
 
@@ -238,6 +239,7 @@ def serve(
         domain: ROS_DOMAIN_ID.
         distro: ROS 2 distribution, for type hashes.
         stop: Ends it.
+        identity: Whose certificate is shown, in a lab.
 
     Raises:
         BodyError: If the extra `ros` is not installed.
@@ -245,7 +247,9 @@ def serve(
     """
     types = ros2.types(distro)
     with ExitStack() as stack:
-        session = outside = stack.enter_context(network.open_session(endpoints, name="ros2", stop=stop))
+        session = outside = stack.enter_context(
+            network.open_session(endpoints, name="ros2", stop=stop, identity=identity)
+        )
         if ros_endpoints:
             outside = stack.enter_context(network.open_session(ros_endpoints, name="ros2", stop=stop))
         graph = Graph(session, Participant(outside, types, style="rmw", domain=domain), Keys(realm))
@@ -261,7 +265,7 @@ def serve(
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
     parser = argparse.ArgumentParser(prog="zenpark bridge ros2", description="The robots as ROS 2 topics.")
-    add_network(parser)
+    add_network(parser, "ros2")
     parser.add_argument("--ros", action="append", default=[], metavar="ENDPOINT", help="router of ROS 2, if another")
     parser.add_argument("--domain", type=int, default=0, choices=range(ros2.MAX_DOMAIN + 1), metavar="0..232")
     parser.add_argument("--distro", default="jazzy", choices=get_args(Distro))
@@ -272,12 +276,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with told_to_end(stop.set):
             serve(
-                chosen.connect or [network.DEFAULT_ENDPOINT],
+                reached(chosen),
                 ros_endpoints=chosen.ros,
                 realm=chosen.realm,
                 domain=chosen.domain,
                 distro=chosen.distro,
                 stop=stop,
+                identity=chosen.identity,
             )
     except (BodyError, network.EndpointError, network.Unreachable) as error:
         print(f"zenpark: {error}", file=sys.stderr)

@@ -23,7 +23,7 @@ from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
 from agents.positioning import External
-from agents.process import add_network, told_to_end
+from agents.process import add_network, reached, told_to_end
 from agents.protocols import datastream
 from agents.protocols.datastream import Malformed, Segment
 from bridges.datastream import Frame, Reader
@@ -189,6 +189,7 @@ def bridge(
     *,
     realm: str = "park",
     lifeline: bool = False,
+    identity: str = "positioning",
 ) -> int:
     """Bridges until SIGINT, SIGTERM or the loss of its lifeline (and of the robots); returns the exit code.
 
@@ -198,6 +199,7 @@ def bridge(
         endpoints: Routers.
         realm: First chunk of the keys.
         lifeline: Whether standard input is a lifeline.
+        identity: Whose certificate is shown, in a lab.
 
     Raises:
         network.Unreachable: If no router answers.
@@ -213,7 +215,7 @@ def bridge(
         Lifeline(lost).start()
     with (
         told_to_end(stop.set),
-        network.open_session(endpoints, name="vicon", stop=stop, identity="positioning") as session,
+        network.open_session(endpoints, name="vicon", stop=stop, identity=identity) as session,
     ):
         keys, robots = Keys(realm), list(subjects)
         farewell = Farewell(session, keys, robots, lost)
@@ -264,11 +266,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--map", action="append", required=True, metavar="ROBOT[=SUBJECT]", help="a robot, and what the Vicon calls it"
     )
-    add_network(parser)
+    add_network(parser, "positioning")
     chosen = parser.parse_args(arguments)
-    endpoints = chosen.connect or [network.DEFAULT_ENDPOINT]
     try:
-        return bridge(chosen.server, pairs(chosen.map), endpoints, realm=chosen.realm, lifeline=chosen.lifeline)
+        return bridge(
+            chosen.server,
+            pairs(chosen.map),
+            reached(chosen),
+            realm=chosen.realm,
+            lifeline=chosen.lifeline,
+            identity=chosen.identity,
+        )
     except (ValueError, network.Unreachable) as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2

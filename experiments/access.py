@@ -34,11 +34,11 @@ def rights(cases: Iterable[Experiment]) -> Rights:
     return reduce(Rights.joined, map(_rights, cases))
 
 
-def needed(experiment: Experiment) -> list[str]:
+def needed(experiment: Experiment, operator: str = "operator") -> list[str]:
     """The identities whose certificates a run of this experiment needs on the machine that starts it."""
     robots = experiment.robots.values()
     abroad = {robot for host in experiment.hosts.values() for robot in host.robots}
-    found = ["router", "operator", "recorder", *(name for name in experiment.robots if name not in abroad)]
+    found = ["router", operator, "recorder", *(name for name in experiment.robots if name not in abroad)]
     if any(assign.WORLD in (robot.body, robot.ranges) for robot in robots):
         found.append("world")
     if any(robot.body in plugins.names(plugins.DEVICES) for robot in robots) or experiment.positioning == VICON_TWIN:

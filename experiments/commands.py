@@ -36,6 +36,7 @@ def run(
     report: bool,
     open_report: bool,
     lab: str | None = None,
+    identity: str = "operator",
 ) -> int:
     """`zenpark run`; returns the exit code: 0, 2 if the check finds errors, or 130 after Ctrl-C."""
     changes = [*settings, *([] if seed is None else [f"seed={seed}"])]
@@ -72,6 +73,7 @@ def run(
                         bodies=bodies,
                         local=here,
                         lab=lab,
+                        identity=identity,
                     )
                 ]
             except KeyboardInterrupt:
@@ -82,7 +84,7 @@ def run(
         return 130
     again = _command(
         file, virtual=virtual, changes=changes, cases=cases, seeds=seeds, bodies=bodies,
-        here=here, anyway=anyway, lab=lab,
+        here=here, anyway=anyway, lab=lab, identity=identity,
     )  # fmt: skip
     page = _keep(runs, folder, again) if report else None
     summary: dict[str, Any] = runs[0].summary()
@@ -178,6 +180,7 @@ def _command(
     here: bool,
     anyway: bool,
     lab: str | None,
+    identity: str,
 ) -> str:
     parts = ["zenpark", "run", file, *(["--virtual"] if virtual else [])]
     parts += [part for case in cases for part in ("--case", case)]
@@ -186,6 +189,7 @@ def _command(
     parts += ["--bodies", bodies] if bodies is not None else []
     parts += ["--here"] if here else []
     parts += ["--lab", lab] if lab is not None else []
+    parts += ["--as", identity] if identity != "operator" else []
     return " ".join([*parts, *(["--anyway"] if anyway else [])])
 
 

@@ -64,6 +64,7 @@ class Conductor:
         folder: Path,
         endpoints: Sequence[str],
         rights: Path | None = None,
+        identity: str = "operator",
         launcher: Launcher,
         hosts: Hosts,
         show: Show,
@@ -79,13 +80,14 @@ class Conductor:
             folder: Where the recording goes.
             endpoints: Routers.
             rights: Who may do what, for a router that is started again, in a lab.
+            identity: Whose certificate it shows, in a lab.
             launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
             hosts: Other machines, on which robots may be started.
             show: Called with the progress, about ten times a second.
             interrupted: Asked whether the user wants to end it.
         """
         self._experiment, self._case = experiment, case
-        self._file = file
+        self._file, self._identity = file, identity
         self._recording = folder / f"{case}.mcap"
         self._endpoints = list(endpoints)
         self._hosts, self._show, self._interrupted = hosts, show, interrupted
@@ -287,7 +289,9 @@ class Conductor:
     # ------------------------------------------------------------------ what happens meanwhile
 
     def _join(self, stack: ExitStack) -> None:
-        self._view = Overview(stack, self._experiment, self._endpoints, self._progress, self._recording.parent)
+        self._view = Overview(
+            stack, self._experiment, self._endpoints, self._progress, self._recording.parent, identity=self._identity
+        )
         self._changes = HotChanges(self._experiment, self._crew, self._view, self._keys)
 
     def _look(self) -> None:

@@ -121,7 +121,15 @@ def stand_in(file: str, names: Sequence[str], *, faults: Faults, connect: Sequen
     return _serve(word, request, keys=keys, rate_hz=rate, connect=endpoints, lifeline=lifeline)
 
 
-def by_hand(kind: str, count: int, *, faults: Faults, device: dict[str, object], connect: Sequence[str]) -> int:
+def by_hand(
+    kind: str,
+    count: int,
+    *,
+    faults: Faults,
+    device: dict[str, object],
+    connect: Sequence[str],
+    identity: str = "twin",
+) -> int:
     """Runs `count` protocol twins of a kind of robot, in a row on the floor, without an experiment.
 
     Args:
@@ -130,6 +138,7 @@ def by_hand(kind: str, count: int, *, faults: Faults, device: dict[str, object],
         faults: What goes wrong on purpose.
         device: Settings of the device.
         connect: Routers at which the truth is told, and at which twins that live on Zenoh are reached; may be none.
+        identity: Whose certificate is shown, in a lab.
 
     Raises:
         DocumentError: If there is no such protocol twin.
@@ -148,11 +157,18 @@ def by_hand(kind: str, count: int, *, faults: Faults, device: dict[str, object],
     endpoints = list(connect) or [network.DEFAULT_ENDPOINT]
     request = DeviceRequest(assign.request(experiment, list(robots), [experiment.seed], endpoints), faults)
     keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
-    return _serve(word, request, keys=keys, rate_hz=rate, connect=connect, lifeline=False)
+    return _serve(word, request, keys=keys, rate_hz=rate, connect=connect, lifeline=False, identity=identity)
 
 
 def _serve(
-    word: str, request: DeviceRequest, *, keys: Keys, rate_hz: float, connect: Sequence[str], lifeline: bool
+    word: str,
+    request: DeviceRequest,
+    *,
+    keys: Keys,
+    rate_hz: float,
+    connect: Sequence[str],
+    lifeline: bool,
+    identity: str = "twin",
 ) -> int:
     """Runs a device until it is told to end, or its lifeline is lost and the robots are gone."""
     names = request.body.names
@@ -162,7 +178,7 @@ def _serve(
     with told_to_end(over.set), ExitStack() as stack:
         session, declared = None, list[object]()
         if connect:
-            joined = held(network.open_session(connect, name=word, stop=over, identity="twin"))
+            joined = held(network.open_session(connect, name=word, stop=over, identity=identity))
             session, declared = stack.enter_context(joined)
         device: Device = plugins.load(plugins.DEVICES, word)(request)
         stack.callback(device.close)
@@ -174,10 +190,10 @@ def _serve(
     return 0
 
 
-def command(kind: str, count: int, *, faults: str, device: str, connect: Sequence[str]) -> int:
+def command(kind: str, count: int, *, faults: str, device: str, connect: Sequence[str], identity: str = "twin") -> int:
     """`zenpark twin`: as `by_hand`, with faults and settings as JSON."""
     settings = json_text.table("--device", device)
-    return by_hand(kind, count, faults=_faults(faults), device=settings, connect=connect)
+    return by_hand(kind, count, faults=_faults(faults), device=settings, connect=connect, identity=identity)
 
 
 def _faults(text: str) -> Faults:

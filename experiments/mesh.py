@@ -7,6 +7,7 @@ from typing import Final
 
 from agents import lab, topology
 from agents.access import Rights
+from agents.endpoint import Endpoint
 from agents.session import free_endpoint
 from experiments import access, assign
 from experiments.experiment import Experiment
@@ -45,6 +46,16 @@ def members(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
                 found[name] = chosen
                 taken.add(chosen)
     return [topology.owned(endpoint, name) for name, endpoint in found.items()]
+
+
+def listeners(experiment: Experiment) -> dict[str, list[str]]:
+    """At which names of machines the identities of a lab listen in a mesh; nobody where there are routers."""
+    if experiment.network.topology != "mesh":
+        return {}
+    here = ["localhost", "127.0.0.1", "::1"]
+    given = experiment.network.addresses
+    robots = {name: [Endpoint.parse(given[name]).host] if name in given else here for name in experiment.robots}
+    return {**dict.fromkeys(("recorder", "world", "centre", "twin", "operator"), here), **robots}
 
 
 def near(experiment: Experiment, names: Sequence[str], endpoints: Sequence[str]) -> list[str]:

@@ -43,6 +43,8 @@ class Overview:
         endpoints: Sequence[str],
         progress: Progress,
         folder: Path,
+        *,
+        identity: str,
     ) -> None:
         """Joins the network.
 
@@ -52,6 +54,7 @@ class Overview:
             endpoints: Routers.
             progress: Takes in what is said, and has the robots.
             folder: Of the run, where the endpoints are written down.
+            identity: Whose certificate it shows, in a lab.
 
         Raises:
             Unreachable: If no router answers.
@@ -62,7 +65,7 @@ class Overview:
             endpoints,
             name="conductor",
             wait_s=ROUTER_S,
-            identity="operator",
+            identity=identity,
             rights=mesh.rights(experiment, endpoints),
         )
         self._session, declared = stack.enter_context(held(opened))

@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from agents.access import rules
+from agents.lab import LabError, register, require, secured
 from agents.lab import of as lab_of
-from agents.lab import register, require, secured
 from agents.session import free_endpoints
 from agents.topology import from_here
 from experiments import access, document, mesh, metrics, playback, reach, results, virtual
@@ -177,6 +177,7 @@ def fly(
     bodies: str | None = None,
     local: bool = False,
     lab: str | None = None,
+    identity: str = "operator",
 ) -> Run:
     """Runs an experiment in real time, see `conduct`, and reads back what was recorded.
 
@@ -184,7 +185,15 @@ def fly(
         RecordingError: If a recording cannot be read.
     """
     begun, notes = conduct(
-        read, folder, cases=cases, show=show, interrupted=interrupted, bodies=bodies, local=local, lab=lab
+        read,
+        folder,
+        cases=cases,
+        show=show,
+        interrupted=interrupted,
+        bodies=bodies,
+        local=local,
+        lab=lab,
+        identity=identity,
     )
     return _read_back(folder, begun, notes)
 
@@ -200,6 +209,7 @@ def conduct(
     local: bool = False,
     lab: str | None = None,
     launching: Callable[[Path], Launcher] = Launcher,
+    identity: str = "operator",
 ) -> tuple[dict[str, Path], list[str]]:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
@@ -214,6 +224,7 @@ def conduct(
         local: Whether all robots run on this machine, whatever the file says of hosts.
         lab: Folder of certificates, instead of the file's.
         launching: Makes the launcher of the processes, given the folder of their logs.
+        identity: Whose certificate the conductor shows, in a lab: an operator's.
 
     Returns:
         The recordings of the cases that have begun, and what the reader should know.
@@ -243,7 +254,7 @@ def conduct(
     endpoints = list(map(from_here, listening)) if own_router else listening
     if meshed:
         endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)
-    rights = enforced(embodied.values(), endpoints, folder)
+    rights = enforced(embodied.values(), endpoints, folder, identity)
     (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
     with launching(folder / "logs") as launcher:
         for router in divided(listening, network.routers) if own_router else ():
@@ -263,6 +274,7 @@ def conduct(
                     folder=folder,
                     endpoints=endpoints,
                     rights=rights,
+                    identity=identity,
                     launcher=launcher,
                     hosts=hosts,
                     show=show,
@@ -273,7 +285,9 @@ def conduct(
     return {case: result.recording for case, result in results.items() if result.start is not None}, notes
 
 
-def enforced(cases: Collection[Experiment], endpoints: Sequence[str], folder: Path) -> Path | None:
+def enforced(
+    cases: Collection[Experiment], endpoints: Sequence[str], folder: Path, operator: str = "operator"
+) -> Path | None:
     """Who may do what, as a file for the router; None without a lab.
 
     Robots on hosts have their certificates there, and need none here.
@@ -285,7 +299,10 @@ def enforced(cases: Collection[Experiment], endpoints: Sequence[str], folder: Pa
     if of is None:
         return None
     known = register(of)
-    require(of, list(dict.fromkeys(name for case in cases for name in access.needed(case))))
+    require(of, list(dict.fromkeys(name for case in cases for name in access.needed(case, operator))))
+    role = known.identities[operator].role
+    if role != "operator":
+        raise LabError(f"{operator} is {role} in the lab, and gives no orders: choose an operator with --as")
     made = access.rights(cases)
     rules(made, known)  # what is wrong with it is said now, and not by a router that does not start
     file = folder / "rights.json"

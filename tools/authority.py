@@ -47,6 +47,7 @@ def create(
     identities: Mapping[str, Role],
     *,
     hosts: Sequence[str] = (),
+    listening: Mapping[str, Sequence[str]] | None = None,
     days: float = DAYS,
     authority_days: float = AUTHORITY_DAYS,
 ) -> Register:
@@ -56,6 +57,7 @@ def create(
         folder: Must not hold a lab.
         identities: Role by name.
         hosts: Names and addresses at which the routers can be reached, beside this machine.
+        listening: The same for others who must listen themselves, by name: the members of a mesh.
         days: For which certificates are valid.
         authority_days: For which the authority is.
 
@@ -72,9 +74,14 @@ def create(
         folder.chmod(0o700)
     except OSError as error:
         raise LabError(f"{folder}: cannot be made: {error.strerror}") from None
+    for host in hosts:
+        _alternative(host)
     authority = _found(folder, authority_days)
-    return _issued(authority, Register({}), {name: Identity(role, name, "", "") for name, role in identities.items()},
-                   hosts=hosts, days=days)  # fmt: skip
+    wanted = {
+        name: Identity(role, name, "", "", [*(hosts if role == "router" else ()), *(listening or {}).get(name, ())])
+        for name, role in identities.items()
+    }
+    return _issued(authority, Register({}), wanted, days=days)
 
 
 def issue(folder: Path, identities: Mapping[str, Role], *, hosts: Sequence[str] = (), days: float = DAYS) -> Register:

@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.options import Case, Connect, File, Lab, Lifeline
+from tools.options import As, Case, Connect, File, Lab, Lifeline, routers
 
 app: Final = typer.Typer()
 
@@ -77,11 +77,24 @@ def router(
     bodies: Annotated[
         str | None, typer.Option(metavar="twin|world|protocol", help="As behind `zenpark run`, for the rights.")
     ] = None,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print the configuration for a zenohd that is to do the same.")
+    ] = False,
 ) -> None:
     """Run the Zenoh router that the robots meet at."""
     from tools.router import command  # noqa: PLC0415
 
-    raise typer.Exit(command(file, listen=listen or [], link=connect or [], lifeline=lifeline, lab=lab, bodies=bodies))
+    raise typer.Exit(
+        command(
+            file,
+            listen=listen or [],
+            link=connect or [],
+            lifeline=lifeline,
+            lab=lab,
+            bodies=bodies,
+            print_config=print_config,
+        )
+    )
 
 
 @app.command()
@@ -120,15 +133,19 @@ def world(
 @app.command()
 def twin(
     kind: Annotated[str, typer.Argument(metavar="KIND", help="crazyflie, tello, khepera4 or turtlebot3.")],
+    *,
     count: Annotated[int, typer.Option(min=1, max=99, help="How many.")] = 1,
     connect: Connect = None,
     faults: Annotated[str, typer.Option(metavar="JSON", help="What goes wrong, such as '{\"loss\": 0.05}'.")] = "{}",
     device: Annotated[str, typer.Option(metavar="JSON", help="Settings of the device.")] = "{}",
+    lab: Lab = None,
+    identity: As = "twin",
 ) -> None:
     """Stand in for hardware: protocol twins, to which vendor libraries connect."""
     from experiments.device import command  # noqa: PLC0415
 
-    raise typer.Exit(command(kind, count, faults=faults, device=device, connect=connect or []))
+    endpoints = routers(connect, lab)
+    raise typer.Exit(command(kind, count, faults=faults, device=device, connect=endpoints, identity=identity))
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})

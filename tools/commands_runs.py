@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.options import Anyway, AsJson, Case, Cases, File, Lab, OpenReport, Settings
+from tools.options import Anyway, As, AsJson, Case, Cases, File, Lab, OpenReport, Settings
 
 app: Final = typer.Typer()
 
@@ -36,6 +36,7 @@ def run(
     report: Annotated[bool, typer.Option(help="Writes the report.")] = True,
     open_report: OpenReport = False,
     lab: Lab = None,
+    identity: As = "operator",
 ) -> None:
     """Run an experiment: one process per robot, or in virtual time."""
     from experiments.commands import run as command  # noqa: PLC0415
@@ -56,6 +57,7 @@ def run(
             report=report,
             open_report=open_report,
             lab=lab,
+            identity=identity,
         )
     )
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from agents.lab import Register, Role
+    from experiments.experiment import Experiment
 
 app: Final = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -59,7 +60,9 @@ def init(
     place = Path(folder)
     identities: dict[str, Role] = {role: role for role in SERVICES}
     identities |= _robots(who or [], set(SERVICES))
-    known = create(place, identities, hosts=host or [], days=days, authority_days=authority_days)
+    known = create(
+        place, identities, hosts=host or [], listening=_listening(who or []), days=days, authority_days=authority_days
+    )
     _tell(place, known, list(known.identities))
     typer.echo(
         f"{place}/ca.key makes new identities: keep it here. A robot's computer needs ca.pem and its own .pem and .key,"
@@ -140,21 +143,31 @@ def show(folder: Folder, as_json: Annotated[bool, typer.Option("--json", help="F
     raise typer.Exit(any(datetime.fromisoformat(each.until) < now for each in known.identities.values()))
 
 
-def _robots(who: list[str], taken: set[str]) -> dict[str, Role]:
-    """Robots of experiments, and those that are named themselves."""
+def _cases(each: str) -> list[Experiment] | None:
+    """The cases of an experiment; None if it is a robot that is named."""
     from pathlib import Path  # noqa: PLC0415
 
-    from agents.lab import LabError  # noqa: PLC0415
     from experiments import document  # noqa: PLC0415
 
-    catalogue = {name for name, _ in document.names()}
+    known = each in {name for name, _ in document.names()} or Path(each).suffix or Path(each).exists()
+    return list(document.read(each).cases().values()) if known else None
+
+
+def _listening(who: list[str]) -> dict[str, list[str]]:
+    """Where identities of experiments listen that are meshes."""
+    from experiments import mesh  # noqa: PLC0415
+
+    return {name: at for each in who for case in _cases(each) or () for name, at in mesh.listeners(case).items()}
+
+
+def _robots(who: list[str], taken: set[str]) -> dict[str, Role]:
+    """Robots of experiments, and those that are named themselves."""
+    from agents.lab import LabError  # noqa: PLC0415
+
     found: dict[str, Role] = {}
     for each in who:
-        if each in catalogue or Path(each).suffix or Path(each).exists():
-            cases = document.read(each).cases().values()
-            found |= {robot: "robot" for case in cases for robot in case.robots}
-        else:
-            found[each] = "robot"
+        cases = _cases(each)
+        found |= {each: "robot"} if cases is None else {robot: "robot" for case in cases for robot in case.robots}
     if clash := sorted(set(found) & taken):
         raise LabError(f"{', '.join(clash)}: every lab has an identity of that name; rename the robot")
     return found

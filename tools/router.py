@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from agents.access import Rights
 from agents.lab import LabError, secured
 from agents.router import serve
-from agents.session import DEFAULT_ENDPOINT
+from agents.session import DEFAULT_ENDPOINT, settings
 
 
 def command(
@@ -19,6 +21,7 @@ def command(
     lifeline: bool = False,
     lab: str | None = None,
     bodies: str | None = None,
+    print_config: bool = False,
 ) -> int:
     """Runs a router until it is told to end; returns the exit code.
 
@@ -29,21 +32,40 @@ def command(
         lifeline: Whether standard input is a lifeline.
         lab: Folder of certificates, instead of that of the file.
         bodies: What every robot is put into, as in `zenpark run --bodies`.
+        print_config: Prints the configuration with which a zenohd does the same instead.
 
     Raises:
         DocumentError: If the file is wrong.
         EndpointError: If it cannot listen there.
         LabError: If a lab is named and no experiment.
     """
-    if file is None:
-        if lab is not None:
-            raise LabError(f"name the experiment too, from which the rights follow: zenpark router FILE --lab {lab}")
-        return serve(listen or [DEFAULT_ENDPOINT], link=link, lifeline=lifeline)
-    rights, folder = _rights(file, lab, bodies)
+    if file is None and lab is not None:
+        raise LabError(f"name the experiment too, from which the rights follow: zenpark router FILE --lab {lab}")
+    rights, folder = (None, None) if file is None else _rights(file, lab, bodies)
     if folder is None:
-        return serve(listen or [DEFAULT_ENDPOINT], link=link, lifeline=lifeline)
-    linked = secured(link, folder) if link else []
-    return serve(secured(listen, folder), link=linked, lifeline=lifeline, rights=rights)
+        endpoints, linked, rights = list(listen) or [DEFAULT_ENDPOINT], list(link), None
+    else:
+        endpoints, linked = secured(listen, folder), secured(link, folder) if link else []
+    if print_config:
+        print(json.dumps(of_zenohd(endpoints, linked, rights), indent=1))
+        return 0
+    return serve(endpoints, link=linked, lifeline=lifeline, rights=rights)
+
+
+def of_zenohd(endpoints: Sequence[str], link: Sequence[str] = (), rights: Rights | None = None) -> dict[str, Any]:
+    """The configuration with which a zenohd is the router that `serve` would be, as its file has it.
+
+    Raises:
+        EndpointError: As `serve`.
+    """
+    made: dict[str, Any] = {}
+    for path, value in settings("router", listen=endpoints, connect=link, name="router", rights=rights).items():
+        *above, last = path.split("/")
+        inner = made
+        for part in above:
+            inner = inner.setdefault(part, {})
+        inner[last] = value
+    return made
 
 
 def _rights(file: str, lab: str | None, bodies: str | None) -> tuple[Rights, Path | None]:

@@ -25,7 +25,7 @@ from agents import session as network
 from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
-from agents.process import add_network, told_to_end
+from agents.process import add_network, reached, told_to_end
 from agents.protocols import datastream
 from agents.protocols.datastream import Framer, Kind, Malformed, Segment
 from agents.rows import Array
@@ -278,7 +278,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="vicon twin", description="A simulated Vicon that sees simulated robots.")
     parser.add_argument("--robots", nargs="+", required=True, metavar="ROBOT", help="their names are the subjects'")
     parser.add_argument("--listen", type=_address, default=("127.0.0.1", 0), metavar="HOST:PORT")
-    add_network(parser)
+    add_network(parser, "twin")
     parser.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="frames per second")
     parser.add_argument("--sigma", type=float, default=0.0003, metavar="METRES", help="noise of the positions")
     parser.add_argument("--seed", type=int, default=0, help="of the noise")
@@ -291,11 +291,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.lifeline:
         Lifeline(lost).start()
     host, port = chosen.listen
-    endpoints = chosen.connect or [network.DEFAULT_ENDPOINT]
     try:
         with (
             told_to_end(stop.set),
-            network.open_session(endpoints, name="vicon-twin", stop=stop, identity="twin") as session,
+            network.open_session(reached(chosen), name="vicon-twin", stop=stop, identity=chosen.identity) as session,
         ):
             vicon = ViconTwin(
                 chosen.robots,

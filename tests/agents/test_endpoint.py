@@ -29,6 +29,12 @@ def test_what_is_none_is_refused(text):
         Endpoint.parse(text)
 
 
+@pytest.mark.parametrize("text", ["udp/127.0.0.1:1", "ws/lab:1", "serial//dev/ttyUSB0", "wss/lab:1"])
+def test_what_is_not_used_is_refused_with_what_is(text):
+    with pytest.raises(ValueError, match=r"cannot be used: .*; write it like tcp/"):
+        Endpoint.parse(text)
+
+
 @pytest.mark.parametrize(
     ("text", "loopback", "wildcard"),
     [

@@ -42,7 +42,6 @@ def payloads(handler):
         "tcp/0.0.0.0:7447",
         "tcp/[::]:7447",
         "tcp/192.168.1.2:7447",
-        "udp/0.0.0.0:7447",
         "tcp/host.example:7447",
         "tcp/:1",
     ],
@@ -56,6 +55,17 @@ def test_refuses_to_listen_beyond_loopback(endpoint):
 def test_refuses_what_is_no_endpoint(endpoint):
     with pytest.raises(EndpointError, match=r"write it like tcp/127\.0\.0\.1:7447"):
         config("client", connect=[endpoint])
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "why"),
+    [("udp/127.0.0.1:1", "loses"), ("ws/127.0.0.1:1", "certificates"), ("serial//dev/ttyUSB0", "no network"),
+     ("http/127.0.0.1:1", "no such protocol")],
+)  # fmt: skip
+def test_transports_that_are_not_used_are_refused(endpoint, why):
+    for ends in ({"listen": [endpoint]}, {"connect": [endpoint]}):
+        with pytest.raises(EndpointError, match=rf"{why}.*; write it like tcp/127.* unixsock-stream/PATH"):
+            config("router", **ends)
 
 
 @pytest.mark.parametrize("endpoint", ["t#tcp/localhost:1", "tcp/127.0.0.1:7447\n", "tcp?/x/y"])

@@ -12,10 +12,11 @@ import zenoh
 
 from agents import session as network
 from agents import topology, wire
-from experiments import access
+from agents.lab import Role
+from experiments import access, mesh
 from experiments.run import load, reopen
 from tests.system.lab import Flight, Started, Watcher
-from tools import estop
+from tools import authority, estop
 from tools.network import members
 
 pytestmark = pytest.mark.system
@@ -137,3 +138,36 @@ def free(count: int) -> list[str]:
     while len(found) < count:
         found.add(network.free_endpoint(0))
     return sorted(found)
+
+
+def test_members_of_a_lab_let_nobody_do_what_is_not_his(tmp_path: Path) -> None:
+    """There is no router that could refuse anything: whoever is told it does."""
+    file = tmp_path / "mesh.toml"
+    file.write_text(load("triangle").path.read_text() + '\n[network]\ntopology = "mesh"\nlab = "lab"\n')
+    case = load(file).experiment
+    listening = mesh.listeners(case)
+    identities: dict[str, Role] = {role: role for role in authority.SERVICES}
+    authority.create(
+        tmp_path / "lab", {**identities, **dict.fromkeys((*case.robots, "KH09"), "robot")}, listening=listening
+    )
+    flight = Flight(tmp_path / "run", str(file), "--case", "periodic", "--no-report", "--set", "duration_s=6")
+    flight.until_said("phase conductor: formation")
+    endpoints = (flight.folder / "network.txt").read_text().split()
+    stop = wire.encode(wire.Stop("mallory", "because"))
+    pose = wire.encode(wire.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
+    for who in ("KH09", "KH02", "observer", "recorder"):
+        with network.open_session(endpoints, name="intruder", identity=who) as intruder:
+            for _ in range(10):
+                for key in ("park/estop", "park/**"):
+                    intruder.put(key, stop, encoding=wire.JSON)
+                intruder.put("park/KH01/pose", pose, encoding=wire.JSON)
+                time.sleep(0.01)
+            order = wire.encode(wire.Order("land"))
+            assert not [reply for reply in intruder.get("park/CF01/order", payload=order, timeout=0.5) if reply.ok]
+    code, _ = flight.finish()
+    assert code == 0, flight.logs()
+    run = reopen(flight.folder)
+    assert not run.notes
+    for log in ("CF01", "KH01", "KH02"):
+        assert "emergency stop" not in (flight.folder / "logs" / f"periodic-{log}.log").read_text()
+    assert run.metrics["periodic"].lost == 0, "a pose with a higher number would have made all after it old"

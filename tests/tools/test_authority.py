@@ -54,6 +54,8 @@ def test_only_who_listens_can_pose_as_a_router(folder):
     names = extension(certificate(folder, "router"), x509.SubjectAlternativeName)
     assert names.get_values_for_type(x509.DNSName) == ["localhost", "lab.example.org"]
     assert [str(each) for each in names.get_values_for_type(x509.IPAddress)] == ["127.0.0.1", "::1", "192.0.2.7"]
+    for name in set(ROBOTS) - {"router"}:
+        assert set(extension(certificate(folder, name), x509.ExtendedKeyUsage)) == {ExtendedKeyUsageOID.CLIENT_AUTH}
     authority.issue(folder, {"KH01": "robot"}, hosts=["192.0.2.9"])
     assert ExtendedKeyUsageOID.SERVER_AUTH in extension(certificate(folder, "KH01"), x509.ExtendedKeyUsage)
     meshed = extension(certificate(folder, "KH01"), x509.SubjectAlternativeName)
