@@ -4,8 +4,10 @@ import time
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from agents.clock import SLEW, Clock, said
+from agents.clock import SLEW, STEP_S, Clock, said
 from agents.graph import links
 from agents.hearing import Hearing
 from agents.prediction import HOLD, ConstantVelocity, Predictor
@@ -67,3 +69,13 @@ def test_nonsense_and_jumps_are_not_followed(line, capsys):
     clock.heed(line)
     assert clock.slew(1.0) == 0.0
     assert capsys.readouterr().err.startswith("clock: ")
+
+
+@given(st.binary(max_size=60) | st.floats().map(lambda number: b"clock %r" % number))
+def test_whatever_is_told_moves_it_no_farther_than_drift_does(line):
+    clock = Clock(0.1)
+    clock.heed(line)
+    assert abs(clock.slew(1.0)) <= SLEW
+    for _ in range(200):
+        clock.slew(1.0)
+    assert abs(clock.correction_s - 0.1) <= STEP_S

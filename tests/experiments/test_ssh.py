@@ -26,7 +26,7 @@ from experiments import ssh
         ("/usr/bin/env: 'python3': No such file or directory", "no Python", "apt install python3"),
         ("Usage: zenpark [OPTIONS]\nError: No such command 'station'.", "too old", "hosts install"),
         ("Timeout, server lab1 not responding.", "connection to it broke", "still on"),
-        ("new\nnobody knows it", "ssh failed: nobody knows it", "by hand, which must ask nothing: ssh pi@lab1 true"),
+        ("something new\nthat nobody knows", "ssh failed: that nobody knows", "must ask nothing: ssh pi@lab1"),
         ("", "it said nothing", ""),
     ],
 )  # fmt: skip

@@ -77,7 +77,7 @@ def of_all() -> dict[str, list[object]]:
         KEYS.contact: [wire.Contact(now, "KH01", "wall", 0.1, 0.001)],
         KEYS.world: [world],
         KEYS.centre: [centre],
-        KEYS.clock: [wire.HostClock("lab1", now, 0.2, 0.001, ["KH01"])],
+        KEYS.clock: [wire.HostClock("lab1", now, 0.2, 0.001, ["KH01"], 0.2)],
         KEYS.world_order: list(orders),
     }
 
