@@ -320,7 +320,7 @@ class Conductor:
         self._session = stack.enter_context(
             network.open_session(self._endpoints, name="conductor", wait_s=ROUTER_S, identity="operator")
         )
-        self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
+        self._events = network.pose_publisher(self._session, keys.event, wire.JSON, network.EVENTS)
         if self._endpoints != [network.DEFAULT_ENDPOINT]:
             there = self._endpoints[0]
             look = f"zenpark keys {lab.options(there)}"
