@@ -53,6 +53,7 @@ ASK_S: Final = 2.0  # whoever asks waits no longer for an answer
 OPEN_S: Final = 3.0  # a router that answers nothing for so long is passed over for the next one
 MOST_BYTES: Final = 4 * 1024 * 1024  # of a message that a router of a lab puts together; the largest is an experiment
 HEARTBEAT_S: Final = 0.5  # how long the loss of the last pose before a silence goes unnoticed
+EVENTS: Final = 64  # of a run that are said again to who was cut off: without a router much happens at once
 
 # 4 threads instead of 7 in each client and a sixth less CPU at 50 Hz. Zenoh reads it once, at the first open.
 _RUNTIME: Final = (
@@ -341,8 +342,8 @@ def deserted(session: zenoh.Session) -> bool:
     return all(transport.whatami == zenoh.WhatAmI.ROUTER for transport in session.info.transports())
 
 
-def pose_publisher(session: zenoh.Session, key: str, mime: str) -> AdvancedPublisher:
-    """A publisher whose last value is never lost, however rarely it speaks.
+def pose_publisher(session: zenoh.Session, key: str, mime: str, kept: int = 1) -> AdvancedPublisher:
+    """A publisher whose last value is never lost, however rarely it speaks; nor are the last `kept`.
 
     Late joiners ask for the last value (cache), subscribers that were cut off ask again when they see the publisher
     reappear (detection), and a value lost before a silence is noticed by the heartbeat.
@@ -353,22 +354,25 @@ def pose_publisher(session: zenoh.Session, key: str, mime: str) -> AdvancedPubli
         encoding=mime,
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.DATA_HIGH,
-        cache=CacheConfig(1),
+        cache=CacheConfig(kept),
         sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S),
         publisher_detection=True,
     )
 
 
-def pose_subscriber(session: zenoh.Session, key: str, depth: int = 16) -> AdvancedSubscriber[Handler[zenoh.Sample]]:
+def pose_subscriber(
+    session: zenoh.Session, key: str, depth: int = 16, kept: int = 1
+) -> AdvancedSubscriber[Handler[zenoh.Sample]]:
     """The other end of `pose_publisher`: the newest `depth` samples wait in `.handler`.
 
-    The history is limited to one sample: without a limit a single frozen publisher stalls a wildcard for 10 s.
+    The history is limited to the `kept` of the publisher: without a limit a single frozen publisher stalls a wildcard
+    for 10 s.
     """
     return declare_advanced_subscriber(
         session,
         key,
         RingChannel(depth),
-        history=HistoryConfig(max_samples=1, detect_late_publishers=True),
+        history=HistoryConfig(max_samples=kept, detect_late_publishers=True),
         recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
     )
 

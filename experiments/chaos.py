@@ -30,7 +30,7 @@ from experiments import playback
 from experiments.cables import Cables
 from experiments.chaos_eyes import Eyes
 from experiments.experiment import Experiment
-from experiments.fault_script import FIRST_S, Fault, Round
+from experiments.fault_script import Fault, Round
 from experiments.injection import Injector, WallClock
 from experiments.launcher import Launcher
 from experiments.links import one_way_links
@@ -41,7 +41,8 @@ from experiments.recover import recover
 from experiments.watched import Watched
 
 POLL_S: Final = 0.02
-BEGIN_S: Final = 60.0  # to the common start
+BEGIN_S: Final = 100.0  # to the common start
+FORM_S: Final = 30.0  # a formation that has not come together by then does not
 HEAL_S: Final = 12.0  # after a fault is lifted the formation stands again
 SETTLED_S: Final = 0.5  # and stays so
 FRESH_S: Final = 1.6  # a robot that says nothing for longer is not back: statuses come once a second
@@ -153,12 +154,8 @@ def again(faults: Sequence[Fault]) -> list[Round]:
     rounds = []
     for several in (False, True):
         chosen = [fault for fault in faults if (fault.kind == "failover") == several]
-        t, moved = FIRST_S, list[Fault]()
-        for fault in sorted(chosen, key=lambda fault: fault.kind == "conductor"):
-            moved.append(msgspec.structs.replace(fault, at_s=round(t, 2)))
-            t += fault.lasts_s + 2.0
-        if moved:
-            rounds.append(Round(moved, 2 if several else 1))
+        if chosen:
+            rounds.append(Round(sorted(chosen, key=lambda fault: fault.kind == "conductor"), 2 if several else 1))
     return rounds
 
 
@@ -196,6 +193,8 @@ class Flight:
         self._now: _Running | None = None
         self._started: float | None = None
         self._at = 0.0
+        self._well: float | None = None  # since when all is well, before a fault
+        self._formed_since: float | None = None
         self._hears: dict[str, set[str]] = {name: set() for name in setting.experiment.robots}
         for link in one_way_links(setting.experiment):
             self._hears[link.listener].add(link.speaker)
@@ -233,10 +232,10 @@ class Flight:
             injector = Injector(watched, cables, clock, random, groups=groups, recording=recording)
             nearest = math.inf
             try:
-                session = stack.enter_context(network.open_session(routers, name="chaos", wait_s=BEGIN_S))
-                eyes = Eyes(session, experiment)
-                self._follow(watched, injector, eyes, Keys(experiment.network.realm))
-                nearest = eyes.invariants.nearest
+                with network.open_session(routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
+                    eyes = Eyes(session, experiment)
+                    self._follow(watched, injector, eyes, Keys(experiment.network.realm))
+                    nearest = eyes.invariants.nearest
             except network.Unreachable as error:
                 self._wrong.append(f"it never began: {error}; {watched.process.tail()}")
             if self._now is not None:
@@ -273,9 +272,7 @@ class Flight:
             self._judge(eyes, now)
             if self._now is not None:
                 self._heal(self._now, injector, eyes, t, now)
-            elif self._through(t, duration) or (
-                t >= self._left[0].at_s and not self._begin(injector, eyes, keys, t, now)
-            ):
+            elif self._through(t, duration) or not self._next(injector, eyes, keys, t, now):
                 return
             if t > duration + END_S:
                 self._wrong.append(f"it does not end {END_S:g} s after its time")
@@ -294,6 +291,20 @@ class Flight:
                 wrong.append(f"{name} is dead and still commands its body")
         target = self._wrong if self._now is None else self._now.violations
         target += [each for each in wrong if each not in target]
+
+    def _next(self, injector: Injector, eyes: Eyes, keys: Keys, t: float, now: float) -> bool:
+        """Does the next fault when its time has come; False if there is nothing more to be done in this round."""
+        if self._well is None:
+            live = eyes.running()
+            formed = bool(live) and not self._apart(eyes, live, now - FRESH_S, t)
+            self._formed_since = (self._formed_since or now) if formed else None
+            if self._formed_since is not None and now - self._formed_since >= SETTLED_S:
+                self._well = now
+            elif t > FORM_S:
+                self._wrong.append(f"not in formation {FORM_S:g} s after the start: no fault was done")
+                return False
+            return True
+        return now < self._well + self._left[0].after_s or self._begin(injector, eyes, keys, t, now)
 
     def _begin(self, injector: Injector, eyes: Eyes, keys: Keys, t: float, now: float) -> bool:
         """Does the next fault; False if there are too few robots left for it."""
@@ -354,7 +365,7 @@ class Flight:
             list(running.violations),
         )
         self.outcomes.append(outcome)
-        self._now = None
+        self._now, self._well = None, now
         self._say(line(outcome))
 
     def _unfinished(self, running: _Running) -> None:

@@ -24,8 +24,11 @@ Kind = Literal[
 ]
 
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-FIRST_S: Final = 8.0  # the formation has come together by then
-GAP_S: Final = (1.5, 3.0)  # between the end of a fault and the next, if it has healed by then
+FORM_S: Final = (
+    15.0  # what a formation takes to come together, so that a round gets about as many faults as it has time for
+)
+GAP_S: Final = (0.5, 2.0)  # from when a fault has healed to the next
+HEAL_S: Final = 1.5  # what that takes
 LAST_S: Final = 6.0  # before the end of the run nothing new begins
 MOST: Final = {"kill": 2, "router": 3, "failover": 1, "disk": 1, "conductor": 1}  # of one round
 LASTING: Final = {"freeze": 5.0, "partition": 3.0, "loss": 3.0, "delay": 3.0, "corrupt": 1.0, "bits": 1.0}  # [s]
@@ -40,14 +43,14 @@ class Fault(msgspec.Struct, frozen=True):
 
     Attributes:
         kind: What happens.
-        at_s: Not before this time after the common start [s].
+        after_s: So long after all was well again (or, of the first, after the formation had come together) [s].
         lasts_s: Until it is lifted [s]; 0 if it cannot be.
         victim: A robot; if it is gone by then, the next one that is there. Empty: the whole run.
         size: Of a delay or a step of the clock [s], of a loss as a share.
     """
 
     kind: Kind
-    at_s: float
+    after_s: float
     lasts_s: float = 0.0
     victim: str = ""
     size: float = 0.0
@@ -84,7 +87,7 @@ def script(
 def _deal(deck: list[Kind], robots: Sequence[str], duration_s: float, random: np.random.Generator) -> Round:
     """Takes the faults of one round off the deck."""
     several = deck[0] == "failover"
-    t, faults = FIRST_S, list[Fault]()
+    t, faults = FORM_S, list[Fault]()
     dealt: list[Kind] = []
     while True:
         fitting = (k for k, kind in enumerate(deck) if _fits(kind, dealt, several=several))
@@ -95,8 +98,9 @@ def _deal(deck: list[Kind], robots: Sequence[str], duration_s: float, random: np
             place = 0  # what fits nowhere has a round of its own
         kind = deck.pop(place)
         dealt.append(kind)
-        faults.append(_fault(kind, round(t, 2), robots, random))
-        t += LASTING.get(kind, 0.0) + float(random.uniform(*GAP_S))
+        gap = round(float(random.uniform(*GAP_S)), 2)
+        faults.append(_fault(kind, gap, robots, random))
+        t += gap + LASTING.get(kind, 0.0) + HEAL_S
         if kind == "conductor" or t > duration_s - LAST_S:
             break
     return Round(faults, 2 if several else 1)
@@ -111,7 +115,7 @@ def _fits(kind: Kind, dealt: Sequence[Kind], *, several: bool) -> bool:
     return kind != ("router" if several else "failover")
 
 
-def _fault(kind: Kind, at_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:
+def _fault(kind: Kind, after_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:
     victim = "" if kind in WITHOUT_VICTIM else str(random.choice(list(robots)))
     size = 0.0
     if kind == "loss":
@@ -120,4 +124,4 @@ def _fault(kind: Kind, at_s: float, robots: Sequence[str], random: np.random.Gen
         size = round(float(random.uniform(*DELAY_S)), 3)
     elif kind == "clock":
         size = round(float(random.uniform(*STEP_S) * random.choice([-1.0, 1.0])), 3)
-    return Fault(kind, at_s, LASTING.get(kind, 0.0), victim, size)
+    return Fault(kind, after_s, LASTING.get(kind, 0.0), victim, size)

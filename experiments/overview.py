@@ -70,7 +70,7 @@ class Overview:
         )
         self._session, declared = stack.enter_context(held(opened))
         declared.append(self)
-        self._events = network.pose_publisher(self._session, keys.event, wire.JSON)
+        self._events = network.pose_publisher(self._session, keys.event, wire.JSON, network.EVENTS)
         if list(endpoints) != [network.DEFAULT_ENDPOINT]:
             options = lab.options(endpoints[0]) if len(endpoints) == 1 else f"--connect @{folder / mesh.ENDPOINTS}"
             where = "a mesh" if topology.is_mesh(endpoints) else ", ".join(lab.bare(endpoints))

@@ -48,7 +48,7 @@ class Recorder:
         self._poses = network.pose_subscriber(session, keys.pose("*"), DEPTH)
         self._statuses = network.pose_subscriber(session, keys.status("*"), RARE)
         self._states = network.subscriber(session, keys.state("*"), DEPTH)
-        self._events = network.subscriber(session, keys.event, RARE)
+        self._events = network.pose_subscriber(session, keys.event, RARE, network.EVENTS)
         self._contacts = network.subscriber(session, keys.contact, RARE)
         self._world = network.subscriber(session, keys.world, RARE)
         self._goals = network.subscriber(session, keys.goal("*"), DEPTH)
