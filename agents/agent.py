@@ -259,10 +259,7 @@ class Agent:
             return self._nobody  # nobody asks any more
         lacks = np.zeros(len(life.phase), dtype=bool)
         if assignment.patience_s is None or t <= assignment.patience_s:
-            unheard = ~np.isfinite(self.heard.stamp)
-            if assignment.waited_for is not None:
-                unheard &= assignment.waited_for
-            lacks[assignment.links.listener[unheard]] = True
+            lacks[assignment.links.listener[assignment.lacking(self.heard.stamp)]] = True
             if self.guidance is not None:
                 lacks |= self.guidance.unheard()
         failing = self._preflight.check(t, state, self._where, self.hearing, self.outside, (lacks, self.missing))

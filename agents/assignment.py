@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from agents import coordination
 from agents.anchors import Anchors
 from agents.avoidance import Avoidance
@@ -79,3 +81,8 @@ class Assignment:
     changes: tuple[Change, ...] = ()
     presence: Presence | None = None
     guided: Mask | None = None
+
+    def lacking(self, stamp: Array) -> Mask:
+        """Links (E,) that are waited for and on which nothing was heard yet: the last `stamp` (E,) is not finite."""
+        unheard: Mask = ~np.isfinite(stamp)
+        return unheard if self.waited_for is None else unheard & self.waited_for

@@ -141,7 +141,7 @@ class Centre:
         complete = np.ones(len(self.guided), dtype=bool)
         patience, stamp = self.assignment.patience_s, self.deciding.hearing.heard.stamp
         if patience is None or t <= patience:
-            complete[self.assignment.links.listener[~np.isfinite(stamp)]] = False
+            complete[self.assignment.links.listener[self.assignment.lacking(stamp)]] = False
         return complete
 
     def _links(self, rows: Index) -> Index:

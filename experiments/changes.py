@@ -6,7 +6,6 @@ goes on by one look at a time, so that the conductor waits for nobody.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -17,22 +16,23 @@ import zenoh
 from agents import session as network
 from agents import wire
 from agents.keys import Keys
-from agents.kinds import KINDS
 from agents.plugins import did_you_mean
 from experiments import succession
 from experiments.crew import Crew
-from experiments.experiment import Experiment, Robot
+from experiments.experiment import Experiment
 from experiments.launcher import LAND_S
 from experiments.overview import Overview
+from experiments.room import in_the_way
 from experiments.seen import FROZEN_S
 from experiments.succession import Refused
 
 CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
-READY_S: Final = 25.0  # of a robot that was started again: two seconds, but for what it connects to
+READY_S: Final = 5.0  # a robot counts the deadline of the file from when it runs, which is later
 ROOM_S: Final = 20.0  # so long a robot waits until its place is free, where nobody waits for an answer
-MARGIN_M: Final = 0.1  # free space around a robot that begins to move
 RESTARTS: Final = 3  # a robot that is lost more often is not helped by starting it again
 MOST: Final = 100  # orders at once
+INSIST_S: Final = 5.0  # so long an order is repeated that a robot does not follow,
+AGAIN_S: Final = 0.5  # this often
 
 Steps = Generator[None, None, str]  # what was done, at its end
 
@@ -173,12 +173,12 @@ class HotChanges:
         left = list(dict.fromkeys(asked.order.robots))
         if asked.query is not None:
             self._pending.append(asked)
-        who = asked.order.who
+        who = asked.order.who[:50] or "somebody"
         while left:
             names = tuple(name for name in left if name in self._crew.companions(left[0]))
             left = [name for name in left if name not in names]
             for name in names:
-                self._view.say(asked.order.order, name, "asked" + (f" by {who[:50]}" if who.isprintable() else ""))
+                self._view.say(asked.order.order, name, f"asked by {who if who.isprintable() else 'somebody'}")
             change = _Change(names, self._steps(asked.order, names), asked)
             if busy := sorted(self.under_way & {*names}):
                 self._answer(change, refused=f"{', '.join(busy)}: is being changed already; wait for that")
@@ -260,6 +260,7 @@ class HotChanges:
         for name in names:
             self._robots[name].out = "removed"
             self._robots[name].forget()
+        self._leaving -= {*names}  # the next process that ends is another one
 
     def _process_must_end(self, name: str, names: Sequence[str]) -> bool:
         """Whether a robot's process is still there although it has no other robots that stay."""
@@ -278,6 +279,7 @@ class HotChanges:
         if order.order == "add" and any(robots[name].reached("airborne") and not robots[name].gone for name in names):
             raise Refused("takes part already; `zenpark robot restart` starts it anew")
         if by_hand and not any(robots[name].reached("airborne") for name in names):
+            crew.adopted |= {*names}
             yield from self._join(names)
             return f"takes part after {time.monotonic() - asked:.1f} s"
         if foreign := [name for name in names if name in crew.adopted or name in crew.away]:
@@ -315,13 +317,12 @@ class HotChanges:
         robots = self._robots
         for name in names:
             robots[name].out = ""
-            self._leaving.discard(name)
         try:
-            yield from self._reach(names, "ready", READY_S)
+            yield from self._reach(names, "ready", self._experiment.start.deadline_s + READY_S)
             yield from self._room({name: self._here(name) for name in names}, ROOM_S)
-            self._tell_all(names, wire.Order("takeoff"))
+            yield from self._insist(names, wire.Order("takeoff"))
             yield from self._reach(names, "airborne", CLIMB_S)
-            self._tell_all(names, wire.Order("start", at=self._start))
+            yield from self._insist(names, wire.Order("start", at=self._start))
             yield from self._reach(names, "running", FROZEN_S)
         except Refused:
             self._leaving |= {*names}
@@ -331,11 +332,16 @@ class HotChanges:
                 robots[name].out = "removed"
             raise
 
-    def _tell_all(self, names: Sequence[str], order: wire.Order) -> None:
+    def _insist(self, names: Sequence[str], order: wire.Order) -> Generator[None]:
+        """An order that may be repeated: a robot may not be ready just then, and a busy machine lose an answer."""
         for name in names:
-            reply = self._view.order(name, order)
-            if not reply.ok:
-                raise Refused(f"{name}, {order.order}: {reply.reason}")
+            began = time.monotonic()
+            while not (reply := self._view.order(name, order)).ok:
+                asked = time.monotonic()
+                if asked - began > INSIST_S:
+                    raise Refused(f"{name}, {order.order}: {reply.reason}")
+                while time.monotonic() - asked < AGAIN_S:
+                    yield
 
     def _reach(self, names: Sequence[str], phase: str, limit_s: float) -> Generator[None]:
         began = time.monotonic()
@@ -375,30 +381,10 @@ class HotChanges:
         """
         began = time.monotonic()
         while True:
-            found = [self._in_the_way(name, place, body_stays=body_stays) for name, place in places.items()]
+            robots = {name: self._crew.robot(name) for name in self._robots}
+            found = [in_the_way(*each, robots, self._robots, body_stays=body_stays) for each in places.items()]
             if not any(found):
                 return
             if time.monotonic() - began >= patience_s:
                 raise Refused(next(filter(None, found)))
             yield
-
-    def _in_the_way(self, name: str, place: Sequence[float], *, body_stays: bool) -> str:
-        """Who is too near to a place for a robot to begin there, however high; empty if nobody is."""
-        radius = _radius(self._crew.robot(name))
-        for other, seen in self._robots.items():
-            robot = self._crew.robot(other)
-            vanished = robot.body == succession.TWIN and not seen.alive  # it was but a part of its process
-            if seen.place is None or vanished or (other == name and (seen.alive or not body_stays)):
-                continue
-            gap = math.dist(seen.place[:2], place) - radius - _radius(robot)
-            if gap < MARGIN_M:
-                x, y = place[:2]
-                return (
-                    f"{name} would begin at ({x:.2f}, {y:.2f}) m, {max(gap, 0.0):.2f} m from {other}: it needs "
-                    f"{MARGIN_M:g} m around it; move one of them, or wait"
-                )
-        return ""
-
-
-def _radius(robot: Robot) -> float:
-    return KINDS[robot.kind].radius

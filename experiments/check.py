@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from experiments import architecture, assign, document, motion, safety_checks, surroundings, theory
+from experiments import architecture, assign, document, motion, reserves, safety_checks, surroundings, theory
 from experiments.analysis import Analysis, analyse
 from experiments.claim import FORGIVEN, Claim, Severity, few, listed
 from experiments.document import Document
@@ -186,6 +186,7 @@ def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
     known: dict[bytes, Analysis] = {}
     found = {}
     for name, case in cases.items():
+        case = reserves.taking_part(case)  # noqa: PLW2901
         bare = msgspec.structs.replace(
             case,
             trigger="periodic",

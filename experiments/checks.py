@@ -11,7 +11,7 @@ import numpy as np
 from agents import plugins
 from agents.kinds import KINDS
 from agents.plugins import did_you_mean
-from experiments import channel_checks, formation_checks, host_checks, outlines
+from experiments import channel_checks, formation_checks, host_checks, outlines, reserves
 from experiments.experiment import Arena, Experiment, Hybrid, Robot
 from experiments.problem import Fault
 from twins.scene import Scene
@@ -33,7 +33,10 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
     yield from _rates(experiment)
     yield from of_arena(experiment.arena)
     for name, robot in experiment.robots.items():
-        yield from _robot(experiment, name, robot)
+        yield from _robot(experiment, ("robots", name), robot)
+    for name, robot in experiment.spares.items():
+        yield from _robot(experiment, ("spares", name), robot)
+    yield from reserves.faults(experiment)
     yield from _furnished(experiment)
     yield from formation_checks.faults(experiment)
     yield from channel_checks.faults(experiment)
@@ -123,8 +126,8 @@ def _divisor(body: float, wanted: float) -> float:
     return min(exact, key=lambda rate: abs(rate - wanted), default=body)
 
 
-def _robot(experiment: Experiment, name: str, robot: Robot) -> Iterator[Fault]:
-    path = ("robots", name)
+def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
+    name = path[1]
     if name in _RESERVED:
         yield Fault(
             path, f"a robot cannot be called '{name}', which has a meaning of its own", "rename it", on_key=True
@@ -134,7 +137,7 @@ def _robot(experiment: Experiment, name: str, robot: Robot) -> Iterator[Fault]:
     if body not in bodies:
         yield Fault((*path, "body"), f"no {body!r} among the bodies", did_you_mean(body, bodies))
     if robot.kind in KINDS:
-        yield from _hover(experiment, name, robot)
+        yield from _hover(experiment, path, robot)
     else:
         yield Fault((*path, "kind"), f"no {robot.kind!r} among the kinds of robots", did_you_mean(robot.kind, KINDS))
     for number, sensor in enumerate(robot.sensors or []):
@@ -153,8 +156,8 @@ def _robot(experiment: Experiment, name: str, robot: Robot) -> Iterator[Fault]:
         yield Fault((*path, "start", 2), "the yaw is in radians", f"{robot.start[2]:g} degrees are {radians:.4f}")
 
 
-def _hover(experiment: Experiment, name: str, robot: Robot) -> Iterator[Fault]:
-    path, top, margin = ("robots", name), experiment.arena.size[2], experiment.safety.margin
+def _hover(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
+    name, top, margin = path[1], experiment.arena.size[2], experiment.safety.margin
     if not KINDS[robot.kind].flies:
         if robot.hover is not None:
             yield Fault(

@@ -31,6 +31,7 @@ GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is l
 ADOPT_S: Final = 0.5
 MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
 AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead,
+LATE_S: Final = 1.0  # who says that it waits so long after the common start has not heard of it
 BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behind
 LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
 OUTPUT: Final = "says"  # kind of the events that are a line of a process's output
@@ -251,11 +252,13 @@ class Conductor:
         reached = -1
         end = start + self._experiment.duration_s
         self._changes.begin(start)
+        self._repeat_at = start
         self._progress.phase = "starting together"
         while (now := time.time()) < end + LAND_S and not self._interrupted():
             self._look()
             self._view.tell_drift(*self._drift.news())
             self._progress.elapsed = now - start
+            self._start_late(start)
             while reached + 1 < len(times) and now - start >= times[reached + 1]:
                 reached += 1
                 self._progress.phase = names[reached]
@@ -265,6 +268,16 @@ class Conductor:
             if all(seen.reached("landing") for seen in left) and (left or not busy):
                 return
             time.sleep(POLL_S)
+
+    def _start_late(self, start: float) -> None:
+        """Repeats the start to robots that still wait: a busy machine may have lost the order, or its answer."""
+        now, busy = time.time(), self._changes.under_way
+        for name, seen in self._robots.items():
+            waits = seen.status is not None and seen.status.phase == "airborne" and seen.status.stamp > start + LATE_S
+            if waits and not seen.gone and name not in busy and now > self._repeat_at:
+                self._repeat_at = now + LATE_S
+                self._view.say("late", name, "still waits for the start; told again")
+                self._view.order(name, wire.Order("start", at=start))
 
     def _land(self) -> None:
         """Everybody down."""

@@ -31,7 +31,7 @@ from agents.lab import LabError, register, require, secured
 from agents.lab import of as lab_of
 from agents.session import free_endpoints
 from agents.topology import from_here
-from experiments import access, document, mesh, metrics, playback, reach, results, virtual
+from experiments import access, document, mesh, metrics, playback, reach, reserves, results, virtual
 from experiments.conductor import Conductor, Result
 from experiments.document import Document
 from experiments.experiment import Experiment
@@ -153,6 +153,7 @@ def simulate_seeds(
     """
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     for name, experiment in chosen(read, cases).items():
+        experiment = reserves.taking_part(experiment)  # noqa: PLW2901
         log = virtual.simulate(experiment, seeds, tell=partial(_pass_on, tell, name, experiment.duration_s))
         _pass_on(tell, name, experiment.duration_s, math.inf)
         for copy in range(len(seeds)):

@@ -41,7 +41,8 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
         "setpoint": list(commands),
         "ranges": [wire.Ranges(robot, now, [0.0, 0.1], [0.0, 0.0], [1.0, None])],
         "order": [
-            wire.Order("takeoff"), wire.Order("start", at=now + 0.5), wire.Order("hold"), wire.Order("land"),
+            wire.Order("takeoff"), wire.Order("start", at=now + 0.5), wire.Order("hold"), wire.Order("resume"),
+            wire.Order("leave"), wire.Order("land"),
             wire.Order("stop"), wire.Order("get", name="clamp"), wire.Order("set", name="clamp", value=0.2),
             wire.Order("set", name="trigger.period_s", value=0.05),
         ],
@@ -79,6 +80,14 @@ def of_all() -> dict[str, list[object]]:
         KEYS.centre: [centre],
         KEYS.clock: [wire.HostClock("lab1", now, 0.2, 0.001, ["KH01"], 0.2)],
         KEYS.world_order: list(orders),
+        KEYS.run_order: [
+            wire.RunOrder("pause", ["KH01"], who="ana"),
+            wire.RunOrder("remove", ["KH01", "KH02"]),
+            wire.RunOrder("restart", ["CF01"]),
+            wire.RunOrder("add", ["nobody"]),
+            wire.RunOrder("replace", ["KH01"], spare="S1"),
+            wire.RunOrder("replace", ["KH01"], body="twin", at=(0.1, 0.2), yaw=1.0),
+        ],
     }
 
 

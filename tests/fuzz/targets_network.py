@@ -162,7 +162,7 @@ def recorder() -> Iterator[Target]:
 
 
 def conductor() -> Iterator[Target]:
-    """The conductor follows the robots' statuses, states and tokens."""
+    """The conductor follows the robots' statuses, states and tokens, and changes robots when it is asked."""
     from experiments.conductor import Conductor  # noqa: PLC0415
     from experiments.hosts import Hosts  # noqa: PLC0415
 
@@ -171,6 +171,13 @@ def conductor() -> Iterator[Target]:
     class Nobody:
         def died(self) -> list[object]:
             return []
+
+        def running(self, _name: str) -> bool:
+            return False
+
+        def start(self, *_: str) -> None: ...
+
+        release = kill = start
 
     def make():
         net.forget()
@@ -182,6 +189,7 @@ def conductor() -> Iterator[Target]:
             show=lambda _: None, interrupted=lambda: False,
         )  # fmt: skip
         made._join(ExitStack())
+        made._changes.begin(time.time())
 
         def take(data: bytes) -> None:
             net.deliver(data, gone=len(data) % 16 == 0)

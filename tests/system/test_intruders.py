@@ -164,6 +164,24 @@ def test_orders_are_the_operators(laboratory: Laboratory, who: str) -> None:
     assert laboratory.watcher.order("CF01", wire.Order("get", name="clamp")).ok, "the operator is heard"
 
 
+@pytest.mark.parametrize("who", ["KH03", "observer", "recorder", "world"])
+def test_robots_are_changed_by_operators_only(laboratory: Laboratory, who: str) -> None:
+    """Somebody else neither asks the conductor for a change, nor answers in its place."""
+    order = wire.RunOrder("remove", ["CF01"], who="operator")
+    with laboratory.session(who) as session:
+        false = network.orders(session, KEYS.run_order)
+        reply = orders.give_run(laboratory.watcher.session, KEYS, order, 0.5)
+        assert "no conductor answers" in reply.reason
+        assert false.handler.try_recv() is None, "and it does not even hear of it"
+        false.undeclare()  # type: ignore[no-untyped-call]
+        asked = network.orders(laboratory.watcher.session, KEYS.run_order)
+        settled(laboratory)
+        for key in (KEYS.run_order, "park/run/*", "park/**"):
+            assert not list(session.get(key, payload=wire.encode(order), encoding=wire.JSON, timeout=0.5))
+        assert asked.handler.try_recv() is None
+        asked.undeclare()  # type: ignore[no-untyped-call]
+
+
 def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory: Laboratory) -> None:
     with laboratory.session("KH03") as session:
         neighbour = network.pose_subscriber(session, KEYS.pose("KH01"))

@@ -173,6 +173,23 @@ def test_a_machine_that_is_cut_off_lands_its_robots_and_the_others_go_on(lab: Ma
     until(lambda: not busy(lab), "nothing is left", 5.0)
 
 
+def test_a_robot_that_dies_on_a_machine_is_started_again_there(lab: Machines, tmp_path: Path) -> None:
+    file, folder = tmp_path / "x.toml", tmp_path / "run"
+    text = document.catalogue_path("triangle").read_text("utf-8").replace("duration_s = 15.0", "duration_s = 12.0")
+    text = text.replace("seed = 1 ", 'on_loss = "restart"\nseed = 1 ')
+    file.write_text(f'{text}\n[hosts.lab1]\naddress = "lab1"\nzenpark = "{lab["lab1"].zenpark()}"\nrobots = ["KH01"]\n')
+    flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--no-report")
+    until(lambda: "running" in said(folder / "logs", "KH01"), "it runs", 60.0)
+    (first,) = (each for each in lab["lab1"].processes() if "KH01" in each.cmdline())
+    first.kill()
+    out, _ = flight.communicate(timeout=90)
+    assert flight.returncode == 0, out
+    for each in ("lost KH01: its process ended", "restart KH01: asked by on_loss", "changed KH01: takes part again"):
+        assert each in out, out
+    assert said(folder / "logs", "KH01").count("done (finished)") == 1
+    until(lambda: not busy(lab), "nothing is left", 5.0)
+
+
 def test_hosts_check_tells_of_each_machine(lab: Machines, tmp_path: Path) -> None:
     file = experiment(lab, tmp_path, 4.0)
     checked = zenpark(lab, "hosts", "check", str(file))

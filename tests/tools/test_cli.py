@@ -51,6 +51,7 @@ def test_commands():
                 "twin",
                 "order",
                 "estop",
+                "robot",
                 "bridge",
                 "centre",
                 "world",

@@ -1,0 +1,316 @@
+"""Changes in mid-run, step by step: who is asked for what, in which order, what is refused. No process, no network."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents import wire
+from agents.keys import Keys
+from agents.lifecycle import Phase
+from experiments import changes, document
+from experiments.changes import HotChanges
+from experiments.experiment import Experiment, Robot
+from experiments.seen import Seen
+
+KEYS = Keys()
+START = 1000.0
+
+
+class Clock:
+    """Time that passes when it is told to."""
+
+    now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def time(self) -> float:
+        return START + self.now
+
+
+class Payload:
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def to_bytes(self) -> bytes:
+        return self._data
+
+
+class Query:
+    """An order to the conductor, and its answer."""
+
+    encoding = wire.JSON
+    reply_sent: wire.RunReply | None = None
+    error = b""
+
+    def __init__(self, payload: bytes) -> None:
+        self.payload = Payload(payload)
+
+    def __enter__(self) -> Query:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self.reply_sent is not None or self.error, "a query without an answer"
+
+    def reply(self, key: str, payload: bytes, encoding: str) -> None:
+        assert (key, self.reply_sent) == (KEYS.run_order, None)
+        self.reply_sent = wire.decode(payload, encoding, wire.RunReply)
+
+    def reply_err(self, payload: bytes, encoding: str) -> None:
+        self.error = payload
+
+
+class View:
+    """Robots that do at once what they are told, unless they hang."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage, self.robots = stage, stage.robots
+        self.waiting: deque[Query] = deque()
+        self.orders = self
+        self.handler = self
+        self.given: list[tuple[str, str]] = []
+        self.said: list[tuple[str, str, str]] = []
+
+    def try_recv(self) -> Query | None:
+        return self.waiting.popleft() if self.waiting else None
+
+    def say(self, kind: str, source: str, text: str) -> None:
+        self.said.append((kind, source, text))
+
+    def order(self, name: str, order: wire.Order) -> wire.Reply:
+        self.given.append((name, order.order))
+        if name in self._stage.hung:
+            return wire.Reply(name, ok=False, phase="unknown", reason="no answer")
+        if order.order == "start":
+            assert order.at == START
+        self._stage.told(name, order.order)
+        return wire.Reply(name, ok=True, phase=self.robots[name].phase)
+
+
+class Crew:
+    """Processes that start and end at once."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self.adopted: set[str] = set()
+        self.away: dict[str, str] = {}
+        self.running = {name for name, seen in stage.robots.items() if not seen.gone}
+        self.bodies = dict(stage.experiment.robots)
+        self.did: list[tuple[str, ...]] = []
+
+    def companions(self, name: str) -> list[str]:
+        return [name]
+
+    def runs(self, name: str) -> bool:
+        return name in self.running
+
+    def robot(self, name: str) -> Robot:
+        return self.bodies[name]
+
+    def place(self, name: str, robot: Robot | None = None) -> Any:
+        return np.array((robot or self.bodies[name]).start[:2])
+
+    def release(self, name: str) -> None:
+        self.did.append(("release", name))
+
+    def kill(self, name: str) -> None:
+        self.did.append(("kill", name))
+        self._stage.end(name)
+
+    def start_again(self, names: tuple[str, ...], bodies: dict[str, Robot] | None = None) -> None:
+        self.did.append(("start", *names))
+        self.bodies |= bodies or {}
+        for name in names:
+            self.running.add(name)
+            self._stage.appear(name)
+
+
+class Stage:
+    """The triangle in flight, a spare beside it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **more: Any) -> None:
+        self.clock = Clock()
+        monkeypatch.setattr(changes, "time", self.clock)
+        spare = Robot(kind="crazyflie", start=[0.8, 0.8], hover=0.5)
+        experiment = msgspec.structs.replace(document.read("triangle").experiment, spares={"S1": spare}, **more)
+        self.experiment: Experiment = experiment
+        self.robots = {name: Seen(place=(*robot.start[:2], 0.0)) for name, robot in experiment.robots.items()}  # type: ignore[arg-type]
+        self.hung: set[str] = set()
+        self._pid = 1
+        self.view = View(self)
+        self.crew = Crew(self)
+        for name in self.robots:
+            self.appear(name)
+            self.told(name, "start")
+        self.changes = HotChanges(experiment, self.crew, self.view, KEYS)  # type: ignore[arg-type]
+        self.changes.begin(START)
+
+    def appear(self, name: str) -> None:
+        self._pid += 1
+        self.robots[name].alive = True
+        self.phase(name, "ready")
+
+    def phase(self, name: str, phase: str) -> None:
+        assert phase in [each.word for each in Phase]
+        self.robots[name].status = wire.Status(
+            robot=name, stamp=self.clock.time(), phase=phase, reason="", body="", battery=None, sent=0, heard=0,
+            lost={}, dropped={}, malformed=0, refused=0, ticks=0, missed=0, decisions=0, interventions=0, avoided=0,
+            late_s=0.0, started=0.0, missing=[], pid=self._pid, cpu_s=0.0, rss_mb=0.0,
+        )  # fmt: skip
+
+    def told(self, name: str, order: str) -> None:
+        if order == "leave":
+            self.end(name)
+        elif order in ("takeoff", "start"):
+            self.phase(name, {"takeoff": "airborne", "start": "running"}[order])
+
+    def end(self, name: str) -> None:
+        """Its process is over."""
+        self.crew.running.discard(name)
+        self.robots[name].alive = False
+        if not self.changes.expects(name, "its process ended"):
+            self.changes.lose(name)
+
+    def ask(self, what: wire.ChangeKind, *names: str, **more: Any) -> Query:
+        query = Query(wire.encode(wire.RunOrder(what, list(names), **more)))
+        self.view.waiting.append(query)
+        return query
+
+    def go_on(self, seconds: float = 1.0) -> None:
+        for _ in range(round(seconds / 0.5)):
+            self.changes.go_on()
+            self.clock.now += 0.5
+
+    def after(self, query: Query, seconds: float = 1.0) -> wire.RunReply:
+        self.go_on(seconds)
+        assert query.reply_sent is not None, self.view.said
+        return query.reply_sent
+
+
+@pytest.fixture
+def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
+    return Stage(monkeypatch)
+
+
+def test_a_restart_lands_starts_and_joins_by_the_common_clock(stage: Stage) -> None:
+    reply = stage.after(stage.ask("restart", "CF01"), 5.0)
+    assert set(reply.done) == {"CF01"}
+    assert stage.view.given == [("CF01", "leave"), ("CF01", "takeoff"), ("CF01", "start")]
+    assert stage.crew.did == [("start", "CF01")]
+    assert (stage.robots["CF01"].phase, stage.robots["CF01"].out) == ("running", "")
+
+
+def test_one_order_for_several_is_answered_when_all_are_done(stage: Stage) -> None:
+    stage.hung.add("KH02")
+    query = stage.ask("remove", "KH01", "KH02", "KH01")
+    stage.go_on(2.0)
+    assert query.reply_sent is None
+    assert stage.robots["KH01"].out == "removed"
+    reply = stage.after(query, 4.0)
+    assert set(reply.done) == {"KH01", "KH02"}
+    assert stage.crew.did == [("release", "KH02"), ("kill", "KH02")], "who hangs lands if it can, and is ended else"
+
+
+@pytest.mark.parametrize("away", [0.3, 0.1])
+def test_a_place_is_free_or_not(stage: Stage, away: float) -> None:
+    x, y = stage.experiment.robots["CF01"].start[:2]
+    stage.robots["KH01"].place = (x + away, y, 0.0)
+    reply = stage.after(stage.ask("restart", "CF01"), 5.0)
+    assert bool(reply.done) == (away > 0.2), reply
+    assert reply.done or "m from KH01: it needs 0.1 m around it" in reply.refused["CF01"]
+    assert bool(stage.view.given) == bool(reply.done), "who is refused is left alone"
+
+
+def test_what_lies_where_it_was_lost_counts_unless_it_was_a_twin(stage: Stage) -> None:
+    x, y = stage.experiment.robots["CF01"].start[:2]
+    stage.robots["KH01"].place = (x, y, 0.0)
+    stage.end("KH01")
+    stage.crew.bodies["KH01"] = msgspec.structs.replace(stage.crew.bodies["KH01"], body="khepera4://192.0.2.1")
+    assert "from KH01" in stage.after(stage.ask("restart", "CF01"), 2.0).refused["CF01"]
+    stage.crew.bodies["KH01"] = stage.experiment.robots["KH01"]
+    assert stage.after(stage.ask("restart", "CF01"), 5.0).done
+
+
+def test_whole_orders_that_are_refused(stage: Stage) -> None:
+    for query, said in (
+        (stage.ask("pause", "KH1"), "no robot 'KH1' in this run"),
+        (stage.ask("pause"), "name one or more of KH01, KH02, CF01"),
+        (stage.ask("restart", "KH01", body="twin"), "belong to replace"),
+        (stage.ask("replace", "KH01", "KH02", body="twin"), "one robot at a time"),
+    ):
+        assert said in stage.after(query).reason
+    mad = Query(b'{"order": "explode", "robots": []}')
+    stage.view.waiting.append(mad)
+    stage.go_on()
+    assert b"not a RunOrder" in mad.error
+    assert not stage.view.given
+
+
+def test_who_is_being_changed_is_not_changed_again(stage: Stage) -> None:
+    stage.hung.add("CF01")
+    first, second = stage.ask("remove", "CF01"), stage.ask("restart", "CF01")
+    assert "is being changed already" in stage.after(second).refused["CF01"]
+    assert stage.after(first, 5.0).done
+
+
+def test_the_end_of_the_run_answers_everybody(stage: Stage) -> None:
+    stage.hung.add("CF01")
+    query = stage.ask("remove", "CF01")
+    stage.go_on()
+    stage.changes.close()
+    assert query.reply_sent is not None
+    assert query.reply_sent.refused == {"CF01": "the run is over"}
+    assert "this run is not there" in stage.after(stage.ask("pause", "KH01")).reason
+
+
+def test_a_lost_robot_is_started_again_three_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = Stage(monkeypatch, on_loss="restart")
+    for _ in range(3):
+        stage.end("KH01")
+        assert stage.robots["KH01"].out == "lost"
+        stage.go_on(5.0)
+        assert stage.robots["KH01"].phase == "running"
+    stage.end("KH01")
+    stage.go_on(5.0)
+    assert (stage.robots["KH01"].out, stage.view.said[-1]) == ("lost", ("given up", "KH01", "lost 4 times"))
+
+
+def test_a_spare_takes_over_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = Stage(monkeypatch, on_loss="replace")
+    stage.end("CF01")
+    stage.go_on(5.0)
+    assert stage.crew.bodies["CF01"].start == [0.8, 0.8]
+    assert stage.robots["CF01"].phase == "running"
+    stage.end("CF01")
+    stage.go_on(5.0)
+    kind, source, text = stage.view.said[-1]
+    assert (kind, source) == ("refused", "CF01")
+    assert "no spare crazyflie left" in text
+
+
+def test_a_process_that_ends_while_it_joins_is_told(stage: Stage) -> None:
+    query = stage.ask("restart", "KH01")
+    stage.crew.start_again = lambda names, bodies=None: stage.end("KH01")  # type: ignore[method-assign]
+    reply = stage.after(query, 5.0)
+    assert reply.refused == {"KH01": "KH01: its process ended"}
+    assert stage.robots["KH01"].out == "removed"
+    assert stage.changes.under_way == set()
+
+
+def test_orders_that_get_lost_are_repeated_and_time_is_limited(stage: Stage) -> None:
+    query = stage.ask("restart", "KH01")
+    start = stage.crew.start_again
+
+    def hanging(names: tuple[str, ...], bodies: dict[str, Robot] | None = None) -> None:
+        start(names, bodies)
+        stage.hung.add("KH01")
+
+    stage.crew.start_again = hanging  # type: ignore[method-assign]
+    reply = stage.after(query, 10.0)
+    assert reply.refused == {"KH01": "KH01, takeoff: no answer"}
+    assert stage.view.given.count(("KH01", "takeoff")) > 3

@@ -1,0 +1,139 @@
+"""Robots on standby and spares: what the file may say, what runs without them, and who takes over a name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents import wire
+from agents.agent import Agent
+from agents.body import BodyState
+from experiments import assign, checks, document, reserves, run
+from experiments.experiment import Channel, Experiment, Formation, Hybrid, Leg, Link, LinkChannel, Outage, Robot
+from experiments.succession import Refused, Spares
+
+BOT = Robot(kind="khepera4", start=[0.0, 0.0])
+FLY = Robot(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
+
+
+def experiment(**more: Any) -> Experiment:
+    robots = {
+        "A": BOT,
+        "B": msgspec.structs.replace(BOT, start=[0.5, 0.0]),
+        "C": msgspec.structs.replace(FLY, standby=True),
+    }
+    links: dict[str, float | Link] = {"A - B": 0.5, "A - C": 0.7, "C > B": 0.7}
+    made = Experiment(title="x", robots=robots, duration_s=5.0, formation=Formation(links=links))
+    return msgspec.structs.replace(made, **more)
+
+
+@pytest.mark.parametrize(
+    ("change", "path", "said"),
+    [
+        ({"robots": {"A": msgspec.structs.replace(BOT, standby=True, process="p")}}, ("robots", "A", "process"), "own"),
+        ({"robots": {"A": msgspec.structs.replace(BOT, standby=True)}}, ("robots", "A", "standby"), "all robots"),
+        ({"spares": {"A": BOT}}, ("spares", "A"), "name of a robot already"),
+        ({"spares": {"S": msgspec.structs.replace(FLY, kind="tello")}}, ("spares", "S", "kind"), "no robot is a tello"),
+        ({"spares": {"S": msgspec.structs.replace(FLY, hover=None)}}, ("spares", "S"), "height to hold"),
+        ({"spares": {"S": msgspec.structs.replace(BOT, process="p")}}, ("spares", "S", "process"), "of its own"),
+        ({"spares": {"S": msgspec.structs.replace(BOT, body="khepera4-twin")}}, ("spares", "S", "body"), "before the"),
+        ({"spares": {"S": msgspec.structs.replace(BOT, body="nothing")}}, ("spares", "S", "body"), "no 'nothing'"),
+        ({"on_loss": "replace"}, ("on_loss",), "there is no spare"),
+    ],
+)  # fmt: skip
+def test_reserves_that_nobody_could_call_upon(change: dict[str, object], path: tuple[str, ...], said: str) -> None:
+    found = [(fault.path, f"{fault.message}; {fault.hint}") for fault in checks.faults(experiment(**change))]
+    assert any(where == path and said in what for where, what in found), found
+
+
+def test_what_is_right_is_not_complained_of() -> None:
+    assert not list(checks.faults(experiment(spares={"S": FLY, "T": BOT}, on_loss="replace")))
+
+
+def test_without_those_on_standby_nothing_names_them() -> None:
+    whole = experiment(
+        timeline=[Leg(at_s=1.0, robot="C", plan="hold")],
+        architecture=Hybrid("hybrid", ["A", "C"]),
+        channel=Channel(
+            links={"A > C": LinkChannel(loss=0.5), "A > B": LinkChannel(loss=0.1)},
+            outages=[Outage(from_s=1.0, links=["A - C"]), Outage(from_s=2.0, robots=["B", "C"]), Outage(from_s=3.0)],
+        ),
+    )
+    made = reserves.taking_part(whole)
+    assert list(made.robots) == ["A", "B"]
+    assert made.formation.links == {"A - B": 0.5}
+    assert not made.timeline
+    assert list(made.channel.links) == ["A > B"]
+    assert [(outage.from_s, outage.robots) for outage in made.channel.outages] == [(2.0, ["B"]), (3.0, [])]
+    assert made.architecture == Hybrid("hybrid", ["A"])
+    assert not list(checks.faults(made))
+    assert reserves.taking_part(made) is made
+
+
+def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:
+    file = tmp_path / "x.json"
+    file.write_bytes(document.write_json(experiment()))
+    trace = next(iter(run.simulate(document.read(file)).traces.values()))
+    assert trace.robots == ("A", "B")
+
+
+@pytest.mark.parametrize("standby", [True, False])
+def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
+    case = experiment()
+    robots = {**case.robots, "C": msgspec.structs.replace(FLY, standby=standby)}
+    told = assign.assign(msgspec.structs.replace(case, robots=robots), ["A"])
+    agent = Agent(told)
+    assert agent.missing(0) == ["B", "C"]
+    link = np.array([told.speakers[j] for j in told.links.speaker]) == "B"
+    at = np.flatnonzero(link)
+    agent.hear(at, np.array([[0.5, 0.0, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+    state = BodyState(
+        time=np.zeros(1), position=np.zeros((1, 3)), yaw=np.zeros(1), velocity=np.zeros((1, 3)),
+        flying=np.zeros(1, dtype=bool), battery=np.ones(1), true_position=np.zeros((1, 3)), true_yaw=np.zeros(1),
+    )  # fmt: skip
+    for tick in range(3):
+        agent.step(0.01 * tick, state)
+    assert (agent.life.phase[0] > 0) == standby
+    assert agent.missing(0) == ["C"]
+
+
+def order(**more: object) -> wire.RunOrder:
+    return wire.RunOrder("replace", ["A"], **more)  # type: ignore[arg-type]
+
+
+def test_a_spare_brings_its_body_and_keeps_the_rest() -> None:
+    spare = msgspec.structs.replace(BOT, start=[0.2, 0.3, 1.0], body="khepera4://192.0.2.1", avoids=False)
+    spares = Spares(experiment(spares={"F": FLY, "S": spare}))
+    old = msgspec.structs.replace(BOT, ranges="world")
+    robot, whose = spares.successor("A", old, order())
+    assert whose == "S", "the first of its kind"
+    assert (robot.body, robot.start, robot.avoids, robot.ranges) == (spare.body, spare.start, True, "body")
+    spares.used["S"] = "A"
+    with pytest.raises(Refused, match="no spare khepera4 left"):
+        spares.successor("A", old, order())
+    robot, whose = spares.successor("A", old, order(body="twin", at=(0.5, 0.25), yaw=1.0))
+    assert (robot.body, robot.start, whose) == ("twin", [0.5, 0.25, 1.0], None)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (order(spare="F"), "is a crazyflie and cannot be A"),
+        (order(spare="G"), "no spare 'G'"),
+        (order(spare="S", body="twin"), "leave --body or --with out"),
+        (order(body="tello-twin"), "before the run only"),
+        (order(body="nowhere://1"), "no 'nowhere'"),
+        (order(body="world"), "into the world"),
+        (order(body="twin", at=(99.0, 0.0)), "outside of the arena"),
+        (order(body="twin", at=(float("nan"), 0.0)), "outside of the arena"),
+        (order(body="twin", at=(0.0, 0.0), yaw=float("inf")), "outside of the arena"),
+        (order(body="khepera4://192.0.2.1", at=(0.0, 0.0)), "only a twin"),
+    ],
+)
+def test_what_cannot_take_over_a_name(asked: wire.RunOrder, said: str) -> None:
+    with pytest.raises(Refused, match=said):
+        Spares(experiment(spares={"F": FLY, "S": BOT})).successor("A", BOT, asked)
