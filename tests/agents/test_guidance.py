@@ -41,9 +41,11 @@ class Bench:
         for _ in range(count):
             rows = len(self.position)
             still, flying = np.zeros((rows, 3)), np.array([False, True])[:rows]
+            life, position = self.agent.life, self.position.copy()
+            position[(life.phase <= READY) & ~life.active, 2] = 0.0  # on the floor, until it is told to climb
             state = BodyState(
-                time=np.full(rows, self.t), position=self.position.copy(), velocity=still, yaw=np.zeros(rows),
-                battery=np.full(rows, NAN), flying=flying, true_position=self.position.copy(), true_yaw=np.zeros(rows),
+                time=np.full(rows, self.t), position=position, velocity=still, yaw=np.zeros(rows),
+                battery=np.full(rows, NAN), flying=flying, true_position=position, true_yaw=np.zeros(rows),
             )  # fmt: skip
             self.actions = self.agent.step(self.t, state)
             self.t = round(self.t + 0.01, 9)
@@ -179,12 +181,12 @@ def test_orders_are_obeyed_whatever_the_centre_says():
 
 def test_cut_off_from_the_network_it_holds():
     bench = Bench(pair()).running()
-    bench.agent.outside.offline_since = bench.t - 0.5
-    bench.told([0, 1], [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])
-    bench.step()
+    bench.agent.outside.offline_since = bench.t
+    bench.step(50)
+    bench.told([0, 1], [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])  # the last that came through
+    bench.step(50)
     np.testing.assert_array_equal(bench.agent.goal[0], [-0.3, 0.1, 0.0])
-    bench.agent.outside.offline_since = bench.t - 1.1
-    bench.step()
+    bench.step(2)
     np.testing.assert_array_equal(bench.agent.goal, bench.position)
 
 
