@@ -190,7 +190,11 @@ class BodyState:
 
 
 class Body(Protocol):
-    """What the runtime drives. `takes` of each row's kind says how a row of `command` is read."""
+    """What the runtime drives. `takes` of each row's kind says how a row of `command` is read.
+
+    Calls come from one thread, but for `land` and `stop`: these come from others too, more than once, and while another
+    call runs or hangs (`agents.watchdog`, emergency stops). They must neither block nor need the loop to go on.
+    """
 
     def open(self) -> None:
         """Connects; returns when poses arrive.
