@@ -66,3 +66,37 @@ def test_what_is_wrong_is_told_with_its_place(tmp_path, text, at, message, hint)
     assert line_number == at
     assert message in told
     assert hint in remedy
+
+
+@pytest.mark.parametrize(
+    ("text", "at", "message", "hint"),
+    [
+        (
+            'routers = 2\nconnect = ["tcp/lab:1"]\n',
+            10,
+            "with `connect` it starts none",
+            "zenpark router --connect OTHER",
+        ),
+        ('routers = 2\nlisten = ["tcp/127.0.0.1:1"]\n', 10, "2 routers cannot share 1 endpoints", "of its own"),
+        ('listen = ["udp/127.0.0.1:1"]\n', 10, "cannot be used: what it loses", "tls, quic or unixsock-stream/PATH"),
+        ('topology = "mesh"\nrouters = 2\n', 11, "a mesh has no routers", "leave it out"),
+        ('topology = "mesh"\nconnect = ["tcp/lab:1"]\n', 11, "a mesh has no routers", "leave it out"),
+        ('topology = "mesh"\naddresses.C = "tcp/127.0.0.1:1"\n', 11, "no robot is called 'C'", "known: A, B"),
+        ('topology = "mesh"\naddresses.A = "tcp/0.0.0.0:1"\n', 11, "nobody can connect to every", "its neighbours"),
+        ('topology = "mesh"\naddresses.A = "ws/127.0.0.1:1"\n', 11, "shows no certificates", "tls"),
+        ('topology = "mesh"\n' + LAB, 10, "nobody knows where it listens there", "addresses.A"),
+        ('addresses.A = "tcp/127.0.0.1:1"\n', 10, "where robots listen in a mesh", 'topology = "mesh"'),
+    ],
+)
+def test_what_does_not_go_together_in_a_network(tmp_path, text, at, message, hint):
+    found = problems(tmp_path, HEAD + "[network]\n" + text)
+    assert len(found) == 1, found
+    assert found[0][0] == at
+    assert message in found[0][1]
+    assert hint in found[0][2]
+
+
+def test_several_routers_with_endpoints_of_their_own(tmp_path):
+    assert problems(tmp_path, HEAD + '[network]\nrouters = 2\nlisten = ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]\n') == []
+    text = 'topology = "mesh"\naddresses.A = "tcp/127.0.0.1:1"\n'
+    assert problems(tmp_path, HEAD + "[network]\n" + text) == []

@@ -1,4 +1,5 @@
 import importlib
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -140,3 +141,23 @@ def test_bad_input_is_explained(arguments, why):
 @pytest.mark.parametrize(("module", "name"), EXPLAINED)
 def test_explained_errors_exist(module, name):
     assert issubclass(getattr(importlib.import_module(module), name), Exception)
+
+
+def test_a_configuration_for_zenohd_is_printed():
+    done = zenpark("router", "--print-config", "--listen", "tcp/127.0.0.1:7999", "--connect", "tcp/lab:1")
+    assert done.returncode == 0
+    made = json.loads(done.stdout)
+    assert made["listen"] == {"endpoints": ["tcp/127.0.0.1:7999"]}
+    assert made["connect"]["endpoints"] == ["tcp/lab:1"]
+    assert made["scouting"]["multicast"] == {"enabled": False}
+    assert zenpark("router", "--print-config", "--listen", "tcp/0.0.0.0:1").returncode == 2
+
+
+def test_endpoints_come_from_the_file_of_a_run(tmp_path):
+    file = tmp_path / "network.txt"
+    endpoint = free_endpoint(0)
+    file.write_text(f"{endpoint}\n")
+    done = zenpark("keys", "--connect", f"@{file}")
+    assert (done.returncode, endpoint in done.stderr) == (2, True)
+    done = zenpark("keys", "--connect", "@nowhere")
+    assert (done.returncode, done.stderr[:30]) == (2, "zenpark: nowhere: cannot be re")
