@@ -110,6 +110,7 @@ class Runtime:
         self._channel = Channel(setup.conditions or Conditions.ideal(len(assignment.links)))
         self._state_slot = 0
         self._stopping: str | None = None
+        self._retired: set[int] = set()  # rows that came down while the experiment goes on
         self._news = False  # somebody came or went since the last report
         self._utc = self._now = self._next = 0.0
         self._reach = reach_of(assignment.limits)
@@ -396,10 +397,12 @@ class Runtime:
             state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))
             self._counts.malformed += self._ranges.malformed - refused
         said = self.agent.speak(t, state)
-        for row in said.rows:
+        for row in said.rows if not self._retired else [row for row in said.rows if row not in self._retired]:
             self._say(int(row), said, float(state.yaw[row]), t)
         actions = self.agent.act(t, state, said)
         self._act(actions)
+        if self.agent.life.moved:
+            self._retire(t)
         counts, telemetry = self._counts, self._telemetry
         if not begun and self.agent.decisions:
             counts.begin()
@@ -413,6 +416,15 @@ class Runtime:
             telemetry.scan(state)
         telemetry.report(t, everything=t >= telemetry.due, state=state, changed=self._news)
         self._news = False
+
+    def _retire(self, t: float) -> None:
+        """Who is down before the end takes its token back: neighbours must not keep to somebody on the floor."""
+        life = self.agent.life
+        begun = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
+        for row in np.flatnonzero(begun & (life.phase == Phase.DONE)).tolist():
+            if row not in self._retired:
+                self._retired.add(row)
+                self._tokens[row].undeclare()  # type: ignore[no-untyped-call]
 
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""

@@ -387,7 +387,8 @@ class Conductor:
 
     def _miss(self, name: str, seen: Seen) -> None:
         """The token of an adopted robot has vanished: all that is known of its end. Without a router all vanish."""
-        if name in self._crew.adopted and not seen.alive and network.connected(self._session):
+        there = seen.alive or seen.reached("landing")  # who is down before the others takes its token back
+        if name in self._crew.adopted and not there and network.connected(self._session):
             seen.gone = True
             self._say("lost", name, "is not on the network any more")
 
