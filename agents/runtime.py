@@ -121,6 +121,7 @@ class Runtime:
         self._state_slot = 0
         self._stopping: str | None = None
         self._leaving: set[int] = set()  # rows that were told to go while the run goes on
+        self._retired: set[int] = set()  # rows that are down while the run goes on
         self._doubt_until = -np.inf
         self._cut_off = False  # motors were cut by a stop that the loop has not seen yet
         self._slept, self._joined = 0.0, False
@@ -248,7 +249,7 @@ class Runtime:
         self._tokens = {
             row: network.alive_token(self._session, keys.alive(name))
             for row, name in enumerate(self._names)
-            if row not in self._leaving
+            if row not in self._retired
         }
 
     def _call_for_help(self, why: str) -> None:
@@ -487,10 +488,12 @@ class Runtime:
             state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))
             self._counts.malformed += self._ranges.malformed - refused
         said = self.agent.speak(t, state)
-        for row in said.rows if not self._leaving else self._still_heard(said.rows):
+        for row in said.rows if not self._retired else [row for row in said.rows if row not in self._retired]:
             self._say(int(row), said, float(state.yaw[row]), t)
         actions = self.agent.act(t, state, said)
         self._act(actions)
+        if self.agent.life.moved or self._leaving:
+            self._retire(t)
         counts, telemetry = self._counts, self._telemetry
         if not begun and self.agent.decisions:
             counts.begin()
@@ -505,13 +508,14 @@ class Runtime:
         telemetry.report(t, everything=t >= telemetry.due, state=state, changed=self._news)
         self._news = False
 
-    def _still_heard(self, rows: Index) -> list[int]:
-        """Those of `rows` that have not left; who has is down, and no neighbour must find it by a pose or a token."""
-        left = [row for row in self._leaving if self.agent.life.phase[row] == Phase.DONE]
-        for row in left:
-            if (token := self._tokens.pop(row, None)) is not None:
-                token.undeclare()  # type: ignore[no-untyped-call]
-        return [row for row in rows.tolist() if row not in left]
+    def _retire(self, t: float) -> None:
+        """Who is down before the end takes its token back: no neighbour must keep to somebody on the floor."""
+        life = self.agent.life
+        early = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
+        for row in np.flatnonzero(life.phase == Phase.DONE).tolist():
+            if (early[row] or row in self._leaving) and row not in self._retired:
+                self._retired.add(row)
+                self._tokens.pop(row).undeclare()  # type: ignore[no-untyped-call]
 
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""

@@ -87,13 +87,24 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 class Ended(msgspec.Struct, frozen=True):
-    """How a round ended: faults that it had no time for, what was wrong with it, and how near robots came [m]."""
+    """How a round ended.
+
+    Attributes:
+        round: Counted from 1.
+        left: Faults that it had no time for.
+        violations: What was wrong that no fault explains.
+        nearest_m: How near robots came to each other, between surfaces [m].
+        gone_s: After its end, how long until all of its processes were gone [s].
+        missed: Share of the ticks that robots missed which were never stopped: how busy the machine was.
+        recording: Its folder, if there is a recording.
+    """
 
     round: int
     left: list[Fault]
     violations: list[str]
     nearest_m: float
     gone_s: float
+    missed: float
     recording: str
 
 
@@ -230,12 +241,12 @@ class Flight:
             )
             stack.callback(self._sweep, watched)
             injector = Injector(watched, cables, clock, random, groups=groups, recording=recording)
-            nearest = math.inf
+            nearest, missed = math.inf, 0.0
             try:
                 with network.open_session(routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
                     eyes = Eyes(session, experiment)
                     self._follow(watched, injector, eyes, Keys(experiment.network.realm))
-                    nearest = eyes.invariants.nearest
+                    nearest, missed = eyes.invariants.nearest, self._missed(eyes)
             except network.Unreachable as error:
                 self._wrong.append(f"it never began: {error}; {watched.process.tail()}")
             if self._now is not None:
@@ -246,7 +257,7 @@ class Flight:
         for each in self._wrong:
             self._say(f"round {self._number}: {each}")
         kept = folder.name if recording.exists() else ""
-        return Ended(self._number, self._left, self._wrong, round(nearest, 4), round(gone_s, 1), kept)
+        return Ended(self._number, self._left, self._wrong, round(nearest, 4), round(gone_s, 1), missed, kept)
 
     # ------------------------------------------------------------------ the run
 
@@ -466,6 +477,13 @@ class Flight:
         if not self._conductor_dead and code != 0:
             self._wrong.append(f"the run ended with exit code {code}: {watched.process.tail()}")
         return gone
+
+    def _missed(self, eyes: Eyes) -> float:
+        """Share of the ticks that robots missed which nobody stopped."""
+        stopped = {each.victim for each in self.outcomes} | self._dead.keys()
+        statuses = [status for name, status in eyes.status.items() if name not in stopped and status.ticks]
+        ticks, missed = (sum(getattr(status, what) for status in statuses) for what in ("ticks", "missed"))
+        return round(missed / (ticks + missed), 4) if ticks else 0.0
 
     @staticmethod
     def _sweep(watched: Watched) -> None:

@@ -41,6 +41,7 @@ MEANT: Final = (
     ("corrupt", "Payloads of nonsense on every key that a robot believes, and on the emergency stop's."),
     ("bits", "One bit is wrong in 5 % of a robot's segments for 1 s: its connection breaks."),
 )  # fmt: skip
+BUSY: Final = 0.05  # share of the ticks that a machine may miss which is to be trusted with the rest
 SMALL: Final = 20  # so many rows stand open
 
 
@@ -96,6 +97,11 @@ def findings(result: Result) -> list[Finding]:
     found.append(Finding("plain", f"robots came as near as {nearest:.3f} m to each other, surface to surface"))
     late = max((each.gone_s for each in rounds), default=0.0)
     found.append(Finding("plain", f"after the end of a round all of its processes were gone within {late:.1f} s"))
+    found += [
+        Finding("fair", f"round {each.round}: the machine was too busy, {100 * each.missed:.0f} % of ticks were missed")
+        for each in rounds
+        if each.missed > BUSY
+    ]
     found += [Finding("fair", f"{kind} was left out: {why}") for kind, why in result.skipped.items()]
     wrong = [line(each) for each in result.outcomes if each.violations]
     wrong += [f"round {each.round}: {text}" for each in rounds for text in each.violations]

@@ -330,7 +330,9 @@ class Conductor:
 
     def _miss(self, name: str) -> None:
         """The token of an adopted robot has vanished for good: all that is known of its end."""
-        if name in self._crew.adopted and not self._changes.expects(name, "it is gone"):
+        if name not in self._crew.adopted or self._changes.expects(name, "it is gone"):
+            return
+        if not self._robots[name].reached("landing"):  # who is down before the others takes its token back
             self._view.say("lost", name, "is not on the network any more")
             self._changes.lose(name)
 

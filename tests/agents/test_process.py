@@ -6,7 +6,8 @@ import signal
 
 import pytest
 
-from agents.process import add_network, told_to_end
+from agents.process import add_network, reached, told_to_end
+from agents.session import DEFAULT_ENDPOINT, EndpointError
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -29,7 +30,17 @@ def test_what_was_before_comes_back_after_an_error():
 
 def test_the_arguments_of_the_network():
     parser = argparse.ArgumentParser()
-    add_network(parser)
-    assert vars(parser.parse_args([])) == {"connect": None, "realm": "park", "lifeline": False}
+    add_network(parser, "twin")
+    plain = {"connect": None, "lab": None, "identity": "twin", "realm": "park", "lifeline": False}
+    assert vars(parser.parse_args([])) == plain
     given = parser.parse_args(["--connect", "tcp/a:1", "--connect", "tcp/b:2", "--realm", "hall", "--lifeline"])
-    assert vars(given) == {"connect": ["tcp/a:1", "tcp/b:2"], "realm": "hall", "lifeline": True}
+    assert vars(given) == {**plain, "connect": ["tcp/a:1", "tcp/b:2"], "realm": "hall", "lifeline": True}
+    assert reached(given) == ["tcp/a:1", "tcp/b:2"]
+    assert reached(parser.parse_args([])) == [DEFAULT_ENDPOINT]
+
+
+def test_a_lab_wants_endpoints_that_ask_for_certificates(tmp_path):
+    parser = argparse.ArgumentParser()
+    add_network(parser, "twin")
+    with pytest.raises(EndpointError, match="asks for no certificate"):
+        reached(parser.parse_args(["--connect", "tcp/a:1", "--lab", str(tmp_path), "--as", "CF01"]))

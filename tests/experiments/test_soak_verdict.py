@@ -1,0 +1,71 @@
+"""The verdict of a soak finds what was planted."""
+
+import pytest
+
+from experiments.soak_verdict import Row, Soaked, figure, judge, passed, table
+
+ROBOTS = ("TB01", "CF02")
+SPAN = 3600.0
+
+
+def soaked(change=None, *, until=SPAN, **more):
+    rows = []
+    for k in range(int(until / 5.0)):
+        t = 5.0 * k
+        for name in (*ROBOTS, "router", "recorder"):
+            fields = {"rss_mb": 60.0, "threads": 5, "files": 10, "cpu_s": 0.02 * t}
+            if name in ROBOTS:
+                fields |= {"lost": 0, "missed": 0, "ticks": 100 * k, "malformed": 0}
+                fields |= {"heard": 5, "delay_s": 0.002, "longest_s": 0.01}
+            if change is not None:
+                fields |= change(name, t)
+            rows.append(Row(t, name, **fields))
+    return Soaked("test", ROBOTS, SPAN, rows, **({"exit": 0, "died": {}} | more))
+
+
+def bad(found):
+    return [finding.text for finding in found if finding.mark == "bad"]
+
+
+def test_nothing_is_wrong():
+    made = soaked()
+    assert passed(judge(made))
+    assert [row.cells[0] for row in table(made).rows] == ["CF02", "TB01", "recorder", "router"]
+    figure(made)
+
+
+def test_memory_that_is_taken_before_the_warm_up_does_not_count():
+    assert passed(judge(soaked(lambda name, t: {"rss_mb": 60.0 + min(t, 250.0) / 10.0})))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda name, t: {"rss_mb": 60.0 + t / 1000.0} if name == "recorder" else {},
+            "memory grows beyond 2 %: recorder",
+        ),
+        (lambda name, t: {"threads": 5 + (t > 3500.0)} if name == "router" else {}, "threads grow: router +1"),
+        (lambda name, t: {"files": 10 + int(t / 600.0)} if name == "TB01" else {}, "file descriptors grow: TB01"),
+        (lambda name, t: {"lost": int(t > 1800.0)} if name == "CF02" else {}, "lost poses: CF02 1"),
+        (lambda name, t: {"malformed": 3} if name == "CF02" else {}, "3 payloads were refused"),
+        (lambda name, t: {"delay_s": 0.002 + t / 1e5} if name in ROBOTS else {}, "delay of poses"),
+        (lambda name, t: {"heard": 0} if name in ROBOTS else {}, "nobody heard a pose"),
+    ],
+)
+def test_what_was_planted_is_found(change, said):
+    found = bad(judge(soaked(change)))
+    assert len(found) == 1
+    assert found[0].startswith(said)
+
+
+def test_the_dead_are_named():
+    found = bad(judge(soaked(died={"CF02": 12.0}, exit=2)))
+    assert found == ["CF02 ended after 12 s", "the run ended with exit code 2: see logs/"]
+
+
+def test_memory_of_a_short_run_is_not_judged():
+    made = soaked(lambda name, t: {"rss_mb": 60.0 + t}, until=60.0)
+    short = Soaked(made.title, made.robots, 60.0, made.rows, 0, {})
+    assert passed(judge(short))
+    assert any("not judged" in finding.text for finding in judge(short))

@@ -1,0 +1,47 @@
+"""The fault laboratory on a small experiment, with real processes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.system.lab import ENVIRONMENT, ROOT
+
+pytestmark = pytest.mark.system
+
+
+def chaos(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "tools.guard", "chaos", *arguments, "--out", str(folder)],
+        cwd=ROOT,
+        env=ENVIRONMENT,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=150,
+    )
+
+
+def test_a_router_dies_a_step_of_the_clock_and_the_death_of_the_launcher(tmp_path: Path) -> None:
+    folder = tmp_path / "chaos"
+    kinds = ("--kinds", "router,clock,conductor")
+    done = chaos(folder, "triangle", "--faults", "3", "--seed", "1", *kinds, "--set", "duration_s=30", "--json")
+    assert done.stdout, done.stderr
+    result = json.loads(done.stdout)
+    assert {each["fault"]["kind"] for each in result["outcomes"]} == {"router", "clock", "conductor"}, done.stderr
+    assert all(each["recovered"] for each in result["outcomes"]), done.stderr
+    assert not any("left behind" in text for each in result["rounds"] for text in each["violations"])
+    assert json.loads((folder / "chaos.json").read_text()) == result
+    assert (folder / "chaos.html").stat().st_size > 1000
+
+
+def test_a_fault_that_nobody_knows_is_refused(tmp_path: Path) -> None:
+    done = chaos(tmp_path / "chaos", "triangle", "--kinds", "kil")
+    assert done.returncode == 2
+    assert "no such fault" in done.stderr
+    assert done.stderr.count("\n") <= 2

@@ -1,0 +1,39 @@
+"""A short soak, with real processes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.system.lab import ENVIRONMENT, ROOT
+
+pytestmark = pytest.mark.system
+
+
+def test_four_robots_for_a_quarter_of_a_minute(tmp_path: Path) -> None:
+    asked = ("--minutes", "0.2", "--robots", "4", "--json", "--out", str(tmp_path / "soak"))
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.guard", "soak", *asked],
+        cwd=ROOT,
+        env=ENVIRONMENT,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.stdout, done.stderr
+    said = json.loads(done.stdout)
+    texts = [finding["text"] for finding in said["findings"]]
+    assert texts[0].startswith("all 4 robots lived"), texts
+    assert any(text.startswith("0 of ") and text.endswith("poses were lost") for text in texts), texts
+    with (tmp_path / "soak" / "soak.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["process"] for row in rows} == {"TB01", "KH02", "CF03", "CF04", "router", "recorder", "conductor"}
+    assert all(float(row["rss_mb"]) > 5.0 and int(row["threads"]) > 0 for row in rows)
+    assert (tmp_path / "soak" / "soak.html").stat().st_size > 1000
