@@ -193,7 +193,7 @@ def _check_form(endpoint: str) -> None:
     protocol, slash, address = endpoint.partition("/")
     if not (protocol and slash and address and endpoint.isprintable()):
         raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
-    if why := refusal(endpoint):
+    if why := refusal(lab.bare([endpoint])[0]):
         raise EndpointError(why)
 
 
