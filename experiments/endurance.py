@@ -33,6 +33,9 @@ state_hz = 10                        # telemetry for hours: five times less than
 [disturbance.all]
 position_sigma = 0.0003              # m
 
+[safety]
+battery_low = 0                      # it lasts longer than a drone's battery
+
 [formation]
 law = "displacement"
 

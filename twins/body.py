@@ -165,7 +165,7 @@ class TwinBody:
             yaw=heading,
             true_position=truth,
             true_yaw=yaw,
-            battery=1.0 - self._used / self._endurance,
+            battery=np.maximum(1.0 - self._used / self._endurance, 0.0),
             flying=engine.flying.copy(),
             rays=None if self._sensors is None else self._sensors.rays,
             attitude=engine.attitude,

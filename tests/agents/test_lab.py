@@ -35,7 +35,7 @@ def test_without_endpoints_a_lab_is_on_this_machine(folder):
 def test_a_lab_needs_endpoints_that_ask_for_certificates(folder, endpoint):
     with pytest.raises(LabError, match=rf"{endpoint} asks for no certificate.*write tls/"):
         secured([endpoint], folder)
-    with pytest.raises(EndpointError, match="asks for no certificate|cannot be used"):
+    with pytest.raises(EndpointError, match=r"asks for no certificate|cannot be used"):
         config("client", connect=[f"{endpoint}#lab={folder}"], name="CF01")
 
 
