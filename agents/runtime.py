@@ -27,7 +27,7 @@ from agents.goals import HeardGoals
 from agents.keys import Keys
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
-from agents.orders import carry_out
+from agents.orders import LAND, STOP, carry_out
 from agents.process import told_to_end
 from agents.ranging import HeardRanges, instead
 from agents.rows import Index
@@ -401,7 +401,7 @@ class Runtime:
             self._say(int(row), said, float(state.yaw[row]), t)
         actions = self.agent.act(t, state, said)
         self._act(actions)
-        if self.agent.life.moved:
+        if self.agent.life.moved or self._retired:
             self._retire(t)
         counts, telemetry = self._counts, self._telemetry
         if not begun and self.agent.decisions:
@@ -418,13 +418,19 @@ class Runtime:
         self._news = False
 
     def _retire(self, t: float) -> None:
-        """Who is down before the end takes its token back: neighbours must not keep to somebody on the floor."""
+        """Who came down unasked takes its token back: neighbours must not keep to somebody on the floor.
+
+        When the experiment is over it says again that it is there; whoever was ordered down is told about elsewhere.
+        """
         life = self.agent.life
-        begun = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
-        for row in np.flatnonzero(begun & (life.phase == Phase.DONE)).tolist():
-            if row not in self._retired:
+        during = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
+        for row in np.flatnonzero(during & (life.phase == Phase.DONE)).tolist():
+            if row not in self._retired and life.reason[row] not in (LAND, STOP):
                 self._retired.add(row)
                 self._tokens[row].undeclare()  # type: ignore[no-untyped-call]
+        for row in [row for row in self._retired if not during[row]]:
+            self._retired.remove(row)
+            self._tokens[row] = network.alive_token(self._session, self._setup.keys.alive(self._names[row]))
 
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""
