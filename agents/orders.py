@@ -11,6 +11,8 @@ from agents.agent import Agent
 from agents.wire import Order
 
 SOON_S: Final = 3600.0  # a common start further ahead than this is a mistake of somebody's clock
+LAND: Final = "ordered to land"
+STOP: Final = "ordered to stop"
 OWN: Final = ("clamp", "tracking_gain")
 PAUSED: Final = "told to hold"
 
@@ -42,9 +44,9 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
         case "leave":
             agent.life.land(row, "told to leave")
         case "land":
-            agent.life.land(row, "ordered to land")
+            agent.life.land(row, LAND)
         case "stop":
-            agent.life.stop(row, "ordered to stop")
+            agent.life.stop(row, STOP)
         case "get" | "set":
             return _parameter(agent, order)
     return "", None

@@ -30,7 +30,7 @@ from agents.keys import Keys
 from agents.leaving import leave
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
-from agents.orders import carry_out
+from agents.orders import LAND, STOP, carry_out
 from agents.process import told_to_end
 from agents.ranging import HeardRanges, instead
 from agents.rows import Index
@@ -492,7 +492,7 @@ class Runtime:
             self._say(int(row), said, float(state.yaw[row]), t)
         actions = self.agent.act(t, state, said)
         self._act(actions)
-        if self.agent.life.moved or self._leaving:
+        if self.agent.life.moved or self._leaving or self._retired:
             self._retire(t)
         counts, telemetry = self._counts, self._telemetry
         if not begun and self.agent.decisions:
@@ -509,13 +509,21 @@ class Runtime:
         self._news = False
 
     def _retire(self, t: float) -> None:
-        """Who is down before the end takes its token back: no neighbour must keep to somebody on the floor."""
+        """Who is told to leave, or came down unasked, takes its token back: none must keep to somebody on the floor.
+
+        When the experiment is over the latter says again that it is there; whoever was ordered down is told about
+        elsewhere.
+        """
         life = self.agent.life
-        early = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
+        during = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
         for row in np.flatnonzero(life.phase == Phase.DONE).tolist():
-            if (early[row] or row in self._leaving) and row not in self._retired:
+            unasked = during[row] and life.reason[row] not in (LAND, STOP)
+            if (unasked or row in self._leaving) and row not in self._retired:
                 self._retired.add(row)
                 self._tokens.pop(row).undeclare()  # type: ignore[no-untyped-call]
+        for row in [row for row in self._retired if not (during[row] or row in self._leaving)]:
+            self._retired.remove(row)
+            self._tokens[row] = network.alive_token(self._session, self._setup.keys.alive(self._names[row]))
 
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""

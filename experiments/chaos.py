@@ -12,6 +12,7 @@ import json
 import math
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Sequence, Set
 from contextlib import ExitStack
@@ -55,6 +56,7 @@ BARREN: Final = 3  # rounds without any fault, and it gives up
 CABLES: Final = "cables.json"
 SAYS: Final = {"router": "router", "failover": "router", "disk": "recorder"}  # who ends, and is said to
 LANDED_S: Final = 40.0  # after the launcher's death or the end everything is gone
+LAST_BREATH_S: Final = 5.0  # from when a process cannot be found any more to when its exit code is known
 END_S: Final = 60.0  # and no round takes longer than this after its time
 
 
@@ -471,11 +473,13 @@ class Flight:
             time.sleep(POLL_S * 5)
         gone = time.monotonic() - began
         self._events += watched.news()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            watched.process.handle.wait(LAST_BREATH_S)
         if left:
             self._wrong.append(f"left behind after {LANDED_S:g} s: {', '.join(sorted(left.values()))}")
         code = watched.process.handle.poll()
         if not self._conductor_dead and code != 0:
-            self._wrong.append(f"the run ended with exit code {code}: {watched.process.tail()}")
+            self._wrong.append(f"the run ended with exit code {code}: {' '.join(watched.said)}")
         return gone
 
     def _missed(self, eyes: Eyes) -> float:
