@@ -20,20 +20,20 @@ import zenoh
 from agents import plausibility, wire
 from agents import session as network
 from agents.access import Rights
-from agents.agent import Actions, Agent, links_by_speaker
+from agents.agent import Actions, Agent
 from agents.assignment import Assignment
 from agents.body import Body
-from agents.channel import Channel, Conditions, Samples
+from agents.channel import Conditions
 from agents.clock import Clock
 from agents.goals import HeardGoals
 from agents.keys import Keys
 from agents.leaving import leave
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
+from agents.neighbours import Neighbours
 from agents.orders import LAND, STOP, carry_out
 from agents.process import told_to_end
 from agents.ranging import HeardRanges, instead
-from agents.rows import Index
 from agents.safety import Limits
 from agents.speaking import Said
 from agents.telemetry import Counts, Telemetry
@@ -83,19 +83,6 @@ class Setup:
     loop_silence_s: float = SILENCE_S
 
 
-@dataclass
-class _Neighbour:
-    """What comes from one speaker: its pose channel, its liveliness, and the count of its samples."""
-
-    name: str
-    links: Index
-    poses: network.Polled[zenoh.Sample]
-    alive: network.Polled[zenoh.Sample]
-    seq: int = 0
-    stamp: float = 0.0
-    lost: int = 0
-
-
 class NameTaken(RuntimeError):
     """A robot of the same name is on the network already."""
 
@@ -117,7 +104,6 @@ class Runtime:
         self._dt = 1.0 / assignment.body_hz
         self._state_every = round(assignment.body_hz / setup.state_hz)
         self._counts = Counts.nothing(len(self._names))
-        self._channel = Channel(setup.conditions or Conditions.ideal(len(assignment.links)))
         self._state_slot = 0
         self._stopping: str | None = None
         self._leaving: set[int] = set()  # rows that were told to go while the run goes on
@@ -125,7 +111,6 @@ class Runtime:
         self._doubt_until = -np.inf
         self._cut_off = False  # motors were cut by a stop that the loop has not seen yet
         self._slept, self._joined = 0.0, False
-        self._news = False  # somebody came or went since the last report
         self._utc = self._now = self._next = 0.0
         self._reach = reach_of(assignment.limits)
         self._everyone = np.arange(len(self._names))
@@ -218,25 +203,20 @@ class Runtime:
         seen_by_world = [row for row, source in enumerate(ranging) if source == "world"]
         self._from_world = np.array(seen_by_world, dtype=np.intp)
         self._ranges = HeardRanges(session, keys, names, seen_by_world) if seen_by_world else None
-        by_speaker = links_by_speaker(self._assignment.links, self._assignment.speakers)
-        self._subscribers = [network.pose_subscriber(session, keys.pose(name)) for name in by_speaker]
-        self._watches = [network.alive_watch(session, keys.alive(name)) for name in by_speaker]
+        self._neighbours = neighbours = Neighbours(
+            session, keys, self.agent, reach=self._reach, conditions=self._setup.conditions
+        )
         guidance = self.agent.guidance
         self._goals = None
         if guidance is not None:
             of_goals = self._setup.goal_conditions
             self._goals = HeardGoals(session, keys, self.agent, guidance, reach=self._reach, conditions=of_goals)
-        self._neighbours = [
-            _Neighbour(name, links, poses.handler, watch.handler)
-            for (name, links), poses, watch in zip(by_speaker.items(), self._subscribers, self._watches, strict=True)
-        ]
         self._telemetry = Telemetry(
             session,
             keys,
             self._setup.encoding,
             agent=self.agent,
-            speakers=self._neighbours,
-            dropped=self._channel.dropped,
+            neighbours=neighbours,
             counts=self._counts,
             ranged=[source == "body" for source in ranging],
             followed=None if self._goals is None else self._goals.news,
@@ -281,7 +261,7 @@ class Runtime:
             if str(sample.key_expr) == self._setup.keys.conductor:
                 gone = sample.kind == zenoh.SampleKind.DELETE
                 outside.unattended_since = min(outside.unattended_since, t) if gone else np.inf
-        self._listen_to_neighbours(t)
+        self._neighbours.listen(t, self._utc)
         if self._goals is not None:
             refused = self._goals.malformed
             self._goals.take(t, self._utc)
@@ -301,24 +281,6 @@ class Runtime:
         if t < self._doubt_until:  # long enough ago to hold, and not long enough to land
             return min(before, t - self._assignment.limits.link_silence_s - self._dt)
         return np.inf if network.connected(self._session) else min(before, t)
-
-    def _listen_to_neighbours(self, t: float) -> None:
-        """Poses, as the modelled network lets them through, and who is there."""
-        agent = self.agent
-        for neighbour in self._neighbours:
-            for sample in network.received(neighbour.poses):
-                self._hear(neighbour, sample, t)
-            for sample in network.received(neighbour.alive):
-                if str(sample.key_expr) != self._setup.keys.alive(neighbour.name):
-                    continue  # a token on many keys at once (`park/**`) is nobody's life
-                self._news = True
-                if sample.kind == zenoh.SampleKind.DELETE:
-                    self._channel.forget(neighbour.links)
-                    agent.lose(neighbour.links, t)
-                else:
-                    agent.find(neighbour.links)
-        if (got := self._channel.due(t)) is not None:
-            self._believe(got)
 
     def _locate(self, row: int, sample: zenoh.Sample, t: float) -> None:
         """Where a row is, as something outside of it says."""
@@ -349,51 +311,6 @@ class Runtime:
             self._cut_off = False  # the phases say it from now on
             for row in range(len(self._names)):
                 self.agent.life.stop(row, f"emergency stop by {stop.who}: {stop.reason}")
-
-    def _hear(self, neighbour: _Neighbour, sample: zenoh.Sample, t: float) -> None:
-        """One pose of a neighbour has come: checked, counted, and given to the modelled network."""
-        payload = sample.payload.to_bytes()
-        try:
-            pose = wire.decode(payload, str(sample.encoding), wire.Pose)
-            plausibility.check_pose(pose, robot=neighbour.name, now=self._utc + t, reach=self._reach)
-        except wire.Malformed:
-            self._counts.malformed += 1
-            return
-        if pose.stamp <= neighbour.stamp:
-            return  # known already: told again after a reconnection
-        if 0 < neighbour.seq < pose.seq:
-            neighbour.lost += pose.seq - neighbour.seq - 1
-        neighbour.seq, neighbour.stamp = pose.seq, pose.stamp
-        links, count = neighbour.links, len(neighbour.links)
-        said = Samples(
-            links,
-            np.full(count, t),
-            np.full(count, pose.stamp - self._utc),
-            np.full(count, pose.seq),
-            np.array([pose.position] * count),
-            np.array([pose.velocity] * count),
-        )
-        if self._channel.ideal:
-            self._believe(said)
-            return
-        start = self.agent.life.start_at[self._assignment.links.listener[links]]
-        size = np.full(count, len(payload))
-        self._channel.send(links, said.seq, said.stamp, said.position, said.velocity, start=start, size=size, now=t)
-
-    def _believe(self, got: Samples) -> None:
-        """Poses have got through."""
-        self.agent.hear(got.link, got.position, got.velocity, got.stamp, got.arrival)
-        links, speakers = self._assignment.links, self._assignment.speakers
-        columns = (links.listener[got.link], links.speaker[got.link], got.seq, got.stamp, got.arrival)
-        pose = (got.position.tolist(), got.velocity.tolist())
-        for row, who, seq, stamp, arrival, position, velocity in zip(
-            *(c.tolist() for c in columns), *pose, strict=True
-        ):
-            news = wire.Heard(
-                speakers[who], seq, self._utc + stamp, self._utc + arrival, tuple(position), tuple(velocity)
-            )
-            self._telemetry.news[row].append(news)
-            self._counts.heard[row] += 1
 
     def _obey(self, row: int, query: zenoh.Query, t: float) -> None:
         """One order to one row; it always gets a reply."""
@@ -505,8 +422,8 @@ class Runtime:
             self._state_slot = slot
             telemetry.tell(state, actions, t)
             telemetry.scan(state)
-        telemetry.report(t, everything=t >= telemetry.due, state=state, changed=self._news)
-        self._news = False
+        telemetry.report(t, everything=t >= telemetry.due, state=state, changed=self._neighbours.changed)
+        self._neighbours.changed = False
 
     def _retire(self, t: float) -> None:
         """Who is told to leave, or came down unasked, takes its token back: none must keep to somebody on the floor.

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -24,19 +24,12 @@ from agents.agent import Actions, Agent
 from agents.body import BodyState
 from agents.keys import Keys
 from agents.lifecycle import Phase
+from agents.neighbours import Neighbours
 from agents.rows import Array, Index
 
 STATUS_S: Final = 1.0
 INCIDENTS: Final = 16  # so many are told again
 UNDER_WAY: Final = ("airborne", "running")
-
-
-class Speaker(Protocol):
-    """What is counted of somebody who is listened to: on which links, and how many samples are missing."""
-
-    name: str
-    links: Index
-    lost: int
 
 
 @dataclass
@@ -45,10 +38,9 @@ class Counts:
 
     Attributes:
         sent: (n) poses said.
-        heard: (n) poses of neighbours that reached the decision.
         interventions: (n,) ticks on which safety changed what had been decided.
         avoided: (n,) ticks on which avoidance did.
-        malformed: Payloads that were refused.
+        malformed: Payloads that were refused, other than poses.
         refused: Orders that were.
         ticks: Since the start, and `missed` ones.
         missed: See `ticks`.
@@ -56,7 +48,6 @@ class Counts:
     """
 
     sent: list[int]
-    heard: Index
     interventions: Index
     avoided: Index
     malformed: int = 0
@@ -68,7 +59,7 @@ class Counts:
     @classmethod
     def nothing(cls, rows: int) -> Counts:
         """Before anything was counted."""
-        return cls([0] * rows, *np.zeros((3, rows), dtype=np.intp))
+        return cls([0] * rows, *np.zeros((2, rows), dtype=np.intp))
 
     def begin(self) -> None:
         """At the common start."""
@@ -81,7 +72,6 @@ class Telemetry:
 
     Attributes:
         utc: UTC time at which the process's clock was 0 [s].
-        news: Poses heard since the last telemetry, per row; sent along with it.
         due: When all rows' statuses are sent next, on the process's clock [s].
     """
 
@@ -92,8 +82,7 @@ class Telemetry:
         encoding: wire.Encoding,
         *,
         agent: Agent,
-        speakers: Sequence[Speaker],
-        dropped: Index,
+        neighbours: Neighbours,
         counts: Counts,
         ranged: Sequence[bool],
         followed: list[list[wire.Followed]] | None = None,
@@ -105,14 +94,13 @@ class Telemetry:
             keys: Of the realm.
             encoding: Of payloads.
             agent: Whose rows they are.
-            speakers: Whom the rows listen to.
-            dropped: (E,) samples that the modelled network dropped, kept by the runtime.
+            neighbours: Whom the rows listen to; what they said since the last telemetry is sent along and emptied.
             counts: Kept by the runtime.
             ranged: (n) rows whose range readings are their own: the others' come from the network, where they need
                 not be said again.
             followed: Goals that reached each row since the last telemetry; emptied here. None: nobody is guided.
         """
-        self._agent, self._speakers, self._dropped, self._counts = agent, speakers, dropped, counts
+        self._agent, self._neighbours, self._counts = agent, neighbours, counts
         self._encoding = encoding
         names = self._names = agent.assignment.names
         mime = wire.MIME[encoding]
@@ -123,7 +111,6 @@ class Telemetry:
             for name, own in zip(names, ranged, strict=True)
         ]
         self.utc = self.due = 0.0
-        self.news: list[list[wire.Heard]] = [[] for _ in names]
         self._followed: list[list[wire.Followed]] = [[] for _ in names] if followed is None else followed
         self._told = 0
         self._scanned = [-inf] * len(names)
@@ -156,14 +143,14 @@ class Telemetry:
                 float(agent.error[row]),
                 tuple(truth[row]) if known else None,
                 float(state.true_yaw[row]) if known else None,
-                self.news[row],
+                self._neighbours.news[row],
                 _known_row(state.attitude, row),
                 _known_row(state.shadow_position, row),
                 _known_row(state.shadow_yaw, row),
                 self._followed[row],
             )
             self._states[row].put(wire.encode(message, self._encoding))
-            self.news[row] = []
+            self._neighbours.news[row] = []
             self._followed[row] = []
 
     def scan(self, state: BodyState) -> None:
@@ -199,7 +186,7 @@ class Telemetry:
             if news[:2] != self._reported[row][:2]:
                 print(f"{name}: {Phase(life.phase[row]).word}" + (f" ({news[1]})" if news[1] else ""), flush=True)
             self._reported[row] = news
-            mine = [speaker for speaker in self._speakers if (listener[speaker.links] == row).any()]
+            mine = [speaker for speaker in self._neighbours.speakers if (listener[speaker.links] == row).any()]
             battery = float(state.battery[row]) if state is not None else float("nan")
             if self._origin[row] is None and state is not None and life.phase[row] == Phase.RUNNING:
                 x, y, z = state.position[row].tolist()
@@ -213,10 +200,10 @@ class Telemetry:
                 body=state.notes[row] if state is not None and state.notes else "",
                 battery=battery if isfinite(battery) else None,
                 sent=counts.sent[row],
-                heard=int(counts.heard[row]),
+                heard=int(self._neighbours.heard[row]),
                 lost={speaker.name: speaker.lost for speaker in mine},
                 dropped=self._dropped_of(row),
-                malformed=counts.malformed,
+                malformed=counts.malformed + self._neighbours.malformed,
                 refused=counts.refused,
                 ticks=counts.ticks,
                 missed=counts.missed,
@@ -261,9 +248,10 @@ class Telemetry:
     def _dropped_of(self, row: int) -> dict[str, int]:
         """How many samples of whom a row did not get because the modelled network dropped them."""
         assignment = self._agent.assignment
-        at = np.flatnonzero((self._dropped > 0) & (assignment.links.listener == row))
+        dropped = self._neighbours.dropped
+        at = np.flatnonzero((dropped > 0) & (assignment.links.listener == row))
         speakers = assignment.links.speaker[at].tolist()
-        return {assignment.speakers[j]: int(n) for j, n in zip(speakers, self._dropped[at].tolist(), strict=True)}
+        return {assignment.speakers[j]: int(n) for j, n in zip(speakers, dropped[at].tolist(), strict=True)}
 
 
 def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it

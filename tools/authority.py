@@ -30,6 +30,7 @@ SERVICES: Final[tuple[Role, ...]] = tuple(role for role in ROLES if role != "rob
 HERE: Final = ("localhost", "127.0.0.1", "::1")
 DAYS: Final = 90.0  # of a certificate
 AUTHORITY_DAYS: Final = 1826.0  # five years
+MOST_OF_NAME: Final = 24  # characters of a lab's name in its certificate, whose common name holds 64
 CLOCKS: Final = timedelta(hours=1)  # how far a robot's clock may be behind
 
 
@@ -159,7 +160,8 @@ def _found(folder: Path, days: float) -> Authority:
     key = ec.generate_private_key(ec.SECP256R1())
     now = datetime.now(UTC)
     # a name of its own: with that of the one before, which of the two signed would be found out by trying
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"zenpark {folder.name} {now:%Y-%m-%d %H:%M:%S.%f}")])
+    title = f"zenpark {folder.name[:MOST_OF_NAME]} {now:%Y-%m-%d %H:%M:%S.%f}"
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, title)])
     certificate = (
         x509.CertificateBuilder()
         .subject_name(name)

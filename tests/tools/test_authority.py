@@ -48,6 +48,12 @@ def test_a_certificate_says_who_and_until_when_and_who_vouches(folder):
         assert not extension(made, x509.BasicConstraints).ca
 
 
+@pytest.mark.parametrize("name", ["a laboratory with a name that goes on and on, for as long as it likes", "Löwe " * 9])
+def test_a_lab_may_have_a_long_name(tmp_path, name):
+    authority.create(tmp_path / name, ROBOTS, hosts=[], days=30.0)
+    assert len(common_name(tmp_path / name, "ca")) <= 64
+
+
 def test_only_who_listens_can_pose_as_a_router(folder):
     purposes = extension(certificate(folder, "router"), x509.ExtendedKeyUsage)
     assert set(purposes) == {ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH}
