@@ -89,16 +89,17 @@ class Sight:
         return own, near
 
     def _others(self, t: float, state: BodyState, heard: Heard, aware: Mask) -> Nearby:
-        """The robots that were heard, where they are near."""
+        """The robots that were heard, where they are near; those that are gone stay where they were heard last."""
         row = self._listener
         age = np.maximum(t - heard.stamp, 0.0)
         position = heard.position + heard.velocity * np.minimum(age, AHEAD_S)[:, None]
         apart = state.position[row] - position
         near = (np.vecdot(apart[:, :2], apart[:, :2]) <= REACH**2) & aware[row]
+        # who is gone hangs there still, has come down, or falls: it is in the way from the floor up
+        lost = t - heard.gone > self._limits.link_silence_s
         # their lower end under my upper one, and the other way round; `apart` is how much higher I am
-        near &= apart[:, 2] + self._height[row] + self._clearance > 0.0
+        near &= (apart[:, 2] + self._height[row] + self._clearance > 0.0) | lost
         near &= apart[:, 2] - self._their_height - self._clearance < 0.0
-        near &= t - heard.gone <= self._limits.link_silence_s
         which = np.flatnonzero(near)
         z, believed = position[which, 2], age[which] <= BELIEVED_S
         return Nearby(
@@ -106,7 +107,7 @@ class Sight:
             position[which, :2],
             np.where(believed[:, None], heard.velocity[which, :2], 0.0),
             self._their_radius[which],
-            z,
+            np.where(lost[which], np.minimum(z, 0.0), z),
             z + self._their_height[which],
             np.ones(len(which), dtype=bool),
             self._their_lag[which],

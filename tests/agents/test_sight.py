@@ -101,15 +101,33 @@ def test_only_things_beside_a_robot_disturb_it(height, there):
     assert len(placed(wide, 0.0, state([0, 0, height]), heard([0.1, 0, 0]))) == 1
 
 
-def test_who_is_far_or_was_never_heard_or_is_gone_for_long_is_not_near():
+def test_who_is_far_or_was_never_heard_is_not_near():
     sight, now = pair(), state([0, 0, 0], time=9.0)
     assert len(placed(sight, 9.0, now, heard([REACH - 0.01, 0, 0], stamp=9.0))) == 1
     assert len(placed(sight, 9.0, now, heard([REACH + 0.01, 0, 0], stamp=9.0))) == 0
     assert len(placed(sight, 9.0, now, Heard.nothing(1))) == 0
+
+
+def test_who_is_gone_is_in_the_way_where_it_was_heard_last():
+    sight, now = pair(), state([0, 0, 0], time=9.0)
     told = heard([0.5, 0, 0], stamp=7.0)
-    for gone, there in ((8.5, 1), (7.9, 0)):  # a second of silence is borne
+    for gone in (8.5, 7.9, 7.0):
         told.gone[:] = gone
-        assert len(placed(sight, 9.0, now, told)) == there
+        assert len(placed(sight, 9.0, now, told)) == 1
+
+
+@pytest.mark.parametrize(("height", "before", "after"), [(0.0, 0, 1), (0.9, 1, 1), (1.3, 0, 0)])
+def test_a_drone_that_is_gone_may_have_come_down(height, before, after):
+    """It hovered at 1 m and fell silent: from then on it may be anywhere from there to the floor."""
+    sight, told = pair(TURTLEBOT3 if height == 0.0 else CRAZYFLIE, CRAZYFLIE), heard([0.1, 0, 1.0], stamp=7.0)
+    now = state([0, 0, height], time=9.0)
+    told.gone[:] = 8.5  # a second of silence is borne
+    assert len(placed(sight, 9.0, now, told)) == before
+    told.gone[:] = 7.9
+    _, near = sight.see(9.0, now, told)
+    assert len(near) == after
+    assert near.low.tolist() == [0.0] * after
+    np.testing.assert_allclose(near.high, [1.0 + CRAZYFLIE.height] * after)
 
 
 def test_who_does_not_know_where_it_is_or_does_not_avoid_knows_of_nothing():
