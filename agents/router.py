@@ -15,6 +15,7 @@ import zenoh
 
 from agents import lab
 from agents.access import Rights
+from agents.leaving import end, held
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
 from agents.promptness import prompt_threads
@@ -55,9 +56,9 @@ def serve(
 
     def leave(sessions: Sequence[zenoh.Session]) -> None:
         lost.wait()
-        end = time.monotonic() + linger_s
+        over = time.monotonic() + linger_s
         empty = time.monotonic()
-        while (now := time.monotonic()) < end and not stop.wait(LOOK_S):
+        while (now := time.monotonic()) < over and not stop.wait(LOOK_S):
             if not deserted(sessions[0]):
                 empty = now
             elif now - empty > EMPTY_S:
@@ -112,7 +113,7 @@ def serve_router(
     seen = _stamp(register)  # before it is read: what changes in between is seen then
     settings = config("router", listen=endpoints, connect=link, name="router", rights=rights)
     while True:
-        with _routing(settings, endpoints, patience_s, stop) as session:
+        with held(_routing(settings, endpoints, patience_s, stop)) as (session, _):
             ready(session)
             patience_s = FREED_S
             while not stop.wait(None if register is None else REVOKED_S):
@@ -178,4 +179,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())

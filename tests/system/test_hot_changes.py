@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -172,7 +173,7 @@ def test_a_spare_takes_over_a_name(lab: Lab) -> None:
     assert lab.end()[0] in (0, 130)
     orphan = lab.zenpark("pause", "CF01")
     assert (orphan.returncode, orphan.stdout) == (2, "")
-    assert "no router answers" in orphan.stderr
+    assert re.search("no router answers|this run is not there", orphan.stderr)  # its port may be somebody else's by now
 
 
 def test_robots_of_one_process_come_together(lab: Lab) -> None:

@@ -119,8 +119,14 @@ def test_a_robots_certificate_does_not_make_a_router(laboratory: Laboratory, tmp
     for part in ("key", "pem"):
         (thief / f"router.{part}").write_bytes((thief / f"KH03.{part}").read_bytes())
     plain = network.free_endpoint(preferred_port=0, protocol="tls")
-    (endpoint,) = lab.secured([plain], thief)
-    settings = network.config("peer", listen=[endpoint], name="router")
+    settings = zenoh.Config()  # a thief needs nothing of ours
+    for key, value in {
+        "mode": "peer",
+        "listen/endpoints": [plain],
+        "scouting/multicast/enabled": False,
+        **lab.settings(thief, "router", listens=True),
+    }.items():
+        settings.insert_json5(key, json.dumps(value))
     (honest,) = lab.secured([plain], laboratory.folder)
     with zenoh.open(settings), pytest.raises(zenoh.ZError, match="Unable to connect"):
         zenoh.open(network.config("client", connect=[honest], name="KH01"))
