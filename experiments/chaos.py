@@ -230,7 +230,7 @@ class Flight:
             (folder / CABLES).write_bytes(msgspec.json.encode(laid))
             launcher = stack.enter_context(Launcher(folder / "logs"))
             own = [*setting.changes, f"network.listen={json.dumps(routers)}"]
-            own += [f"network.routers={len(routers)}"] if len(routers) > 1 else []
+            own.append(f"network.routers={len(routers)}")
             watched = Watched(
                 launcher,
                 setting.file,

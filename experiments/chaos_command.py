@@ -13,7 +13,6 @@ import msgspec
 from agents.plugins import did_you_mean
 from experiments import chaos, chaos_report
 from experiments.chaos_report import Result
-from experiments.experiment import Network
 from experiments.fault_script import KINDS, Kind, script
 from experiments.problem import DocumentError, Problem
 from experiments.run import SOURCE, Interrupts, chosen, load, new_folder
@@ -43,9 +42,7 @@ def command(
     read = load(file, *changes)
     name = case or list(read.cases())[-1]
     experiment = chosen(read, [name])[name]
-    skipped = missing()
-    wanted = [kind for kind in _kinds(kinds) if kind not in skipped]
-    rounds = script(list(experiment.robots), experiment.duration_s, faults, seed, wanted)
+    rounds = script(list(experiment.robots), experiment.duration_s, faults, seed, _kinds(kinds))
     folder = new_folder(dataclasses.replace(read, path=Path(f"{read.path.stem}-chaos")), out)
     read.keep(folder / SOURCE)
     (folder / SCRIPT).write_bytes(msgspec.json.format(msgspec.json.encode(rounds), indent=1))
@@ -53,13 +50,11 @@ def command(
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    for kind, why in skipped.items():
-        say(f"{kind} is left out: {why}")
     say(f"{faults} faults in {len(rounds)} rounds of {experiment.duration_s:g} s; script: {folder / SCRIPT}")
     setting = chaos.Setting(folder / SOURCE, name, experiment, folder, changes, BODIES, seed)
     with Interrupts() as interrupted:
         outcomes, ends = chaos.run(setting, rounds, interrupted=interrupted, say=say)
-    result = Result(read.experiment.title, seed, rounds, skipped, outcomes, ends)
+    result = Result(read.experiment.title, seed, rounds, outcomes, ends)
     words = ["zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
     words += [part for kind in kinds for part in ("--kinds", kind)]
     page = chaos_report.write(folder, result, " ".join(words))
@@ -71,13 +66,6 @@ def command(
     if interrupted.asked:
         return 130
     return 1 if result.violations or len(outcomes) < faults else 0
-
-
-def missing() -> dict[str, str]:
-    """Kinds of faults that cannot be done here, and why."""
-    if "routers" not in {each.name for each in msgspec.structs.fields(Network)}:
-        return {"failover": "there is no [network] routers yet"}
-    return {}
 
 
 def _kinds(given: Sequence[str]) -> list[Kind]:

@@ -51,7 +51,6 @@ class Result(msgspec.Struct, frozen=True):
     experiment: str
     seed: int
     script: list[Round]
-    skipped: dict[str, str]
     outcomes: list[Outcome]
     rounds: list[Ended]
 
@@ -66,9 +65,7 @@ def table(result: Result) -> Table:
     lines = []
     for kind in KINDS:
         mine = [each for each in result.outcomes if each.fault.kind == kind]
-        if kind in result.skipped:
-            lines.append(Line((kind, "–", "–", "–", "–", "–", "–", result.skipped[kind])))
-        elif mine:
+        if mine:
             well = [each.begin_s for each in mine if each.recovered]
             lines.append(
                 Line(
@@ -102,7 +99,6 @@ def findings(result: Result) -> list[Finding]:
         for each in rounds
         if each.missed > BUSY
     ]
-    found += [Finding("fair", f"{kind} was left out: {why}") for kind, why in result.skipped.items()]
     wrong = [line(each) for each in result.outcomes if each.violations]
     wrong += [f"round {each.round}: {text}" for each in rounds for text in each.violations]
     return [*found, *(Finding("bad", text) for text in wrong)] if wrong else [*found, Finding("good", "0 violations")]

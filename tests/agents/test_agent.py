@@ -62,6 +62,7 @@ def eventful(experiment, groups):
     return swarm
 
 
+@pytest.mark.slow
 def test_seven_processes_of_one_are_one_of_seven_to_the_last_bit(park):
     assert_the_same(
         park, [[name] for name in park.robots], [["CF03", "TB01", "KH02"], ["KH01", "CF01"], ["CF02", "KH03"]]

@@ -14,6 +14,8 @@ from experiments.problem import DocumentError
 from experiments.report_architecture import architecture_table
 from experiments.verdict import findings
 
+pytestmark = pytest.mark.slow  # runs and reports, whole
+
 HYBRID = Hybrid(kind="hybrid", robots=["KH02", "CF02", "CF03"])
 LINE = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.15}
 

@@ -185,6 +185,7 @@ def slips(text):
 
 
 @pytest.mark.parametrize("name", catalogue.names())
+@pytest.mark.slow
 def test_every_misspelt_key_is_found_in_its_line(name, write):
     found = list(slips(document.catalogue_path(name).read_text("utf-8")))
     assert len(found) > 10

@@ -9,6 +9,8 @@ from experiments.check import check
 from experiments.document import read
 from experiments.run import load, simulate
 
+pytestmark = pytest.mark.slow  # runs and reports, whole
+
 FILE = """
 title = "duel"
 duration_s = 9.0

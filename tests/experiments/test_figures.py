@@ -13,6 +13,8 @@ from experiments.metrics import measure
 from experiments.signals import formation_errors
 from tests.experiments.traces import crowd, cut, experiment, park, trace
 
+pytestmark = pytest.mark.slow  # runs and reports, whole
+
 OF_TRACES = (
     figures.formation_before,
     figures.formation_after,

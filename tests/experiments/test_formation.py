@@ -14,6 +14,8 @@ from experiments.links import one_way_links
 from experiments.signals import net_rotation
 from tests.agents.swarm import Swarm
 
+pytestmark = pytest.mark.slow  # runs and reports, whole
+
 ROBOTS = """title = "Four"
 duration_s = {duration}
 arena = {{ size = [4.0, 4.0, 2.5] }}

@@ -19,6 +19,8 @@ from experiments.seeds import spread
 from experiments.verdict import findings, left_out
 from tests.experiments.traces import crowd, cut, experiment, park, trace
 
+pytestmark = pytest.mark.slow  # runs and reports, whole
+
 VOID = {"meta", "link", "br", "hr", "img", "input"}
 
 

@@ -17,6 +17,8 @@ from experiments.verdict import findings
 from experiments.virtual import simulate
 from tests.experiments.traces import pair
 
+pytestmark = pytest.mark.slow  # runs and reports, whole
+
 BAD = Channel(delay_s=0.05, loss=0.2, links={"TB01 > KH01": LinkChannel(loss=0.0, delay_s=0.03)})
 
 

@@ -35,6 +35,7 @@ def test_a_digest_is_that_of_names_and_contents(tmp_path):
     assert version.digest(tmp_path) != first
 
 
+@pytest.mark.slow
 def test_a_router_that_is_not_there_is_not_reached():
     (found,) = answer(Question("reach", endpoints=["tcp/127.0.0.1:9"]), 0.0).found
     assert not found.well

@@ -18,6 +18,8 @@ from experiments.sweep_command import Request, command
 from experiments.sweep_runs import Stuck
 from experiments.sweep_workers import Processes, SweepError, Work, workers
 
+pytestmark = pytest.mark.slow  # runs and reports, whole
+
 SHORT = ["duration_s=4.0"]
 AXIS = "trigger.threshold=0.005,0.02"
 

@@ -13,6 +13,8 @@ from experiments.experiment import Channel, Formation
 from experiments.logbook import Logbook
 from tests.agents.swarm import changed
 
+pytestmark = pytest.mark.slow  # runs and reports, whole
+
 CHOSEN = {"kind": "predictive", "threshold": 0.011, "smoothing_s": 0.4}
 
 

@@ -54,6 +54,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_others(park):
     assert not np.array_equal(first.position[-1], other.position[-1])
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side_are_what_each_is_alone(park):
     seeds = [3, 9, 4]
     batch = simulate(park, seeds)

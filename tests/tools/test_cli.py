@@ -113,6 +113,7 @@ def test_bad_flags_end_with_2(arguments):
 
 
 @pytest.mark.parametrize("command", [["keys"], ["echo", "park/**"], ["hz", "park/**"]])
+@pytest.mark.slow
 def test_no_router_is_explained(command):
     endpoint = free_endpoint(preferred_port=0)
     done = zenpark(*command, "--connect", endpoint)

@@ -123,6 +123,7 @@ def test_without_contact_it_is_the_point_mass_engine():
     np.testing.assert_allclose(other.velocity, 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_experiment_runs_the_same_on_it_as_on_point_masses():
     logs = []
     for engine in ("point-mass", "pymunk"):
