@@ -376,7 +376,10 @@ def new_folder(read: Document, out: str | None) -> Path:
 
 
 class Interrupts:
-    """Ctrl-C, SIGTERM and SIGHUP as a question: the first asks to land, the second ends at once."""
+    """Ctrl-C, SIGTERM and SIGHUP as a question: the first asks to land, the second ends at once.
+
+    A SIGHUP that `nohup` has set aside stays so.
+    """
 
     def __init__(self) -> None:
         self.asked = False
@@ -384,7 +387,8 @@ class Interrupts:
 
     def __enter__(self) -> Interrupts:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            self._before[number] = signal.signal(number, self._ask)
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._ask)
         return self
 
     def __exit__(self, *_: object) -> None:
