@@ -25,7 +25,9 @@ EMPTY_S: Final = 1.0  # nobody connected for this long: whoever lost its connect
 LOOK_S: Final = 0.1
 FREED_S: Final = 10.0  # so long may the port of a router that begins anew stay taken by what it was before
 AGAIN_S: Final = 0.1
-REVOKED_S: Final = 0.5  # how often it looks whether somebody's certificate has been revoked
+# How often it looks whether somebody's certificate has been revoked, and whether it was told to end: a signal that the
+# kernel gives to another thread, as after a SIGCONT, does not wake the one that waits.
+LOOK_AGAIN_S: Final = 0.5
 
 
 def serve(
@@ -116,7 +118,7 @@ def serve_router(
         with held(_routing(settings, endpoints, patience_s, stop)) as (session, _):
             ready(session)
             patience_s = FREED_S
-            while not stop.wait(None if register is None else REVOKED_S):
+            while not stop.wait(LOOK_AGAIN_S):
                 if (now := _stamp(register)) == seen:
                     continue
                 seen = now

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import psutil
@@ -38,6 +39,20 @@ def test_a_robot_leaves_a_router_that_does_not_answer(router: RouterProcess) -> 
         watcher.close()
         if robot.process.returncode is None:
             robot.kill()
+
+
+def stopped(pid: int) -> bool:
+    return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)
+
+
+def test_a_router_that_was_frozen_ends_when_it_is_told_to() -> None:
+    """The kernel then gives the signal to any of its threads, at every second time to one that does not heed it."""
+    for _ in range(4):
+        router = RouterProcess()
+        router.process.send_signal(signal.SIGSTOP)
+        until(partial(stopped, router.process.pid), "it is frozen")
+        router.process.send_signal(signal.SIGCONT)
+        assert router.stop() == 0
 
 
 def test_a_session_is_left_in_time_and_a_live_one_at_once(router: RouterProcess) -> None:
