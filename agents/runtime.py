@@ -31,7 +31,7 @@ from agents.leaving import leave
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
 from agents.neighbours import Neighbours
-from agents.orders import LAND, STOP, carry_out
+from agents.orders import EMERGENCY, LAND, STOP, carry_out
 from agents.process import told_to_end
 from agents.ranging import HeardRanges, instead
 from agents.safety import Limits
@@ -310,7 +310,7 @@ class Runtime:
                 continue
             self._cut_off = False  # the phases say it from now on
             for row in range(len(self._names)):
-                self.agent.life.stop(row, f"emergency stop by {stop.who}: {stop.reason}")
+                self.agent.life.stop(row, f"{EMERGENCY} by {stop.who}: {stop.reason}")
 
     def _obey(self, row: int, query: zenoh.Query, t: float) -> None:
         """One order to one row; it always gets a reply."""
@@ -434,7 +434,7 @@ class Runtime:
         life = self.agent.life
         during = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
         for row in np.flatnonzero(life.phase == Phase.DONE).tolist():
-            unasked = during[row] and life.reason[row] not in (LAND, STOP)
+            unasked = during[row] and not life.reason[row].startswith((EMERGENCY, LAND, STOP))
             if (unasked or row in self._leaving) and row not in self._retired:
                 self._retired.add(row)
                 self._tokens.pop(row).undeclare()  # type: ignore[no-untyped-call]
