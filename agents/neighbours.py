@@ -59,7 +59,7 @@ class Neighbours:
             conditions: What is done to poses on each link; None: nothing.
         """
         assignment = agent.assignment
-        self._agent, self._keys, self._reach = agent, keys, reach
+        self._agent, self._reach = agent, reach
         self._links, self._names = assignment.links, assignment.speakers
         self._channel = Channel(conditions or Conditions.ideal(len(assignment.links)))
         by_speaker = links_by_speaker(assignment.links, assignment.speakers)
@@ -81,8 +81,6 @@ class Neighbours:
             for sample in network.received(neighbour.poses):
                 self._hear(neighbour, sample, t, utc)
             for sample in network.received(neighbour.alive):
-                if str(sample.key_expr) != self._keys.alive(neighbour.name):
-                    continue  # a token on many keys at once (`park/**`) is nobody's life
                 self.changed = True
                 if sample.kind == zenoh.SampleKind.DELETE:
                     self._channel.forget(neighbour.links)

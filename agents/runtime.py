@@ -258,9 +258,8 @@ class Runtime:
         outside = agent.outside
         outside.offline_since = self._cut_off_since(t, outside.offline_since)
         for sample in network.received(self._conductor.handler):
-            if str(sample.key_expr) == self._setup.keys.conductor:
-                gone = sample.kind == zenoh.SampleKind.DELETE
-                outside.unattended_since = min(outside.unattended_since, t) if gone else np.inf
+            gone = sample.kind == zenoh.SampleKind.DELETE
+            outside.unattended_since = min(outside.unattended_since, t) if gone else np.inf
         self._neighbours.listen(t, self._utc)
         if self._goals is not None:
             refused = self._goals.malformed

@@ -487,13 +487,36 @@ def taken(session: zenoh.Session, key: str) -> bool:
     return False
 
 
-def alive_watch(session: zenoh.Session, keyexpr: str) -> zenoh.Subscriber[Handler[zenoh.Sample]]:
-    """Who comes (PUT) and goes (DELETE), those already there first.
+class AliveWatch:
+    """Who comes (PUT) and goes (DELETE), as samples that wait in `handler`.
+
+    A token on many keys at once (`park/**`) is nobody's life: it is left out.
+    """
+
+    def __init__(self, session: zenoh.Session, keyexpr: str) -> None:
+        """Those already there come first."""
+        self._subscriber = session.liveliness().declare_subscriber(keyexpr, RingChannel(256), history=True)
+
+    @property
+    def handler(self) -> Self:
+        """See `Polled`."""
+        return self
+
+    def try_recv(self) -> zenoh.Sample | None:
+        """See `Polled`."""
+        for sample in received(self._subscriber.handler):
+            if "*" not in str(sample.key_expr):
+                return sample
+        return None
+
+
+def alive_watch(session: zenoh.Session, keyexpr: str) -> AliveWatch:
+    """Who comes and goes, those already there first.
 
     When the router dies every token goes at once and comes back after the reconnection: ask `connected` before
     holding a robot for lost.
     """
-    return session.liveliness().declare_subscriber(keyexpr, RingChannel(256), history=True)
+    return AliveWatch(session, keyexpr)
 
 
 def received(handler: Polled[T_co]) -> Iterator[T_co]:

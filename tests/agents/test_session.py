@@ -244,6 +244,8 @@ def test_a_killed_robot_is_noticed(router, eventually):
         eventually(lambda: seen.extend(received(watch.handler)) or len(seen) == 2)
         assert {str(sample.key_expr) for sample in seen} == {"park/CF01/alive", "park/CF02/alive"}
         assert all(sample.kind == zenoh.SampleKind.PUT for sample in seen)
+        for key in ("park/**", "park/*/alive"):  # on the keys of everybody: nobody's life, and nobody's death
+            alive_token(session, key).undeclare()
         robot.kill()
         seen.clear()
         eventually(lambda: seen.extend(received(watch.handler)) or seen)

@@ -120,6 +120,9 @@ class Session:
     def liveliness(self) -> Session:
         return self
 
+    def declare_subscriber(self, key: str, *_: object, **__: object) -> Channel:
+        return self._net.listen(key)
+
     def get(self, *_: object, **__: object) -> list[Reply]:
         return list(self._net.replies)
 
@@ -196,7 +199,6 @@ class Net:
         made: dict[str, Any] = {
             "pose_subscriber": heard,
             "subscriber": heard,
-            "alive_watch": heard,
             "Alarm": alarm,
             "orders": lambda _session, key: self.listen(key, asked=True),
             "pose_publisher": mute,

@@ -71,7 +71,8 @@ def test_robots_hold_while_the_centre_is_dead_and_go_on_when_it_is_back(tmp_path
     died = killed - playback.read(folder / "default.mcap").started
     back = trace.goals.time[trace.goals.time > died + 0.15].min()  # of the centre that was started again
     assert 0.2 < back - died < 4.0
-    quiet = (trace.time > died + 0.16) & (trace.time < back)  # at the next decision they hold
+    # they hold at the decision after they noticed it: a moment later, or many where the machine is loaded
+    quiet = (trace.time > (died + back) / 2.0) & (trace.time < back)
     assert quiet.any()
     for row, name in enumerate(trace.robots):
         held = np.ptp(trace.goal[quiet, row], axis=0).max()
