@@ -23,6 +23,7 @@ from agents.guidance import Guidance
 from agents.hazards import Hazards, Outcome
 from agents.hearing import Heard, Hearing
 from agents.individual import Individual
+from agents.landing import Landing
 from agents.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, Duties, Lifecycle, Phase
 from agents.plugins import FAILURES, PluginError
 from agents.preflight import Preflight
@@ -109,6 +110,7 @@ class Agent:
         self._individual = Individual(assignment.kinds)
         self._safety = Safety(assignment.kinds, assignment.limits)
         self._sight = _sight(assignment)
+        self._landing = Landing(assignment)
         self._nobody: Mask = np.zeros(rows, dtype=bool)
         self._everybody: Mask = np.ones(rows, dtype=bool)
         self._wild = self._nobody
@@ -189,6 +191,10 @@ class Agent:
         self.tick += ticks
         self.outside.ticked(ticks, 1.0 / self.assignment.body_hz)
 
+    def land_here(self) -> None:
+        """Something else has made the bodies land: nobody looks for a better place any more."""
+        self._landing.hurry()
+
     # ------------------------------------------------------------------ the decision
 
     def step(self, t: float, state: BodyState) -> Actions:
@@ -200,7 +206,10 @@ class Agent:
         self.deciding.settle(t)
         life = self.life
         self._where = self._safety.where(state.position, state.yaw, t - state.time)
-        self._duties = life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
+        duties = life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
+        self._duties = self._landing.direct(
+            t, duties, state, self._where, hearing=self.hearing, late=self.outside.failing, phase=life.phase
+        )
         assignment = self.assignment
         if life.moved and not self.begun and (life.phase == RUNNING).any():
             since = t - float(life.start_at[life.phase == RUNNING].min())
@@ -231,6 +240,9 @@ class Agent:
         if self.guidance is not None:
             self._follow(self.guidance, state.position)
         goal, avoided = self.goal, self._nobody
+        aside = self._landing.aside
+        if some(aside):
+            goal = np.where(aside[:, None], self._landing.spot, goal)
         age, where = t - state.time, self._where
         avoidance = self.assignment.avoidance
         if avoidance is None or self._sight is None:
@@ -238,16 +250,16 @@ class Agent:
             verdict = self._safety.check(setpoint, state.position, state.yaw, age, where=where)
         else:
             own, near = self._sight.see(t, state, self.heard)
-            goal = self._deviate(avoidance, own, near)
+            wanted, goal = goal, self._deviate(avoidance, goal, own, near)
             setpoint = self._individual.setpoint(goal, self.toward, state.position, state.yaw)
             verdict = self._safety.check(setpoint, state.position, state.yaw, age, avoidance, own, near, where)
             avoided = verdict.avoided
-            if goal is not self.goal:
-                avoided = avoided | (np.abs(goal - self.goal) > 0.0).any(axis=1)
+            if goal is not wanted:
+                avoided = avoided | (np.abs(goal - wanted) > 0.0).any(axis=1)
         setpoint, changed, self._wild = verdict.setpoint, verdict.changed, verdict.wild
         if not self.life.all_running:
             phase = self.life.phase
-            passive = (phase < AIRBORNE) | (phase > RUNNING)
+            passive = ((phase < AIRBORNE) | (phase > RUNNING)) & ~aside
             setpoint = np.where(passive[:, None], np.where(self._flies, np.nan, 0.0)[:, None], setpoint)
             changed, avoided, self._wild = changed & ~passive, avoided & ~passive, self._wild & ~passive
         self.tick += 1
@@ -292,6 +304,7 @@ class Agent:
             self.deciding.alone() if hearing.unsettled else None,
             None if guidance is None else running & guidance.lacking(t),
             self._wild,
+            self._landing,
         )
         seen = self._detector.look(t, state, self._where, hearing, rows, self.outside)
         for incident in self.hazards.assess(t, seen, active, landing):
@@ -343,16 +356,16 @@ class Agent:
             self.updates += follows & guidance.fresh
         guidance.fresh[:] = False
 
-    def _deviate(self, avoidance: Avoidance, own: Self, near: Nearby) -> Array:
+    def _deviate(self, avoidance: Avoidance, wanted: Array, own: Self, near: Nearby) -> Array:
         """The goals that are pursued; an avoidance that fails is named, for it may be somebody's first."""
         name = type(avoidance).__name__
         try:
-            goal = avoidance.deviate(self.goal, own, near, 1.0 / self.assignment.body_hz)
+            goal = avoidance.deviate(wanted, own, near, 1.0 / self.assignment.body_hz)
         except FAILURES as error:
             raise PluginError(f"the avoidance {name} failed: {_what(error)}") from error
-        if np.shape(goal) != self.goal.shape:
+        if np.shape(goal) != wanted.shape:
             raise PluginError(
-                f"`deviate` of the avoidance {name} must give a goal per row, {self.goal.shape}, not {np.shape(goal)}"
+                f"`deviate` of the avoidance {name} must give a goal per row, {wanted.shape}, not {np.shape(goal)}"
             )
         return goal
 

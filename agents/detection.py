@@ -12,6 +12,7 @@ from agents.assignment import Assignment
 from agents.body import BodyState
 from agents.hazards import Cause, Sighting
 from agents.hearing import Hearing
+from agents.landing import Landing
 from agents.rows import Array, Mask, norm, some
 from agents.safety import ESCAPED, Whereabouts
 from agents.separation import Separation
@@ -34,6 +35,11 @@ class Outside:
     unattended_since: float = np.inf
     late: float = 0.0
 
+    @property
+    def failing(self) -> bool:
+        """Whether the control loop is none any more."""
+        return self.late > LATE_SHARE
+
     def ticked(self, missed: int, period: float) -> None:
         """A tick has come after `missed` ones that did not; they are `period` apart [s]."""
         if missed or self.late > 0.0:
@@ -53,6 +59,7 @@ class Standing(NamedTuple):
         alone: Nobody is left that the law could listen to; None: nobody is alone.
         lacking: Run and are guided by nobody; None: nobody is guided.
         wild: The last setpoint was not made of finite numbers.
+        places: Where those that land come down.
     """
 
     ordered: Mask
@@ -61,6 +68,7 @@ class Standing(NamedTuple):
     alone: Mask | None
     lacking: Mask | None
     wild: Mask
+    places: Landing
 
 
 class Detector:
@@ -150,6 +158,8 @@ class Detector:
         if some(rows.landing):
             late = rows.landing & self._flies & state.flying
             seen.append(Sighting(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s"))
+            if some(rows.places.aside):
+                seen.append(Sighting(Cause.BELOW, rows.places.aside, rows.places.below))
 
     def _near(self, t: float, state: BodyState, hearing: Hearing, seen: list[Sighting]) -> None:
         """Other robots, where they are believed to be."""
@@ -192,7 +202,7 @@ class Detector:
         elif outside.unattended_since < np.inf:
             since = t - outside.unattended_since
             seen.append(Sighting(Cause.CONDUCTOR, everybody, lambda _: f"for {since:.1f} s"))
-        if outside.late > LATE_SHARE:
+        if outside.failing:
             seen.append(Sighting(Cause.LATE, everybody, lambda _: f"{outside.late:.0%} of the last second's"))
 
 

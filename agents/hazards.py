@@ -56,6 +56,7 @@ class Cause(IntEnum):
     SETPOINT = 16
     LATE = 17
     LANDING = 18
+    BELOW = 19
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,7 @@ RULES: Final[Mapping[Cause, Rule]] = {
     ),
     Cause.LATE: Rule("its control loop misses its ticks", Outcome.HOLD, then=Outcome.LAND, then_s=5.0, clears_s=0.5),
     Cause.LANDING: Rule("its landing takes too long", Outcome.CUT, landing=True),
+    Cause.BELOW: Rule("a robot is below it", Outcome.WARN, landing=True),
 }
 
 

@@ -244,6 +244,7 @@ class Runtime:
         """The loop runs again after the watchdog had its robots land: they do, whatever was decided before."""
         for row in np.flatnonzero(self.agent.life.active).tolist():
             self.agent.life.land(row, why)
+        self.agent.land_here()
         self._be_there()
 
     def _doubt(self, slept: float) -> None:

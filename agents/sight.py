@@ -22,6 +22,8 @@ REACH: Final = 3.0  # [m] between axes; what is farther away is nobody's concern
 AHEAD_S: Final = 0.1  # heard positions are carried on for so long: who is silent for longer may as well have stopped
 BELIEVED_S: Final = 0.5  # and so long a heard velocity is believed
 SCAN_S: Final = 1.0  # readings older than this are none
+DESCENT: Final = 0.1  # [m/s] who sinks faster than this may be coming down,
+DESCENT_S: Final = 2.0  # and is in the way wherever it can be within so long
 OUTLINE: Final = 0.05  # [m] a ray that ends this near to a robot that was heard has seen that robot,
 OUTLINE_SHARE: Final = 0.05  # and this share of its length, as long ones are measured worse
 STEEP: Final = 0.5  # cosine of the elevation above which a ray looks up or down, not around
@@ -97,8 +99,10 @@ class Sight:
         near = (np.vecdot(apart[:, :2], apart[:, :2]) <= REACH**2) & aware[row]
         # who is gone hangs there still, has come down, or falls: it is in the way from the floor up
         lost = t - heard.gone > self._limits.link_silence_s
+        sinking = np.where((heard.velocity[:, 2] < -DESCENT) & (age <= BELIEVED_S), heard.velocity[:, 2], 0.0)
+        low = position[:, 2] + DESCENT_S * sinking
         # their lower end under my upper one, and the other way round; `apart` is how much higher I am
-        near &= (apart[:, 2] + self._height[row] + self._clearance > 0.0) | lost
+        near &= (state.position[row, 2] + self._height[row] + self._clearance > low) | lost
         near &= apart[:, 2] - self._their_height - self._clearance < 0.0
         which = np.flatnonzero(near)
         z, believed = position[which, 2], age[which] <= BELIEVED_S
@@ -107,7 +111,7 @@ class Sight:
             position[which, :2],
             np.where(believed[:, None], heard.velocity[which, :2], 0.0),
             self._their_radius[which],
-            np.where(lost[which], np.minimum(z, 0.0), z),
+            np.where(lost[which], np.minimum(z, 0.0), low[which]),
             z + self._their_height[which],
             np.ones(len(which), dtype=bool),
             self._their_lag[which],

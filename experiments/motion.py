@@ -126,13 +126,18 @@ def encounters(analysis: Analysis) -> Iterator[Claim]:
             yield Claim("note", "avoidance-acts", f"{message}: avoidance will have to act", "", path)
     if analysis.prediction.time[-1] < analysis.experiment.duration_s - 1.0 / analysis.experiment.rates.coordination_hz:
         return
-    final = analysis.prediction.position[-1]
+    final, links = analysis.prediction.position[-1], analysis.assignment.links
     for row in np.flatnonzero([kind.flies for kind in kinds]):
         below = (final[:, 2] < final[row, 2] - FORGIVEN) & (norm(final[:, :2] - final[row, :2]) < radius + radius[row])
         for under in np.flatnonzero(below):
-            message = f"{names[row]} ends above {names[under]} and would land on it"
-            remedy = "change their distances, or end the timeline elsewhere"
-            yield Claim("warning", "lands-on", message, remedy, ("formation", "links"))
+            targets = ("formation", "links")
+            if ((links.listener == row) & (links.speaker == under)).any():
+                message = f"{names[row]} ends above {names[under]}, and goes aside before it lands"
+                yield Claim("note", "lands-beside", message, "", targets)
+                continue
+            message = f"{names[row]} ends above {names[under]}, which it does not hear, and would land on it"
+            remedy = "change their distances, link them, or end the timeline elsewhere"
+            yield Claim("warning", "lands-on", message, remedy, targets)
 
 
 def _first(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:

@@ -10,7 +10,7 @@ from agents.graph import links
 from agents.hearing import Heard
 from agents.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.safety import Limits
-from agents.sight import AHEAD_S, REACH, SCAN_S, Sight
+from agents.sight import AHEAD_S, DESCENT_S, REACH, SCAN_S, Sight
 
 LIMITS = Limits(np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 2.5]), speed=0.5)
 
@@ -114,6 +114,15 @@ def test_who_is_gone_is_in_the_way_where_it_was_heard_last():
     for gone in (8.5, 7.9, 7.0):
         told.gone[:] = gone
         assert len(placed(sight, 9.0, now, told)) == 1
+
+
+def test_who_sinks_is_in_the_way_wherever_it_soon_is():
+    sight, now = pair(TURTLEBOT3, CRAZYFLIE), state([0, 0, 0], time=9.0)
+    hovers, sinks, old = (heard([0.1, 0, 0.9], (0, 0, v), stamp) for v, stamp in ((-0.05, 9), (-0.4, 9), (-0.4, 8)))
+    assert len(placed(sight, 9.0, now, hovers)) == len(placed(sight, 9.0, now, old)) == 0
+    _, near = sight.see(9.0, now, sinks)
+    np.testing.assert_allclose(near.low, [0.9 - 0.4 * DESCENT_S])
+    np.testing.assert_allclose(near.high, [0.9 + CRAZYFLIE.height])
 
 
 @pytest.mark.parametrize(("height", "before", "after"), [(0.0, 0, 1), (0.9, 1, 1), (1.3, 0, 0)])

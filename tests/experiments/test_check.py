@@ -205,10 +205,24 @@ def test_paths_that_cross():
     assert ground(swapped, leader="A")["too-close"].startswith("B and C come within")
 
 
-def test_landing_on_a_robot():
+def test_landing_beside_a_robot_that_is_heard():
     robots = {"G": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="crazyflie", start=[0.5, 0.0], hover=0.8)}
-    found = ground({"G > F": 0.801}, robots=robots, duration_s=30.0, tolerance=0.1)
-    assert found["lands-on"] == "F ends above G and would land on it"
+    formation = Formation(links={"G > F": 0.801})
+    made = Experiment(title="made", robots=robots, duration_s=30.0, tolerance=0.1, formation=formation)
+    found = {each.code: each for each in check(of(made))}
+    assert found["lands-beside"].message == "F ends above G, and goes aside before it lands"
+    assert found["lands-beside"].severity == "note"
+    assert "lands-on" not in found
+
+
+def test_landing_on_a_robot():
+    robots = {
+        "G": Robot(kind="khepera4", start=[0.0, 0.01]),
+        "H": Robot(kind="khepera4", start=[0.5, 0.5]),
+        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.8),
+    }
+    found = ground({"G - H": 0.7}, robots=robots, duration_s=30.0)
+    assert found["lands-on"] == "F ends above G, which it does not hear, and would land on it"
 
 
 def test_a_robot_at_the_wall_is_held_back():
