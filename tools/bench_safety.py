@@ -1,9 +1,10 @@
 """How soon robots react: to an emergency stop, to a neighbour that was killed, to one that hangs.
 
-Twenty robots run as processes of their own. Their bodies are external, and the bench is the far end of all of them: it
-hears what they are told, so that the command to cut the motors is stamped where a body would obey it, by the monotonic
-clock by which the stop was sent. That a robot knows of a death is stamped when its status, which names who is missing,
-arrives here: one way over the router more than the robot itself needs.
+Twenty robots run as processes of their own. The command to cut the motors is stamped where the body obeys it, by the
+monotonic clock by which the stop was sent: in the robot's own process for twins (`tools.bench_robot`), as for a device
+that is driven from there; here for external bodies, of which the bench is the far end. That a robot knows of a death is
+stamped when its status, which names who is missing, arrives here: one way over the router more than the robot itself
+needs.
 
 What arrives is stamped in callbacks of Zenoh's own threads, not when a loop gets round to it.
 """
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
     from experiments.launcher import Launcher
 
 ROBOTS: Final = 20
-STOPS: Final = 5  # emergency stops; each ends its run, so that there is one fresh run for each
+BODIES: Final = ("twin", "external")
+STOPS: Final = 5  # emergency stops of each kind of body; each ends its run, so that there is one fresh run for each
 DEATHS: Final = 3  # runs in which robots die
 KILLED, FROZEN = 7, 3  # of each of those; those next to them in the ring stay, to tell
 SETTLE_S: Final = 2.0  # robots run for so long before anything happens
@@ -49,18 +51,20 @@ STOP_S, KILL_S, FREEZE_S = 0.020, 0.1, 1.5  # what is wanted
 def safety() -> Iterator[Figure]:
     """Reaction times with twenty robots running, beside an empty way over the router in the same run."""
     pings: list[float] = []
-    stops: list[tuple[float, float]] = []
+    stops: dict[str, list[float]] = {body: [] for body in BODIES}
     killed: list[float] = []
     frozen: list[float] = []
     missed = wrong = 0
-    for run in range(STOPS + DEATHS):
+    for _ in range(STOPS):
+        for body, ways in stops.items():
+            with _Park(ROBOTS, body) as park:
+                pings += park.pings()
+                taken, lost = park.stop()
+                ways.extend(taken)
+                missed, wrong = missed + lost, wrong + park.wrong()
+    for _ in range(DEATHS):
         with _Park(ROBOTS) as park:
             pings += park.pings()
-            if run < STOPS:
-                ways, lost = park.stop()
-                stops += ways
-                missed, wrong = missed + lost, wrong + park.wrong()
-                continue
             # every second robot at most, so that each who dies leaves both of its neighbours to notice
             for number, row in enumerate(range(0, 2 * (KILLED + FROZEN), 2)):
                 cause = signal.SIGKILL if number < KILLED else signal.SIGSTOP
@@ -70,8 +74,8 @@ def safety() -> Iterator[Figure]:
             wrong += park.wrong()
     empty = statistics.median(pings)
     yield from _figures("an empty way over the router", pings, empty, empty, "yardstick")
-    yield from _figures("emergency stop until motors off", [whole for whole, _ in stops], empty, STOP_S, "of 20 ms")
-    yield from _figures("of it until the robot has decided", [part for _, part in stops], empty, STOP_S, "of 20 ms")
+    for body, ways in stops.items():
+        yield from _figures(f"emergency stop until motors off, {body}", ways, empty, STOP_S, "of 20 ms")
     yield from _figures("neighbour killed until known", killed, empty, KILL_S, "of 0.1 s")
     yield from _figures("neighbour frozen until known", frozen, empty, FREEZE_S, "of 1.5 s")
     yield Figure("safety", "reactions that did not come", float(missed), "", float(missed), "wanted: 0")
@@ -92,8 +96,8 @@ def _figures(what: str, taken: Sequence[float], empty: float, wanted: float, of:
     yield Figure("safety", f"{what}, slowest", 1e3 * ordered[-1], "ms", ordered[-1] / wanted, of)
 
 
-def ring(count: int) -> Experiment:
-    """Robots on wheels in a ring, each listening to the one before and the one behind, all with external bodies."""
+def ring(count: int, body: str) -> Experiment:
+    """Robots on wheels in a ring, each listening to the one before and the one behind, all with such a body."""
     from math import cos, pi, sin  # noqa: PLC0415
 
     from experiments.experiment import Arena, Experiment, Formation, Rates, Robot  # noqa: PLC0415
@@ -105,7 +109,7 @@ def ring(count: int) -> Experiment:
     return Experiment(
         title="a ring",
         robots={
-            name: Robot(kind="khepera4", start=[radius * cos(turn), radius * sin(turn)], body="external", sensors=[])
+            name: Robot(kind="khepera4", start=[radius * cos(turn), radius * sin(turn)], body=body, sensors=[])
             for name, turn in zip(names, turns, strict=True)
         },
         duration_s=600.0,
@@ -137,7 +141,7 @@ class _Ears:
 
     phase: dict[str, str] = field(default_factory=dict)
     missing: dict[tuple[str, str], float] = field(default_factory=dict)  # (who, whom) -> since when [monotonic s]
-    stopped: dict[str, tuple[float, float]] = field(default_factory=dict)  # arrived [monotonic s], sent [UTC s]
+    stopped: dict[str, float] = field(default_factory=dict)  # when [monotonic s]
     strange: int = 0
 
     def status(self, sample: zenoh.Sample) -> None:
@@ -162,14 +166,14 @@ class _Ears:
         payload = sample.payload.to_bytes()
         if b'"action":"stop"' in payload:  # the others come two thousand times a second
             told = wire.decode(payload, str(sample.encoding), wire.Command)
-            self.stopped.setdefault(told.robot, (now, told.stamp))
+            self.stopped.setdefault(told.robot, now)
 
 
 class _Park:
     """A run of the ring: its processes, and the far end of all bodies; robots run when it is entered."""
 
-    def __init__(self, count: int) -> None:
-        self._experiment = ring(count)
+    def __init__(self, count: int, body: str = BODIES[0]) -> None:
+        self._experiment, self._body = ring(count, body), body
         self._names = list(self._experiment.robots)
         self._ears = _Ears()
         self._over = threading.Event()
@@ -212,17 +216,28 @@ class _Park:
             self._over.wait(0.01)
         return taken
 
-    def stop(self) -> tuple[list[tuple[float, float]], int]:
-        """From an emergency stop to the command at each body, and to its leaving the robot [s]; how many never came."""
+    def stop(self) -> tuple[list[float], int]:
+        """From an emergency stop to the command at each body [s], and how many never came."""
         from agents import wire  # noqa: PLC0415
 
         payload = wire.encode(wire.Stop("bench", "to see how long it takes"))
         self._ears.stopped.clear()
-        began, utc = time.monotonic(), time.time()
+        self._stamps.write_bytes(b"")  # a body that is opened has its motors cut
+        began = time.monotonic()
         self._session.put(self._keys.estop, payload, encoding=wire.JSON, priority=self._urgent, express=True)
-        self._wait(lambda: len(self._ears.stopped) == len(self._names))
-        heard = list(self._ears.stopped.values())
-        return [(at - began, max(0.0, sent - utc)) for at, sent in heard], len(self._names) - len(heard)
+        self._wait(lambda: len(self._stopped()) == len(self._names))
+        heard = [at - began for at in self._stopped().values()]
+        return heard, len(self._names) - len(heard)
+
+    def _stopped(self) -> dict[str, float]:
+        """Which bodies were told to cut their motors, and when first [monotonic s]."""
+        if self._body == "external":
+            return self._ears.stopped
+        first: dict[str, float] = {}
+        for line in self._stamps.read_text().splitlines():
+            name, at = line.split()
+            first.setdefault(name, float(at))
+        return first
 
     def lose(self, row: int, cause: signal.Signals) -> tuple[list[float], int]:
         """From the end of a robot until each of its two neighbours knows [s], and how many never did."""
@@ -255,6 +270,8 @@ class _Park:
         self._urgent = zenoh.Priority.REAL_TIME
         self._keys: Keys = Keys(self._experiment.network.realm)
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
+        self._stamps = folder / "stamps"
+        self._stamps.touch()
         self._launcher: Launcher = self._stack.enter_context(Launcher(folder / "logs"))
         file = folder / "ring.json"
         file.write_bytes(write_json(self._experiment))
@@ -269,16 +286,19 @@ class _Park:
             f"{self._keys.realm}/bench/ping": self._heard,
         }
         self._held = [listener.declare_subscriber(key, Callback(take, indirect=False)) for key, take in heard.items()]
-        # in a process of its own, or what arrives would wait for the interpreter that is busy with this
-        starts = {name: tuple(robot.start) for name, robot in self._experiment.robots.items()}
-        far_end = get_context("spawn").Process(
-            target=places, args=(endpoints[0], self._keys.realm, starts), daemon=True
-        )
-        far_end.start()
-        self._stack.callback(far_end.join)
-        self._stack.callback(far_end.terminate)
+        external = self._body == "external"
+        if external:
+            # in a process of its own, or what arrives would wait for the interpreter that is busy with this
+            starts = {name: tuple(robot.start) for name, robot in self._experiment.robots.items()}
+            far_end = get_context("spawn").Process(
+                target=places, args=(endpoints[0], self._keys.realm, starts), daemon=True
+            )
+            far_end.start()
+            self._stack.callback(far_end.join)
+            self._stack.callback(far_end.terminate)
+        start = ("experiments.robot",) if external else ("tools.bench_robot", str(self._stamps))
         for name in self._names:
-            self._launcher.start(name, "experiments.robot", str(file), name, "--connect", endpoints[0], "--lifeline")
+            self._launcher.start(name, *start, str(file), name, "--connect", endpoints[0], "--lifeline")
 
     def _heard(self, _sample: zenoh.Sample) -> None:
         self._pinged = time.monotonic()
