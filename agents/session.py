@@ -53,6 +53,7 @@ ASK_S: Final = 2.0  # whoever asks waits no longer for an answer
 OPEN_S: Final = 3.0  # a router that answers nothing for so long is passed over for the next one
 MOST_BYTES: Final = 4 * 1024 * 1024  # of a message that a router of a lab puts together; the largest is an experiment
 HEARTBEAT_S: Final = 0.5  # how long the loss of the last pose before a silence goes unnoticed
+POSES: Final = 16  # of one robot that wait to be polled
 EVENTS: Final = 64  # of a run that are said again to who was cut off: without a router much happens at once
 
 # 4 threads instead of 7 in each client and a sixth less CPU at 50 Hz. Zenoh reads it once, at the first open.
@@ -361,7 +362,7 @@ def pose_publisher(session: zenoh.Session, key: str, mime: str, kept: int = 1) -
 
 
 def pose_subscriber(
-    session: zenoh.Session, key: str, depth: int = 16, kept: int = 1
+    session: zenoh.Session, key: str, depth: int = POSES, kept: int = 1
 ) -> AdvancedSubscriber[Handler[zenoh.Sample]]:
     """The other end of `pose_publisher`: the newest `depth` samples wait in `.handler`.
 
