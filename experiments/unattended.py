@@ -24,7 +24,8 @@ from experiments.hosts import HostError
 from experiments.launcher import Launcher, Process
 from experiments.problem import DocumentError
 from experiments.processes import ROBOT
-from experiments.run import conduct, load
+from experiments.realtime import Staging, conduct
+from experiments.run import load
 from experiments.seen import Progress
 from experiments.standins import BODIES, StandInError
 
@@ -88,11 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             conduct(
                 read,
                 chosen.folder,
-                cases=chosen.case,
+                Staging(cases=chosen.case, bodies=chosen.bodies, here=True),
                 show=Told(),
                 interrupted=over.is_set,
-                bodies=chosen.bodies,
-                local=True,
                 launching=partial(Cabled, cables),
             )
     except (

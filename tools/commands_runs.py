@@ -40,24 +40,21 @@ def run(
 ) -> None:
     """Run an experiment: one process per robot, or in virtual time."""
     from experiments.commands import run as command  # noqa: PLC0415
+    from experiments.realtime import Staging  # noqa: PLC0415
 
     raise typer.Exit(
         command(
             file,
+            Staging(case or [], bodies, here, lab, identity),
             virtual=virtual,
-            cases=case or [],
             out=out,
             seed=seed,
             settings=settings or [],
             as_json=as_json,
             seeds=seeds,
-            bodies=bodies,
-            here=here,
             anyway=anyway,
             report=report,
             open_report=open_report,
-            lab=lab,
-            identity=identity,
         )
     )
 

@@ -24,7 +24,7 @@ from experiments.experiment import Experiment, Host
 from experiments.hosts import HostError, Station
 from experiments.launcher import Launcher
 from experiments.problem import DocumentError, Problem
-from experiments.run import enforced
+from experiments.realtime import enforced
 from experiments.servants import start_router
 from experiments.station import Found, Question
 from tools.host_keys import send
