@@ -126,7 +126,7 @@ def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
 
 
 @app.command()
-def show(folder: Folder, as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
+def show(folder: Folder, as_json: AsJson = False) -> None:
     """Show who is in a lab and until when; exit code 1 if a certificate has ended."""
     from pathlib import Path  # noqa: PLC0415
 
