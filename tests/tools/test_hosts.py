@@ -13,7 +13,8 @@ from experiments import document, hosts, playback, version
 from experiments.problem import DocumentError
 from tests.system.lab import ROOT, Flight
 from tools import hosts as tool
-from tools.hosts import HEADING, Row, choose, packed, table
+from tools.freight import packed
+from tools.hosts import HEADING, Row, choose, table
 
 FAKE = """\
 #!{python}
@@ -137,7 +138,7 @@ def test_hosts_are_chosen_by_name_or_tag():
 
 
 def test_a_package_holds_code_and_nothing_that_running_left():
-    with tarfile.open(fileobj=io.BytesIO(packed(ROOT, ["agents", "zenpark", "missing"]))) as tar:
+    with tarfile.open(fileobj=io.BytesIO(packed(ROOT, ["agents", "zenpark"]))) as tar:
         names = tar.getnames()
         assert tar.getmember("zenpark").mode & 0o100
     assert "agents/keys.py" in names
