@@ -35,6 +35,7 @@ from agents.orders import EMERGENCY, LAND, STOP, carry_out
 from agents.process import told_to_end
 from agents.ranging import HeardRanges, instead
 from agents.safety import Limits
+from agents.settings import ASK_S
 from agents.speaking import Said
 from agents.telemetry import Counts, Telemetry
 from agents.watchdog import SILENCE_S, Watchdog
@@ -322,7 +323,7 @@ class Runtime:
                 self._counts.malformed += 1
                 query.reply_err(str(error).encode(), encoding="text/plain")
                 return
-            if order.order == "takeoff" and self._slept > network.ASK_S and t < self._doubt_until:
+            if order.order == "takeoff" and self._slept > ASK_S and t < self._doubt_until:
                 refusal, value = f"the process stood still for {self._slept:.1f} s; ask again", None  # he left long ago
             else:
                 refusal, value = carry_out(self.agent, row, order, t, self._utc)

@@ -25,6 +25,7 @@ from agents import plugins, wire
 from agents import session as network
 from agents.centre import Centre, Told
 from agents.channel import Channel, Samples
+from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.keys import Keys
 from agents.leaving import end, held
 from agents.lifecycle import IDLE, Phase
@@ -45,7 +46,7 @@ REPORT_S: Final = 1.0
 DEPTH: Final = 64  # poses of a robot that may wait for the next decision
 ROUNDING_S: Final = 1e-5  # stamps are rounded
 PHASES: Final = {phase.word: int(phase) for phase in Phase}
-EXPLAINED: Final = (DocumentError, plugins.PluginError, network.EndpointError, network.Unreachable)
+EXPLAINED: Final = (DocumentError, plugins.PluginError, EndpointError, network.Unreachable)
 
 
 class CentreTaken(RuntimeError):
@@ -229,7 +230,7 @@ def serve(
     if not steered:
         hint = 'write architecture = "centralised" at the top of the file, or choose another case with --case'
         raise DocumentError([Problem(file, 0, 0, "every robot of this experiment decides for itself", hint)])
-    endpoints = routers(experiment, read.path, connect, lab) or [network.DEFAULT_ENDPOINT]
+    endpoints = routers(experiment, read.path, connect, lab) or [DEFAULT_ENDPOINT]
     over = threading.Event()
     with told_to_end(over.set):
         if lifeline:

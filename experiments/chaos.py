@@ -25,6 +25,7 @@ import numpy as np
 
 from agents import session as network
 from agents import wire
+from agents.endpoint import free_endpoint
 from agents.keys import Keys
 from agents.rows import Array
 from experiments import playback
@@ -220,7 +221,7 @@ class Flight:
         random = np.random.default_rng([setting.seed, self._number])
         experiment = setting.experiment
         groups = {name: robot.process or name for name, robot in experiment.robots.items()}
-        routers = [network.free_endpoint(preferred_port=0) for _ in range(self._script.routers)]
+        routers = [free_endpoint(preferred_port=0) for _ in range(self._script.routers)]
         recording = folder / f"{setting.case}.mcap"
         with ExitStack() as stack:
             clock = WallClock(folder)

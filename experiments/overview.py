@@ -13,6 +13,7 @@ import zenoh
 
 from agents import lab, topology, wire
 from agents import session as network
+from agents.endpoint import DEFAULT_ENDPOINT
 from agents.keys import Keys
 from agents.leaving import held
 from experiments import hosts as machines
@@ -71,7 +72,7 @@ class Overview:
         self._session, declared = stack.enter_context(held(opened))
         declared.append(self)
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON, network.EVENTS)
-        if list(endpoints) != [network.DEFAULT_ENDPOINT]:
+        if list(endpoints) != [DEFAULT_ENDPOINT]:
             options = lab.options(endpoints[0]) if len(endpoints) == 1 else f"--connect @{folder / mesh.ENDPOINTS}"
             where = "a mesh" if topology.is_mesh(endpoints) else ", ".join(lab.bare(endpoints))
             self.say("router", "conductor", f"{where}: look with `zenpark keys {options}`")

@@ -9,9 +9,9 @@ from pathlib import Path
 import msgspec
 
 from agents.access import rules
+from agents.endpoint import free_endpoints
 from agents.lab import LabError, register, require, secured
 from agents.lab import of as lab_of
-from agents.session import free_endpoints
 from agents.topology import from_here
 from experiments import access, document, mesh, reach
 from experiments.conductor import Conductor, Result

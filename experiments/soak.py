@@ -21,6 +21,7 @@ import zenoh
 
 from agents import session as network
 from agents import wire
+from agents.endpoint import free_endpoint
 from agents.keys import Keys
 from experiments import endurance, processes, soak_verdict
 from experiments.conductor import RunFailed
@@ -145,7 +146,7 @@ def soak(  # noqa: PLR0915 - one loop that follows one run
         groups.setdefault(robot.process or name, []).append(name)
     duration, recording = experiment.duration_s, folder / f"{case}.mcap"
     every = min(SAMPLE_S, duration / SAMPLES)
-    endpoint = network.free_endpoint(preferred_port=0)
+    endpoint = free_endpoint(preferred_port=0)
     sampled: list[Row] = []
     died: dict[str, float] = {}
     start: float | None = None

@@ -17,6 +17,7 @@ from typing import Self
 
 from agents import lab, wire
 from agents import session as network
+from agents.endpoint import EndpointError
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
 from experiments.conductor import RunFailed
@@ -100,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         RunFailed,
         StandInError,
         lab.LabError,
-        network.EndpointError,
+        EndpointError,
         network.Unreachable,
     ) as error:
         print(f"zenpark: {error}", file=sys.stderr)

@@ -13,8 +13,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from agents.endpoint import Endpoint
-from agents.session import free_endpoint
+from agents.endpoint import Endpoint, free_endpoint
 from experiments import certificates, document, reach, version
 from experiments.document import Document
 from experiments.experiment import Experiment, Host

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from agents.endpoint import free_endpoint
 from agents.lifeline import Lifeline
-from agents.session import free_endpoint
 
 ROOT = Path(__file__).resolve().parents[2]
 

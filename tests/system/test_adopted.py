@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from agents import session as network
 from agents import wire
+from agents.endpoint import free_endpoint
 from agents.lab import Role
 from experiments import document, playback
 from tests.conftest import RouterProcess
@@ -67,7 +67,7 @@ def test_who_joins_in_a_lab_needs_its_own_files_alone(tmp_path: Path) -> None:
     own.mkdir(parents=True)
     for name in ("ca.pem", "KH02.pem", "KH02.key"):
         (lab / name).rename(own / name) if name.startswith("KH02") else shutil.copy(lab / name, own)
-    endpoint = network.free_endpoint(preferred_port=0, protocol="tls")
+    endpoint = free_endpoint(preferred_port=0, protocol="tls")
     file = experiment(tmp_path, endpoint)
     reach = ("--connect", endpoint, "--lab", str(own))
     router = Started("tools.guard", "router", file, "--lab", str(lab), "--listen", endpoint)

@@ -104,7 +104,7 @@ def test_a_killed_robot_is_started_again_and_takes_part(lab: Lab) -> None:
                       "it is heard again")  # fmt: skip
     started = lab.watcher.status["CF01"].started
     assert abs(started - lab.watcher.status["KH01"].started) < 0.1, "its time is that of the others"
-    time.sleep(1.0)
+    lab.watcher.until(lambda: lab.watcher.status["CF01"].decisions >= 10, "it has taken part for a while")
     code, _ = lab.end()
     assert code in (0, 130)
     read = playback.read(lab.folder / "run" / "event.mcap")
