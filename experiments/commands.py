@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from agents import plugins
-from experiments import document, results, verdict
+from experiments import document, entries, results, verdict
 from experiments.bar import Bar
 from experiments.problem import DocumentError, Problem
 from experiments.progress import shown
@@ -128,16 +128,16 @@ def report(folders: Sequence[str], *, out: str | None) -> int:
 
 def new(name: str, target: str | None) -> int:
     """`zenpark new`: copies a catalogue entry to begin from."""
-    path = document.copy(name, Path(target) if target else Path(f"{name}.toml"))
+    path = entries.copy(name, Path(target) if target else Path(f"{name}.toml"))
     print(f"{path}: a copy of {name}; change it, then `zenpark check {path}` and `zenpark run {path}`")
     return 0
 
 
 def list_all() -> int:
     """`zenpark list`: the catalogue, and the plug-ins that are installed."""
-    width = max(len(name) for name, _ in document.names())
+    width = max(len(name) for name, _ in entries.names())
     print("Experiments (zenpark run NAME, zenpark new NAME):")
-    for name, title in document.names():
+    for name, title in entries.names():
         print(f"  {name:<{width}}  {title}")
     for what, group in (
         ("Bodies", plugins.BODIES),

@@ -147,9 +147,9 @@ def _cases(each: str) -> list[Experiment] | None:
     """The cases of an experiment; None if it is a robot that is named."""
     from pathlib import Path  # noqa: PLC0415
 
-    from experiments import document  # noqa: PLC0415
+    from experiments import document, entries  # noqa: PLC0415
 
-    known = each in {name for name, _ in document.names()} or Path(each).suffix or Path(each).exists()
+    known = each in {name for name, _ in entries.names()} or Path(each).suffix or Path(each).exists()
     return list(document.read(each).cases().values()) if known else None
 
 

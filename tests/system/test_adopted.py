@@ -12,7 +12,7 @@ import pytest
 from agents import wire
 from agents.endpoint import free_endpoint
 from agents.lab import Role
-from experiments import document, playback
+from experiments import entries, playback
 from tests.conftest import RouterProcess
 from tests.system.lab import Flight, RobotProcess, Started, Watcher
 from tools import authority
@@ -24,7 +24,7 @@ SHORT = ("--json", "--set", "duration_s=2", "--no-report")
 
 def experiment(folder: Path, endpoint: str) -> str:
     file = folder / "x.toml"
-    text = document.catalogue_path("triangle").read_text("utf-8")
+    text = entries.path("triangle").read_text("utf-8")
     text += f'\n[network]\nconnect = ["{endpoint}"]\n[hosts.board]\nrobots = ["KH02"]\n'
     file.write_text(text)
     return str(file)

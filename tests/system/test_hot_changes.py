@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from agents import wire
-from experiments import document, orders, playback, report
+from experiments import entries, orders, playback, report
 from experiments.run import reopen
 from tests.conftest import RouterProcess
 from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher
@@ -43,7 +43,7 @@ class Lab:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.file, self.over = folder, folder / "x.toml", False
-        text = document.catalogue_path("triangle").read_text("utf-8")
+        text = entries.path("triangle").read_text("utf-8")
         text = text.replace("[formation]", f"{SPARES}\n[formation]", 1)
         text = text.replace('"KH01 - KH02"', '"KH01 > KH03" = 0.60\n"KH03 > KH01" = 0.60\n"KH01 - KH02"', 1)
         self.file.write_text(text)

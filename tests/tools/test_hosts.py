@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import document, hosts, playback, version
+from experiments import entries, hosts, playback, version
 from experiments.problem import DocumentError
 from tests.system.lab import ROOT, Flight
 from tools import hosts as tool
@@ -53,7 +53,7 @@ def home(tmp_path, monkeypatch):
 
 def experiment(folder, **hosts):
     file = folder / "x.toml"
-    text = document.catalogue_path("triangle").read_text("utf-8")
+    text = entries.path("triangle").read_text("utf-8")
     for name, fields in hosts.items():
         text += f"\n[hosts.{name}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in fields.items())
     file.write_text(text)
