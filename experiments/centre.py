@@ -30,9 +30,9 @@ from agents.keys import Keys
 from agents.leaving import end, held
 from agents.lifecycle import IDLE, Phase
 from agents.lifeline import Lifeline
+from agents.plausibility import reach_of
 from agents.process import told_to_end
 from agents.rows import Index
-from agents.runtime import reach_of
 from agents.speaker import Said, Speaker
 from agents.telemetry import resident_mb
 from experiments import conditions, document, mesh
@@ -66,7 +66,7 @@ class CentreProcess:
         # what robots say on the tick of a decision is on its way then: half a tick more, and it counts
         self._patience = 0.5 / assignment.body_hz
         names, rows = self._names, centre.listens.tolist()
-        reach = reach_of(assignment.limits)
+        reach = reach_of(assignment.limits.low, assignment.limits.high)
         self._speakers = [
             Speaker(session, keys, names[row], np.array([link]), reach=reach, depth=DEPTH)
             for link, row in enumerate(rows)
