@@ -27,7 +27,7 @@ from experiments.problem import DocumentError
 from experiments.processes import ROBOT
 from experiments.realtime import Staging, conduct
 from experiments.run import load
-from experiments.seen import Progress
+from experiments.seen import News, Progress
 from experiments.standins import BODIES, StandInError
 
 
@@ -51,8 +51,7 @@ class Told:
     """Prints each event once."""
 
     def __init__(self) -> None:
-        self._told = 0
-        self._case = ""
+        self._news = News()
 
     def __enter__(self) -> Self:
         return self
@@ -62,13 +61,9 @@ class Told:
 
     def __call__(self, progress: Progress) -> None:
         """Prints what is new."""
-        if progress.case != self._case:
-            self._case, self._told = progress.case, 0
-        for event in progress.events[self._told :]:
-            sys.stdout.buffer.write(wire.encode(event) + b"\n")
-        if len(progress.events) > self._told:
+        if events := self._news.of(progress):
+            sys.stdout.buffer.write(b"".join(wire.encode(event) + b"\n" for event in events))
             sys.stdout.buffer.flush()
-        self._told = len(progress.events)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,14 +12,6 @@ from agents.lifeline import Lifeline
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture
-def pipe():
-    ends = list(os.pipe())
-    yield ends
-    for end in ends:
-        os.close(end)
-
-
 def test_end_of_file_is_loss(pipe):
     lost = threading.Event()
     line = Lifeline(lost, timeout_s=60.0, fd=pipe[0])

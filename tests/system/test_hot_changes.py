@@ -6,7 +6,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,7 @@ from agents import wire
 from experiments import entries, orders, playback, report
 from experiments.run import reopen
 from tests.conftest import RouterProcess
-from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher
+from tests.system.lab import Flight, RobotProcess, Watcher, zenpark
 
 pytestmark = pytest.mark.system
 
@@ -64,11 +63,7 @@ class Lab:
         return orders.give_run(self.watcher.session, self.watcher.keys, order)
 
     def zenpark(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "tools.guard", "robot", *arguments, "--connect", self.endpoint],
-            cwd=ROOT, env=ENVIRONMENT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
-            timeout=60,
-        )  # fmt: skip
+        return zenpark("robot", *arguments, "--connect", self.endpoint)
 
     def end(self) -> tuple[int, str]:
         """Ctrl-C: all land."""
