@@ -170,6 +170,7 @@ def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
     """Writes tables, figures and report of a run into its folder; returns the report."""
     from experiments import drawing as figures  # noqa: PLC0415 - matplotlib takes 0.6 s
     from experiments import report as pages  # noqa: PLC0415
+    from experiments.page import date_of  # noqa: PLC0415
 
     every = [case for each in runs for case in each.metrics.values()]
     results.write_csv(folder / "metrics.csv", every)
@@ -181,7 +182,7 @@ def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
         folder,
         traces,
         command=command,
-        date=pages.date_of(runs[0].made),
+        date=date_of(runs[0].made),
         run=runs[0].folder,
         text=runs[0].source,
         measured=every,
