@@ -1,11 +1,14 @@
-"""What stands in a Zenoh endpoint: `protocol/host:port`, and behind `?` or `#` settings that only Zenoh reads."""
+"""Zenoh endpoints, `protocol/host:port`, and behind `?` or `#` settings that only Zenoh reads; and which are free."""
 
 from __future__ import annotations
 
 import ipaddress
+import socket
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
+DEFAULT_PORT: Final = 7447
+DEFAULT_ENDPOINT: Final = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 UNIX: Final = "unixsock-stream"
 PROTOCOLS: Final = ("tcp", "tls", "quic", UNIX)
 _WHY_NOT: Final = {
@@ -16,13 +19,17 @@ _WHY_NOT: Final = {
 }
 
 
+class EndpointError(ValueError):
+    """An endpoint that cannot or must not be used, with the remedy."""
+
+
 def refusal(endpoint: str) -> str:
     """Why the protocol of an endpoint is not used, and what is; empty if it is."""
     protocol = endpoint.partition("/")[0]
     if protocol in PROTOCOLS:
         return ""
     why = _WHY_NOT.get(protocol, "there is no such protocol here")
-    return f"'{endpoint}' cannot be used: {why}; write it like tcp/127.0.0.1:7447, or with tls, quic or {UNIX}/PATH"
+    return f"'{endpoint}' cannot be used: {why}; write it like {DEFAULT_ENDPOINT}, or with tls, quic or {UNIX}/PATH"
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ class Endpoint:
             return cls(protocol, address, 0, rest)
         host, _, port = address.rpartition(":")
         if not (protocol and host and port.isdecimal() and 0 < int(port) < 65536):
-            raise ValueError(f"'{text}' is not an endpoint; write it like tcp/127.0.0.1:7447")
+            raise ValueError(f"'{text}' is not an endpoint; write it like {DEFAULT_ENDPOINT}")
         return cls(protocol, host.removeprefix("[").removesuffix("]"), int(port), rest)
 
     def __str__(self) -> str:
@@ -88,3 +95,24 @@ class Endpoint:
             return ipaddress.ip_address(self.host)
         except ValueError:
             return None
+
+
+def free_endpoint(preferred_port: int = DEFAULT_PORT, protocol: str = "tcp") -> str:
+    """A loopback endpoint to listen on: of the preferred port, or of any free one when that is taken."""
+    for port in (preferred_port, 0):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port in TIME_WAIT is free
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+    raise EndpointError("no free TCP port on 127.0.0.1: end some of the processes that listen there")
+
+
+def free_endpoints(count: int, protocol: str = "tcp") -> list[str]:
+    """So many different ones, of the usual port and those after it where they are free."""
+    made: dict[str, None] = {}
+    while len(made) < count:
+        made[free_endpoint(DEFAULT_PORT + len(made), protocol)] = None
+    return list(made)

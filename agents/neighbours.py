@@ -2,30 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import zenoh
 
-from agents import plausibility, wire
-from agents import session as network
+from agents import wire
 from agents.agent import Agent, links_by_speaker
 from agents.channel import Channel, Conditions, Samples
 from agents.keys import Keys
 from agents.rows import Index
-
-
-@dataclass
-class Neighbour:
-    """What comes from one speaker: its pose channel, its liveliness, and the count of its samples."""
-
-    name: str
-    links: Index
-    poses: network.Polled[zenoh.Sample]
-    alive: network.Polled[zenoh.Sample]
-    seq: int = 0
-    stamp: float = 0.0
-    lost: int = 0
+from agents.speaker import Said, Speaker
 
 
 class Neighbours:
@@ -36,7 +21,6 @@ class Neighbours:
         news: (n) poses that got through to each row, which telemetry empties.
         heard: (n) how many that were, ever.
         dropped: (E,) samples that the modelled network dropped.
-        malformed: Samples that were refused.
         changed: Somebody came or went since whoever looks last said so.
     """
 
@@ -59,52 +43,40 @@ class Neighbours:
             conditions: What is done to poses on each link; None: nothing.
         """
         assignment = agent.assignment
-        self._agent, self._reach = agent, reach
+        self._agent = agent
         self._links, self._names = assignment.links, assignment.speakers
         self._channel = Channel(conditions or Conditions.ideal(len(assignment.links)))
         by_speaker = links_by_speaker(assignment.links, assignment.speakers)
-        self._subscribers = [network.pose_subscriber(session, keys.pose(name)) for name in by_speaker]
-        self._watches = [network.alive_watch(session, keys.alive(name)) for name in by_speaker]
-        self.speakers = [
-            Neighbour(name, links, poses.handler, watch.handler)
-            for (name, links), poses, watch in zip(by_speaker.items(), self._subscribers, self._watches, strict=True)
-        ]
+        self.speakers = [Speaker(session, keys, name, links, reach=reach) for name, links in by_speaker.items()]
         self.news: list[list[wire.Heard]] = [[] for _ in assignment.names]
         self.heard: Index = np.zeros(len(assignment.names), dtype=np.intp)
         self.dropped = self._channel.dropped
-        self.malformed = 0
         self.changed = False
+
+    @property
+    def malformed(self) -> int:
+        """Samples that were refused."""
+        return sum(speaker.malformed for speaker in self.speakers)
 
     def listen(self, t: float, utc: float) -> None:
         """Takes in what has arrived at `t` [s] of the process's clock, which stood at 0 at `utc` [s]."""
-        for neighbour in self.speakers:
-            for sample in network.received(neighbour.poses):
-                self._hear(neighbour, sample, t, utc)
-            for sample in network.received(neighbour.alive):
+        for speaker in self.speakers:
+            for said in speaker.news(utc + t):
+                speaker.lost += said.missed
+                self._send(speaker.links, said, t, utc)
+            for came in speaker.comings():
                 self.changed = True
-                if sample.kind == zenoh.SampleKind.DELETE:
-                    self._channel.forget(neighbour.links)
-                    self._agent.lose(neighbour.links, t)
+                if came:
+                    self._agent.find(speaker.links)
                 else:
-                    self._agent.find(neighbour.links)
+                    self._channel.forget(speaker.links)
+                    self._agent.lose(speaker.links, t)
         if (got := self._channel.due(t)) is not None:
             self._believe(got, utc)
 
-    def _hear(self, neighbour: Neighbour, sample: zenoh.Sample, t: float, utc: float) -> None:
-        """One pose has come: checked, counted, and given to the modelled network."""
-        payload = sample.payload.to_bytes()
-        try:
-            pose = wire.decode(payload, str(sample.encoding), wire.Pose)
-            plausibility.check_pose(pose, robot=neighbour.name, now=utc + t, reach=self._reach)
-        except wire.Malformed:
-            self.malformed += 1
-            return
-        if pose.stamp <= neighbour.stamp:
-            return  # known already: told again after a reconnection
-        if 0 < neighbour.seq < pose.seq:
-            neighbour.lost += pose.seq - neighbour.seq - 1
-        neighbour.seq, neighbour.stamp = pose.seq, pose.stamp
-        links, count = neighbour.links, len(neighbour.links)
+    def _send(self, links: Index, heard: Said, t: float, utc: float) -> None:
+        """One pose has come: it is given to the modelled network."""
+        pose, count = heard.pose, len(links)
         said = Samples(
             links,
             np.full(count, t),
@@ -117,7 +89,7 @@ class Neighbours:
             self._believe(said, utc)
             return
         start = self._agent.life.start_at[self._links.listener[links]]
-        size = np.full(count, len(payload))
+        size = np.full(count, heard.size)
         self._channel.send(links, said.seq, said.stamp, said.position, said.velocity, start=start, size=size, now=t)
 
     def _believe(self, got: Samples, utc: float) -> None:

@@ -10,6 +10,9 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+import numpy as np
+
+from agents.rows import Array
 from agents.wire import Command, Goal, Malformed, Pose, Position, Ranges, State, Vector
 
 FUTURE_S: Final = 5.0  # a stamp further ahead is a broken clock or a forgery, and would silence honest samples
@@ -17,7 +20,19 @@ MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
 ABSURD: Final = 1e6  # [m, m/s, rad, rad/s] no setpoint is that large
 MAX_RAYS: Final = 720  # of one sweep; the finest scanner here has 360
 MAX_RANGE: Final = 100.0  # [m]; no range sensor here sees farther
+REACH_M: Final = 1.0  # a neighbour said to be farther outside the arena than this is not believed
 MAX_YAW: Final = 1e3  # [rad]; yaw is counted on over full turns
+
+
+def reach_of(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Vector:
+    """Largest |x|, |y|, |z| [m] that a robot may say it has, and that anybody may tell it to go to.
+
+    Args:
+        low: Smallest x, y, z of the arena [m].
+        high: Largest.
+    """
+    x, y, z = np.maximum(np.abs(low), np.abs(high)) + REACH_M
+    return float(x), float(y), float(z)
 
 
 def check_pose(pose: Pose, *, robot: str, now: float, reach: Vector) -> None:

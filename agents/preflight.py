@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from math import degrees
 from typing import Final
 
@@ -55,7 +56,10 @@ class Preflight:
             lacking: (N,) rows that still wait for somebody, and for whom a row does.
         """
         failing: dict[int, str] = {}
-        for rows, say in self._checks(t, state, where, hearing, outside, lacking):
+        checks = [self._knows(t, state, where, outside, lacking), self._rests(state)]
+        if self._limits.separation is not None:
+            checks.append(self._near(t, state.position, hearing, self._limits.separation))
+        for rows, say in chain.from_iterable(checks):
             for row in np.flatnonzero(rows).tolist():
                 failing.setdefault(row, say(row))
         return failing
@@ -68,38 +72,38 @@ class Preflight:
         self._since = since
         return rows[t - since[rows] >= LOST_S]
 
-    def _checks(  # noqa: PLR0917
+    def _knows(
         self,
         t: float,
         state: BodyState,
         where: Whereabouts,
-        hearing: Hearing,
         outside: Outside,
         lacking: tuple[Mask, Callable[[int], Sequence[str]]],
     ) -> Iterator[Failing]:
-        limits, flies, position = self._limits, self._flies, state.position
-        known = np.isfinite(position).all(axis=1) & (t - state.time <= limits.own_silence_s)
+        """Where it is, and who else is there."""
+        known = np.isfinite(state.position).all(axis=1) & (t - state.time <= self._limits.own_silence_s)
         nowhere = "no position of its own"
         heading = "it does not know which way it looks"
         yield where.blind, lambda row: heading if np.isnan(state.yaw[row]) and known[row] else nowhere
         waits, whom = lacking
         yield waits, lambda row: "never heard " + ", ".join(whom(row))
         if outside.offline_since < np.inf:
-            yield np.ones(len(flies), dtype=bool), lambda _: "no connection to a router"
+            yield np.ones(len(self._flies), dtype=bool), lambda _: "no connection to a router"
         if not where.sure:
             yield where.outside > WALL_M, lambda row: f"it is {where.outside[row]:.2f} m outside the arena"
-        high = flies & (position[:, 2] > FLOOR_M)
-        yield high, lambda row: f"it does not stand on the floor, but at z = {position[row, 2]:.2f} m"
+
+    def _rests(self, state: BodyState) -> Iterator[Failing]:
+        """Its body on the floor."""
+        flies, height, least = self._flies, state.position[:, 2], self._limits.battery_min
+        yield flies & (height > FLOOR_M), lambda row: f"it does not stand on the floor, but at z = {height[row]:.2f} m"
         fast = flies & (np.vecdot(state.velocity, state.velocity) > REST_M_S**2)
         yield fast, lambda row: f"it is not at rest: {np.linalg.norm(state.velocity[row]):.2f} m/s"
         if state.attitude is not None:
             attitude = state.attitude
             leans = flies & leaning(attitude, LEVEL)
             yield leans, lambda row: f"it is not level: it leans {degrees(lean(attitude, row)):.0f}°"
-        low = state.battery < limits.battery_min
-        yield low, lambda row: f"its battery is at {state.battery[row]:.0%}, less than {limits.battery_min:.0%}"
-        if limits.separation is not None:
-            yield from self._near(t, position, hearing, limits.separation)
+        low = state.battery < least
+        yield low, lambda row: f"its battery is at {state.battery[row]:.0%}, less than {least:.0%}"
 
     def _near(self, t: float, position: Array, hearing: Hearing, limit: float) -> Iterator[Failing]:
         apart = self._separation.distances(t, position, hearing)

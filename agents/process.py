@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.keys import Keys
 from agents.lab import LabError, secured
 from agents.lifeline import SILENCE_S
-from agents.session import DEFAULT_ENDPOINT, EndpointError
 
 
 @contextmanager

@@ -15,11 +15,13 @@ import zenoh
 
 from agents import lab
 from agents.access import Rights
+from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.leaving import end, held
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
 from agents.promptness import prompt_threads
-from agents.session import DEFAULT_ENDPOINT, EndpointError, config, deserted, reason
+from agents.session import deserted
+from agents.settings import config, reason, settings
 
 EMPTY_S: Final = 1.0  # nobody connected for this long: whoever lost its connection would have it again
 LOOK_S: Final = 0.1
@@ -113,9 +115,9 @@ def serve_router(
     register = _register(endpoints)
     patience_s = 0.0
     seen = _stamp(register)  # before it is read: what changes in between is seen then
-    settings = config("router", listen=endpoints, connect=link, name="router", rights=rights)
+    chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
     while True:
-        with held(_routing(settings, endpoints, patience_s, stop)) as (session, _):
+        with held(_routing(chosen, endpoints, patience_s, stop)) as (session, _):
             ready(session)
             patience_s = FREED_S
             while not stop.wait(LOOK_AGAIN_S):
@@ -123,7 +125,7 @@ def serve_router(
                     continue
                 seen = now
                 try:
-                    settings = config("router", listen=endpoints, connect=link, name="router", rights=rights)
+                    chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
                 except EndpointError as error:  # what stood there before still holds
                     print(f"router: {error}", file=sys.stderr, flush=True)
                     continue
@@ -133,12 +135,12 @@ def serve_router(
                 return
 
 
-def _routing(settings: zenoh.Config, endpoints: Sequence[str], wait_s: float, stop: threading.Event) -> zenoh.Session:
+def _routing(chosen: zenoh.Config, endpoints: Sequence[str], wait_s: float, stop: threading.Event) -> zenoh.Session:
     deadline = time.monotonic() + wait_s
     while True:
         try:
             with prompt_threads():
-                return zenoh.open(settings)
+                return zenoh.open(chosen)
         except zenoh.ZError as error:
             if time.monotonic() < deadline and not stop.wait(AGAIN_S):
                 continue

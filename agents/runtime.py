@@ -8,25 +8,21 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import ceil, floor, nan
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import zenoh
 
 from agents import plausibility, wire
 from agents import session as network
-from agents.access import Rights
 from agents.agent import Actions, Agent
 from agents.assignment import Assignment
 from agents.body import Body
-from agents.channel import Conditions
-from agents.clock import Clock
 from agents.goals import HeardGoals
-from agents.keys import Keys
 from agents.leaving import leave
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
@@ -34,63 +30,19 @@ from agents.neighbours import Neighbours
 from agents.orders import EMERGENCY, LAND, STOP, carry_out
 from agents.process import told_to_end
 from agents.ranging import HeardRanges, instead
-from agents.safety import Limits
+from agents.settings import ASK_S
+from agents.setup import Setup
 from agents.speaking import Said
 from agents.telemetry import Counts, Telemetry
-from agents.watchdog import SILENCE_S, Watchdog
-
-Ranging = Literal["body", "world", "far"]
+from agents.watchdog import Watchdog
 
 FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its launcher was lost has its motors cut
 HUSH_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
 DOUBT_S: Final = 1.0  # a robot whose process stood still holds for so long: what it knows is old
-REACH_M: Final = 1.0  # a neighbour said to be farther outside the arena than this is not believed
-
-
-@dataclass(frozen=True)
-class Setup:
-    """Where a robot process finds its network and how it talks.
-
-    Attributes:
-        keys: Key expressions of the realm.
-        endpoints: Routers, or the members of a mesh.
-        encoding: Of the payloads that it sends.
-        state_hz: Rate of telemetry.
-        lifeline: Whether standard input is a lifeline.
-        located: Which rows get their position from outside.
-        ranging: Where each row's range readings come from: its body; the world, which says them on the row's key
-            `ranges` ("world"); or that key too, but the body hears them by itself ("far"). Left out: the bodies.
-        conditions: What is done to poses that have come from neighbours, on each link; None: nothing.
-        goal_conditions: The same for goals that have come from a centre, for each guided row.
-        clock: Of the experiment.
-        once: Whether the process ends when its robots are down after an experiment.
-        rights: Who may do what, which robots enforce themselves in the mesh of a lab.
-        loop_silence_s: A loop without a tick for so long hangs: its robots are landed from outside of it [s].
-    """
-
-    keys: Keys
-    endpoints: Sequence[str]
-    encoding: wire.Encoding
-    state_hz: float
-    lifeline: bool
-    located: Sequence[bool]
-    ranging: Sequence[Ranging] = ()
-    conditions: Conditions | None = None
-    goal_conditions: Conditions | None = None
-    clock: Clock = field(default_factory=Clock)
-    once: bool = False
-    rights: Rights | None = None
-    loop_silence_s: float = SILENCE_S
 
 
 class NameTaken(RuntimeError):
     """A robot of the same name is on the network already."""
-
-
-def reach_of(limits: Limits) -> wire.Vector:
-    """Largest |x|, |y|, |z| [m] that a robot may say it has, and that anybody may tell it to go to."""
-    x, y, z = np.maximum(np.abs(limits.low), np.abs(limits.high)) + REACH_M
-    return float(x), float(y), float(z)
 
 
 class Runtime:
@@ -112,7 +64,7 @@ class Runtime:
         self._cut_off = False  # motors were cut by a stop that the loop has not seen yet
         self._slept, self._joined = 0.0, False
         self._utc = self._now = self._next = 0.0
-        self._reach = reach_of(assignment.limits)
+        self._reach = plausibility.reach_of(assignment.limits.low, assignment.limits.high)
         self._everyone = np.arange(len(self._names))
         self._tokens: dict[int, zenoh.LivelinessToken] = {}
         self._watchdog = Watchdog(body, self._everyone, alarm=self._call_for_help, silence_s=setup.loop_silence_s)
@@ -323,7 +275,7 @@ class Runtime:
                 self._counts.malformed += 1
                 query.reply_err(str(error).encode(), encoding="text/plain")
                 return
-            if order.order == "takeoff" and self._slept > network.ASK_S and t < self._doubt_until:
+            if order.order == "takeoff" and self._slept > ASK_S and t < self._doubt_until:
                 refusal, value = f"the process stood still for {self._slept:.1f} s; ask again", None  # he left long ago
             else:
                 refusal, value = carry_out(self.agent, row, order, t, self._utc)

@@ -179,7 +179,8 @@ class Safety:
         avoided = nobody
         if avoidance is not None and own is not None and nearby is not None:
             limited = safe
-            safe = self._restrained(avoidance, limited, own, nearby, here, yaw, blind | wild)
+            wished = _wished(avoidance, limited, own, nearby)
+            safe = self._restrained(limited, wished, here, yaw, blind | wild)
             if safe is not limited:
                 avoided = np.asarray((np.abs(safe - limited) > ROUNDING).any(axis=1))
         other = np.abs(safe - setpoint) > ROUNDING
@@ -202,23 +203,12 @@ class Safety:
             rows = self._twist
             setpoint[rows, :2] = self._drive(setpoint[rows, :2], here[rows, :2], yaw[rows], rows)
 
-    def _restrained(  # noqa: PLR0917
-        self, avoidance: Avoidance, setpoint: Array, own: Self, nearby: Nearby, here: Array, yaw: Array, unknown: Mask
-    ) -> Array:
-        """What avoidance makes of setpoints (N, 4) that are within the limits, within the limits again.
+    def _restrained(self, setpoint: Array, wished: Array, here: Array, yaw: Array, unknown: Mask) -> Array:
+        """Setpoints (N, 4) that avoidance wishes instead of those that are within the limits, within the limits again.
 
-        An avoidance may be somebody's first: one that fails is named, a row that is not made of numbers is not taken,
-        and `unknown` rows (N,), which do not know where they are or what they want, stay as they are.
+        A row that is not made of numbers is not taken, and `unknown` rows (N,), which do not know where they are or
+        what they want, stay as they are.
         """
-        name = type(avoidance).__name__
-        try:
-            wished = np.asarray(avoidance.restrain(setpoint.copy(), own, nearby), dtype=float)
-        except FAILURES as error:
-            raise PluginError(f"the avoidance {name} failed: {type(error).__name__}: {error}") from error
-        if wished.shape != setpoint.shape:
-            raise PluginError(
-                f"`restrain` of the avoidance {name} must give a setpoint per row, {setpoint.shape}, not {wished.shape}"
-            )
         other = np.asarray((wished != setpoint).any(axis=1) & np.isfinite(wished).all(axis=1))
         other &= ~unknown
         if not some(other):
@@ -257,3 +247,17 @@ class Safety:
             v = np.where(outward.any(axis=1), 0.0, v)
         twist[:, 0], twist[:, 1] = v, clamp(twist[:, 1], -turn, turn)
         return twist
+
+
+def _wished(avoidance: Avoidance, setpoint: Array, own: Self, nearby: Nearby) -> Array:
+    """What avoidance makes of setpoints (N, 4). It may be somebody's first: one that fails is named."""
+    name = type(avoidance).__name__
+    try:
+        wished = np.asarray(avoidance.restrain(setpoint.copy(), own, nearby), dtype=float)
+    except FAILURES as error:
+        raise PluginError(f"the avoidance {name} failed: {type(error).__name__}: {error}") from error
+    if wished.shape != setpoint.shape:
+        raise PluginError(
+            f"`restrain` of the avoidance {name} must give a setpoint per row, {setpoint.shape}, not {wished.shape}"
+        )
+    return wished

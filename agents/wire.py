@@ -377,28 +377,7 @@ Message = (
     | RunOrder
     | RunReply
 )
-M = TypeVar(
-    "M",
-    Pose,
-    State,
-    Status,
-    Position,
-    Goal,
-    CentreState,
-    Command,
-    Ranges,
-    Order,
-    Reply,
-    Stop,
-    Event,
-    Contact,
-    HostClock,
-    WorldState,
-    WorldOrder,
-    WorldReply,
-    RunOrder,
-    RunReply,
-)
+M = TypeVar("M", bound=Message)
 
 _json = msgspec.json.Encoder()
 _msgpack = msgspec.msgpack.Encoder()

@@ -18,6 +18,7 @@ import zenoh
 from agents import plausibility, wire
 from agents import session as network
 from agents.body import BodyError, BodyRequest, BodyState
+from agents.endpoint import EndpointError
 from agents.leaving import leave
 from agents.positioning import External
 from agents.ranging import HeardRanges
@@ -102,7 +103,7 @@ class ExternalBody:
         try:
             name = f"body of {'+'.join(self._names)}"
             self._session = network.open_session(self._endpoints, name=name, wait_s=OPEN_S, identity=self._names[0])
-        except (network.Unreachable, network.EndpointError) as error:
+        except (network.Unreachable, EndpointError) as error:
             raise BodyError(f"{', '.join(self._names)}: {error}") from None
         session, keys, mime = self._session, self._keys, wire.MIME["json"]
         self._positions = [network.subscriber(session, keys.position(name), 32) for name in self._names]

@@ -21,6 +21,7 @@ import zenoh
 from agents import plausibility, wire
 from agents import session as network
 from agents.body import BodyError
+from agents.endpoint import EndpointError
 from agents.keys import Keys
 from agents.lifeline import Lifeline
 from agents.process import add_network, reached, told_to_end
@@ -284,7 +285,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 stop=stop,
                 identity=chosen.identity,
             )
-    except (BodyError, network.EndpointError, network.Unreachable) as error:
+    except (BodyError, EndpointError, network.Unreachable) as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2
     return 0

@@ -12,6 +12,7 @@ import zenoh
 
 from agents import session as network
 from agents.body import Body, BodyError, BodyRequest, BodyState, Rays
+from agents.endpoint import EndpointError
 from agents.leaving import leave
 from agents.positioning import External
 from agents.protocols import ros2, turtlebot3
@@ -76,7 +77,7 @@ class TurtleBot3:
                 session = network.open_session(
                     robot.endpoints, name=f"{robot.name} ROS 2", wait_s=wait, identity=robot.name
                 )
-            except (network.Unreachable, network.EndpointError) as error:
+            except (network.Unreachable, EndpointError) as error:
                 raise BodyError(f"{robot.name}: {error}; or set device.endpoint to the router of the robot") from None
             self._sessions[robot.endpoints] = session
         return self._sessions[robot.endpoints]

@@ -203,7 +203,7 @@ def bridge(
 
     Raises:
         network.Unreachable: If no router answers.
-        network.EndpointError: If an endpoint is malformed.
+        EndpointError: If an endpoint is malformed.
     """
     host, port = split(server)
     stop, lost = threading.Event(), threading.Event()

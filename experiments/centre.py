@@ -15,23 +15,25 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import floor, isfinite
 from typing import Final
 
 import numpy as np
 import zenoh
 
-from agents import plausibility, plugins, wire
+from agents import plugins, wire
 from agents import session as network
 from agents.centre import Centre, Told
 from agents.channel import Channel, Samples
+from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.keys import Keys
 from agents.leaving import end, held
 from agents.lifecycle import IDLE, Phase
 from agents.lifeline import Lifeline
+from agents.plausibility import reach_of
 from agents.process import told_to_end
-from agents.runtime import reach_of
+from agents.rows import Index
+from agents.speaker import Said, Speaker
 from agents.telemetry import resident_mb
 from experiments import conditions, document, mesh
 from experiments.assign import assign_centre, guided
@@ -44,25 +46,11 @@ REPORT_S: Final = 1.0
 DEPTH: Final = 64  # poses of a robot that may wait for the next decision
 ROUNDING_S: Final = 1e-5  # stamps are rounded
 PHASES: Final = {phase.word: int(phase) for phase in Phase}
-EXPLAINED: Final = (DocumentError, plugins.PluginError, network.EndpointError, network.Unreachable)
+EXPLAINED: Final = (DocumentError, plugins.PluginError, EndpointError, network.Unreachable)
 
 
 class CentreTaken(RuntimeError):
     """A centre is on the network already."""
-
-
-@dataclass
-class _Robot:
-    """Somebody who is listened to, and the count of its samples."""
-
-    name: str
-    row: int
-    poses: network.Polled[zenoh.Sample]
-    alive: network.Polled[zenoh.Sample]
-    seq: int = 0
-    stamp: float = 0.0
-    heard: int = 0
-    lost: int = 0
 
 
 class CentreProcess:
@@ -74,18 +62,17 @@ class CentreProcess:
         self.centre = centre = Centre(assignment)
         self._names, self._session, self._keys = assignment.names, session, keys
         self._encoding: wire.Encoding = experiment.network.encoding
-        self._reach = reach_of(assignment.limits)
         self._period = assignment.decide_every / assignment.body_hz
         # what robots say on the tick of a decision is on its way then: half a tick more, and it counts
         self._patience = 0.5 / assignment.body_hz
         names, rows = self._names, centre.listens.tolist()
-        self._subscribers = [network.pose_subscriber(session, keys.pose(names[row]), DEPTH) for row in rows]
-        self._watches = [network.alive_watch(session, keys.alive(names[row])) for row in rows]
-        self._channel = Channel(conditions.to_centre(experiment, centre.listens))
-        self._robots = [
-            _Robot(names[row], row, poses.handler, watch.handler)
-            for row, poses, watch in zip(rows, self._subscribers, self._watches, strict=True)
+        reach = reach_of(assignment.limits.low, assignment.limits.high)
+        self._speakers = [
+            Speaker(session, keys, names[row], np.array([link]), reach=reach, depth=DEPTH)
+            for link, row in enumerate(rows)
         ]
+        self._heard: Index = np.zeros(len(rows), dtype=np.intp)
+        self._channel = Channel(conditions.to_centre(experiment, centre.listens))
         self._guided = [row for row in rows if centre.guided[row]]
         self._statuses = {row: network.pose_subscriber(session, keys.status(names[row])) for row in self._guided}
         mime = wire.MIME[self._encoding]
@@ -124,15 +111,16 @@ class CentreProcess:
         for row, statuses in self._statuses.items():
             for sample in network.received(statuses.handler):
                 self._heed(row, sample)
-        for link, robot in enumerate(self._robots):
-            for sample in network.received(robot.poses):
-                self._hear(link, robot, sample, t)
-            for sample in network.received(robot.alive):
-                if sample.kind == zenoh.SampleKind.DELETE:
-                    self._channel.forget(np.array([link]))
-                    self.centre.lose(np.array([robot.row]), t)
+        for speaker in self._speakers:
+            for said in speaker.news(self._utc + t):
+                self._send(speaker, said, t)
+            for came in speaker.comings():
+                rows = self.centre.listens[speaker.links]
+                if came:
+                    self.centre.find(rows)
                 else:
-                    self.centre.find(np.array([robot.row]))
+                    self._channel.forget(speaker.links)
+                    self.centre.lose(rows, t)
         if (got := self._channel.due(t)) is not None:
             self._believe(got)
         begun = float(self._start[self._guided].min())
@@ -140,28 +128,20 @@ class CentreProcess:
             self._begun = begun
             self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
 
-    def _hear(self, link: int, robot: _Robot, sample: zenoh.Sample, t: float) -> None:
-        payload = sample.payload.to_bytes()
-        try:
-            pose = wire.decode(payload, str(sample.encoding), wire.Pose)
-            plausibility.check_pose(pose, robot=robot.name, now=self._utc + t, reach=self._reach)
-        except wire.Malformed:
-            self._malformed += 1
-            return
-        if pose.stamp <= robot.stamp:
-            return  # known already: told again after a reconnection
+    def _send(self, speaker: Speaker, said: Said, t: float) -> None:
+        """One pose has come: it is given to the modelled network."""
+        pose = said.pose
         start = float(self._start[self._guided].min())
         if self._within(pose.stamp - self._utc, start):
-            robot.lost += max(0, pose.seq - robot.seq - 1) if robot.seq else 0
-        robot.seq, robot.stamp = pose.seq, pose.stamp
+            speaker.lost += said.missed
         self._channel.send(
-            np.array([link]),
+            speaker.links,
             np.array([pose.seq]),
             np.array([pose.stamp - self._utc]),
             np.array([pose.position]),
             np.array([pose.velocity]),
             start=np.array([start]),
-            size=np.array([len(payload)]),
+            size=np.array([said.size]),
             now=t,
             extra=np.array([[pose.yaw]]),
         )
@@ -173,7 +153,7 @@ class CentreProcess:
         self.centre.hear(rows, got.position, got.velocity, got.extra[:, 0], got.stamp, got.arrival)
         start = float(self._start[self._guided].min())
         for link, stamp in zip(got.link.tolist(), got.stamp.tolist(), strict=True):
-            self._robots[link].heard += self._within(stamp, start)
+            self._heard[link] += self._within(stamp, start)
 
     def _within(self, taken: float, start: float) -> bool:
         """Whether a pose was taken in the run that began at `start` [s]."""
@@ -211,6 +191,7 @@ class CentreProcess:
 
     def _report(self, t: float) -> None:
         cpu_s = time.process_time()
+        listened = [speaker.name for speaker in self._speakers]
         report = wire.CentreState(
             stamp=self._utc + t,
             robots=[self._names[row] for row in self._guided],
@@ -220,10 +201,10 @@ class CentreProcess:
             decisions=self.centre.decisions,
             missed=self._missed,
             goals=self._sent,
-            heard={robot.name: robot.heard for robot in self._robots},
-            lost={robot.name: robot.lost for robot in self._robots},
-            dropped=dict(zip((robot.name for robot in self._robots), self._channel.dropped.tolist(), strict=True)),
-            malformed=self._malformed,
+            heard=dict(zip(listened, self._heard.tolist(), strict=True)),
+            lost={speaker.name: speaker.lost for speaker in self._speakers},
+            dropped=dict(zip(listened, self._channel.dropped.tolist(), strict=True)),
+            malformed=self._malformed + sum(speaker.malformed for speaker in self._speakers),
             pid=os.getpid(),
             cpu_s=cpu_s,
             rss_mb=resident_mb(),
@@ -249,7 +230,7 @@ def serve(
     if not steered:
         hint = 'write architecture = "centralised" at the top of the file, or choose another case with --case'
         raise DocumentError([Problem(file, 0, 0, "every robot of this experiment decides for itself", hint)])
-    endpoints = routers(experiment, read.path, connect, lab) or [network.DEFAULT_ENDPOINT]
+    endpoints = routers(experiment, read.path, connect, lab) or [DEFAULT_ENDPOINT]
     over = threading.Event()
     with told_to_end(over.set):
         if lifeline:

@@ -12,6 +12,7 @@ import msgspec
 
 from agents.plugins import did_you_mean
 from experiments import chaos, chaos_report
+from experiments.chaos_flight import Setting
 from experiments.chaos_report import Result
 from experiments.fault_script import KINDS, Kind, script
 from experiments.problem import DocumentError, Problem
@@ -51,7 +52,7 @@ def command(
         print(text, file=sys.stderr, flush=True)
 
     say(f"{faults} faults in {len(rounds)} rounds of {experiment.duration_s:g} s; script: {folder / SCRIPT}")
-    setting = chaos.Setting(folder / SOURCE, name, experiment, folder, changes, BODIES, seed)
+    setting = Setting(folder / SOURCE, name, experiment, folder, changes, BODIES, seed)
     with Interrupts() as interrupted:
         outcomes, ends = chaos.run(setting, rounds, interrupted=interrupted, say=say)
     result = Result(read.experiment.title, seed, rounds, outcomes, ends)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import TypeVar
+from contextlib import suppress
 
 import numpy as np
 import zenoh
@@ -14,8 +14,7 @@ from agents.keys import Keys
 from agents.rows import Array
 from experiments.experiment import Experiment
 from experiments.invariants import Invariants
-
-M = TypeVar("M", wire.Status, wire.State, wire.Position, wire.Command, wire.Contact)
+from experiments.said import by_robots
 
 
 class Eyes:
@@ -50,29 +49,29 @@ class Eyes:
         self.told: dict[str, tuple[wire.Command, float]] = {}
         self.wrong: list[str] = []
         self.connected = True
-        self.malformed = 0
 
     def look(self) -> None:
         """Takes in what was said since the last look."""
-        now = time.monotonic()
+        now, names = time.monotonic(), self.invariants.names
         self.connected = network.connected(self._session)
-        for status in self._messages(self._statuses.handler, wire.Status):
+        for status in by_robots(self._statuses.handler, wire.Status, keys=self._keys, robots=names):
             self.status[status.robot], self.heard[status.robot] = status, now
-        for truth in self._messages(self._truths.handler, wire.Position):
+        for truth in by_robots(self._truths.handler, wire.Position, keys=self._keys, robots=names):
             self.invariants.place(truth.robot, truth.position)
             self.truth[truth.robot] = now
-        for state in self._messages(self._states.handler, wire.State):
+        for state in by_robots(self._states.handler, wire.State, keys=self._keys, robots=names):
             if state.true_position is not None:
                 self.invariants.place(state.robot, state.true_position)
                 self.truth[state.robot] = now
-        for command in self._messages(self._commands.handler, wire.Command):
+        for command in by_robots(self._commands.handler, wire.Command, keys=self._keys, robots=names):
             self.told[command.robot] = command, now
             if insane := self.invariants.insane(command):
                 self.wrong.append(insane)
         for sample in network.received(self._contacts.handler):
-            contact = self._decoded(sample, wire.Contact)
-            if contact is not None and sample.kind == zenoh.SampleKind.PUT:
-                self.wrong.append(f"{contact.first} and {contact.second} touched")
+            with suppress(wire.Malformed):  # of our own making, as often as not
+                contact = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Contact)
+                if sample.kind == zenoh.SampleKind.PUT:
+                    self.wrong.append(f"{contact.first} and {contact.second} touched")
         for sample in network.received(self._watch.handler):
             name = self._keys.whose(str(sample.key_expr))
             if name is not None:
@@ -95,19 +94,3 @@ class Eyes:
     def moved(self, name: str, before: Array) -> float:
         """How far a robot is from where it was, seen from above [m]."""
         return float(np.linalg.norm((self.invariants.where(name) - before)[:2]))
-
-    def _messages(self, handler: network.Polled[zenoh.Sample], kind: type[M]) -> list[M]:
-        found = []
-        for sample in network.received(handler):
-            message = self._decoded(sample, kind)
-            name = self._keys.whose(str(sample.key_expr))
-            if message is not None and getattr(message, "robot", None) == name and name in self.invariants.names:
-                found.append(message)
-        return found
-
-    def _decoded(self, sample: zenoh.Sample, kind: type[M]) -> M | None:
-        try:
-            return wire.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
-        except wire.Malformed:
-            self.malformed += 1  # of our own making, as often as not
-            return None

@@ -11,9 +11,9 @@ import matplotlib.pyplot as plt
 import msgspec
 
 from experiments import drawing
-from experiments.chaos import Ended, Outcome, line
+from experiments.chaos_outcome import Ended, Outcome, line
 from experiments.fault_script import KINDS, Round
-from experiments.report import Section, date_of, numbered, render
+from experiments.page import Section, date_of, numbered, render
 from experiments.report_tables import Row as Line
 from experiments.report_tables import Table
 from experiments.verdict import Finding

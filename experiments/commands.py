@@ -10,39 +10,36 @@ from pathlib import Path
 from typing import Any
 
 from agents import plugins
-from experiments import document, results, verdict
+from experiments import document, entries, results, verdict
 from experiments.bar import Bar
 from experiments.problem import DocumentError, Problem
 from experiments.progress import shown
+from experiments.realtime import Staging, conduct
 from experiments.records import RecordingError
-from experiments.run import SOURCE, Interrupts, Run, chosen, fly, load, new_folder, reopen, simulate_seeds
+from experiments.run import SOURCE, Interrupts, Run, chosen, load, new_folder, read_back, reopen, simulate_seeds
 from experiments.seeds import across_seeds
 from experiments.standins import BODIES
 
 
 def run(
     file: str,
+    staging: Staging,
     *,
     virtual: bool,
-    cases: Sequence[str],
     out: str | None,
     seed: int | None,
     settings: Sequence[str],
     as_json: bool,
     seeds: int,
-    bodies: str | None,
-    here: bool,
     anyway: bool,
     report: bool,
     open_report: bool,
-    lab: str | None = None,
-    identity: str = "operator",
 ) -> int:
     """`zenpark run`; returns the exit code: 0, 2 if the check finds errors, or 130 after Ctrl-C."""
     changes = [*settings, *([] if seed is None else [f"seed={seed}"])]
     read = load(file, *changes)
-    _refuse(virtual=virtual, seeds=seeds, bodies=bodies, lab=lab)
-    chosen(read, cases)
+    _refuse(staging, virtual=virtual, seeds=seeds)
+    chosen(read, staging.cases)
     if not sound(read, changes) and not anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
@@ -55,7 +52,7 @@ def run(
             runs = simulate_seeds(
                 read,
                 range(first, first + seeds),
-                cases=cases,
+                cases=staging.cases,
                 folder=folder,
                 tell=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
             )
@@ -63,29 +60,14 @@ def run(
         with interrupted:
             show = shown(quiet=as_json)
             try:
-                runs = [
-                    fly(
-                        read,
-                        folder,
-                        cases=cases,
-                        show=show,
-                        interrupted=interrupted,
-                        bodies=bodies,
-                        local=here,
-                        lab=lab,
-                        identity=identity,
-                    )
-                ]
+                runs = [read_back(folder, *conduct(read, folder, staging, show=show, interrupted=interrupted))]
             except KeyboardInterrupt:
                 print(f"\nended at once; `zenpark report {folder}` shows what was recorded", file=sys.stderr)
                 return 130
     if not runs[0].traces:
         print(f"interrupted before the common start: there is nothing to report; logs: {folder / 'logs'}")
         return 130
-    again = _command(
-        file, virtual=virtual, changes=changes, cases=cases, seeds=seeds, bodies=bodies,
-        here=here, anyway=anyway, lab=lab, identity=identity,
-    )  # fmt: skip
+    again = _command(file, staging, virtual=virtual, changes=changes, seeds=seeds, anyway=anyway)
     page = _keep(runs, folder, again) if report else None
     summary: dict[str, Any] = runs[0].summary()
     if seeds > 1:
@@ -99,13 +81,15 @@ def run(
     return 130 if interrupted.asked else 0
 
 
-def _refuse(*, virtual: bool, seeds: int, bodies: str | None, lab: str | None) -> None:
+def _refuse(staging: Staging, *, virtual: bool, seeds: int) -> None:
     """Raises DocumentError for options that do not go together."""
     if seeds > 1 and not virtual:
         raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
-    if bodies not in (None, *BODIES):
-        raise DocumentError([Problem(f"--bodies {bodies}", 0, 0, "is not known", f"there are: {', '.join(BODIES)}")])
-    for option, given in (("--bodies", bodies), ("--lab", lab)):
+    if staging.bodies not in (None, *BODIES):
+        raise DocumentError(
+            [Problem(f"--bodies {staging.bodies}", 0, 0, "is not known", f"there are: {', '.join(BODIES)}")]
+        )
+    for option, given in (("--bodies", staging.bodies), ("--lab", staging.lab)):
         if given is not None and virtual:
             raise DocumentError([Problem(option, 0, 0, "is for real time", "leave out --virtual")])
 
@@ -144,16 +128,16 @@ def report(folders: Sequence[str], *, out: str | None) -> int:
 
 def new(name: str, target: str | None) -> int:
     """`zenpark new`: copies a catalogue entry to begin from."""
-    path = document.copy(name, Path(target) if target else Path(f"{name}.toml"))
+    path = entries.copy(name, Path(target) if target else Path(f"{name}.toml"))
     print(f"{path}: a copy of {name}; change it, then `zenpark check {path}` and `zenpark run {path}`")
     return 0
 
 
 def list_all() -> int:
     """`zenpark list`: the catalogue, and the plug-ins that are installed."""
-    width = max(len(name) for name, _ in document.names())
+    width = max(len(name) for name, _ in entries.names())
     print("Experiments (zenpark run NAME, zenpark new NAME):")
-    for name, title in document.names():
+    for name, title in entries.names():
         print(f"  {name:<{width}}  {title}")
     for what, group in (
         ("Bodies", plugins.BODIES),
@@ -169,27 +153,16 @@ def list_all() -> int:
     return 0
 
 
-def _command(
-    file: str,
-    *,
-    virtual: bool,
-    changes: Sequence[str],
-    cases: Sequence[str],
-    seeds: int,
-    bodies: str | None,
-    here: bool,
-    anyway: bool,
-    lab: str | None,
-    identity: str,
-) -> str:
+def _command(file: str, staging: Staging, *, virtual: bool, changes: Sequence[str], seeds: int, anyway: bool) -> str:
+    """What to type for the same run again."""
     parts = ["zenpark", "run", file, *(["--virtual"] if virtual else [])]
-    parts += [part for case in cases for part in ("--case", case)]
+    parts += [part for case in staging.cases for part in ("--case", case)]
     parts += [part for change in changes for part in ("--set", f"'{change}'")]
     parts += ["--seeds", str(seeds)] if seeds > 1 else []
-    parts += ["--bodies", bodies] if bodies is not None else []
-    parts += ["--here"] if here else []
-    parts += ["--lab", lab] if lab is not None else []
-    parts += ["--as", identity] if identity != "operator" else []
+    parts += ["--bodies", staging.bodies] if staging.bodies is not None else []
+    parts += ["--here"] if staging.here else []
+    parts += ["--lab", staging.lab] if staging.lab is not None else []
+    parts += ["--as", staging.identity] if staging.identity != "operator" else []
     return " ".join([*parts, *(["--anyway"] if anyway else [])])
 
 
@@ -197,6 +170,7 @@ def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
     """Writes tables, figures and report of a run into its folder; returns the report."""
     from experiments import drawing as figures  # noqa: PLC0415 - matplotlib takes 0.6 s
     from experiments import report as pages  # noqa: PLC0415
+    from experiments.page import date_of  # noqa: PLC0415
 
     every = [case for each in runs for case in each.metrics.values()]
     results.write_csv(folder / "metrics.csv", every)
@@ -208,7 +182,7 @@ def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
         folder,
         traces,
         command=command,
-        date=pages.date_of(runs[0].made),
+        date=date_of(runs[0].made),
         run=runs[0].folder,
         text=runs[0].source,
         measured=every,

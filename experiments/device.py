@@ -22,6 +22,7 @@ import zenoh
 from agents import plugins, wire
 from agents import session as network
 from agents.body import BodyError
+from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.kinds import KINDS
@@ -38,7 +39,7 @@ EXPLAINED: Final = (
     DocumentError,
     BodyError,
     plugins.PluginError,
-    network.EndpointError,
+    EndpointError,
     network.Unreachable,
     OSError,
 )
@@ -114,7 +115,7 @@ def stand_in(file: str, names: Sequence[str], *, faults: Faults, connect: Sequen
     if len(words) != 1 or not words <= set(known):
         hint = f"their `body` must be one of {', '.join(known)}"
         raise DocumentError([Problem(file, 0, 0, f"{', '.join(names)} cannot share a protocol twin", hint)])
-    endpoints = routers(experiment, read.path, connect) or [network.DEFAULT_ENDPOINT]
+    endpoints = routers(experiment, read.path, connect) or [DEFAULT_ENDPOINT]
     request = DeviceRequest(assign.request(experiment, names, [experiment.seed], endpoints), faults)
     word = words.pop()
     keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
@@ -154,7 +155,7 @@ def by_hand(
         for k in range(count)
     }
     experiment = Experiment(title=word, robots=robots, duration_s=1.0)
-    endpoints = list(connect) or [network.DEFAULT_ENDPOINT]
+    endpoints = list(connect) or [DEFAULT_ENDPOINT]
     request = DeviceRequest(assign.request(experiment, list(robots), [experiment.seed], endpoints), faults)
     keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
     return _serve(word, request, keys=keys, rate_hz=rate, connect=connect, lifeline=False, identity=identity)

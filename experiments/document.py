@@ -6,7 +6,6 @@ for name, experiment in document.cases().items(): ...
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -17,7 +16,7 @@ from typing import Any, Final
 import msgspec
 
 from agents.plugins import did_you_mean
-from experiments import arena, catalogue, checks, shape
+from experiments import arena, checks, entries, shape
 from experiments.arena import ArenaFile
 from experiments.experiment import Experiment
 from experiments.links import parse_links
@@ -26,11 +25,11 @@ from experiments.locate import Place, nearest, places
 from experiments.overrides import Override, OverrideError, assign, merged, parse, used
 from experiments.problem import DocumentError, Fault, Problem, at_offset
 from experiments.schema import schema, write_schema
-from experiments.syntax import LARGEST, content, decoded, parsed, reason
+from experiments.syntax import LARGEST, content, decoded, parsed
 
 __all__ = [
-    "LARGEST", "Document", "DocumentError", "Problem", "catalogue_path", "copy", "names", "parse_links", "read",
-    "read_text", "schema", "write_json", "write_schema",
+    "LARGEST", "Document", "DocumentError", "Problem", "parse_links", "read", "read_text", "schema", "write_json",
+    "write_schema",
 ]  # fmt: skip
 
 _Table = dict[str, Any]
@@ -83,12 +82,12 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
     Raises:
         DocumentError: With everything that is wrong and where, whatever is in the file.
     """
-    file = _file(path)
+    file = entries.found(path)
     label = str(path) if file == Path(path) else str(file)
     try:
         text = decoded(content(file, label), label)
     except FileNotFoundError:
-        raise DocumentError([_no_entry(label)]) from None
+        raise DocumentError([entries.no_entry(label)]) from None
     return _document(file, label, text, overrides)
 
 
@@ -126,106 +125,6 @@ def listed(texts: Sequence[str]) -> str:
 def write_json(experiment: Experiment) -> bytes:
     """The experiment as JSON that `read` takes; what has its default is left out."""
     return msgspec.json.format(msgspec.json.encode(experiment), indent=2) + b"\n"
-
-
-def names() -> list[tuple[str, str]]:
-    """Name and title of every experiment of the catalogue, by name."""
-    return [(name, str(tomllib.loads(_entry(name).read_text("utf-8"))["title"])) for name in catalogue.names()]
-
-
-def catalogue_path(name: str) -> Path:
-    """The file of a catalogue entry.
-
-    Raises:
-        DocumentError: If there is none of that name.
-    """
-    if name not in catalogue.names():
-        raise DocumentError([_no_entry(name)])
-    return _entry(name)
-
-
-def copy(name: str, target: Path) -> Path:
-    """Copies a catalogue entry; beside it its arena file, and the schema that its first line shows to editors.
-
-    Args:
-        name: Of the entry.
-        target: The new file, or a folder for it.
-
-    Returns:
-        The file that was written.
-
-    Raises:
-        DocumentError: If there is no such entry, or the target exists or cannot be written, or another arena file of
-            that name is there.
-    """
-    source = catalogue_path(name)
-    return write_new(source.read_text("utf-8"), target / source.name if target.is_dir() else target, furnished=True)
-
-
-def write_new(text: str, target: Path, *, furnished: bool = False) -> Path:
-    """Writes a new experiment file, with the schema beside it that its first line shows to editors.
-
-    Args:
-        text: Of the file.
-        target: The file.
-        furnished: The text is a catalogue entry's: the arena file that it names comes along.
-
-    Returns:
-        The file.
-
-    Raises:
-        DocumentError: If the target exists or cannot be written, or another arena file of that name is there.
-    """
-    try:
-        beside = _arena_beside(text, target.parent) if furnished else None
-        with target.open("x", encoding="utf-8") as new:
-            new.write(text)
-        if beside is not None:
-            (target.parent / beside.name).write_text(beside.text, encoding="utf-8")
-        if not (target.parent / catalogue.SCHEMA).exists():
-            write_schema(target.parent / catalogue.SCHEMA)
-    except FileExistsError:
-        hint = "choose another name; nothing was changed"
-        raise DocumentError([Problem(str(target), 0, 0, "exists already", hint)]) from None
-    except (OSError, ValueError) as error:
-        hint = "choose a place that exists and may be written to"
-        raise DocumentError([Problem(str(target), 0, 0, f"cannot be written: {reason(error)}", hint)]) from error
-    return target
-
-
-def _arena_beside(text: str, folder: Path) -> ArenaFile | None:
-    """The arena file that an entry needs in a folder.
-
-    Raises:
-        DocumentError: If another one of that name is there.
-    """
-    name = arena.named(tomllib.loads(text))
-    if name is None:
-        return None
-    wanted, there = arena.load(name, catalogue.FOLDER), folder / name
-    if there.exists() and there.read_text("utf-8") != wanted.text:
-        hint = "choose another folder, or rename that file; nothing was changed"
-        raise DocumentError([Problem(str(there), 0, 0, "is another arena than that of the entry", hint)])
-    return wanted
-
-
-def _entry(name: str) -> Path:
-    return catalogue.FOLDER / f"{name}.toml"
-
-
-def _no_entry(name: str) -> Problem:
-    hint = did_you_mean(name, catalogue.names())
-    return Problem(name, 0, 0, "neither a file nor an experiment of the catalogue", f"{hint} (zenpark new copies one)")
-
-
-def _file(path: str | Path) -> Path:
-    """The file itself, or that of the catalogue entry; a folder of the same name does not hide an entry."""
-    file = Path(path)
-    known = str(path) in catalogue.names()
-    try:
-        return _entry(str(path)) if known and not file.is_file() else file
-    except (OSError, ValueError):  # a name too long, or with a character that no name has
-        return file
 
 
 @dataclass(frozen=True)

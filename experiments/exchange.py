@@ -33,7 +33,6 @@ CLIMB_S: Final = 15.0  # one that climbs, or was found in the air, is given this
 GONE_S: Final = 1.0  # a mirrored robot that was not heard of for this long is taken out
 HANG_S: Final = 0.3  # whoever was stopped for longer could not hear: nobody was silent
 ANSWER_S: Final = 1.0  # to say where one is
-REACH_M: Final = 1.0  # a robot said to be farther outside the arena than this is not believed
 STRANGERS: Final = 100  # that are told apart
 IN_AIR_M: Final = 0.05
 UP: Final = ("ready", "airborne", "running", "landing")  # phases in which a robot may be in the air
@@ -58,7 +57,7 @@ class Exchange:
         self._encoding = experiment.network.encoding
         self._mime = wire.MIME[self._encoding]
         x, y, z = experiment.arena.size
-        self._reach = (0.5 * x + REACH_M, 0.5 * y + REACH_M, z + REACH_M)
+        self._reach = plausibility.reach_of((-0.5 * x, -0.5 * y, 0.0), (0.5 * x, 0.5 * y, z))
         self._truth_every = max(1, round(experiment.rates.body_hz / TRUTH_HZ))
         # robots with another body have another simulator, or none, to tell things to
         self._elsewhere = {keys.setpoint(name) for name, robot in experiment.robots.items() if robot.body != WORLD}

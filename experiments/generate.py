@@ -17,7 +17,7 @@ import numpy as np
 from agents.kinds import KINDS, Kind
 from agents.plugins import did_you_mean
 from agents.rows import Array, norm
-from experiments import catalogue, document, layouts
+from experiments import catalogue, entries, layouts
 from experiments.layouts import Layout, LayoutError
 from experiments.prediction import closed
 from experiments.problem import DocumentError, Problem
@@ -177,7 +177,7 @@ def command(what: str, size: str, target: str | None, wanted: Wanted, jumps: str
     except LayoutError as error:
         message, _, hint = str(error).partition(": ")
         raise DocumentError([Problem(flag, 0, 0, message, hint)]) from None
-    path = document.write_new(text, Path(target or f"{what}-{size.lower().replace('×', 'x')}.toml"))
+    path = entries.write_new(text, Path(target or f"{what}-{size.lower().replace('×', 'x')}.toml"))
     print(f"{path}: {made.title}, {len(made.pairs)} links; `zenpark check {path}`, `zenpark run {path} --virtual`")
     return 0
 

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from agents.kinds import KINDS
-from experiments import catalogue, document
+from experiments import catalogue, document, entries
 from experiments.importing_links import Described, Notes, described, tasks
 from experiments.importing_shape import Heights, heights_of
 from experiments.problem import DocumentError, Problem
@@ -53,7 +53,7 @@ def command(file: str, target: str | None, duration_s: float) -> int:
         hint = "name an experiment file of Robotic Park's authors (.yaml)"
         raise DocumentError([Problem(file, 0, 0, "there is no such file", hint)]) from None
     made, notes = imported(text, file, duration_s)
-    path = document.write_new(made, Path(target) if target else Path(f"{source.stem}.toml"))
+    path = entries.write_new(made, Path(target) if target else Path(f"{source.stem}.toml"))
     document.read(path)
     print(f"{path}: from {file}; `zenpark check {path}`, `zenpark run {path} --virtual`")
     if notes:
@@ -120,9 +120,9 @@ def _written(  # noqa: PLR0917 - everything that was found out
         *(_robot(robot, found, row) for row, robot in enumerate(park.robots)),
         "",
     ]
-    for table, entries in (("links", formation.links), ("anchors", formation.anchors)):
-        if entries:
-            lines += [f"[formation.{table}]", *entries, ""]
+    for table, rows in (("links", formation.links), ("anchors", formation.anchors)):
+        if rows:
+            lines += [f"[formation.{table}]", *rows, ""]
     return "\n".join(lines)
 
 

@@ -16,6 +16,7 @@ import zenoh
 
 from agents import lab
 from agents import session as network
+from agents.endpoint import EndpointError
 from agents.keys import Keys
 from agents.lifeline import SILENCE_S
 from experiments import document
@@ -95,4 +96,4 @@ def reached(connect: Sequence[str], folder: str | None) -> list[str]:
     try:
         return lab.secured(connect, None if folder is None else Path(folder).absolute())
     except lab.LabError as error:
-        raise network.EndpointError(str(error)) from None
+        raise EndpointError(str(error)) from None

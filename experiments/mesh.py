@@ -7,8 +7,7 @@ from typing import Final
 
 from agents import lab, topology
 from agents.access import Rights
-from agents.endpoint import Endpoint
-from agents.session import free_endpoint
+from agents.endpoint import Endpoint, free_endpoint
 from experiments import access, assign
 from experiments.experiment import Experiment
 from experiments.standins import VICON_TWIN

@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from math import inf, isfinite
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 import zenoh
 
 from agents import lab, topology, wire
 from agents import session as network
+from agents.endpoint import DEFAULT_ENDPOINT
 from agents.keys import Keys
 from agents.leaving import held
 from experiments import hosts as machines
 from experiments import mesh, orders
 from experiments.experiment import Experiment
+from experiments.said import by_robots
 from experiments.seen import ORDER, Progress
 
 ROUTER_S: Final = 10.0
 MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
-
-M = TypeVar("M", wire.Status, wire.State)
 
 
 class Overview:
@@ -71,7 +71,7 @@ class Overview:
         self._session, declared = stack.enter_context(held(opened))
         declared.append(self)
         self._events = network.pose_publisher(self._session, keys.event, wire.JSON, network.EVENTS)
-        if list(endpoints) != [network.DEFAULT_ENDPOINT]:
+        if list(endpoints) != [DEFAULT_ENDPOINT]:
             options = lab.options(endpoints[0]) if len(endpoints) == 1 else f"--connect @{folder / mesh.ENDPOINTS}"
             where = "a mesh" if topology.is_mesh(endpoints) else ", ".join(lab.bare(endpoints))
             self.say("router", "conductor", f"{where}: look with `zenpark keys {options}`")
@@ -99,9 +99,9 @@ class Overview:
         """Takes in what has arrived since the last look; gives the robots whose token has vanished for good."""
         for sample in network.received(self._recorder_watch.handler):
             self.recording_begun |= sample.kind == zenoh.SampleKind.PUT
-        for status in self._messages(self._statuses.handler, wire.Status):
+        for status in by_robots(self._statuses.handler, wire.Status, keys=self._keys, robots=self.robots):
             self._heed(status)
-        for state in self._messages(self._states.handler, wire.State):
+        for state in by_robots(self._states.handler, wire.State, keys=self._keys, robots=self.robots):
             seen = self.robots[state.robot]
             if seen.error is not None:
                 seen.error = state.error
@@ -146,15 +146,6 @@ class Overview:
         for name in missed:
             self.robots[name].vanished = inf
         return missed
-
-    def _messages(self, handler: network.Polled[zenoh.Sample], kind: type[M]) -> Iterator[M]:
-        for sample in network.received(handler):
-            try:
-                message = wire.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
-            except wire.Malformed:
-                continue
-            if message.robot in self.robots and self._keys.whose(str(sample.key_expr)) == message.robot:
-                yield message
 
     def _heed(self, status: wire.Status) -> None:
         seen = self.robots[status.robot]

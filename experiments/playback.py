@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -15,20 +14,19 @@ import numpy as np
 from agents.lifecycle import Phase
 from agents.rows import Array, Index
 from agents.wire import CentreState, Contact, Event, HostClock, State, Status, WorldState
-from experiments import assign
 from experiments.assign import guided
 from experiments.cdr import Undecodable, codec
 from experiments.clocks import Correction, Lie
 from experiments.contacts import ROUNDING_S, looked_for, within
 from experiments.experiment import Experiment
 from experiments.goals import of_recording
+from experiments.losses import STATUS_S, dropped, lost
 from experiments.recording import JSON, METADATA, SentGoal, SentPose
 from experiments.records import RecordingError, Records
 from experiments.resample import HOLE_S, attitude, line, step, turn
 from experiments.trace import HeardPoses, Sent, Trace
 
 HOLD_PERIODS: Final = 2.0  # for so many state periods a robot is where it last said; then nobody knows
-STATUS_S: Final = 1.0  # what happened in the run is counted by a status at most this much after its end
 EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the whole run are not that much early
 LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
 NOWHERE: Final = (math.nan, math.nan, math.nan)
@@ -247,8 +245,8 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         setpoint=column("setpoint"),
         sent=_sent(poses, start, duration),
         heard=_heard(states, robots, start, duration),
-        lost=_lost(robots, poses, statuses, (start, start + duration)) + (0 if goals is None else goals.lost),
-        dropped=_dropped(experiment, statuses, (start, start + duration)),
+        lost=lost(robots, poses, statuses, (start, start + duration)) + (0 if goals is None else goals.lost),
+        dropped=dropped(experiment, statuses, (start, start + duration)),
         missed_deadlines=_counted(last, "missed"),
         ticks=_counted(last, "ticks"),
         decisions=_counted(last, "decisions"),
@@ -381,55 +379,3 @@ def _in_run(rows: list[tuple[float, ...]], shape: tuple[int, float, float]) -> A
     table = table[(table[:, 0] >= -ROUNDING_S) & (table[:, 0] < duration - ROUNDING_S)]
     np.maximum(table[:, 0], 0.0, out=table[:, 0])
     return table[np.argsort(table[:, 0], kind="stable")]
-
-
-def _lost(
-    robots: tuple[str, ...], poses: list[list[SentPose]], statuses: list[list[Status]], run: tuple[float, float]
-) -> Index:
-    """(N,) what was lost of each robot, as `read` defines it; `run` is its beginning and end in UTC [s]."""
-    missed: Counter[str] = Counter()
-    for robot, own, said in zip(robots, poses, statuses, strict=True):
-        missed[robot] += _gaps(own, run) + _tail(own, said, run)
-        missed.update(_by_speaker(said, run, "lost"))
-    return np.array([missed[robot] for robot in robots], dtype=np.intp)
-
-
-def _gaps(poses: list[SentPose], run: tuple[float, float]) -> int:
-    begin, end = run[0] - ROUNDING_S, run[1] + ROUNDING_S
-    seq = np.array([pose.seq for pose in poses if begin <= pose.stamp <= end], dtype=np.intp)
-    step = np.diff(seq)
-    anew = seq[1:][step < 0]
-    return int((step[step > 0] - 1).sum() + (anew - 1).sum())
-
-
-def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float]) -> int:
-    said = [status for status in statuses if run[0] < status.stamp <= run[1] + STATUS_S]
-    if not said:
-        return 0
-    last = said[-1]
-    recorded = [pose.seq for pose in poses if pose.stamp <= last.stamp + ROUNDING_S]
-    before = [status.sent for status in statuses if status.stamp <= run[0] and status.pid == last.pid]
-    return max(0, last.sent - max(recorded[-1:] + before[-1:], default=0))
-
-
-def _dropped(experiment: Experiment, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
-    """(E,) what the modelled network dropped on each of `assign.heard_links`; `statuses` of each robot."""
-    links, robots = assign.heard_links(experiment), list(experiment.robots)
-    found = [_by_speaker(said, run, "dropped") for said in statuses]
-    ends = zip(links.listener.tolist(), links.speaker.tolist(), strict=True)
-    return np.array([found[i][robots[j]] for i, j in ends], dtype=np.intp)
-
-
-def _by_speaker(statuses: list[Status], run: tuple[float, float], what: Literal["lost", "dropped"]) -> Counter[str]:
-    """What one listener's process, or several after each other, counted in the run, by speaker."""
-    total: Counter[str] = Counter()
-    before: dict[str, int] = {}
-    process = None
-    for status in statuses:
-        if status.pid != process:
-            before, process = {}, status.pid
-        if run[0] < status.stamp <= run[1] + STATUS_S:
-            now: dict[str, int] = getattr(status, what)
-            total.update({speaker: max(0, count - before.get(speaker, 0)) for speaker, count in now.items()})
-        before = getattr(status, what)
-    return total

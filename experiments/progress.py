@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING, Final, Protocol, Self
 
 from experiments.conductor import OUTPUT
-from experiments.seen import FROZEN_S, Progress, Seen
+from experiments.seen import FROZEN_S, News, Progress, Seen
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -32,9 +32,7 @@ class Lines:
     """A line for each event and every few seconds, on standard error."""
 
     def __init__(self) -> None:
-        self._told = 0
-        self._case = ""
-        self._next = 0.0
+        self._news, self._next = News(), 0.0
 
     def __enter__(self) -> Self:
         return self
@@ -44,14 +42,11 @@ class Lines:
 
     def __call__(self, progress: Progress) -> None:
         """Prints what is new."""
-        if progress.case != self._case:
-            self._case, self._told = progress.case, 0
-        for event in progress.events[self._told :]:
+        for event in self._news.of(progress):
             if event.kind == OUTPUT:
                 print(f"{event.source}| {event.text}", file=sys.stderr)
             elif event.kind not in QUIET:
                 print(f"{progress.case}: {event.kind} {event.source}: {event.text}", file=sys.stderr)
-        self._told = len(progress.events)
         now = time.monotonic()
         if now >= self._next and progress.elapsed is not None:
             self._next = now + LINE_S
@@ -67,8 +62,7 @@ class Table:
         from rich.live import Live  # noqa: PLC0415
 
         self._live = Live(console=Console(stderr=True), refresh_per_second=4, auto_refresh=False)
-        self._next = 0.0
-        self._told = 0
+        self._news, self._next = News(), 0.0
 
     def __enter__(self) -> Self:
         self._live.__enter__()
@@ -79,8 +73,7 @@ class Table:
 
     def __call__(self, progress: Progress) -> None:
         """Draws the table anew, four times a second at most."""
-        told, self._told = self._told, len(progress.events)
-        for event in progress.events[told:]:
+        for event in self._news.of(progress):
             if event.kind == OUTPUT:
                 self._live.console.print(f"{event.source}| {event.text}", markup=False, highlight=False)
         now = time.monotonic()

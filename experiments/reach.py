@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from agents import lab
-from agents.session import EndpointError
+from agents.endpoint import EndpointError
 from experiments.experiment import Experiment
 
 

@@ -19,6 +19,7 @@ import zenoh
 
 from agents import session as network
 from agents import wire
+from agents.endpoint import EndpointError
 from agents.keys import Keys
 from agents.leaving import end, held
 from agents.lifeline import Lifeline
@@ -211,7 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     try:
         record(chosen.file, chosen.target, case=chosen.case, source=chosen.source, connect=chosen.connect)
-    except (DocumentError, RecordingError, network.EndpointError, network.Unreachable, OSError) as error:
+    except (DocumentError, RecordingError, EndpointError, network.Unreachable, OSError) as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2
     return 0

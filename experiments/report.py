@@ -1,29 +1,24 @@
-"""The report of a run, and of several runs side by side: one HTML file that needs nothing else, now or in ten years."""
+"""The report of a run, and of several runs side by side."""
 
 from __future__ import annotations
 
 import itertools
-import re
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 import msgspec
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from matplotlib.figure import Figure
 
 from experiments import figures, scenery, shadow_figures
 from experiments.measured import CaseMetrics
 from experiments.metrics import measure
+from experiments.page import Picture, Section, date_of, numbered, render, seeds_in_words
 from experiments.report_architecture import EXPLAINED, architecture_table
 from experiments.report_network import PROSE as MODELLED
 from experiments.report_network import network_tables
 from experiments.report_tables import (
     DEFINITIONS,
-    Table,
     clocks_table,
     events_table,
     gaps_table,
@@ -38,7 +33,6 @@ from experiments.seeds import by_case
 from experiments.trace import Trace
 from experiments.verdict import Finding, findings, interruptions, left_out
 
-TEMPLATE: Final = "report.html.jinja"
 PROOF: Final = (
     "Every pose carries a running number, so a gap proves a loss. Heard is counted over all listeners together; a pose "
     "sent in the last instant of the run may still be under way."
@@ -70,28 +64,6 @@ class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     command: str
     date: str
-
-
-@dataclass(frozen=True)
-class Picture:
-    """An SVG drawing to stand in the page, with its number and caption."""
-
-    svg: str
-    number: int
-    caption: str
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of the page; whatever it has is shown in this order. `folded` is the text on which to click, if folded."""
-
-    title: str
-    prose: tuple[str, ...] = ()
-    tables: tuple[Table, ...] = ()
-    pictures: tuple[Picture, ...] = ()
-    listing: str = ""
-    terms: tuple[tuple[str, str], ...] = ()
-    folded: str = ""
 
 
 def write(
@@ -255,11 +227,6 @@ def _modelled(cases: Sequence[CaseMetrics]) -> list[Section]:
     return [Section(title, (MODELLED,), tables, folded=folded)] if tables else []
 
 
-def date_of(at: float) -> str:
-    """A UTC time [s], such as `Playback.started`, as reports show it."""
-    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M} UTC"
-
-
 def _origin(folder: Path, now: Origin) -> Origin:
     """What is kept of the making of the run in its folder; kept now if nothing was, and there is a command."""
     file = folder / ORIGIN
@@ -271,31 +238,6 @@ def _origin(folder: Path, now: Origin) -> Origin:
         return now
     except (ValueError, RecursionError):  # another file of this name: a case may be called "run"
         return now
-
-
-def render(
-    target: Path,
-    *,
-    title: str,
-    source: str,
-    facts: Sequence[tuple[str, str]],
-    command: str,
-    verdict: Sequence[Finding],
-    sections: Sequence[Section],
-) -> Path:
-    """Writes a page that needs nothing else: facts and findings on top, then the sections."""
-    pages = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = pages.get_template(TEMPLATE).render(
-        title=title, source=source, facts=facts, command=command, findings=verdict, sections=sections
-    )
-    target.write_text(page, encoding="utf-8")
-    return target
 
 
 def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Picture, ...]:
@@ -353,38 +295,6 @@ def _robot_caption(cases: Sequence[CaseMetrics]) -> str:
     return f"Each robot; those in brackets are left out of the means.{_interval_note(cases)}"
 
 
-def numbered(drawn: Iterable[tuple[Figure, str]], first: int = 1) -> tuple[Picture, ...]:
-    """Figures and their captions, to stand in a page."""
-    return tuple(
-        Picture(inline(figures.svg(figure), f"f{number}-", caption), number, caption)
-        for number, (figure, caption) in enumerate(drawn, start=first)
-    )
-
-
-def inline(svg: str, prefix: str, label: str) -> str:
-    """An SVG file as an element of a page: ids of its own, black and white as the page's ink and paper.
-
-    Args:
-        svg: As `figures.svg` gives it.
-        prefix: For every id and every reference to one.
-        label: What it shows, for those who cannot see it; plain words without markup.
-    """
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<style.*?</style>|<metadata.*?</metadata>|<!--.*?-->", "", svg, flags=re.DOTALL)
-    svg = re.sub(r'\bid="', f'id="{prefix}', svg)
-    svg = re.sub(r'\b(?:xlink:)?href="#', f'href="#{prefix}', svg)
-    svg = svg.replace("url(#", f"url(#{prefix}")
-    svg = (
-        svg.replace("stroke: #000000", "stroke: currentColor")
-        .replace("#ffffff", "var(--paper)")
-        .replace("#c0c0c0", "var(--line)")
-    )
-    box = re.search(r'viewBox="[^"]*"', svg)
-    words = label.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
-    head = f'<svg {box[0] if box else ""} role="img" aria-label="{words}">'
-    return re.sub(r"\n\s*", "\n", head + svg[svg.index(">") + 1 :]).strip()
-
-
 def _distinct(names: Sequence[str]) -> list[str]:
     """The names, with a number behind those that were there before."""
     found: list[str] = []
@@ -413,13 +323,6 @@ def _first_seed(traces: Sequence[Trace]) -> list[Trace]:
     for trace in traces:
         found.setdefault(trace.case, trace)
     return list(found.values())
-
-
-def seeds_in_words(seeds: Sequence[int]) -> str:
-    """`1 to 50` of many that follow one another, else each."""
-    if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
-        return f"{seeds[0]} to {seeds[-1]}"
-    return ", ".join(str(seed) for seed in seeds)
 
 
 def _words(words: Iterable[str]) -> str:

@@ -20,11 +20,13 @@ from agents import output, plugins
 from agents import session as network
 from agents.body import BodyError
 from agents.clock import Clock
+from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.fleet import assemble
 from agents.keys import Keys
 from agents.leaving import end
-from agents.runtime import NameTaken, Ranging, Runtime, Setup
-from agents.session import DEFAULT_ENDPOINT, EndpointError, Unreachable
+from agents.runtime import NameTaken, Runtime
+from agents.session import Unreachable
+from agents.setup import Ranging, Setup
 from agents.shadow import shadowed
 from experiments import assign, conditions, document, joining, mesh
 from experiments.experiment import Experiment, Robot

@@ -1,4 +1,4 @@
-"""Runs experiments: from Python and from the command line, in real and in virtual time, by the same functions.
+"""Runs experiments in virtual time, and reads back what any run has left: from Python and from the command line.
 
 In a notebook:
 
@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
@@ -24,25 +24,12 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
-
-from agents.access import rules
-from agents.lab import LabError, register, require, secured
-from agents.lab import of as lab_of
-from agents.session import free_endpoints
-from agents.topology import from_here
-from experiments import access, document, mesh, metrics, playback, reach, reserves, results, virtual
-from experiments.conductor import Conductor, Result
+from experiments import document, metrics, playback, reserves, results, virtual
 from experiments.document import Document
 from experiments.experiment import Experiment
-from experiments.hosts import Hosts
-from experiments.launcher import Launcher
 from experiments.logbook import Logbook
 from experiments.measured import CaseMetrics
 from experiments.problem import DocumentError, Problem
-from experiments.progress import Shown
-from experiments.servants import divided
-from experiments.standins import choose_bodies
 from experiments.trace import Trace
 
 if TYPE_CHECKING:
@@ -168,149 +155,6 @@ def _pass_on(tell: Told, case: str, duration_s: float, elapsed: float) -> None:
     tell(case, int(min(elapsed, duration_s)) if elapsed > 0.0 else 0, math.ceil(duration_s))
 
 
-def fly(
-    read: Document,
-    folder: Path,
-    *,
-    cases: Sequence[str] = (),
-    show: Shown,
-    interrupted: Callable[[], bool] = lambda: False,
-    bodies: str | None = None,
-    local: bool = False,
-    lab: str | None = None,
-    identity: str = "operator",
-) -> Run:
-    """Runs an experiment in real time, see `conduct`, and reads back what was recorded.
-
-    Raises:
-        RecordingError: If a recording cannot be read.
-    """
-    begun, notes = conduct(
-        read,
-        folder,
-        cases=cases,
-        show=show,
-        interrupted=interrupted,
-        bodies=bodies,
-        local=local,
-        lab=lab,
-        identity=identity,
-    )
-    return _read_back(folder, begun, notes)
-
-
-def conduct(
-    read: Document,
-    folder: Path,
-    *,
-    cases: Sequence[str] = (),
-    show: Shown,
-    interrupted: Callable[[], bool] = lambda: False,
-    bodies: str | None = None,
-    local: bool = False,
-    lab: str | None = None,
-    launching: Callable[[Path], Launcher] = Launcher,
-    identity: str = "operator",
-) -> tuple[dict[str, Path], list[str]]:
-    """Runs an experiment in real time: a router, a process per robot, a recorder.
-
-    Args:
-        read: The experiment.
-        folder: Where recordings and logs go; it exists.
-        cases: Which of its cases; all if none is named.
-        show: Shows the progress.
-        interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
-        bodies: What every robot is put into instead of the body that the file gives it: "twin", "world", or
-            "protocol" for its real bridge and a protocol twin.
-        local: Whether all robots run on this machine, whatever the file says of hosts.
-        lab: Folder of certificates, instead of the file's.
-        launching: Makes the launcher of the processes, given the folder of their logs.
-        identity: Whose certificate the conductor shows, in a lab: an operator's.
-
-    Returns:
-        The recordings of the cases that have begun, and what the reader should know.
-
-    Raises:
-        LabError: If a certificate is missing.
-        RunFailed: If robots are not ready in time, unless the file says to go on without them.
-        Unreachable: If the routers of the file do not answer.
-        HostError: If a host cannot be reached, or has another zenpark.
-        DocumentError: If robots that run on hosts are to be put behind protocol twins.
-    """
-    if bodies == "protocol" and read.experiment.hosts and not local:
-        hint = "add --here, which lets all robots run on this machine"
-        raise DocumentError([Problem("--bodies protocol", 0, 0, "protocol twins cannot be seen from hosts", hint)])
-    results: dict[str, Result] = {}
-    read.keep(folder / SOURCE)
-    embodied = {name: choose_bodies(case, bodies) for name, case in chosen(read, cases).items()}
-    if local:
-        embodied = {name: msgspec.structs.replace(case, hosts={}) for name, case in embodied.items()}
-    network = read.experiment.network
-    meshed = network.topology == "mesh"
-    own_router = network.connect is None and not meshed
-    of_lab = reach.folder(read.experiment, read.path, lab)
-    secure = of_lab is not None
-    own = network.listen or free_endpoints(network.routers, protocol="tls" if secure else "tcp")
-    listening = reach.routers(read.experiment, read.path, own if own_router else [], lab)
-    endpoints = list(map(from_here, listening)) if own_router else listening
-    if meshed:
-        endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)
-    rights = enforced(embodied.values(), endpoints, folder, identity)
-    (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
-    with launching(folder / "logs") as launcher:
-        for router in divided(listening, network.routers) if own_router else ():
-            router.start(launcher, rights)
-        hosts = Hosts(launcher, endpoints if meshed else listening)
-        with show:
-            for name, experiment in embodied.items():
-                if interrupted():
-                    break
-                file = folder / f"{name}.json"
-                file.write_bytes(document.write_json(experiment))
-                results[name] = Conductor(
-                    experiment,
-                    name,
-                    file=file,
-                    source=folder / SOURCE,
-                    folder=folder,
-                    endpoints=endpoints,
-                    rights=rights,
-                    identity=identity,
-                    launcher=launcher,
-                    hosts=hosts,
-                    show=show,
-                    interrupted=interrupted,
-                ).run()
-        left = hosts.sweep()
-    notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
-    return {case: result.recording for case, result in results.items() if result.start is not None}, notes
-
-
-def enforced(
-    cases: Collection[Experiment], endpoints: Sequence[str], folder: Path, operator: str = "operator"
-) -> Path | None:
-    """Who may do what, as a file for the router; None without a lab.
-
-    Robots on hosts have their certificates there, and need none here.
-
-    Raises:
-        LabError: If a certificate is missing, or somebody else's.
-    """
-    of = lab_of(endpoints)
-    if of is None:
-        return None
-    known = register(of)
-    require(of, list(dict.fromkeys(name for case in cases for name in access.needed(case, operator))))
-    role = known.identities[operator].role
-    if role != "operator":
-        raise LabError(f"{operator} is {role} in the lab, and gives no orders: choose an operator with --as")
-    made = access.rights(cases)
-    rules(made, known)  # what is wrong with it is said now, and not by a router that does not start
-    file = folder / "rights.json"
-    file.write_bytes(msgspec.json.format(msgspec.json.encode(made), indent=1))
-    return file
-
-
 def reopen(folder: Path) -> Run:
     """The run in a folder, read back from its recordings; without traces if no case had begun.
 
@@ -324,11 +168,15 @@ def reopen(folder: Path) -> Run:
     files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
     if not files:
         raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
-    return _read_back(folder, {file.stem: file for file in files}, [])
+    return read_back(folder, {file.stem: file for file in files}, [])
 
 
-def _read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]) -> Run:
-    """Traces from recordings; those of killed recorders too, as far as they go."""
+def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]) -> Run:
+    """A run from its recordings, by case; those of killed recorders too, as far as they go.
+
+    Raises:
+        RecordingError: If one cannot be read.
+    """
     traces: dict[str, Trace] = {}
     remarks, made = list(notes), []
     for case, file in recordings.items():

@@ -77,4 +77,19 @@ class Progress:
     events: list[wire.Event] = field(default_factory=list)
 
 
+class News:
+    """Tells each event of a run once, whatever its case."""
+
+    def __init__(self) -> None:
+        self._told, self._case = 0, ""
+
+    def of(self, progress: Progress) -> list[wire.Event]:
+        """What has happened since it was asked last."""
+        if progress.case != self._case:
+            self._case, self._told = progress.case, 0
+        events = progress.events[self._told :]
+        self._told = len(progress.events)
+        return events
+
+
 Show = Callable[[Progress], None]

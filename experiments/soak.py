@@ -14,19 +14,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 import msgspec
 import zenoh
 
 from agents import session as network
 from agents import wire
+from agents.endpoint import free_endpoint
 from agents.keys import Keys
 from experiments import endurance, processes, soak_verdict
 from experiments.conductor import RunFailed
 from experiments.document import Document
 from experiments.launcher import Launcher
 from experiments.run import SOURCE, Interrupts, chosen, load, loads, new_folder
+from experiments.said import by_robots
 from experiments.soak_verdict import COLUMNS, Row, Soaked
 from experiments.watched import Watched
 
@@ -39,9 +41,6 @@ OVER_S: Final = 90.0  # landing, and the end of the recording
 TABLE: Final = "soak.csv"
 TELL_S: Final = 60.0
 MARKS: Final = {"good": "✓", "fair": "!", "bad": "✗", "plain": "·"}
-
-
-M = TypeVar("M", wire.Status, wire.State)
 
 
 @dataclass
@@ -62,20 +61,11 @@ class _Ear:
         self._states = network.subscriber(session, keys.state("*"), 16384)
 
     def listen(self) -> None:
-        for status in self._messages(self._statuses.handler, wire.Status):
+        for status in by_robots(self._statuses.handler, wire.Status, keys=self._keys, robots=self.robots):
             self.robots[status.robot].status = status
-        for state in self._messages(self._states.handler, wire.State):
+        for state in by_robots(self._states.handler, wire.State, keys=self._keys, robots=self.robots):
             if state.phase == "running":
                 self.robots[state.robot].delays += [heard.arrived - heard.stamp for heard in state.heard]
-
-    def _messages(self, handler: network.Polled[zenoh.Sample], kind: type[M]) -> Iterator[M]:
-        for sample in network.received(handler):
-            try:
-                message = wire.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
-            except wire.Malformed:
-                continue
-            if message.robot in self.robots and self._keys.whose(str(sample.key_expr)) == message.robot:
-                yield message
 
 
 def rows(found: Mapping[int, str], robots: Mapping[str, _Counts], t: float, recording: Path) -> Iterator[Row]:
@@ -145,7 +135,7 @@ def soak(  # noqa: PLR0915 - one loop that follows one run
         groups.setdefault(robot.process or name, []).append(name)
     duration, recording = experiment.duration_s, folder / f"{case}.mcap"
     every = min(SAMPLE_S, duration / SAMPLES)
-    endpoint = network.free_endpoint(preferred_port=0)
+    endpoint = free_endpoint(preferred_port=0)
     sampled: list[Row] = []
     died: dict[str, float] = {}
     start: float | None = None

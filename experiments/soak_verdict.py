@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import msgspec
 
 from experiments import drawing
-from experiments.report import Section, date_of, numbered, render
+from experiments.page import Section, date_of, numbered, render
 from experiments.report_tables import Row as Line
 from experiments.report_tables import Table
 from experiments.verdict import Finding

@@ -25,6 +25,7 @@ import msgspec
 
 from agents import lab, plugins
 from agents import session as network
+from agents.endpoint import EndpointError
 from agents.lifeline import SILENCE_S
 from experiments import certificates, version
 from experiments.launcher import LAND_S
@@ -104,7 +105,7 @@ def _reach(endpoint: str, question: Question) -> Found:
         routers = lab.secured([endpoint], question.lab)
         with network.open_session(routers, name="zenpark hosts", wait_s=REACH_S, identity=identity):
             return Found(endpoint, True, f"{(time.monotonic() - began) * 1e3:.0f} ms")
-    except (network.Unreachable, network.EndpointError, lab.LabError) as error:
+    except (network.Unreachable, EndpointError, lab.LabError) as error:
         return Found(endpoint, False, str(error))
 
 

@@ -9,8 +9,8 @@ from typing import Final
 
 from experiments import drawing
 from experiments.document import Document
+from experiments.page import Picture, Section, date_of, numbered, render, seeds_in_words
 from experiments.pareto import front, pareto
-from experiments.report import Picture, Section, date_of, numbered, render, seeds_in_words
 from experiments.report_tables import Row as Line
 from experiments.report_tables import Table
 from experiments.sweep import Found

@@ -17,6 +17,7 @@ from typing import Self
 
 from agents import lab, wire
 from agents import session as network
+from agents.endpoint import EndpointError
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
 from experiments.conductor import RunFailed
@@ -24,8 +25,9 @@ from experiments.hosts import HostError
 from experiments.launcher import Launcher, Process
 from experiments.problem import DocumentError
 from experiments.processes import ROBOT
-from experiments.run import conduct, load
-from experiments.seen import Progress
+from experiments.realtime import Staging, conduct
+from experiments.run import load
+from experiments.seen import News, Progress
 from experiments.standins import BODIES, StandInError
 
 
@@ -49,8 +51,7 @@ class Told:
     """Prints each event once."""
 
     def __init__(self) -> None:
-        self._told = 0
-        self._case = ""
+        self._news = News()
 
     def __enter__(self) -> Self:
         return self
@@ -60,13 +61,9 @@ class Told:
 
     def __call__(self, progress: Progress) -> None:
         """Prints what is new."""
-        if progress.case != self._case:
-            self._case, self._told = progress.case, 0
-        for event in progress.events[self._told :]:
-            sys.stdout.buffer.write(wire.encode(event) + b"\n")
-        if len(progress.events) > self._told:
+        if events := self._news.of(progress):
+            sys.stdout.buffer.write(b"".join(wire.encode(event) + b"\n" for event in events))
             sys.stdout.buffer.flush()
-        self._told = len(progress.events)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -88,11 +85,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             conduct(
                 read,
                 chosen.folder,
-                cases=chosen.case,
+                Staging(cases=chosen.case, bodies=chosen.bodies, here=True),
                 show=Told(),
                 interrupted=over.is_set,
-                bodies=chosen.bodies,
-                local=True,
                 launching=partial(Cabled, cables),
             )
     except (
@@ -101,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         RunFailed,
         StandInError,
         lab.LabError,
-        network.EndpointError,
+        EndpointError,
         network.Unreachable,
     ) as error:
         print(f"zenpark: {error}", file=sys.stderr)

@@ -21,6 +21,7 @@ import zenoh
 from agents import plugins, wire
 from agents import session as network
 from agents.body import BodyError
+from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.leaving import end, held
@@ -38,7 +39,7 @@ from experiments.robot import chosen_case
 REPORT_S: Final = 1.0
 SLIP_S: Final = 0.05  # what it makes up for when it was late; the rest of the time is lost, and the factor says so
 MOST_STEPS: Final = 1_000_000
-EXPLAINED: Final = (DocumentError, BodyError, plugins.PluginError, network.EndpointError, network.Unreachable)
+EXPLAINED: Final = (DocumentError, BodyError, plugins.PluginError, EndpointError, network.Unreachable)
 
 
 class WorldTaken(RuntimeError):
@@ -234,7 +235,7 @@ def serve(
     if engine is not None:
         changed = msgspec.structs.replace(experiment.world, engine=engine)
         experiment = msgspec.structs.replace(experiment, world=changed)
-    endpoints = routers(experiment, read.path, connect, lab) or [network.DEFAULT_ENDPOINT]
+    endpoints = routers(experiment, read.path, connect, lab) or [DEFAULT_ENDPOINT]
     over, lost = threading.Event(), threading.Event()
 
     def leave() -> None:

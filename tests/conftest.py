@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from agents.session import free_endpoint
+from agents.endpoint import free_endpoint
 
 ROOT = Path(__file__).resolve().parent.parent
 

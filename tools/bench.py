@@ -86,7 +86,7 @@ def codec() -> Iterator[Figure]:
 def process() -> Iterator[Figure]:
     """Robot processes of the reference experiment in flight: CPU, memory, punctuality, time until all are ready."""
     from agents import wire  # noqa: PLC0415
-    from agents.session import free_endpoint  # noqa: PLC0415
+    from agents.endpoint import free_endpoint  # noqa: PLC0415
     from experiments import document  # noqa: PLC0415
     from experiments.conductor import Conductor  # noqa: PLC0415
     from experiments.hosts import Hosts  # noqa: PLC0415

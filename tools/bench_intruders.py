@@ -112,7 +112,7 @@ def intruders() -> Iterator[Figure]:
 
 def _siege(protocol: str) -> Iterator[Figure]:
     from agents import lab  # noqa: PLC0415
-    from agents.session import free_endpoint  # noqa: PLC0415
+    from agents.endpoint import free_endpoint  # noqa: PLC0415
     from experiments import document  # noqa: PLC0415
     from experiments.conductor import Conductor  # noqa: PLC0415
     from experiments.hosts import Hosts  # noqa: PLC0415
@@ -183,7 +183,8 @@ def _joining(protocol: str) -> Iterator[Figure]:
 def _joined(protocol: str, kind: str) -> tuple[float, float]:
     """How long it takes [s], in quiet and under an attack."""
     from agents import lab  # noqa: PLC0415
-    from agents.session import Unreachable, free_endpoint, open_session  # noqa: PLC0415
+    from agents.endpoint import free_endpoint  # noqa: PLC0415
+    from agents.session import Unreachable, open_session  # noqa: PLC0415
     from experiments.launcher import Launcher  # noqa: PLC0415
     from experiments.servants import start_router  # noqa: PLC0415
 

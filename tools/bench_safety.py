@@ -262,6 +262,7 @@ class _Park:
         from zenoh.handlers import Callback  # noqa: PLC0415
 
         from agents import session as network  # noqa: PLC0415
+        from agents.endpoint import free_endpoint  # noqa: PLC0415
         from agents.keys import Keys  # noqa: PLC0415
         from experiments.document import write_json  # noqa: PLC0415
         from experiments.launcher import Launcher  # noqa: PLC0415
@@ -275,7 +276,7 @@ class _Park:
         self._launcher: Launcher = self._stack.enter_context(Launcher(folder / "logs"))
         file = folder / "ring.json"
         file.write_bytes(write_json(self._experiment))
-        endpoints = [network.free_endpoint(0)]
+        endpoints = [free_endpoint(0)]
         start_router(self._launcher, endpoints)
         self._session = self._stack.enter_context(network.open_session(endpoints, name="bench"))
         listener = self._stack.enter_context(network.open_session(endpoints, name="bench listens"))

@@ -124,7 +124,7 @@ def _stepping() -> Iterator[Figure]:
 
 
 def _service() -> Iterator[Figure]:
-    from agents.session import free_endpoint  # noqa: PLC0415
+    from agents.endpoint import free_endpoint  # noqa: PLC0415
     from experiments.document import write_json  # noqa: PLC0415
     from experiments.launcher import Launcher  # noqa: PLC0415
     from experiments.servants import start_router  # noqa: PLC0415

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from agents import session as network
 from agents import wire
+from agents.endpoint import DEFAULT_ENDPOINT
 from agents.keys import Keys
 from experiments import orders
 from tools.network import printable
@@ -34,7 +35,7 @@ def command(
     """
     order = wire.RunOrder(what, list(names), who=identity, spare=spare, body=body, at=at, yaw=yaw)
     with network.open_session(
-        list(connect) or [network.DEFAULT_ENDPOINT], name="zenpark robot", wait_s=2.0, identity=identity
+        list(connect) or [DEFAULT_ENDPOINT], name="zenpark robot", wait_s=2.0, identity=identity
     ) as session:
         reply = orders.give_run(session, Keys(realm), order)
     if reply.reason:

@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.options import As, Case, Connect, File, Lab, Lifeline, routers
+from tools.options import As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, routers
 
 app: Final = typer.Typer()
 
@@ -25,7 +25,7 @@ def agent(
         float, typer.Option(metavar="SECONDS", help="Added to this machine's clock to get the conductor's.")
     ] = 0.0,
     once: Annotated[bool, typer.Option("--once", help="End when down after the experiment.")] = False,
-    realm: Annotated[str, typer.Option(metavar="NAME", help="In which to join.")] = "park",
+    realm: Realm = "park",
     lab: Lab = None,
 ) -> None:
     """Be one robot of an experiment, or several that share a device.
@@ -70,13 +70,9 @@ def router(
     connect: Annotated[
         list[str] | None, typer.Option(metavar="ENDPOINT", help="Another router to be linked with; may be repeated.")
     ] = None,
-    lifeline: Annotated[
-        bool, typer.Option("--lifeline", help="End when standard input ends or is silent for 3 s.")
-    ] = False,
+    lifeline: Lifeline = False,
     lab: Lab = None,
-    bodies: Annotated[
-        str | None, typer.Option(metavar="twin|world|protocol", help="As behind `zenpark run`, for the rights.")
-    ] = None,
+    bodies: Bodies = None,
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the configuration for a zenohd that is to do the same.")
     ] = False,

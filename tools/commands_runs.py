@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.options import Anyway, As, AsJson, Case, Cases, File, Lab, OpenReport, Settings
+from tools.options import Anyway, As, AsJson, Bodies, Case, Cases, File, Lab, OpenReport, Out, Report, Settings
 
 app: Final = typer.Typer()
 
@@ -19,45 +19,36 @@ def run(
         bool, typer.Option("--virtual", help="In virtual time, in this process, as fast as it goes.")
     ] = False,
     case: Cases = None,
-    out: Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")] = None,
+    out: Out = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of all randomness, instead of the file's.")] = None,
     settings: Settings = None,
     as_json: AsJson = False,
     seeds: Annotated[int, typer.Option(min=1, help="Runs so many seeds: mean and spread (virtual only).")] = 1,
-    bodies: Annotated[
-        str | None,
-        typer.Option(
-            metavar="twin|world|protocol",
-            help="Every robot in a twin of its own, in one world, or behind a protocol twin (real time).",
-        ),
-    ] = None,
+    bodies: Bodies = None,
     here: Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")] = False,
     anyway: Anyway = False,
-    report: Annotated[bool, typer.Option(help="Writes the report.")] = True,
+    report: Report = True,
     open_report: OpenReport = False,
     lab: Lab = None,
     identity: As = "operator",
 ) -> None:
     """Run an experiment: one process per robot, or in virtual time."""
     from experiments.commands import run as command  # noqa: PLC0415
+    from experiments.realtime import Staging  # noqa: PLC0415
 
     raise typer.Exit(
         command(
             file,
+            Staging(case or [], bodies, here, lab, identity),
             virtual=virtual,
-            cases=case or [],
             out=out,
             seed=seed,
             settings=settings or [],
             as_json=as_json,
             seeds=seeds,
-            bodies=bodies,
-            here=here,
             anyway=anyway,
             report=report,
             open_report=open_report,
-            lab=lab,
-            identity=identity,
         )
     )
 
@@ -83,14 +74,14 @@ def sweep(
             help="Seeks values in the ranges instead: 'messages, iae<=1.01' (relative to the first case).",
         ),
     ] = None,
-    out: Annotated[str | None, typer.Option(metavar="FOLDER", help="Where runs and table are kept. [runs/...]")] = None,
+    out: Out = None,
     processes: Annotated[int | None, typer.Option(min=1, help="How many at once. [one per core]")] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="On the workers of this dask scheduler, tcp://HOST:PORT.")
     ] = None,
     as_json: AsJson = False,
     anyway: Anyway = False,
-    report: Annotated[bool, typer.Option(help="Writes the page and the figure.")] = True,
+    report: Report = True,
     open_report: OpenReport = False,
 ) -> None:
     """Run cases x values x seeds in virtual time on all cores; what is done is never run again."""
@@ -126,9 +117,9 @@ def soak(
     minutes: Annotated[float, typer.Option(min=0.1, max=1440.0, help="How long.")] = 60.0,
     robots: Annotated[int, typer.Option(min=2, help="Of the ready-made experiment.")] = 20,
     case: Case = None,
-    out: Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")] = None,
+    out: Out = None,
     settings: Settings = None,
-    bodies: Annotated[str | None, typer.Option(metavar="twin|world|protocol", help="As behind `run`.")] = None,
+    bodies: Bodies = None,
     as_json: AsJson = False,
 ) -> None:
     """Run an experiment for long and say whether anything grows, is lost, slows down or dies."""
@@ -158,7 +149,7 @@ def chaos(
         list[str] | None, typer.Option(metavar="KIND,KIND", help="Only these: kill, freeze, partition, ... [all]")
     ] = None,
     case: Annotated[str | None, typer.Option(metavar="NAME", help="A case of the file. [the last]")] = None,
-    out: Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")] = None,
+    out: Out = None,
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:

@@ -11,6 +11,7 @@ import zenoh
 
 from agents import session as network
 from agents import topology, wire
+from agents.endpoint import DEFAULT_ENDPOINT
 from agents.keys import Keys
 from agents.leaving import held
 
@@ -29,7 +30,7 @@ def command(*, connect: Sequence[str], realm: str, reason: str, who: str) -> int
         EndpointError, Unreachable: If no router can be reached.
     """
     keys = Keys(realm)
-    endpoints = list(connect) or [network.DEFAULT_ENDPOINT]
+    endpoints = list(connect) or [DEFAULT_ENDPOINT]
     # who does not answer must not keep it from those who do
     opened = network.open_session(endpoints, name="estop", wait_s=2.0, identity=who, gather_s=0.0)
     with held(opened) as (session, declared):

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import io
-import subprocess
-import tarfile
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Final
 
 from agents.lab import AUTHORITY
-from experiments import certificates, ssh
+from experiments import certificates
 from experiments.experiment import Host
 from experiments.hosts import HostError
+from tools.freight import deliver, packed
 
 SEND_S: Final = 60.0
 
@@ -63,7 +61,6 @@ def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
         HostError: If some cannot be sent, or there is no place for them.
         LabError: If the register of the lab cannot be read.
     """
-    assert host.address is not None
     if trouble := list(certificates.ended(folder, robots)):
         raise HostError("\n".join(f"{name}: {each}" for each in trouble))
     place = PurePosixPath(host.lab.removeprefix("~/"))
@@ -71,37 +68,16 @@ def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
         raise HostError(f"{name}: '{host.lab}' names no folder of its own; write lab = \"zenpark-lab\"")
     # the key before its certificate: who reads them in between finds that they do not fit, and tries again
     files = [f"{AUTHORITY}.pem", *(f"{robot}.{end}" for robot in robots for end in ("key", "pem"))]
-    try:
-        done = subprocess.run(
-            ssh.script(host.address, PUT, [str(place), *files]),
-            input=_packed(folder, files),
-            capture_output=True,
-            check=False,
-            timeout=SEND_S,
-        )
-    except subprocess.TimeoutExpired:
-        raise HostError(f"{name}: has not taken its certificates in {SEND_S:g} s; is it overloaded?") from None
-    said = done.stderr.decode(errors="replace").strip()
-    if done.returncode == ssh.BROKEN:
-        raise HostError(f"{name}: {ssh.explained(host.address, host.zenpark, said)}")
-    if done.returncode != 0:
-        raise HostError(f"{name}: certificates not put there: {said or 'it said nothing'}")
-    removed = done.stdout.decode(errors="replace").split()
+    said = deliver(
+        name,
+        host,
+        PUT,
+        [place, *files],
+        packed(folder, files, mode=0o600),
+        limit_s=SEND_S,
+        late=f"has not taken its certificates in {SEND_S:g} s; is it overloaded?",
+        failed="certificates not put there",
+    )
+    removed = said.split()
     more = f"; removed {', '.join(removed)}" if removed else ""
     return f"certificates of {', '.join(robots)} put into {place}{more}"
-
-
-def _packed(folder: Path, files: Sequence[str]) -> bytes:
-    """Files as a compressed tar, which only their owner will be able to read."""
-    sink = io.BytesIO()
-
-    def owned(member: tarfile.TarInfo) -> tarfile.TarInfo:
-        member.uid = member.gid = 0
-        member.uname = member.gname = ""
-        member.mode = 0o600
-        return member
-
-    with tarfile.open(fileobj=sink, mode="w:gz") as tar:
-        for name in files:
-            tar.add(folder / name, name, filter=owned)
-    return sink.getvalue()

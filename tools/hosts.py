@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
-import subprocess
 import sys
-import tarfile
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,17 +13,17 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from agents.endpoint import Endpoint
-from agents.session import free_endpoint
-from experiments import certificates, document, reach, ssh, version
+from agents.endpoint import Endpoint, free_endpoint
+from experiments import certificates, document, reach, version
 from experiments.document import Document
 from experiments.experiment import Experiment, Host
 from experiments.hosts import HostError, Station
 from experiments.launcher import Launcher
 from experiments.problem import DocumentError, Problem
-from experiments.run import enforced
+from experiments.realtime import enforced
 from experiments.servants import start_router
 from experiments.station import Found, Question
+from tools.freight import deliver, packed
 from tools.host_keys import send
 
 YES, NO, DOUBTFUL, NOTHING = "✓", "✗", "!", "–"
@@ -278,42 +275,21 @@ def put(name: str, host: Host) -> str:
     Raises:
         HostError: If there is no place for it, or it cannot be made ready there.
     """
-    assert host.address is not None
     place = PurePosixPath(host.zenpark.removeprefix("~/"))
     if place.name != "zenpark" or place.parent in (PurePosixPath(), PurePosixPath("/")):
         raise HostError(f"{name}: '{host.zenpark}' names no folder of its own; write zenpark = \"zenpark/zenpark\"")
     if not (version.ROOT / "zenpark").is_file():
         raise HostError(f"{name}: this zenpark is no checkout, which is what can be copied; start ./zenpark of one")
-    names = [*version.PACKAGES, *FILES, *sorted(path.name for path in version.ROOT.glob("requirements*.lock"))]
-    try:
-        done = subprocess.run(
-            ssh.script(host.address, PUT, [str(place.parent), *names]),
-            input=packed(version.ROOT, names),
-            capture_output=True,
-            check=False,
-            timeout=INSTALL_S,
-        )
-    except subprocess.TimeoutExpired:
-        raise HostError(f"{name}: not ready after {INSTALL_S / 60:g} minutes; start {place} there by hand") from None
-    said = done.stderr.decode(errors="replace").strip()
-    if done.returncode == ssh.BROKEN:
-        raise HostError(f"{name}: {ssh.explained(host.address, host.zenpark, said)}")
-    if done.returncode != 0:
-        raise HostError(f"{name}: not installed: {said or 'it said nothing'}")
-    return f"{done.stdout.decode(errors='replace').strip()} ({version.digest()[: version.SHOWN]}) installed"
-
-
-def packed(root: Path, names: Sequence[str]) -> bytes:
-    """What stands at a place, as a compressed tar; nothing that was made there by running it."""
-    sink = io.BytesIO()
-
-    def kept(member: tarfile.TarInfo) -> tarfile.TarInfo | None:
-        member.uid = member.gid = 0
-        member.uname = member.gname = ""
-        return None if "__pycache__" in PurePosixPath(member.name).parts else member
-
-    with tarfile.open(fileobj=sink, mode="w:gz", compresslevel=6) as tar:
-        for name in names:
-            if (root / name).exists():
-                tar.add(root / name, name, filter=kept)
-    return sink.getvalue()
+    wanted = [*version.PACKAGES, *FILES, *sorted(path.name for path in version.ROOT.glob("requirements*.lock"))]
+    names = [each for each in wanted if (version.ROOT / each).exists()]
+    said = deliver(
+        name,
+        host,
+        PUT,
+        [place.parent, *names],
+        packed(version.ROOT, names),
+        limit_s=INSTALL_S,
+        late=f"not ready after {INSTALL_S / 60:g} minutes; start {place} there by hand",
+        failed="not installed",
+    )
+    return f"{said.strip()} ({version.digest()[: version.SHOWN]}) installed"

@@ -126,7 +126,7 @@ def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
 
 
 @app.command()
-def show(folder: Folder, as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
+def show(folder: Folder, as_json: AsJson = False) -> None:
     """Show who is in a lab and until when; exit code 1 if a certificate has ended."""
     from pathlib import Path  # noqa: PLC0415
 
@@ -147,9 +147,9 @@ def _cases(each: str) -> list[Experiment] | None:
     """The cases of an experiment; None if it is a robot that is named."""
     from pathlib import Path  # noqa: PLC0415
 
-    from experiments import document  # noqa: PLC0415
+    from experiments import document, entries  # noqa: PLC0415
 
-    known = each in {name for name, _ in document.names()} or Path(each).suffix or Path(each).exists()
+    known = each in {name for name, _ in entries.names()} or Path(each).suffix or Path(each).exists()
     return list(document.read(each).cases().values()) if known else None
 
 

@@ -13,7 +13,8 @@ from typing import Final
 import msgspec
 import zenoh
 
-from agents.session import DEFAULT_ENDPOINT, open_session, pose_subscriber, received, subscriber
+from agents.endpoint import DEFAULT_ENDPOINT
+from agents.session import open_session, pose_subscriber, received, subscriber
 from agents.wire import JSON, MSGPACK
 
 WAIT_S: Final = 1.0  # for a router that is on this machine or not at all

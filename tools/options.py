@@ -26,6 +26,15 @@ Realm = Annotated[str, typer.Option(metavar="NAME", help="First chunk of the key
 Case = Annotated[str | None, typer.Option(metavar="NAME", help="A case of the file. [the first]")]
 Cases = Annotated[list[str] | None, typer.Option("--case", metavar="NAME", help="Only this case; may be repeated.")]
 Lifeline = Annotated[bool, typer.Option("--lifeline", help="End when standard input ends or falls silent.")]
+Out = Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")]
+Bodies = Annotated[
+    str | None,
+    typer.Option(
+        metavar="twin|world|protocol",
+        help="Every robot in a twin of its own, in one world, or behind a protocol twin (real time).",
+    ),
+]
+Report = Annotated[bool, typer.Option(help="Writes the report.")]
 Anyway = Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")]
 OpenReport = Annotated[bool, typer.Option("--open", help="Opens it in the browser.")]
 

@@ -9,6 +9,7 @@ from typing import Final, get_args
 
 from agents import session as network
 from agents import wire
+from agents.endpoint import DEFAULT_ENDPOINT
 from agents.keys import Keys
 from experiments import orders
 
@@ -30,7 +31,7 @@ def command(what: str, robots: Sequence[str], *, connect: Sequence[str], realm: 
         return 2
     keys = Keys(realm)
     with network.open_session(
-        list(connect) or [network.DEFAULT_ENDPOINT], name="order", wait_s=2.0, identity=identity
+        list(connect) or [DEFAULT_ENDPOINT], name="order", wait_s=2.0, identity=identity
     ) as session:
         there = [
             robot

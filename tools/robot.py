@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from tools.options import As, Connect, Lab, Realm, routers
+
+if TYPE_CHECKING:
+    from agents import wire
 
 app: Final = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False, no_args_is_help=True)
 
@@ -14,54 +18,30 @@ Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Robots of t
 Name = Annotated[str, typer.Argument(metavar="NAME", help="A robot of the run.")]
 
 
-@app.command()
-def pause(
-    names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
-) -> None:
-    """Let robots hold where they are; the others go on."""
-    from tools.change import command  # noqa: PLC0415
-
-    raise typer.Exit(command("pause", names, connect=routers(connect, lab), realm=realm, identity=identity))
-
-
-@app.command()
-def resume(
-    names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
-) -> None:
-    """Let robots go on that were paused."""
-    from tools.change import command  # noqa: PLC0415
-
-    raise typer.Exit(command("resume", names, connect=routers(connect, lab), realm=realm, identity=identity))
+SAYS: Final[Mapping[wire.ChangeKind, str]] = {
+    "pause": "Let robots hold where they are; the others go on.",
+    "resume": "Let robots go on that were paused.",
+    "remove": "Land robots and end their processes; the others go on without them.",
+    "restart": "Start robots again, whether they fly, were removed or crashed; they join the run under way.",
+    "add": "Let robots join that are on standby, were missing at the start, or were started by hand.",
+}
 
 
-@app.command()
-def remove(
-    names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
-) -> None:
-    """Land robots and end their processes; the others go on without them."""
-    from tools.change import command  # noqa: PLC0415
+def _named(what: wire.ChangeKind) -> Callable[..., None]:
+    """A command that asks for one change of the robots that are named."""
 
-    raise typer.Exit(command("remove", names, connect=routers(connect, lab), realm=realm, identity=identity))
+    def change(
+        names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
+    ) -> None:
+        from tools.change import command  # noqa: PLC0415
 
+        raise typer.Exit(command(what, names, connect=routers(connect, lab), realm=realm, identity=identity))
 
-@app.command()
-def restart(
-    names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
-) -> None:
-    """Start robots again, whether they fly, were removed or crashed; they join the run under way."""
-    from tools.change import command  # noqa: PLC0415
-
-    raise typer.Exit(command("restart", names, connect=routers(connect, lab), realm=realm, identity=identity))
+    return change
 
 
-@app.command()
-def add(
-    names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
-) -> None:
-    """Let robots join that are on standby, were missing at the start, or were started by hand."""
-    from tools.change import command  # noqa: PLC0415
-
-    raise typer.Exit(command("add", names, connect=routers(connect, lab), realm=realm, identity=identity))
+for _what, _says in SAYS.items():
+    app.command(name=_what, help=_says)(_named(_what))
 
 
 @app.command()

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from agents.access import Rights
+from agents.endpoint import DEFAULT_ENDPOINT
 from agents.lab import LabError, secured
 from agents.router import serve
-from agents.session import DEFAULT_ENDPOINT, settings
+from agents.settings import settings
 
 
 def command(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from agents import session as network
 from agents import wire
+from agents.endpoint import DEFAULT_ENDPOINT
 from agents.keys import Keys
 from agents.plugins import did_you_mean
 from experiments import json_text, orders
@@ -53,7 +54,7 @@ def command(
             raise WorldOrderError(f"{name or 'the obstacle'} has no place; say where, with --at X Y")
     order = wire.WorldOrder(what, steps=steps, name=name, kind=kind, at=at, yaw=yaw, obstacle=given)  # type: ignore[arg-type]
     with network.open_session(
-        list(connect) or [network.DEFAULT_ENDPOINT], name="world-order", wait_s=2.0, identity=identity
+        list(connect) or [DEFAULT_ENDPOINT], name="world-order", wait_s=2.0, identity=identity
     ) as session:
         reply = orders.give_world(session, Keys(realm), order)
     if not reply.ok:

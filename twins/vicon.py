@@ -22,6 +22,7 @@ import zenoh
 
 from agents import plausibility, wire
 from agents import session as network
+from agents.endpoint import EndpointError
 from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
@@ -313,7 +314,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 serve(vicon, truths, chosen.rate, lambda: stop.is_set() or farewell.over())
             finally:
                 vicon.close()
-    except (network.Unreachable, network.EndpointError) as error:
+    except (network.Unreachable, EndpointError) as error:
         print(f"vicon twin: {error}", file=sys.stderr)
         return 2
     except OSError as error:

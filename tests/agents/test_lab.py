@@ -2,8 +2,9 @@ import pytest
 
 from agents import lab
 from agents.access import Grant, Rights
+from agents.endpoint import EndpointError
 from agents.lab import LabError, bare, files, of, options, register, require, secured
-from agents.session import EndpointError, config
+from agents.settings import config, settings
 from tools import authority
 
 
@@ -36,7 +37,7 @@ def test_a_lab_needs_endpoints_that_ask_for_certificates(folder, endpoint):
     with pytest.raises(LabError, match=rf"{endpoint} asks for no certificate.*write tls/"):
         secured([endpoint], folder)
     with pytest.raises(EndpointError, match=r"asks for no certificate|cannot be used"):
-        config("client", connect=[f"{endpoint}#lab={folder}"], name="CF01")
+        config(settings("client", connect=[f"{endpoint}#lab={folder}"], name="CF01"))
 
 
 def test_a_session_has_one_identity(folder):
@@ -45,7 +46,7 @@ def test_a_session_has_one_identity(folder):
 
 
 def test_sessions_of_a_lab_show_certificates_and_ask_for_them(folder):
-    made = config("client", connect=[f"tls/127.0.0.1:7447#lab={folder}"], name="CF01+CF02", identity="CF01")
+    made = config(settings("client", connect=[f"tls/127.0.0.1:7447#lab={folder}"], name="CF01+CF02", identity="CF01"))
     assert made.get_json("connect/endpoints") == '["tls/127.0.0.1:7447"]'
     tls = made.get_json("transport/link/tls")
     for part in (
@@ -63,16 +64,16 @@ RIGHTS = Rights("park", {"CF01": Grant(say=["park/CF01/**"])}, {})
 
 @pytest.mark.parametrize("endpoint", ["tls/0.0.0.0:7447", "quic/[::]:7447", "tls/lab.example.org:7447"])
 def test_with_a_lab_a_router_listens_anywhere_and_without_nowhere_else(folder, endpoint):
-    made = config("router", listen=[f"{endpoint}#lab={folder}"], name="router", rights=RIGHTS)
+    made = config(settings("router", listen=[f"{endpoint}#lab={folder}"], name="router", rights=RIGHTS))
     assert made.get_json("listen/endpoints") == f'["{endpoint}"]'
     assert '"default_permission":"deny"' in made.get_json("access_control")
     with pytest.raises(EndpointError, match=r"zenpark keys init LAB FILE.*--lab LAB"):
-        config("router", listen=[endpoint], name="router")
+        config(settings("router", listen=[endpoint], name="router"))
 
 
 def test_a_router_of_a_lab_must_know_who_may_do_what(folder):
     with pytest.raises(EndpointError, match="name the experiment"):
-        config("router", listen=[f"tls/0.0.0.0:7447#lab={folder}"], name="router")
+        config(settings("router", listen=[f"tls/0.0.0.0:7447#lab={folder}"], name="router"))
 
 
 def test_what_is_missing_is_named_with_its_remedy(folder, tmp_path):
@@ -81,7 +82,7 @@ def test_what_is_missing_is_named_with_its_remedy(folder, tmp_path):
     with pytest.raises(LabError, match=r"no certificates of CF08, CF09: `zenpark keys issue .* CF08 CF09`"):
         require(folder, ["CF01", "CF08", "CF09"])
     with pytest.raises(EndpointError, match=r"CF09\.pem is missing"):
-        config("client", connect=[f"tls/127.0.0.1:7447#lab={folder}"], name="CF09")
+        config(settings("client", connect=[f"tls/127.0.0.1:7447#lab={folder}"], name="CF09"))
     with pytest.raises(LabError, match=r"is no lab, lab\.json is missing: `zenpark keys init"):
         register(tmp_path)
     (tmp_path / lab.REGISTER).write_text("{")

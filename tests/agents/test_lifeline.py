@@ -6,18 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from agents.endpoint import free_endpoint
 from agents.lifeline import Lifeline
-from agents.session import free_endpoint
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture
-def pipe():
-    ends = list(os.pipe())
-    yield ends
-    for end in ends:
-        os.close(end)
 
 
 def test_end_of_file_is_loss(pipe):

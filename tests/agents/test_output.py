@@ -1,16 +1,6 @@
 import os
 
-import pytest
-
 from agents.output import Output
-
-
-@pytest.fixture
-def pipe():
-    ends = list(os.pipe())
-    yield ends
-    for end in ends:
-        os.close(end)
 
 
 def test_it_prints(pipe):

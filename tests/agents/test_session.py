@@ -7,16 +7,14 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from agents.endpoint import EndpointError, free_endpoint
 from agents.router import serve_router
 from agents.session import (
     Alarm,
-    EndpointError,
     Unreachable,
     alive_token,
     alive_watch,
-    config,
     connected,
-    free_endpoint,
     last_value,
     open_session,
     orders,
@@ -26,6 +24,7 @@ from agents.session import (
     received,
     subscriber,
 )
+from agents.settings import config, settings
 
 ROOT = Path(__file__).resolve().parents[2]
 JSON = "application/json"
@@ -48,13 +47,13 @@ def payloads(handler):
 )
 def test_refuses_to_listen_beyond_loopback(endpoint):
     with pytest.raises(EndpointError, match="SSH tunnel"):
-        config("router", listen=[endpoint])
+        config(settings("router", listen=[endpoint]))
 
 
 @pytest.mark.parametrize("endpoint", ["127.0.0.1:7447", "tcp/", "/127.0.0.1:7447", ""])
 def test_refuses_what_is_no_endpoint(endpoint):
     with pytest.raises(EndpointError, match=r"write it like tcp/127\.0\.0\.1:7447"):
-        config("client", connect=[endpoint])
+        config(settings("client", connect=[endpoint]))
 
 
 @pytest.mark.parametrize(
@@ -65,18 +64,18 @@ def test_refuses_what_is_no_endpoint(endpoint):
 def test_transports_that_are_not_used_are_refused(endpoint, why):
     for ends in ({"listen": [endpoint]}, {"connect": [endpoint]}):
         with pytest.raises(EndpointError, match=rf"{why}.*; write it like tcp/127.* unixsock-stream/PATH"):
-            config("router", **ends)
+            config(settings("router", **ends))
 
 
 @pytest.mark.parametrize("endpoint", ["t#tcp/localhost:1", "tcp/127.0.0.1:7447\n", "tcp?/x/y"])
 def test_what_zenoh_would_not_understand_is_refused_by_name(endpoint):
     with pytest.raises(EndpointError, match=r"write .*tcp/127\.0\.0\.1:7447"):
-        config("client", connect=[endpoint])
+        config(settings("client", connect=[endpoint]))
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:0", "tcp/127.3.2.1:7447", "tcp/[::1]:7447", "tcp/localhost:7447"])
 def test_listens_on_loopback(endpoint):
-    made = config("router", listen=[endpoint], name="router", lease_s=1.5)
+    made = config(settings("router", listen=[endpoint], name="router", lease_s=1.5))
     assert made.get_json("listen/endpoints") == f'["{endpoint}"]'
     assert made.get_json("scouting/multicast/enabled") == "false"
     assert made.get_json("scouting/gossip/enabled") == "false"

@@ -3,7 +3,9 @@
 import pytest
 
 from agents import topology
-from agents.session import EndpointError, Unreachable, config, free_endpoint, free_endpoints, open_session
+from agents.endpoint import EndpointError, free_endpoint, free_endpoints
+from agents.session import Unreachable, open_session
+from agents.settings import config, settings
 
 MESH = ["tcp/127.0.0.1:1#of=A", "tcp/127.0.0.1:2#of=B+C", "tcp/127.0.0.1:3#of=D", "tcp/127.0.0.1:4#of=recorder"]
 
@@ -55,7 +57,7 @@ def test_whoever_listens_in_a_lab_must_know_the_rights(tmp_path):
     folder = tmp_path / "lab"
     authority.create(folder, {"A": "robot"}, hosts=["127.0.0.1"])
     with pytest.raises(EndpointError, match="must know who may do what"):
-        config("peer", listen=[f"tls/127.0.0.1:1#lab={folder}"], name="A")
+        config(settings("peer", listen=[f"tls/127.0.0.1:1#lab={folder}"], name="A"))
 
 
 def test_nobody_in_a_mesh_is_said_so():

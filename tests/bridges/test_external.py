@@ -19,6 +19,7 @@ import pytest
 from agents import session as network
 from agents import wire
 from agents.body import BodyError, BodyRequest, Disturbance
+from agents.endpoint import free_endpoint
 from agents.keys import Keys
 from agents.kinds import KINDS
 from bridges import external
@@ -194,7 +195,7 @@ def test_what_is_no_position_is_said_and_so_are_settings_and_routers(
     with pytest.raises(BodyError, match=r"CF01: device: .*`rate`.*has no settings"):
         open_external(request(router.endpoint, {"CF01": "crazyflie"}, rate=5))
     with pytest.raises(BodyError, match="CF01: no router answers at"):
-        open_external(request(network.free_endpoint(preferred_port=0), {"CF01": "crazyflie"})).open()
+        open_external(request(free_endpoint(preferred_port=0), {"CF01": "crazyflie"})).open()
 
 
 # ---------------------------------------------------------------------- what it believes

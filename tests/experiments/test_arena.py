@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from experiments import catalogue, document
+from experiments import catalogue, document, entries
 from experiments.check import check
 from experiments.document import DocumentError, read
 from twins.scene import Obstacle
@@ -185,14 +185,14 @@ def test_the_catalogue_has_arena_files_that_are_no_experiments(tmp_path):
     assert catalogue.arenas() == ["gate.arena.toml"]
     assert "obstacle-course" in catalogue.names()
     assert not any("arena" in name for name in catalogue.names())
-    made = document.copy("obstacle-course", tmp_path)
+    made = entries.copy("obstacle-course", tmp_path)
     assert read(made).experiment == read("obstacle-course").experiment
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(
         [made.name, "gate.arena.toml", catalogue.SCHEMA]
     )  # fmt: skip
     (tmp_path / "gate.arena.toml").write_text("[arena]\n")
     with pytest.raises(DocumentError, match="is another arena"):
-        document.copy("obstacle-course", tmp_path / "again.toml")
+        entries.copy("obstacle-course", tmp_path / "again.toml")
     assert not (tmp_path / "again.toml").exists()
 
 

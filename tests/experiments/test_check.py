@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import document
+from experiments import document, entries
 from experiments.check import Figures, check, command, figures, schema_command
 from experiments.document import Document
 from experiments.experiment import Arena, Experiment, Formation, Leg, Robot
@@ -66,7 +66,7 @@ def test_the_reference_is_feasible_but_its_leader_is_quick():
     assert "0.095 m/s" in message
     assert "0.15 m/s" in message
     assert "clamp" in remedy
-    lines = document.catalogue_path(PARK).read_text("utf-8").splitlines()
+    lines = entries.path(PARK).read_text("utf-8").splitlines()
     (line,) = (number for number, line in enumerate(lines, 1) if line.startswith("plan = "))
     assert where.endswith(f"robotic-park.toml:{line}:8")
 
@@ -250,7 +250,7 @@ def test_only_the_case_at_fault_is_named():
 
 
 def test_the_place_is_in_the_case_that_changes_it(tmp_path):
-    text = document.catalogue_path(PARK).read_text("utf-8")
+    text = entries.path(PARK).read_text("utf-8")
     file = tmp_path / "mine.toml"
     file.write_text(f"{text}\n[cases.wild]\nformation = {{ gain = 12.0 }}\n", encoding="utf-8")
     (hunts,) = (each for each in check(document.read(file)) if each.code == "hunts")

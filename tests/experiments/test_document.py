@@ -11,7 +11,7 @@ import pytest
 
 from agents.graph import edges, links, rigidity
 from agents.kinds import KINDS
-from experiments import catalogue, document
+from experiments import catalogue, document, entries
 from experiments.document import DocumentError, parse_links, read
 
 MALFORMED = Path(__file__).parent / "malformed"
@@ -187,7 +187,7 @@ def slips(text):
 @pytest.mark.parametrize("name", catalogue.names())
 @pytest.mark.slow
 def test_every_misspelt_key_is_found_in_its_line(name, write):
-    found = list(slips(document.catalogue_path(name).read_text("utf-8")))
+    found = list(slips(entries.path(name).read_text("utf-8")))
     assert len(found) > 10
     for number, text in found:
         assert (number, 1) in [(problem.line, problem.column) for problem in refused(write(text)).problems]
@@ -412,13 +412,13 @@ def test_links_come_in_the_order_of_the_robots():
 
 
 def test_names_and_titles():
-    found = dict(document.names())
+    found = dict(entries.names())
     assert list(found) == sorted(found)
     assert {"convoy", "robotic-park", "triangle"} <= set(found)
     assert found["robotic-park"] == tomllib.loads(PARK.read_text("utf-8"))["title"]
-    assert document.catalogue_path("robotic-park") == PARK
+    assert entries.path("robotic-park") == PARK
     with pytest.raises(DocumentError, match="did you mean 'convoy'"):
-        document.catalogue_path("convoi")
+        entries.path("convoi")
 
 
 @pytest.mark.parametrize("name", catalogue.names())
@@ -461,17 +461,17 @@ def test_the_leader_of_the_convoy_stays_inside_and_below_its_top_speed():
 
 
 def test_copy_gives_an_experiment_that_reads_and_never_overwrites(tmp_path):
-    target = document.copy("triangle", tmp_path / "mine.toml")
+    target = entries.copy("triangle", tmp_path / "mine.toml")
     assert read(target).experiment == read("triangle").experiment
     assert json.loads((tmp_path / catalogue.SCHEMA).read_bytes()) == document.schema()
     with pytest.raises(DocumentError, match="exists already"):
-        document.copy("convoy", target)
+        entries.copy("convoy", target)
     assert read(target).experiment == read("triangle").experiment
-    assert document.copy("convoy", tmp_path) == tmp_path / "convoy.toml"
+    assert entries.copy("convoy", tmp_path) == tmp_path / "convoy.toml"
     with pytest.raises(DocumentError, match="cannot be written: No such file"):
-        document.copy("convoy", tmp_path / "nowhere" / "x.toml")
+        entries.copy("convoy", tmp_path / "nowhere" / "x.toml")
     with pytest.raises(DocumentError, match="neither a file nor"):
-        document.copy("convoi", tmp_path)
+        entries.copy("convoi", tmp_path)
 
 
 # The schema
@@ -486,7 +486,7 @@ def test_the_schema_beside_the_catalogue_is_the_one_that_is_generated(tmp_path):
 
 def test_every_entry_of_the_catalogue_shows_the_schema_to_editors():
     for name in catalogue.names():
-        assert document.catalogue_path(name).read_text("utf-8").startswith(f"#:schema ./{catalogue.SCHEMA}\n")
+        assert entries.path(name).read_text("utf-8").startswith(f"#:schema ./{catalogue.SCHEMA}\n")
 
 
 def test_the_schema_is_draft_7_and_knows_the_plugins():

@@ -13,6 +13,7 @@ from agents.wire import Contact, Event, WorldState
 from experiments import report
 from experiments.experiment import Arena, Experiment, Shadow
 from experiments.metrics import measure
+from experiments.page import date_of, inline
 from experiments.report_tables import interval, number, proof_tables, robot_tables, summary_table
 from experiments.results import write_csv
 from experiments.seeds import spread
@@ -229,7 +230,7 @@ def test_another_file_of_that_name_is_left_alone(tmp_path, text):
 
 
 def test_without_a_command_nothing_is_kept(tmp_path):
-    page = checked(report.write(tmp_path, [crowd(3, duration=2.0)], date=report.date_of(1.76e9)).read_text())
+    page = checked(report.write(tmp_path, [crowd(3, duration=2.0)], date=date_of(1.76e9)).read_text())
     assert "2025-10-09 08:53 UTC" in page.words
     assert "Do it again" not in page.words
     assert not (tmp_path / "run.json").exists()
@@ -404,7 +405,7 @@ def test_inline_drawings_have_ids_of_their_own():
         '<?xml version="1.0"?><svg width="9pt" viewBox="0 0 9 9" xmlns="a"><defs><path id="p"/></defs>'
         '<use xlink:href="#p"/><g id="g" style="stroke: #000000" clip-path="url(#p)"/></svg>'
     )
-    placed = report.inline(drawing, "f3-", 'A "b" & <c>')
+    placed = inline(drawing, "f3-", 'A "b" & <c>')
     assert placed == (
         '<svg viewBox="0 0 9 9" role="img" aria-label="A &quot;b&quot; &amp; &lt;c>"><defs><path id="f3-p"/></defs>'
         '<use href="#f3-p"/><g id="f3-g" style="stroke: currentColor" clip-path="url(#f3-p)"/></svg>'

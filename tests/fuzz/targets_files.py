@@ -18,7 +18,7 @@ import msgspec
 
 from agents import plugins, wire
 from agents.body import BodyError
-from agents.session import EndpointError
+from agents.endpoint import EndpointError
 from experiments import catalogue, document
 from experiments.document import DocumentError, write_json
 from experiments.records import RecordingError
@@ -337,7 +337,7 @@ def sweep_arguments() -> Iterator[Target]:
 
 def words() -> Iterator[Target]:
     """Addresses, endpoints, settings of devices, faults, key expressions: kind and text with a zero byte between."""
-    from agents import session  # noqa: PLC0415
+    from agents import settings as sessions  # noqa: PLC0415
     from agents.protocols import crazyflie, khepera4, tello, turtlebot3  # noqa: PLC0415
     from agents.protocols.settings import settings  # noqa: PLC0415
     from bridges.crazyflie.positioning import stations  # noqa: PLC0415
@@ -362,7 +362,7 @@ def words() -> Iterator[Target]:
             stations(str(file), 4)
 
         read: dict[str, Callable[[str], object]] = {
-            "endpoint": lambda text: session.config("client", connect=[text], listen=[text]),
+            "endpoint": lambda text: sessions.config(sessions.settings("client", connect=[text], listen=[text])),
             "crazyflie": lambda text: crazyflie.address("R1", text),
             "khepera": lambda text: Address.of("R1", text),
             "tello": lambda text: tello.endpoint("R1", text),

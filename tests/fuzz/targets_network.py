@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, redirect_stdout, suppress
 from pathlib import Path
 from threading import Event
+from typing import get_args
 
 import msgspec
 import numpy as np
@@ -16,7 +17,8 @@ import numpy as np
 from agents import wire
 from agents.body import BodyRequest, Disturbance
 from agents.kinds import KINDS
-from agents.runtime import Runtime, Setup
+from agents.runtime import Runtime
+from agents.setup import Setup
 from experiments import assign, document, orders
 from tests.fuzz.loopnet import Net, Reply, Sample
 from tests.fuzz.messages import KEYS, everything, good, of_all, sent
@@ -27,7 +29,7 @@ RUBBISH = io.StringIO()  # where processes say what they would say on a terminal
 
 def messages() -> Iterator[Target]:
     """Every struct, both encodings: what is decoded can be encoded again."""
-    kinds = {kind.__name__: kind for kind in wire.M.__constraints__}
+    kinds = {kind.__name__: kind for kind in get_args(wire.Message)}
     examples = []
     for said in [*good("KH01").values(), *of_all().values()]:
         for message in said:

@@ -38,6 +38,20 @@ def until(true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) ->
         pause.wait(0.01)
 
 
+def zenpark(*arguments: object, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+    """A command of zenpark, to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "tools.guard", *map(str, arguments)],
+        cwd=ROOT,
+        env=ENVIRONMENT,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=timeout_s,
+    )
+
+
 def typed(file: Path, topic: str) -> list[Any]:
     """Messages of a topic, as another library decodes them from the schema in the file."""
     with file.open("rb") as stream:

@@ -15,7 +15,8 @@ import msgspec
 import zenoh
 
 from agents import lab, wire
-from agents import session as network
+from agents.endpoint import free_endpoint
+from agents.settings import config, settings
 from experiments import access
 from experiments.run import load
 from tests.system.lab import ENVIRONMENT, ROOT, RobotProcess, Watcher, until
@@ -36,7 +37,7 @@ class Laboratory:
         self.rights = folder / "rights.json"
         rights = msgspec.structs.replace(access.rights(cases.values()), linked=linked)
         self.rights.write_bytes(msgspec.json.encode(rights))
-        self.plain = network.free_endpoint(preferred_port=0, protocol=protocol)
+        self.plain = free_endpoint(preferred_port=0, protocol=protocol)
         (self.endpoint,) = lab.secured([self.plain], self.folder)
         self.robots: list[RobotProcess] = []
         self.last: dict[str, wire.Status] = {}
@@ -83,7 +84,7 @@ class Laboratory:
     def session(self, identity: str, folder: Path | None = None) -> zenoh.Session:
         """A session of whoever has these certificates; at once, or zenoh.ZError."""
         (endpoint,) = lab.secured([self.plain], folder or self.folder)
-        return zenoh.open(network.config("client", connect=[endpoint], name="intruder", identity=identity))
+        return zenoh.open(config(settings("client", connect=[endpoint], name="intruder", identity=identity)))
 
     def close(self) -> None:
         for robot in self.robots:

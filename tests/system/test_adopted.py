@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from agents import session as network
 from agents import wire
+from agents.endpoint import free_endpoint
 from agents.lab import Role
-from experiments import document, playback
+from experiments import entries, playback
 from tests.conftest import RouterProcess
 from tests.system.lab import Flight, RobotProcess, Started, Watcher
 from tools import authority
@@ -24,7 +24,7 @@ SHORT = ("--json", "--set", "duration_s=2", "--no-report")
 
 def experiment(folder: Path, endpoint: str) -> str:
     file = folder / "x.toml"
-    text = document.catalogue_path("triangle").read_text("utf-8")
+    text = entries.path("triangle").read_text("utf-8")
     text += f'\n[network]\nconnect = ["{endpoint}"]\n[hosts.board]\nrobots = ["KH02"]\n'
     file.write_text(text)
     return str(file)
@@ -67,7 +67,7 @@ def test_who_joins_in_a_lab_needs_its_own_files_alone(tmp_path: Path) -> None:
     own.mkdir(parents=True)
     for name in ("ca.pem", "KH02.pem", "KH02.key"):
         (lab / name).rename(own / name) if name.startswith("KH02") else shutil.copy(lab / name, own)
-    endpoint = network.free_endpoint(preferred_port=0, protocol="tls")
+    endpoint = free_endpoint(preferred_port=0, protocol="tls")
     file = experiment(tmp_path, endpoint)
     reach = ("--connect", endpoint, "--lab", str(own))
     router = Started("tools.guard", "router", file, "--lab", str(lab), "--listen", endpoint)

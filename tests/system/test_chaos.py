@@ -4,27 +4,17 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.system.lab import ENVIRONMENT, ROOT
+from tests.system.lab import zenpark
 
 pytestmark = pytest.mark.system
 
 
 def chaos(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tools.guard", "chaos", *arguments, "--out", str(folder)],
-        cwd=ROOT,
-        env=ENVIRONMENT,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=150,
-    )
+    return zenpark("chaos", *arguments, "--out", folder, timeout_s=150.0)
 
 
 def test_a_router_dies_a_step_of_the_clock_and_the_death_of_the_launcher(tmp_path: Path) -> None:

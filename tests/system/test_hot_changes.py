@@ -6,7 +6,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from agents import wire
-from experiments import document, orders, playback, report
+from experiments import entries, orders, playback, report
 from experiments.run import reopen
 from tests.conftest import RouterProcess
-from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher
+from tests.system.lab import Flight, RobotProcess, Watcher, zenpark
 
 pytestmark = pytest.mark.system
 
@@ -43,7 +42,7 @@ class Lab:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.file, self.over = folder, folder / "x.toml", False
-        text = document.catalogue_path("triangle").read_text("utf-8")
+        text = entries.path("triangle").read_text("utf-8")
         text = text.replace("[formation]", f"{SPARES}\n[formation]", 1)
         text = text.replace('"KH01 - KH02"', '"KH01 > KH03" = 0.60\n"KH03 > KH01" = 0.60\n"KH01 - KH02"', 1)
         self.file.write_text(text)
@@ -64,11 +63,7 @@ class Lab:
         return orders.give_run(self.watcher.session, self.watcher.keys, order)
 
     def zenpark(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "tools.guard", "robot", *arguments, "--connect", self.endpoint],
-            cwd=ROOT, env=ENVIRONMENT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
-            timeout=60,
-        )  # fmt: skip
+        return zenpark("robot", *arguments, "--connect", self.endpoint)
 
     def end(self) -> tuple[int, str]:
         """Ctrl-C: all land."""
@@ -104,7 +99,7 @@ def test_a_killed_robot_is_started_again_and_takes_part(lab: Lab) -> None:
                       "it is heard again")  # fmt: skip
     started = lab.watcher.status["CF01"].started
     assert abs(started - lab.watcher.status["KH01"].started) < 0.1, "its time is that of the others"
-    time.sleep(1.0)
+    lab.watcher.until(lambda: lab.watcher.status["CF01"].decisions >= 10, "it has taken part for a while")
     code, _ = lab.end()
     assert code in (0, 130)
     read = playback.read(lab.folder / "run" / "event.mcap")

@@ -16,7 +16,9 @@ import zenoh
 
 from agents import lab, wire
 from agents import session as network
+from agents.endpoint import free_endpoint
 from agents.keys import Keys
+from agents.settings import config, settings
 from experiments import orders
 from tests.system.secured import FLOWN, Laboratory, copy, elsewhere, flying, steady
 from tools import authority
@@ -79,14 +81,14 @@ def settled(laboratory: Laboratory, seconds: float = 0.5) -> None:
 @pytest.mark.parametrize("protocol", ["tcp", "tls", "quic"])
 def test_without_a_certificate_nobody_gets_in(laboratory: Laboratory, protocol: str) -> None:
     address = laboratory.plain.partition("/")[2]
-    settings = network.config("client", connect=[f"{protocol}/{address}"], name="intruder")
-    settings.insert_json5("transport/unicast/open_timeout", "1000")
+    chosen = config(settings("client", connect=[f"{protocol}/{address}"], name="intruder"))
+    chosen.insert_json5("transport/unicast/open_timeout", "1000")
     if protocol != "tcp":  # it trusts the router, and has nothing to show
-        settings.insert_json5(
+        chosen.insert_json5(
             "transport/link/tls", json.dumps({"root_ca_certificate": str(laboratory.folder / "ca.pem")})
         )
     with pytest.raises(zenoh.ZError, match="Unable to connect"):
-        zenoh.open(settings)
+        zenoh.open(chosen)
 
 
 def test_a_certificate_of_another_authority_is_refused(laboratory: Laboratory, tmp_path: Path) -> None:
@@ -118,25 +120,25 @@ def test_a_robots_certificate_does_not_make_a_router(laboratory: Laboratory, tmp
     thief = copy(laboratory.folder, tmp_path / "thief")
     for part in ("key", "pem"):
         (thief / f"router.{part}").write_bytes((thief / f"KH03.{part}").read_bytes())
-    plain = network.free_endpoint(preferred_port=0, protocol="tls")
-    settings = zenoh.Config()  # a thief needs nothing of ours
+    plain = free_endpoint(preferred_port=0, protocol="tls")
+    chosen = zenoh.Config()  # a thief needs nothing of ours
     for key, value in {
         "mode": "peer",
         "listen/endpoints": [plain],
         "scouting/multicast/enabled": False,
         **lab.settings(thief, "router", listens=True),
     }.items():
-        settings.insert_json5(key, json.dumps(value))
+        chosen.insert_json5(key, json.dumps(value))
     (honest,) = lab.secured([plain], laboratory.folder)
-    with zenoh.open(settings), pytest.raises(zenoh.ZError, match="Unable to connect"):
-        zenoh.open(network.config("client", connect=[honest], name="KH01"))
+    with zenoh.open(chosen), pytest.raises(zenoh.ZError, match="Unable to connect"):
+        zenoh.open(config(settings("client", connect=[honest], name="KH01")))
 
 
 def test_a_router_elsewhere_than_its_certificate_says_is_refused(laboratory: Laboratory) -> None:
     address = laboratory.plain.rpartition(":")[2]
     (endpoint,) = lab.secured([f"tls/127.0.0.2:{address}"], laboratory.folder)
     with pytest.raises(zenoh.ZError, match="Unable to connect"):
-        zenoh.open(network.config("client", connect=[endpoint], name="KH01"))
+        zenoh.open(config(settings("client", connect=[endpoint], name="KH01")))
 
 
 # ---------------------------------------------------------------------- who is let in, and wants more than its due

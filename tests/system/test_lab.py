@@ -14,26 +14,13 @@ import zenoh
 from agents import session as network
 from agents import wire
 from agents.keys import Keys
-from tests.system.lab import ENVIRONMENT, ROOT, Flight, until
+from tests.system.lab import ENVIRONMENT, ROOT, Flight, until, zenpark
 from tests.system.secured import FILE, Laboratory, copy
 from tools import authority
 
 pytestmark = pytest.mark.system
 
 KEYS = Keys()
-
-
-def zenpark(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tools.guard", *map(str, arguments)],
-        cwd=ROOT,
-        env=ENVIRONMENT,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=30,
-    )
 
 
 def test_one_command_runs_it_and_others_look_and_stop_it(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from agents.lab import register
-from experiments import document, playback
+from experiments import entries, playback
 from tests.system.lab import typed, until
 from tests.system.machines import Machines, machines, why_not
 from tests.system.test_machines import busy, zenpark
@@ -37,7 +37,7 @@ class Laboratory:
 
     def __init__(self, lab: Machines, folder: Path, network: str = "", *, drift: float = 0.0) -> None:
         self.lab, self.keys, self.file, self.out = lab, folder / "lab", folder / "triangle.toml", folder / "run"
-        text = document.catalogue_path("triangle").read_text("utf-8")
+        text = entries.path("triangle").read_text("utf-8")
         text += f'\n[network]\nlab = "lab"\n{network}\n'
         self.there = {host: folder / "there" / host for host in ROBOTS}
         for host, robots in ROBOTS.items():

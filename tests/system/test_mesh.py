@@ -12,7 +12,9 @@ import zenoh
 
 from agents import session as network
 from agents import topology, wire
+from agents.endpoint import free_endpoint
 from agents.lab import Role
+from agents.settings import config, settings
 from experiments import access, mesh
 from experiments.run import load, reopen
 from tests.system.lab import Flight, Started, Watcher
@@ -100,8 +102,8 @@ def test_a_robot_that_is_cut_off_from_everybody_holds(tmp_path: Path) -> None:
 
 
 def test_an_endpoint_that_somebody_else_has_is_named(tmp_path: Path) -> None:
-    taken = network.free_endpoint(0)
-    with zenoh.open(network.config("router", listen=[taken], name="stranger")):
+    taken = free_endpoint(0)
+    with zenoh.open(config(settings("router", listen=[taken], name="stranger"))):
         flight = Flight(
             tmp_path / "run", "triangle", "--case", "periodic", "--no-report", "--set", "network.topology=mesh",
             "--set", f'network.addresses={{KH01 = "{taken}"}}',
@@ -116,7 +118,7 @@ def test_an_endpoint_that_somebody_else_has_is_named(tmp_path: Path) -> None:
 def test_a_silent_missing_link_is_named() -> None:
     robots = ("KH01", "KH02", "CF01")
     right = [topology.owned(endpoint, name) for endpoint, name in zip(free(3), robots, strict=True)]
-    wrong = [topology.owned(network.free_endpoint(0), "KH01"), *right[1:]]  # where KH02 seeks it
+    wrong = [topology.owned(free_endpoint(0), "KH01"), *right[1:]]  # where KH02 seeks it
     with ExitStack() as stack:
         for name in robots:
             connect = [part for each in (wrong if name == "KH02" else right) for part in ("--connect", each)]
@@ -136,7 +138,7 @@ def free(count: int) -> list[str]:
     """So many endpoints at which nobody listens."""
     found: set[str] = set()
     while len(found) < count:
-        found.add(network.free_endpoint(0))
+        found.add(free_endpoint(0))
     return sorted(found)
 
 

@@ -20,13 +20,6 @@ TRIANGLE = ("KH01", "KH02", "CF01")
 
 
 @pytest.fixture
-def watcher(router: RouterProcess) -> Iterator[Watcher]:
-    made = Watcher(router.endpoint)
-    yield made
-    made.close()
-
-
-@pytest.fixture
 def robots(router: RouterProcess, watcher: Watcher) -> Iterator[dict[str, RobotProcess]]:
     """The triangle, each robot in a process of its own, all ready."""
     with ExitStack() as stack:

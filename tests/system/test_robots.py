@@ -6,7 +6,6 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
@@ -21,13 +20,6 @@ from tests.system.lab import RobotProcess, Watcher
 pytestmark = pytest.mark.system
 
 TRIANGLE = ("KH01", "KH02", "CF01")
-
-
-@pytest.fixture
-def watcher(router: RouterProcess) -> Iterator[Watcher]:
-    made = Watcher(router.endpoint)
-    yield made
-    made.close()
 
 
 def fly(stack: ExitStack, router: RouterProcess, file: str, *names: str) -> RobotProcess:

@@ -16,6 +16,8 @@ import zenoh
 from agents import lab, wire
 from agents import session as network
 from agents.access import Rights
+from agents.endpoint import free_endpoint
+from agents.settings import config, settings
 from experiments.run import reopen
 from tests.system.lab import ENVIRONMENT, ROOT, Flight, Watcher
 from tests.system.secured import FLOWN, Laboratory
@@ -67,7 +69,7 @@ def test_a_killed_router_holds_nobody_up(tmp_path: Path) -> None:
 def laboratory(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
     """Robots in flight at one router of a lab, and the endpoint of another that is linked with it."""
     made = Laboratory(tmp_path, linked=True)
-    plain = network.free_endpoint(preferred_port=0, protocol="tls")
+    plain = free_endpoint(preferred_port=0, protocol="tls")
     (other,) = lab.secured([plain], made.folder)
     second = subprocess.Popen(
         [sys.executable, "-m", "agents.router", "--listen", other, "--connect", made.endpoint,
@@ -104,9 +106,9 @@ def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[L
     forged = wire.encode(wire.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
     stop = wire.encode(wire.Stop("mallory", "because"))
     for mode in ("client", "router"):  # the latter would be a link, were it a router's certificate
-        settings = network.config("client", connect=[other], name="intruder", identity="KH03")
-        settings.insert_json5("mode", f'"{mode}"')
-        with zenoh.open(settings) as intruder:
+        chosen = config(settings("client", connect=[other], name="intruder", identity="KH03"))
+        chosen.insert_json5("mode", f'"{mode}"')
+        with zenoh.open(chosen) as intruder:
             states = network.subscriber(intruder, keys.state("*"))
             for _ in range(20):
                 intruder.put(keys.pose("KH01"), forged, encoding=wire.JSON)
@@ -118,7 +120,7 @@ def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[L
             heard = {str(sample.key_expr) for sample in network.received(states.handler)}
             assert heard <= {"park/**"}, "its own words, and nobody else's"
     with pytest.raises(zenoh.ZError, match="Unable to connect"):
-        zenoh.open(network.config("client", connect=[other.partition("#")[0]], name="intruder"))
+        zenoh.open(config(settings("client", connect=[other.partition("#")[0]], name="intruder")))
     after = made.statuses()
     for name in FLOWN:
         assert after[name].phase == "running"

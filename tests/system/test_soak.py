@@ -4,29 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.system.lab import ENVIRONMENT, ROOT
+from tests.system.lab import zenpark
 
 pytestmark = pytest.mark.system
 
 
 def test_four_robots_for_a_quarter_of_a_minute(tmp_path: Path) -> None:
     asked = ("--minutes", "0.2", "--robots", "4", "--json", "--out", str(tmp_path / "soak"))
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.guard", "soak", *asked],
-        cwd=ROOT,
-        env=ENVIRONMENT,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    done = zenpark("soak", *asked, timeout_s=120.0)
     assert done.stdout, done.stderr
     said = json.loads(done.stdout)
     texts = [finding["text"] for finding in said["findings"]]

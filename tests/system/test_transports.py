@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from agents import session as network
+from agents.endpoint import free_endpoint
 from experiments.run import load, reopen
 from tests.system import machines
 from tests.system.lab import PATIENCE_S, Flight, until
@@ -29,7 +29,7 @@ def found(folder: Path, *hosts: str) -> Path:
 @pytest.mark.parametrize("protocol", ["unixsock-stream", "tls", "quic"])
 def test_an_experiment_over_each_transport(tmp_path: Path, protocol: str) -> None:
     secure = protocol in ("tls", "quic")
-    listen = network.free_endpoint(0, protocol) if secure else f"{protocol}/{tmp_path}/router.sock"
+    listen = free_endpoint(0, protocol) if secure else f"{protocol}/{tmp_path}/router.sock"
     lab = ("--lab", str(found(tmp_path / "lab"))) if secure else ()
     flight = Flight(tmp_path / "run", "triangle", *SHORT, *lab, "--set", f'network.listen=["{listen}"]')
     code, _ = flight.finish()

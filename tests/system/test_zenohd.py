@@ -13,7 +13,8 @@ import pytest
 import zenoh
 
 from agents import lab
-from agents import session as network
+from agents.endpoint import free_endpoint
+from agents.settings import config, settings
 from experiments import access
 from experiments.run import load, reopen
 from tests.system.lab import Flight, until
@@ -25,18 +26,18 @@ Router = Callable[[Path], AbstractContextManager[None]]
 
 
 @contextmanager
-def ours(config: Path) -> Iterator[None]:
+def ours(file: Path) -> Iterator[None]:
     """The library that the wheel brings, from the very file."""
-    with zenoh.open(zenoh.Config.from_file(str(config))):
+    with zenoh.open(zenoh.Config.from_file(str(file))):
         yield
 
 
 @contextmanager
-def theirs(config: Path) -> Iterator[None]:
+def theirs(file: Path) -> Iterator[None]:
     """A zenohd on PATH."""
-    process = subprocess.Popen(["zenohd", "--config", str(config)], stdin=subprocess.DEVNULL)
+    process = subprocess.Popen(["zenohd", "--config", str(file)], stdin=subprocess.DEVNULL)
     try:
-        endpoint = json.loads(config.read_text())["listen"]["endpoints"]
+        endpoint = json.loads(file.read_text())["listen"]["endpoints"]
         until(lambda: answers(endpoint, process), "zenohd answers", 10.0)
         yield
     finally:
@@ -60,7 +61,7 @@ WITH = [
 @pytest.mark.parametrize("start", WITH)
 @pytest.mark.parametrize("secure", [False, True])
 def test_an_experiment_at_a_router_of_somebody_else(tmp_path: Path, start: Router, secure: bool) -> None:
-    plain = network.free_endpoint(0, "tls" if secure else "tcp")
+    plain = free_endpoint(0, "tls" if secure else "tcp")
     rights, endpoint = None, plain
     options: tuple[str, ...] = ()
     if secure:
@@ -68,14 +69,14 @@ def test_an_experiment_at_a_router_of_somebody_else(tmp_path: Path, start: Route
         rights = access.rights(load("triangle").cases().values())
         (endpoint,) = lab.secured([plain], folder)
         options = ("--lab", str(folder))
-    config = tmp_path / "zenohd.json5"
-    config.write_text(json.dumps(router.of_zenohd([endpoint], rights=rights)))
-    with start(config):
+    file = tmp_path / "zenohd.json5"
+    file.write_text(json.dumps(router.of_zenohd([endpoint], rights=rights)))
+    with start(file):
         flight = Flight(tmp_path / "run", "triangle", *SHORT, *options, "--set", f'network.connect=["{plain}"]')
         code, _ = flight.finish()
         assert code == 0, flight.logs()
         if secure:
-            stranger = network.config("client", connect=[endpoint], name="stranger", identity="observer")
+            stranger = config(settings("client", connect=[endpoint], name="stranger", identity="observer"))
             with zenoh.open(stranger) as session:
                 assert not [r for r in session.get("park/KH01/order", payload=b"{}", timeout=0.5) if r.ok]
     assert reopen(flight.folder).metrics["periodic"].lost == 0

@@ -8,7 +8,7 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from agents.session import free_endpoint
+from agents.endpoint import free_endpoint
 from tools.cli import EXPLAINED, app
 
 ROOT = Path(__file__).resolve().parents[2]

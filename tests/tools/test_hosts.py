@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from experiments import document, hosts, playback, version
+from experiments import entries, hosts, playback, version
 from experiments.problem import DocumentError
 from tests.system.lab import ROOT, Flight
 from tools import hosts as tool
-from tools.hosts import HEADING, Row, choose, packed, table
+from tools.freight import packed
+from tools.hosts import HEADING, Row, choose, table
 
 FAKE = """\
 #!{python}
@@ -52,7 +53,7 @@ def home(tmp_path, monkeypatch):
 
 def experiment(folder, **hosts):
     file = folder / "x.toml"
-    text = document.catalogue_path("triangle").read_text("utf-8")
+    text = entries.path("triangle").read_text("utf-8")
     for name, fields in hosts.items():
         text += f"\n[hosts.{name}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in fields.items())
     file.write_text(text)
@@ -137,7 +138,7 @@ def test_hosts_are_chosen_by_name_or_tag():
 
 
 def test_a_package_holds_code_and_nothing_that_running_left():
-    with tarfile.open(fileobj=io.BytesIO(packed(ROOT, ["agents", "zenpark", "missing"]))) as tar:
+    with tarfile.open(fileobj=io.BytesIO(packed(ROOT, ["agents", "zenpark"]))) as tar:
         names = tar.getnames()
         assert tar.getmember("zenpark").mode & 0o100
     assert "agents/keys.py" in names

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 from agents import session as network
 from agents import wire
+from agents.endpoint import free_endpoint
 from agents.keys import Keys
 from agents.protocols import datastream
 from agents.protocols.datastream import Framer, Kind, Malformed, Segment
@@ -351,7 +352,7 @@ def test_the_process_ends_with_its_starter_but_not_before_the_robots(
 
 @pytest.mark.system
 def test_what_a_user_can_mend_is_said_without_a_traceback() -> None:
-    endpoint = network.free_endpoint(preferred_port=0)
+    endpoint = free_endpoint(preferred_port=0)
     for arguments, words in (
         (["--listen", "801"], "is not HOST:PORT"),
         (["--faults", '{"occluded": 1}'], "occluded"),

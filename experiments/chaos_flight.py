@@ -1,0 +1,407 @@
+"""A round of the fault laboratory: one run, in a process of its own that may be killed.
+
+Robots live in one world, so that the body of a robot whose process is dead, frozen or cut off stays in the room. They
+reach their routers through cables (`experiments.cables`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Sequence, Set
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from agents import session as network
+from agents import wire
+from agents.endpoint import free_endpoint
+from agents.keys import Keys
+from agents.rows import Array
+from experiments.cables import Cables
+from experiments.chaos_eyes import Eyes
+from experiments.chaos_outcome import Ended, Outcome, line, misrecorded
+from experiments.experiment import Experiment
+from experiments.fault_script import Fault, Round
+from experiments.injection import Injector, WallClock
+from experiments.launcher import Launcher
+from experiments.links import one_way_links
+from experiments.watched import Watched
+
+POLL_S: Final = 0.02
+BEGIN_S: Final = 100.0  # to the common start
+FORM_S: Final = 30.0  # a formation that has not come together by then does not
+HEAL_S: Final = 12.0  # after a fault is lifted the formation stands again
+SETTLED_S: Final = 0.5  # and stays so
+FRESH_S: Final = 1.6  # a robot that says nothing for longer is not back: statuses come once a second
+HELD_M: Final = 0.25  # a robot that nobody steers goes no farther than this
+NOTICE_S: Final = 1.0  # after which it must have stopped
+FEWEST: Final = 3  # running robots with which a round goes on
+LATEST_S: Final = 4.0  # before the end no fault is begun that could not heal
+LEAD_S: Final = 1.0  # the start is announced not longer before
+CABLES: Final = "cables.json"
+SAYS: Final = {"router": "router", "failover": "router", "disk": "recorder"}  # who ends, and is said to
+LANDED_S: Final = 40.0  # after the launcher's death or the end everything is gone
+LAST_BREATH_S: Final = 5.0  # from when a process cannot be found any more to when its exit code is known
+END_S: Final = 60.0  # and no round takes longer than this after its time
+
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all rounds have in common.
+
+    Attributes:
+        file: The experiment.
+        case: Its case.
+        experiment: The same, changes applied.
+        folder: Where each round gets a folder.
+        changes: As behind `--set`.
+        bodies: As behind `--bodies`.
+        seed: Of what the script leaves open: bits, segments, nonsense.
+    """
+
+    file: Path
+    case: str
+    experiment: Experiment
+    folder: Path
+    changes: Sequence[str]
+    bodies: str | None
+    seed: int
+
+
+@dataclass
+class _Running:
+    """A fault that was begun: to whom, when (monotonic [s]), when it was lifted, since when all is well again."""
+
+    fault: Fault
+    victim: str
+    begun: float
+    note: str
+    before: Array
+    lifted: float | None = None
+    well_since: float | None = None
+    held_at: Array | None = None
+    violations: list[str] = field(default_factory=list)
+
+
+class Flight:
+    """One round.
+
+    Attributes:
+        outcomes: Of the faults that were done.
+    """
+
+    def __init__(self, setting: Setting, script: Round, number: int, interrupted: Callable[[], bool], say: Say) -> None:
+        self._setting, self._script, self._number = setting, script, number
+        self._interrupted, self._say = interrupted, say
+        self.outcomes: list[Outcome] = []
+        self._left = list(script.faults)
+        self._wrong: list[str] = []
+        self._events: list[wire.Event] = []
+        self._dead: dict[str, float] = {}  # killed by us, and when
+        self._conductor_dead = self._disk_full = False
+        self._now: _Running | None = None
+        self._started: float | None = None
+        self._at = 0.0
+        self._well: float | None = None  # since when all is well, before a fault
+        self._formed_since: float | None = None
+        self._hears: dict[str, set[str]] = {name: set() for name in setting.experiment.robots}
+        for link in one_way_links(setting.experiment):
+            self._hears[link.listener].add(link.speaker)
+
+    def fly(self) -> Ended:
+        """Runs the round to its end; leaves no process behind."""
+        setting = self._setting
+        folder = setting.folder / f"round-{self._number:03}"
+        folder.mkdir()
+        random = np.random.default_rng([setting.seed, self._number])
+        experiment = setting.experiment
+        groups = {name: robot.process or name for name, robot in experiment.robots.items()}
+        routers = [free_endpoint(preferred_port=0) for _ in range(self._script.routers)]
+        recording = folder / f"{setting.case}.mcap"
+        with ExitStack() as stack:
+            clock = WallClock(folder)
+            stack.callback(clock.close)
+            cables = stack.enter_context(Cables(random))
+            laid = {group: {end: cables.lay(group, end) for end in routers} for group in dict.fromkeys(groups.values())}
+            (folder / CABLES).write_bytes(msgspec.json.encode(laid))
+            launcher = stack.enter_context(Launcher(folder / "logs"))
+            own = [*setting.changes, f"network.listen={json.dumps(routers)}"]
+            own.append(f"network.routers={len(routers)}")
+            watched = Watched(
+                launcher,
+                setting.file,
+                folder,
+                cases=[setting.case],
+                changes=own,
+                bodies=setting.bodies,
+                environment=clock.environment,
+                cables=folder / CABLES,
+            )
+            stack.callback(self._sweep, watched)
+            injector = Injector(watched, cables, clock, random, groups=groups, recording=recording)
+            nearest, missed = math.inf, 0.0
+            try:
+                with network.open_session(routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
+                    eyes = Eyes(session, experiment)
+                    self._follow(watched, injector, eyes, Keys(experiment.network.realm))
+                    nearest, missed = eyes.invariants.nearest, self._missed(eyes)
+            except network.Unreachable as error:
+                self._wrong.append(f"it never began: {error}; {watched.process.tail()}")
+            if self._now is not None:
+                self._unfinished(self._now)
+            injector.release()
+            gone_s = self._finish(watched)
+        if self._started is not None:
+            self._wrong += misrecorded(recording, self.outcomes, disk_full=self._disk_full)
+        for each in self._wrong:
+            self._say(f"round {self._number}: {each}")
+        kept = folder.name if recording.exists() else ""
+        return Ended(self._number, self._left, self._wrong, round(nearest, 4), round(gone_s, 1), missed, kept)
+
+    # ------------------------------------------------------------------ the run
+
+    def _follow(self, watched: Watched, injector: Injector, eyes: Eyes, keys: Keys) -> None:
+        """Until the script is through, or the run ends."""
+        duration = self._setting.experiment.duration_s
+        began = time.monotonic()
+        while watched.process.alive and not self._conductor_dead:
+            time.sleep(POLL_S)
+            eyes.look()
+            now = time.monotonic()
+            for event in watched.news():
+                self._events.append(event)
+                if event.kind == "start":
+                    self._started = now + max(0.0, min(LEAD_S, event.stamp - time.time()))
+            if self._started is None:
+                eyes.judge()  # robots are placed
+                if now > began + BEGIN_S:
+                    self._wrong.append(f"no common start within {BEGIN_S:g} s")
+                    return
+                continue
+            t = now - self._started
+            self._judge(eyes, now)
+            if self._now is not None:
+                self._heal(self._now, injector, eyes, t, now)
+            elif self._through(t, duration) or not self._next(injector, eyes, keys, t, now):
+                return
+            if t > duration + END_S:
+                self._wrong.append(f"it does not end {END_S:g} s after its time")
+                return
+
+    def _through(self, t: float, duration: float) -> bool:
+        """Whether nothing more can be done in this round."""
+        return not self._left or self._interrupted() or t > duration - self._left[0].lasts_s - LATEST_S
+
+    def _judge(self, eyes: Eyes, now: float) -> None:
+        """Gives what is wrong to the fault that is under way, or to the round."""
+        wrong = eyes.judge()
+        for name, since in self._dead.items():
+            told = eyes.told.get(name)
+            if told is not None and told[1] > since + NOTICE_S and now < told[1] + POLL_S * 5:
+                wrong.append(f"{name} is dead and still commands its body")
+        target = self._wrong if self._now is None else self._now.violations
+        target += [each for each in wrong if each not in target]
+
+    def _next(self, injector: Injector, eyes: Eyes, keys: Keys, t: float, now: float) -> bool:
+        """Does the next fault when its time has come; False if there is nothing more to be done in this round."""
+        if self._well is None:
+            live = eyes.running()
+            formed = bool(live) and not self._apart(eyes, live, now - FRESH_S, t)
+            self._formed_since = (self._formed_since or now) if formed else None
+            if self._formed_since is not None and now - self._formed_since >= SETTLED_S:
+                self._well = now
+            elif t > FORM_S:
+                self._wrong.append(f"not in formation {FORM_S:g} s after the start: no fault was done")
+                return False
+            return True
+        return now < self._well + self._left[0].after_s or self._begin(injector, eyes, keys, t, now)
+
+    def _begin(self, injector: Injector, eyes: Eyes, keys: Keys, t: float, now: float) -> bool:
+        """Does the next fault; False if there are too few robots left for it."""
+        running = eyes.running() - self._dead.keys()
+        if len(running) < FEWEST:
+            return False
+        fault = self._left.pop(0)
+        victim = fault.victim
+        if victim:
+            order = [*eyes.invariants.names, *eyes.invariants.names]
+            victim = next(name for name in order[order.index(victim) :] if name in running)
+        before = eyes.invariants.position.copy()
+        note = injector.begin(fault, victim, eyes.session, keys)
+        if fault.kind == "kill":
+            self._dead[victim] = now
+        self._disk_full |= fault.kind == "disk"
+        self._conductor_dead = fault.kind == "conductor"
+        self._now = _Running(fault, victim, now, note, before)
+        self._at = t
+        if fault.kind == "conductor":
+            self._watch_landing(eyes, self._now)
+        return True
+
+    def _heal(self, running: _Running, injector: Injector, eyes: Eyes, t: float, now: float) -> None:
+        """Lifts the fault when its time is over, and waits until all is well."""
+        fault = running.fault
+        if fault.kind in ("freeze", "partition") and running.lifted is None:
+            self._hold(running, eyes, now)
+        if running.lifted is None and now >= running.begun + fault.lasts_s:
+            injector.end(fault)
+            running.lifted = time.monotonic()
+        if running.lifted is None:
+            return
+        why = self._unwell(running, eyes, t, now)
+        running.well_since = None if why else (running.well_since or now)
+        settled = running.well_since is not None and now - running.well_since >= SETTLED_S
+        if not settled and now < running.lifted + HEAL_S:
+            return
+        if not settled:
+            running.violations.append(f"not well {HEAL_S:g} s later: {why}")
+        self._close(running, running.well_since, eyes)
+
+    def _close(self, running: _Running, well: float | None, eyes: Eyes) -> None:
+        now = time.monotonic()
+        well = now if well is None else well
+        status = eyes.status.get(running.victim)
+        ended = running.fault.kind != "kill" and status is not None and status.phase in ("landing", "done")
+        outcome = Outcome(
+            self._number,
+            running.fault,
+            running.victim,
+            round(self._at, 2),
+            running.note + (f"; {status.reason}" if ended and status is not None else ""),
+            not any(text.startswith("not well") for text in running.violations),
+            round(well - running.begun, 3),
+            round(max(0.0, well - (running.lifted or running.begun)), 3),
+            ended,
+            list(running.violations),
+        )
+        self.outcomes.append(outcome)
+        self._now, self._well = None, now
+        self._say(line(outcome))
+
+    def _unfinished(self, running: _Running) -> None:
+        """The run has ended before it could be seen whether all was well again: the fault is done once more."""
+        if running.violations:
+            self._wrong += [f"{running.fault.kind} {running.victim}: {text}" for text in running.violations]
+        self._left.insert(0, running.fault)
+        self._now = None
+
+    def _hold(self, running: _Running, eyes: Eyes, now: float) -> None:
+        """Nobody steers the victim: its body stops soon."""
+        if now < running.begun + NOTICE_S or not eyes.connected:
+            return
+        if running.held_at is None:
+            running.held_at = eyes.invariants.where(running.victim)
+        moved = eyes.moved(running.victim, running.held_at)
+        text = f"{running.victim} moved although nobody steered it"
+        if moved > HELD_M and text not in running.violations:
+            running.violations.append(text)
+
+    def _unwell(self, running: _Running, eyes: Eyes, t: float, now: float) -> str:
+        """Why the run is not yet as it was; empty if it is."""
+        live = eyes.running() - self._dead.keys()
+        return self._unsettled(running, eyes, live, now) or self._apart(
+            eyes, live, max(running.lifted or now, now - FRESH_S), t
+        )
+
+    def _unsettled(self, running: _Running, eyes: Eyes, live: Set[str], now: float) -> str:
+        """What of the effect of a fault has still to come, or to pass."""
+        kind, victim = running.fault.kind, running.victim
+        if kind == "kill":
+            blind = [name for name in live if victim in self._hears[name] and victim not in eyes.status[name].missing]
+            if victim in eyes.alive:
+                return f"{victim} is killed, and its token still stands"
+            return f"{', '.join(blind)}: not noticed that {victim} is gone" if blind else ""
+        if victim:
+            return self._absent(victim, eyes, live, running.lifted or now)
+        if kind in SAYS and not any(e.kind.startswith(SAYS[kind]) and "ended" in e.text for e in self._events):
+            return f"nobody has said that the {SAYS[kind]} ended"
+        return ""
+
+    @staticmethod
+    def _absent(victim: str, eyes: Eyes, live: Set[str], lifted: float) -> str:
+        """Why a victim that lives is not back, and not down either."""
+        status = eyes.status.get(victim)
+        if eyes.heard.get(victim, 0.0) < lifted:
+            return f"{victim} says nothing yet"
+        if status is not None and status.phase in ("landing", "done"):
+            return f"{victim} has not come down yet" if eyes.invariants.up(victim) else ""
+        return "" if victim in live else f"{victim} is not back"
+
+    def _apart(self, eyes: Eyes, live: Set[str], since: float, t: float) -> str:
+        """Why those who live are not in formation: silent since then, missing each other, or elsewhere."""
+        if not live and not self._dead:
+            return "nobody is running"
+        for name in live:
+            if eyes.heard.get(name, 0.0) < since:
+                return f"{name} says nothing yet"
+            absent = [other for other in eyes.status[name].missing if other in live]
+            if absent:
+                return f"{name} misses {', '.join(absent)}"
+        error = eyes.invariants.deformed(live, t)
+        return f"a link is {error:.3f} off" if error > self._setting.experiment.tolerance else ""
+
+    def _watch_landing(self, eyes: Eyes, running: _Running) -> None:
+        """The conductor is dead: robots land by themselves, and everything ends."""
+        running.lifted = running.begun
+        deadline = running.begun + LANDED_S
+        names = set(self._setting.experiment.robots) - self._dead.keys()
+        while time.monotonic() < deadline:
+            time.sleep(POLL_S)
+            eyes.look()
+            running.violations += [each for each in eyes.judge() if each not in running.violations]
+            down = [eyes.status[name].phase == "done" for name in names if name in eyes.status]
+            if all(down) and not any(map(eyes.invariants.up, eyes.invariants.names)):
+                break
+        else:
+            up = [name for name in eyes.invariants.names if eyes.invariants.up(name)]
+            awake = [name for name in names if name in eyes.status and eyes.status[name].phase != "done"]
+            running.violations.append(f"not well {LANDED_S:g} s later: in the air {up}, not done {awake}")
+        self._close(running, time.monotonic(), eyes)
+
+    # ------------------------------------------------------------------ the end
+
+    def _finish(self, watched: Watched) -> float:
+        """Ends the run if it has not ended; how long until all its processes were gone [s]."""
+        began = time.monotonic()
+        if watched.process.alive:
+            watched.close()
+        deadline = began + LANDED_S
+        while (left := watched.processes()) and time.monotonic() < deadline:
+            time.sleep(POLL_S * 5)
+        gone = time.monotonic() - began
+        self._events += watched.news()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            watched.process.handle.wait(LAST_BREATH_S)
+        if left:
+            self._wrong.append(f"left behind after {LANDED_S:g} s: {', '.join(sorted(left.values()))}")
+        code = watched.process.handle.poll()
+        if not self._conductor_dead and code != 0:
+            self._wrong.append(f"the run ended with exit code {code}: {' '.join(watched.said)}")
+        return gone
+
+    def _missed(self, eyes: Eyes) -> float:
+        """Share of the ticks that robots missed which nobody stopped."""
+        stopped = {each.victim for each in self.outcomes} | self._dead.keys()
+        statuses = [status for name, status in eyes.status.items() if name not in stopped and status.ticks]
+        ticks, missed = (sum(getattr(status, what) for status in statuses) for what in ("ticks", "missed"))
+        return round(missed / (ticks + missed), 4) if ticks else 0.0
+
+    @staticmethod
+    def _sweep(watched: Watched) -> None:
+        """Whatever happened: nothing of the run survives the round."""
+        for pid in watched.processes():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)

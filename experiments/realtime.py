@@ -1,0 +1,149 @@
+"""Runs an experiment in real time: a router, a process per robot, a recorder. See also `experiments.virtual`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from agents.access import rules
+from agents.endpoint import free_endpoints
+from agents.lab import LabError, register, require, secured
+from agents.lab import of as lab_of
+from agents.topology import from_here
+from experiments import access, document, mesh, reach
+from experiments.conductor import Conductor, Result
+from experiments.document import Document
+from experiments.experiment import Experiment
+from experiments.hosts import Hosts
+from experiments.launcher import Launcher
+from experiments.problem import DocumentError, Problem
+from experiments.progress import Shown
+from experiments.run import SOURCE, chosen
+from experiments.servants import divided
+from experiments.standins import choose_bodies
+
+
+@dataclass(frozen=True)
+class Staging:
+    """How an experiment is put on, as far as its file leaves that open.
+
+    Attributes:
+        cases: Which of its cases; all if none is named.
+        bodies: What every robot is put into instead of the body that the file gives it: "twin", "world", or
+            "protocol" for its real bridge and a protocol twin.
+        here: Whether all robots run on this machine, whatever the file says of hosts.
+        lab: Folder of certificates, instead of the file's.
+        identity: Whose certificate the conductor shows, in a lab: an operator's.
+    """
+
+    cases: Sequence[str] = ()
+    bodies: str | None = None
+    here: bool = False
+    lab: str | None = None
+    identity: str = "operator"
+
+
+def conduct(
+    read: Document,
+    folder: Path,
+    staging: Staging,
+    *,
+    show: Shown,
+    interrupted: Callable[[], bool],
+    launching: Callable[[Path], Launcher] = Launcher,
+) -> tuple[dict[str, Path], list[str]]:
+    """Runs an experiment in real time: a router, a process per robot, a recorder.
+
+    Args:
+        read: The experiment.
+        folder: Where recordings and logs go; it exists.
+        staging: What the file leaves open.
+        show: Shows the progress.
+        interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
+        launching: Makes the launcher of the processes, given the folder of their logs.
+
+    Returns:
+        The recordings of the cases that have begun, and what the reader should know.
+
+    Raises:
+        LabError: If a certificate is missing.
+        RunFailed: If robots are not ready in time, unless the file says to go on without them.
+        Unreachable: If the routers of the file do not answer.
+        HostError: If a host cannot be reached, or has another zenpark.
+        DocumentError: If robots that run on hosts are to be put behind protocol twins.
+    """
+    if staging.bodies == "protocol" and read.experiment.hosts and not staging.here:
+        hint = "add --here, which lets all robots run on this machine"
+        raise DocumentError([Problem("--bodies protocol", 0, 0, "protocol twins cannot be seen from hosts", hint)])
+    results: dict[str, Result] = {}
+    read.keep(folder / SOURCE)
+    embodied = {name: choose_bodies(case, staging.bodies) for name, case in chosen(read, staging.cases).items()}
+    if staging.here:
+        embodied = {name: msgspec.structs.replace(case, hosts={}) for name, case in embodied.items()}
+    network = read.experiment.network
+    meshed = network.topology == "mesh"
+    own_router = network.connect is None and not meshed
+    of_lab = reach.folder(read.experiment, read.path, staging.lab)
+    secure = of_lab is not None
+    own = network.listen or free_endpoints(network.routers, protocol="tls" if secure else "tcp")
+    listening = reach.routers(read.experiment, read.path, own if own_router else [], staging.lab)
+    endpoints = list(map(from_here, listening)) if own_router else listening
+    if meshed:
+        endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)
+    rights = enforced(embodied.values(), endpoints, folder, staging.identity)
+    (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
+    with launching(folder / "logs") as launcher:
+        for router in divided(listening, network.routers) if own_router else ():
+            router.start(launcher, rights)
+        hosts = Hosts(launcher, endpoints if meshed else listening)
+        with show:
+            for name, experiment in embodied.items():
+                if interrupted():
+                    break
+                file = folder / f"{name}.json"
+                file.write_bytes(document.write_json(experiment))
+                results[name] = Conductor(
+                    experiment,
+                    name,
+                    file=file,
+                    source=folder / SOURCE,
+                    folder=folder,
+                    endpoints=endpoints,
+                    rights=rights,
+                    identity=staging.identity,
+                    launcher=launcher,
+                    hosts=hosts,
+                    show=show,
+                    interrupted=interrupted,
+                ).run()
+        left = hosts.sweep()
+    notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
+    return {case: result.recording for case, result in results.items() if result.start is not None}, notes
+
+
+def enforced(
+    cases: Collection[Experiment], endpoints: Sequence[str], folder: Path, operator: str = "operator"
+) -> Path | None:
+    """Who may do what, as a file for the router; None without a lab.
+
+    Robots on hosts have their certificates there, and need none here.
+
+    Raises:
+        LabError: If a certificate is missing, or somebody else's.
+    """
+    of = lab_of(endpoints)
+    if of is None:
+        return None
+    known = register(of)
+    require(of, list(dict.fromkeys(name for case in cases for name in access.needed(case, operator))))
+    role = known.identities[operator].role
+    if role != "operator":
+        raise LabError(f"{operator} is {role} in the lab, and gives no orders: choose an operator with --as")
+    made = access.rights(cases)
+    rules(made, known)  # what is wrong with it is said now, and not by a router that does not start
+    file = folder / "rights.json"
+    file.write_bytes(msgspec.json.format(msgspec.json.encode(made), indent=1))
+    return file
