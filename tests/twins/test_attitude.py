@@ -108,6 +108,38 @@ def test_a_small_step_is_that_of_the_linear_cascade():
     assert rise_and_overshoot(path, 0.1)[1] == pytest.approx(rise_and_overshoot(theory, 0.1)[1], abs=0.015)
 
 
+STEPS = ((0, 0.3), (0, 1.0), (2, 0.3), (2, 1.0), (3, 1.0))
+
+
+@pytest.fixture(scope="module")
+def flown_steps():
+    """(T,) along the axis of each step, from where it began: of the rigid body, the law, and the law that leans."""
+    rows = np.arange(len(STEPS))
+    before = np.column_stack([np.zeros(len(rows)), 4.0 * rows, np.ones(len(rows)), np.zeros(len(rows))])  # far apart
+    engine = RigidBody().build(stage((CRAZYFLIE,) * len(rows)))
+    engine.place(rows, before[:, :3], before[:, 3], np.ones(len(rows), dtype=bool))
+    fly(engine, before, 0.5)
+    laws = [
+        Quadrotor((CRAZYFLIE,) * len(rows), engine.position, np.zeros(len(rows)), DT, leaning=leans)
+        for leans in (False, True)
+    ]
+    setpoint = before.copy()
+    for row, (axis, step) in enumerate(STEPS):
+        setpoint[row, axis] += step
+    paths = [fly(engine, setpoint, 6.0)]
+    for model in laws:
+        model.flying[:] = True
+        path = []
+        for _ in range(600):
+            model.command(setpoint)
+            model.advance()
+            path.append(np.column_stack([model.position, model.yaw]))
+        paths.append(np.array(path))
+    return {
+        wanted: [path[:, row, wanted[0]] - before[row, wanted[0]] for path in paths] for row, wanted in enumerate(STEPS)
+    }
+
+
 @pytest.mark.parametrize(
     ("axis", "step", "rise", "overshoot", "law"),
     [
@@ -118,23 +150,10 @@ def test_a_small_step_is_that_of_the_linear_cascade():
         (3, 1.0, 0.283, 0.035, 0.721),
     ],
 )
-def test_steps_beside_the_fitted_law(axis, step, rise, overshoot, law):
+def test_steps_beside_the_fitted_law(flown_steps, axis, step, rise, overshoot, law):
     """As in docs/mujoco.md; the law of second order has no attitude loop and is slower, the one that leans is not."""
-    engine = hovering()
-    laws = [Quadrotor((CRAZYFLIE,), engine.position, np.zeros(1), DT, leaning=leans) for leans in (False, True)]
-    setpoint = [0.0, 0.0, 1.0, 0.0]
-    before = np.array(setpoint)
-    setpoint[axis] += step
-    path = fly(engine, [setpoint], 6.0)[:, 0, axis] - before[axis]
-    found = []
-    for model in laws:
-        model.flying[:] = True
-        other = []
-        for _ in range(600):
-            model.command(np.array([setpoint]))
-            model.advance()
-            other.append([*model.position[0], model.yaw[0]])
-        found.append(rise_and_overshoot(np.array(other)[:, axis] - before[axis], step))
+    path, *others = flown_steps[axis, step]
+    found = [rise_and_overshoot(other, step) for other in others]
     mine, (its, leaning) = rise_and_overshoot(path, step), found
     assert leaning[0] == pytest.approx(mine[0], rel=0.10)  # the law that leans follows
     assert abs(mine[1] - leaning[1]) < 0.04
