@@ -12,8 +12,8 @@ from agents.hazards import RULES, Cause, Hazards, Outcome, Sighting, rules
 from agents.lifecycle import AIRBORNE, DONE, LANDING, READY, RUNNING
 from agents.safety import Limits
 from experiments.experiment import Formation, Robot, Safety
+from tests.agents.few import drone, pair, triangle
 from tests.agents.swarm import Swarm
-from tests.agents.test_agent import drone, pair, triangle
 
 LIMITS = Limits(np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5]))
 DT = 0.01

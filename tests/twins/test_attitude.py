@@ -141,18 +141,19 @@ def flown_steps():
 
 
 @pytest.mark.parametrize(
-    ("axis", "step", "rise", "overshoot", "law"),
+    ("wanted", "rise", "overshoot", "law"),
     [
-        (0, 0.3, 0.487, 0.112, 0.761),
-        (0, 1.0, 0.730, 0.029, 0.995),
-        (2, 0.3, 0.572, 0.087, 0.611),
-        (2, 1.0, 0.735, 0.121, 0.935),
-        (3, 1.0, 0.283, 0.035, 0.721),
+        (STEPS[0], 0.487, 0.112, 0.761),
+        (STEPS[1], 0.730, 0.029, 0.995),
+        (STEPS[2], 0.572, 0.087, 0.611),
+        (STEPS[3], 0.735, 0.121, 0.935),
+        (STEPS[4], 0.283, 0.035, 0.721),
     ],
 )
-def test_steps_beside_the_fitted_law(flown_steps, axis, step, rise, overshoot, law):
+def test_steps_beside_the_fitted_law(flown_steps, wanted, rise, overshoot, law):
     """As in docs/mujoco.md; the law of second order has no attitude loop and is slower, the one that leans is not."""
-    path, *others = flown_steps[axis, step]
+    _, step = wanted
+    path, *others = flown_steps[wanted]
     found = [rise_and_overshoot(other, step) for other in others]
     mine, (its, leaning) = rise_and_overshoot(path, step), found
     assert leaning[0] == pytest.approx(mine[0], rel=0.10)  # the law that leans follows

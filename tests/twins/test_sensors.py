@@ -66,7 +66,7 @@ def swept(request, world, times=(0.0,)):
     return np.array(seen), ranges
 
 
-def facing(kind, sensor, gap, noise=0.0, times=(0.0,), robots=1):
+def facing(kind, sensor, gap, noise=0.0, times=(0.0,), *, robots=1):
     """Readings (len(times) * robots,) of the rays ahead, of robots, each in a room of its own, whose sensor is `gap`
     from a wall."""
     ahead = (SENSORS[sensor].bearing == 0.0) & (SENSORS[sensor].elevation == 0.0)
