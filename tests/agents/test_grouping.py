@@ -16,9 +16,6 @@ def park():
     return document.read("robotic-park").cases()["event"]
 
 
-# ---------------------------------------------------------------- a robot is a swarm of one
-
-
 def eventful(experiment, groups):
     """A short run with everything that may happen; the same whoever shares a process with whom."""
     swarm = Swarm(experiment, groups).running()

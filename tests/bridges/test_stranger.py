@@ -18,8 +18,6 @@ from tests.bridges.test_external import ALONE, KEYS, PLACES
 from tests.conftest import ROOT, RouterProcess
 from tests.system.lab import Flight, RobotProcess, Watcher, until
 
-# ---------------------------------------------------------------------- a stranger's simulator
-
 
 class Simulator:
     """tests/bridges/simulator.py, which knows nothing of zenpark."""
