@@ -24,11 +24,11 @@ def written(tmp_path, what, size, wanted=None, jumps=(1, 2)):
         ("polygon", "9", "crazyflie"),
         ("grid", "3x4", "turtlebot3"),
         ("hemisphere", "4", "crazyflie"),
-        ("hemisphere", "40", "crazyflie"),
+        pytest.param("hemisphere", "40", "crazyflie", marks=pytest.mark.slow),
         ("hemisphere", "12", "tello"),
         ("henneberg", "2", "crazyflie"),
-        ("henneberg", "15", "khepera4"),
-        ("circulant", "24", "crazyflie"),
+        pytest.param("henneberg", "15", "khepera4", marks=pytest.mark.slow),
+        pytest.param("circulant", "24", "crazyflie", marks=pytest.mark.slow),
     ],
 )
 def test_files_pass_the_check_without_a_word(tmp_path, what, size, kind):
@@ -94,6 +94,7 @@ def test_by_offsets_they_come_from_anywhere(tmp_path):
     assert law.error(end, end[net.speaker], net).max() < 0.07  # three times the threshold at which robots speak
 
 
+@pytest.mark.slow
 def test_large_formations_say_less_of_themselves(tmp_path):
     assert written(tmp_path, "circulant", "100").experiment.rates.state_hz == 50.0
     large = written(tmp_path, "circulant", "1000").experiment

@@ -151,6 +151,7 @@ def read_or_refuse(path):
         return None
 
 
+@pytest.mark.slow
 def test_a_file_cut_anywhere(path, tmp_path, recorded):
     found = []
     for size in range(0, len(recorded), 61):

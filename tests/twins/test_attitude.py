@@ -165,6 +165,7 @@ def test_steps_beside_the_fitted_law(flown_steps, wanted, rise, overshoot, law):
     assert path[-1] == pytest.approx(step, abs=0.06 * step)  # the vertical integrals need some ten seconds
 
 
+@pytest.mark.slow
 def test_the_lag_of_the_motors_hardly_shows_in_the_position():
     quick, slow = (fly(hovering(lag=lag), [[0.5, 0.2, 1.0, 0.5]], 4.0)[:, 0, :2] for lag in (0.02, 0.06))
     assert np.abs(quick - slow).max() < 0.01
@@ -290,7 +291,10 @@ def test_rows_and_copies_are_what_they_are_alone_to_the_last_bit():
     assert (np.abs(together[-1, :, :3] - np.array(start)).max(axis=1) > 0.05).all()
 
 
-@pytest.mark.parametrize("dt", [0.01, 0.02, 0.004, 1.0 / 64.0, 1.0 / 30.0])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("dt", [0.02, *(pytest.param(dt, marks=SLOW) for dt in (0.01, 0.004, 1.0 / 64.0, 1.0 / 30.0))])
 def test_any_step_divides_into_the_rate_of_the_firmware(dt):
     path = fly(hovering(dt=dt), [[0.3, 0.0, 1.0, 0.0]], 4.0, dt)[:, 0, 0]
     rise, overshoot = rise_and_overshoot(path, 0.3, dt)
@@ -298,6 +302,7 @@ def test_any_step_divides_into_the_rate_of_the_firmware(dt):
     assert overshoot == pytest.approx(0.112, abs=0.015)
 
 
+@pytest.mark.slow
 def test_what_stands_fast_is_in_the_way():
     obstacles = {
         "table": Obstacle(box=(0.4, 0.4), at=(0.0, 0.0), height=0.5),
