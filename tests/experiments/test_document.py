@@ -176,20 +176,28 @@ def test_contradictions_come_all_at_once(write):
 
 
 def slips(text):
-    """Every line `key = value` of a file, with its key misspelt: the number of the line, and the text that results."""
-    lines = text.split("\n")
+    """Every line `key = value` of a file, with its key misspelt: table and key, the number of the line, the text that
+    results."""
+    lines, table = text.split("\n"), ""
     for number, line in enumerate(lines, 1):
-        if re.match("[a-z_]+ =", line):
-            yield number, "\n".join([*lines[: number - 1], f"x{line}", *lines[number:]])
+        if line.startswith("["):
+            table = re.sub(r"\b[A-Z]{2}\d+\b", "a robot", line.partition("#")[0].strip())
+        elif known := re.match("([a-z_]+) =", line):
+            yield (table, known[1]), number, "\n".join([*lines[: number - 1], f"x{line}", *lines[number:]])
 
 
-@pytest.mark.parametrize("name", catalogue.names())
 @pytest.mark.slow
-def test_every_misspelt_key_is_found_in_its_line(name, write):
-    found = list(slips(document.catalogue_path(name).read_text("utf-8")))
-    assert len(found) > 10
-    for number, text in found:
-        assert (number, 1) in [(problem.line, problem.column) for problem in refused(write(text)).problems]
+def test_every_misspelt_key_is_found_in_its_line(write):
+    tried = set()
+    for name in catalogue.names():
+        found = list(slips(document.catalogue_path(name).read_text("utf-8")))
+        assert len(found) > 10
+        for place, number, text in found:
+            if place not in tried:  # the same key of the same table in another file is read by the same rules
+                tried.add(place)
+                lines = [(problem.line, problem.column) for problem in refused(write(text)).problems]
+                assert (number, 1) in lines, (name, place)
+    assert len(tried) > 30
 
 
 # Files that are not what they should be
