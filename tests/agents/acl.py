@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import zenoh
 
 
-def permitted(control: dict[str, Any], common_name: str, flow: str, message: str, key: str) -> bool:
-    """Whether a message passes: a rule of one of the sender's policies includes its key."""
+@cache
+def includes(each: str, key: str) -> bool:
+    """Whether a key expression has all keys of another; asked for the same ones thousands of times."""
+    return zenoh.KeyExpr(each).includes(key)
+
+
+def held(control: dict[str, Any], common_name: str) -> list[dict[str, Any]]:
+    """The rules of all policies of somebody."""
     assert control["enabled"]
     assert control["default_permission"] == "deny"
     assert all(rule["permission"] == "allow" for rule in control["rules"])
     mine = {each["id"] for each in control["subjects"] if common_name in each["cert_common_names"]}
-    held = {rule for policy in control["policies"] if mine & set(policy["subjects"]) for rule in policy["rules"]}
+    names = {rule for policy in control["policies"] if mine & set(policy["subjects"]) for rule in policy["rules"]}
+    return [rule for rule in control["rules"] if rule["id"] in names]
+
+
+def permitted(rules: list[dict[str, Any]], flow: str, message: str, key: str) -> bool:
+    """Whether a message passes: one of the sender's rules includes its key."""
     return any(
-        rule["id"] in held
-        and flow in rule["flows"]
-        and message in rule["messages"]
-        and any(zenoh.KeyExpr(each).includes(key) for each in rule["key_exprs"])
-        for rule in control["rules"]
+        flow in rule["flows"] and message in rule["messages"] and any(includes(each, key) for each in rule["key_exprs"])
+        for rule in rules
     )
 
 
@@ -54,7 +63,8 @@ def may(control: dict[str, Any], common_name: str, action: str, key: str) -> boo
             ("egress", "liveliness_token", key),
         ],
     }
-    return all(permitted(control, common_name, *message) for message in takes[action])
+    rules = held(control, common_name)
+    return all(permitted(rules, *message) for message in takes[action])
 
 
 ACTIONS = ("put", "delete", "keep", "hear", "last", "ask", "answer", "be", "watch")

@@ -59,7 +59,10 @@ def test_losses_by_chance(loss):
     assert after == pytest.approx(loss, abs=0.03)
 
 
-@pytest.mark.parametrize(("loss", "burst"), [(0.1, 5.0), (0.3, 2.0), (0.3, 20.0), (0.02, 100.0)])
+LONG = [pytest.param(*each, marks=pytest.mark.slow) for each in ((0.3, 20.0), (0.02, 100.0))]
+
+
+@pytest.mark.parametrize(("loss", "burst"), [(0.1, 5.0), (0.3, 2.0), *LONG])
 def test_losses_in_bursts(loss, burst):
     gone = np.concatenate([lost(conditions(8, loss=loss, burst=burst), link) for link in range(8)])
     length = runs(gone)
@@ -281,6 +284,7 @@ def test_after_the_end_nothing_is_lost():
 # ---------------------------------------------------------------------- the two places
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.lists(st.floats(0.0, 0.04), min_size=200, max_size=200))
 def test_the_listener_of_a_real_network_loses_what_the_virtual_one_does(seed, took):

@@ -1,5 +1,5 @@
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.endpoint import Endpoint
@@ -7,6 +7,7 @@ from agents.endpoint import Endpoint
 HOSTS = st.one_of(st.ip_addresses().map(str), st.from_regex(r"[a-z][a-z0-9-]{0,20}(\.[a-z]{2,5})?", fullmatch=True))
 
 
+@settings(max_examples=40)
 @given(
     st.sampled_from(["tcp", "tls", "quic"]), HOSTS, st.integers(1, 65535), st.sampled_from(["", "#iface=eth0", "?a=1"])
 )

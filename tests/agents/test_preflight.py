@@ -7,8 +7,8 @@ import pytest
 
 from agents.lifecycle import IDLE, READY, RUNNING
 from experiments.experiment import Robot, Safety
+from tests.agents.few import drone, pair
 from tests.agents.swarm import Swarm
-from tests.agents.test_agent import drone, pair
 from tests.agents.test_hazards import leant, spoiled
 
 FAILURES = {

@@ -129,6 +129,7 @@ VALUES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "field", ["trigger", "robots", "cases", "timeline", "formation", "disturbance", "rates", "arena", "start"]
 )

@@ -9,8 +9,8 @@ from experiments.check import check
 from experiments.experiment import Formation, Robot, Safety
 from experiments.logbook import Logbook
 from experiments.virtual import simulate
+from tests.agents.few import pair
 from tests.agents.swarm import changed
-from tests.agents.test_agent import pair
 
 
 def events(log, experiment, copy=0):

@@ -13,7 +13,7 @@ from agents import wire
 from agents.keys import Keys
 from experiments.recorder import Recorder
 from tests.conftest import RouterProcess
-from tests.experiments.test_recording import touched, world
+from tests.experiments.recordings import touched, world
 
 KEYS = Keys()
 

@@ -126,6 +126,7 @@ def test_space_shows_every_obstacle(short):
     assert axes.get_ylim()[1] > 3.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [space.formation_before, space.formation_after, space.plan_view])
 def test_pictures_of_full_arenas_are_drawn(draw, short):
     figure = draw([within(short, FULL), within(short, EMPTY)])

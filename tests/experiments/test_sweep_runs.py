@@ -17,6 +17,7 @@ def park():
     return msgspec.structs.replace(load("robotic-park").cases()["event"], duration_s=6.0, timeline=[])
 
 
+@pytest.mark.slow
 def test_a_lean_log_gives_the_figures_of_the_report_to_the_bit(park):
     seeds = [3, 8]
     lean, whole = simulate(park, seeds, lean=True), simulate(park, seeds)

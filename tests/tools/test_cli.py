@@ -126,10 +126,15 @@ def test_no_router_is_explained(command):
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
-        (["echo", "park//pose"], "'park//pose' is not a key expression"),
-        (["keys", "--connect", "localhost"], "'localhost' is not an endpoint"),
         (["router", "--listen", "tcp/0.0.0.0:7447"], "will not listen on tcp/0.0.0.0:7447"),
-        (["world-order", "reste"], "no order 'reste' to a world; did you mean 'reset'?"),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in (
+                (["echo", "park//pose"], "'park//pose' is not a key expression"),
+                (["keys", "--connect", "localhost"], "'localhost' is not an endpoint"),
+                (["world-order", "reste"], "no order 'reste' to a world; did you mean 'reset'?"),
+            )
+        ),
     ],
 )
 def test_bad_input_is_explained(arguments, why):
@@ -144,6 +149,7 @@ def test_explained_errors_exist(module, name):
     assert issubclass(getattr(importlib.import_module(module), name), Exception)
 
 
+@pytest.mark.slow
 def test_a_configuration_for_zenohd_is_printed():
     done = zenpark("router", "--print-config", "--listen", "tcp/127.0.0.1:7999", "--connect", "tcp/lab:1")
     assert done.returncode == 0
@@ -154,6 +160,7 @@ def test_a_configuration_for_zenohd_is_printed():
     assert zenpark("router", "--print-config", "--listen", "tcp/0.0.0.0:1").returncode == 2
 
 
+@pytest.mark.slow
 def test_endpoints_come_from_the_file_of_a_run(tmp_path):
     file = tmp_path / "network.txt"
     endpoint = free_endpoint(0)

@@ -108,33 +108,53 @@ def test_a_small_step_is_that_of_the_linear_cascade():
     assert rise_and_overshoot(path, 0.1)[1] == pytest.approx(rise_and_overshoot(theory, 0.1)[1], abs=0.015)
 
 
-@pytest.mark.parametrize(
-    ("axis", "step", "rise", "overshoot", "law"),
-    [
-        (0, 0.3, 0.487, 0.112, 0.761),
-        (0, 1.0, 0.730, 0.029, 0.995),
-        (2, 0.3, 0.572, 0.087, 0.611),
-        (2, 1.0, 0.735, 0.121, 0.935),
-        (3, 1.0, 0.283, 0.035, 0.721),
-    ],
-)
-def test_steps_beside_the_fitted_law(axis, step, rise, overshoot, law):
-    """As in docs/mujoco.md; the law of second order has no attitude loop and is slower, the one that leans is not."""
-    engine = hovering()
-    laws = [Quadrotor((CRAZYFLIE,), engine.position, np.zeros(1), DT, leaning=leans) for leans in (False, True)]
-    setpoint = [0.0, 0.0, 1.0, 0.0]
-    before = np.array(setpoint)
-    setpoint[axis] += step
-    path = fly(engine, [setpoint], 6.0)[:, 0, axis] - before[axis]
-    found = []
+STEPS = ((0, 0.3), (0, 1.0), (2, 0.3), (2, 1.0), (3, 1.0))
+
+
+@pytest.fixture(scope="module")
+def flown_steps():
+    """(T,) along the axis of each step, from where it began: of the rigid body, the law, and the law that leans."""
+    rows = np.arange(len(STEPS))
+    before = np.column_stack([np.zeros(len(rows)), 4.0 * rows, np.ones(len(rows)), np.zeros(len(rows))])  # far apart
+    engine = RigidBody().build(stage((CRAZYFLIE,) * len(rows)))
+    engine.place(rows, before[:, :3], before[:, 3], np.ones(len(rows), dtype=bool))
+    fly(engine, before, 0.5)
+    laws = [
+        Quadrotor((CRAZYFLIE,) * len(rows), engine.position, np.zeros(len(rows)), DT, leaning=leans)
+        for leans in (False, True)
+    ]
+    setpoint = before.copy()
+    for row, (axis, step) in enumerate(STEPS):
+        setpoint[row, axis] += step
+    paths = [fly(engine, setpoint, 6.0)]
     for model in laws:
         model.flying[:] = True
-        other = []
+        path = []
         for _ in range(600):
-            model.command(np.array([setpoint]))
+            model.command(setpoint)
             model.advance()
-            other.append([*model.position[0], model.yaw[0]])
-        found.append(rise_and_overshoot(np.array(other)[:, axis] - before[axis], step))
+            path.append(np.column_stack([model.position, model.yaw]))
+        paths.append(np.array(path))
+    return {
+        wanted: [path[:, row, wanted[0]] - before[row, wanted[0]] for path in paths] for row, wanted in enumerate(STEPS)
+    }
+
+
+@pytest.mark.parametrize(
+    ("wanted", "rise", "overshoot", "law"),
+    [
+        (STEPS[0], 0.487, 0.112, 0.761),
+        (STEPS[1], 0.730, 0.029, 0.995),
+        (STEPS[2], 0.572, 0.087, 0.611),
+        (STEPS[3], 0.735, 0.121, 0.935),
+        (STEPS[4], 0.283, 0.035, 0.721),
+    ],
+)
+def test_steps_beside_the_fitted_law(flown_steps, wanted, rise, overshoot, law):
+    """As in docs/mujoco.md; the law of second order has no attitude loop and is slower, the one that leans is not."""
+    _, step = wanted
+    path, *others = flown_steps[wanted]
+    found = [rise_and_overshoot(other, step) for other in others]
     mine, (its, leaning) = rise_and_overshoot(path, step), found
     assert leaning[0] == pytest.approx(mine[0], rel=0.10)  # the law that leans follows
     assert abs(mine[1] - leaning[1]) < 0.04
@@ -145,6 +165,7 @@ def test_steps_beside_the_fitted_law(axis, step, rise, overshoot, law):
     assert path[-1] == pytest.approx(step, abs=0.06 * step)  # the vertical integrals need some ten seconds
 
 
+@pytest.mark.slow
 def test_the_lag_of_the_motors_hardly_shows_in_the_position():
     quick, slow = (fly(hovering(lag=lag), [[0.5, 0.2, 1.0, 0.5]], 4.0)[:, 0, :2] for lag in (0.02, 0.06))
     assert np.abs(quick - slow).max() < 0.01
@@ -270,7 +291,10 @@ def test_rows_and_copies_are_what_they_are_alone_to_the_last_bit():
     assert (np.abs(together[-1, :, :3] - np.array(start)).max(axis=1) > 0.05).all()
 
 
-@pytest.mark.parametrize("dt", [0.01, 0.02, 0.004, 1.0 / 64.0, 1.0 / 30.0])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("dt", [0.02, *(pytest.param(dt, marks=SLOW) for dt in (0.01, 0.004, 1.0 / 64.0, 1.0 / 30.0))])
 def test_any_step_divides_into_the_rate_of_the_firmware(dt):
     path = fly(hovering(dt=dt), [[0.3, 0.0, 1.0, 0.0]], 4.0, dt)[:, 0, 0]
     rise, overshoot = rise_and_overshoot(path, 0.3, dt)
@@ -278,6 +302,7 @@ def test_any_step_divides_into_the_rate_of_the_firmware(dt):
     assert overshoot == pytest.approx(0.112, abs=0.015)
 
 
+@pytest.mark.slow
 def test_what_stands_fast_is_in_the_way():
     obstacles = {
         "table": Obstacle(box=(0.4, 0.4), at=(0.0, 0.0), height=0.5),

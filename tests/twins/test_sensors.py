@@ -66,11 +66,13 @@ def swept(request, world, times=(0.0,)):
     return np.array(seen), ranges
 
 
-def facing(kind, sensor, gap, noise=0.0, times=(0.0,), **figures):
-    """Readings (len(times),) of the ray ahead, of a robot whose sensor is `gap` from a wall."""
-    ahead = np.flatnonzero((SENSORS[sensor].bearing == 0.0) & (SENSORS[sensor].elevation == 0.0))[0]
-    request = asked([kind], [[3.0 - SENSORS[sensor].mount - gap, 0.0, 0.0]], **figures)
-    return swept(request, placed([kind], [(sensor,)], noise=noise), times)[0][:, ahead]
+def facing(kind, sensor, gap, noise=0.0, times=(0.0,), *, robots=1):
+    """Readings (len(times) * robots,) of the rays ahead, of robots, each in a room of its own, whose sensor is `gap`
+    from a wall."""
+    ahead = (SENSORS[sensor].bearing == 0.0) & (SENSORS[sensor].elevation == 0.0)
+    request = asked([kind] * robots, [[3.0 - SENSORS[sensor].mount - gap, 0.0, 0.0]] * robots)
+    world = placed([kind] * robots, [(sensor,)] * robots, noise=noise, copy=range(robots))
+    return swept(request, world, times)[0][:, np.tile(ahead, robots)].ravel()
 
 
 def test_every_sensor_makes_sense_and_kinds_carry_known_ones():
@@ -233,8 +235,7 @@ def test_readings_that_were_handed_out_do_not_change():
 )
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_noise_has_the_makers_sigma(kind, sensor, gap, sigma, scale):
-    times = np.arange(3000) * 0.25
-    readings = facing(kind, sensor, gap, scale, times)
+    readings = facing(kind, sensor, gap, scale, np.arange(100) * 0.25, robots=30)
     seen = readings[np.isfinite(readings)] - SENSORS[sensor].mount
     step = SENSORS[sensor].resolution
     expected = np.array([NormalDist(gap, sigma * scale).inv_cdf((k + 0.5) / 4000) for k in range(4000)])
@@ -249,7 +250,7 @@ def test_noise_has_the_makers_sigma(kind, sensor, gap, sigma, scale):
 
 def test_95_percent_of_a_lidar_s_readings_are_within_the_maker_s_limits():
     for gap, limit in ((0.3, 0.015), (3.0, 0.15)):
-        readings = facing(TURTLEBOT3, "lds01", gap, 1.0, np.arange(2000) * 0.2)
+        readings = facing(TURTLEBOT3, "lds01", gap, 1.0, np.arange(100) * 0.2, robots=20)
         within = np.abs(readings[np.isfinite(readings)] - gap) <= limit
         assert within.mean() == pytest.approx(0.9545, abs=0.015)
 

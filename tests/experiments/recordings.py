@@ -1,0 +1,157 @@
+"""Messages of a run of two robots, and recordings made of them."""
+
+import numpy as np
+
+from agents.wire import Contact, Event, Heard, HostClock, Pose, Standing, State, Status, WorldState
+from experiments.experiment import Experiment, Rates, Robot
+from experiments.recording import Recording
+
+START = 1_760_000_000.0
+
+
+DOCUMENT = 'title = "pair"  # as it was written\n'
+
+
+PAIR = Experiment(
+    title="pair",
+    robots={"TB01": Robot("turtlebot3", [0.0, 0.0]), "CF01": Robot("crazyflie", [1.0, 0.0], hover=0.8)},
+    duration_s=1.0,
+    rates=Rates(state_hz=10.0),
+)
+
+
+def state(robot="TB01", seq=1, at=0.0, x=0.0, **more):
+    known = {
+        "robot": robot,
+        "seq": seq,
+        "stamp": START + at,
+        "phase": "run",
+        "position": (x, 0.0, 0.0),
+        "velocity": (0.1, 0.2, 0.3),
+        "yaw": 0.0,
+        "goal": (x + 1.0, 2.0, 3.0),
+        "setpoint": (x, 0.0, 0.5, 0.25),
+        "error": 0.05,
+    }
+    return State(**known | more)
+
+
+def pose(robot="TB01", seq=1, at=0.0, x=0.0):
+    return Pose(robot, seq, START + at, (x, 0.5, 0.0), (0.1, 0.2, 0.3), 0.4)
+
+
+def status(
+    robot="TB01", at=1.0, *, sent=0, lost=None, dropped=None, started=START, pid=7, ticks=0, missed=0, decisions=0
+):
+    return Status(
+        robot=robot,
+        stamp=START + at,
+        phase="run",
+        reason="",
+        body="",
+        battery=None,
+        sent=sent,
+        heard=0,
+        lost=lost or {},
+        dropped=dropped or {},
+        malformed=0,
+        refused=0,
+        ticks=ticks,
+        missed=missed,
+        decisions=decisions,
+        interventions=0,
+        avoided=0,
+        late_s=0.0,
+        started=started,
+        missing=[],
+        pid=pid,
+        cpu_s=0.0,
+        rss_mb=1.0,
+    )
+
+
+def begun(at=0.0):
+    return Event(START + at, "start", "conductor", "go")
+
+
+def landed(at=1.0, text="landing"):
+    return Event(START + at, "phase", "conductor", text)
+
+
+def write(path, *messages, experiment=PAIR, **more):
+    """Records messages as they come; a pose is received 2 ms after its stamp, with 150 bytes."""
+    with Recording(path, experiment, DOCUMENT, **{"case": "only", "seed": 4, "clock": "real"} | more) as recording:
+        put(recording, messages)
+        return recording
+
+
+def put(recording, messages):
+    for message in messages:
+        match message:
+            case Pose():
+                recording.pose(message, message.stamp + 0.002, 150)
+            case State():
+                recording.state(message)
+            case Status():
+                recording.status(message)
+            case Event():
+                recording.event(message)
+            case Contact():
+                recording.contact(message)
+            case HostClock():
+                recording.clock(message)
+            case WorldState():
+                recording.world(message)
+
+
+def touched(at, first="TB01", second="CF01"):
+    return Contact(START + at, first, second, 0.25, 0.001)
+
+
+def world(at, engine="pymunk", **more):
+    known = {
+        "stamp": START + at,
+        "engine": engine,
+        "time": at + 3.0,
+        "factor": 0.98,
+        "load": 0.4,
+        "paused": False,
+        "robots": ["TB01"],
+        "mirrored": ["CF01"],
+        "obstacles": [Standing("box", (1.0, 0.5 * at, 0.1)), Standing("post", (0.0, 0.0, 0.0))],
+        "contacts": 2,
+        "refused": 0,
+        "malformed": 1,
+        "trouble": "none",
+    }
+    return WorldState(**known | more)
+
+
+def whole_run():
+    """One second of two robots, the leader along x at 1 m/s."""
+    messages = [begun(), status("TB01", at=0.0), status("CF01", at=0.0)]
+    for k in range(11):
+        at = k / 10
+        pose_heard = ((at - 0.05, 0.0, 0.0), (1.0, 0.0, 0.0))
+        heard = [Heard("TB01", k, START + at - 0.05, START + at - 0.04, *pose_heard)] if k else []
+        messages += [
+            state("TB01", k + 1, at, at, true_position=(at, 0.0, 0.01), true_yaw=0.1),
+            state("CF01", k + 1, at, -at, heard=heard),
+            pose("TB01", k + 1, at, at),
+        ]
+    return [
+        *messages,
+        status("TB01", sent=11, ticks=100, missed=3, decisions=10),
+        status("CF01", sent=0, ticks=99, decisions=9, lost={"TB01": 1}),
+    ]
+
+
+def seconds(count, phase="running"):
+    """States of two robots at 10 Hz."""
+    return [state(name, k, k / 10, phase=phase) for k in range(count) for name in ("TB01", "CF01")]
+
+
+def scattered(count):
+    """States that do not compress."""
+    x = np.random.default_rng(1).normal(size=(count, 3)).tolist()
+    return [state(seq=k + 1, at=k / count, position=tuple(p), goal=tuple(p)) for k, p in enumerate(x)]

@@ -1,0 +1,416 @@
+"""A recording is read back as what was written: what is between, what is missing, when a run began and ended."""
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from rosbags.highlevel import AnyReader
+
+from agents.wire import Event, Heard, HostClock
+from experiments.experiment import Formation, Rates
+from experiments.playback import NotStarted, read
+from experiments.records import RecordingError
+from experiments.recover import recover
+from tests.experiments.recordings import (
+    PAIR,
+    START,
+    begun,
+    landed,
+    pose,
+    seconds,
+    state,
+    status,
+    touched,
+    whole_run,
+    world,
+    write,
+)
+
+
+def test_a_run_is_read_back(path):
+    write(path, *whole_run())
+    playback = read(path)
+    trace = playback.trace
+    assert playback.complete
+    assert playback.messages == 1 + 4 + 22 * 2 + 11
+    assert (trace.case, trace.seed, trace.clock, trace.robots) == ("only", 4, "real", ("TB01", "CF01"))
+    assert trace.experiment == PAIR
+    np.testing.assert_allclose(trace.time, np.arange(11) / 10, rtol=0, atol=1e-12)
+    along = np.arange(11) / 10
+    np.testing.assert_allclose(trace.position[:, 0, 0], along, atol=1e-6)
+    np.testing.assert_allclose(trace.position[:, 1, 0], -along, atol=1e-6)
+    np.testing.assert_allclose(trace.true_position[:, 0, 2], 0.01)
+    np.testing.assert_allclose(trace.true_position[:, 1], trace.position[:, 1])
+    assert (trace.contacts, trace.world, trace.attitude, trace.shadow_position, trace.shadow_yaw) == (
+        None, (), None, None, None
+    )  # fmt: skip
+    np.testing.assert_allclose(trace.goal[:, 0], np.column_stack([along + 1, along * 0 + 2, along * 0 + 3]))
+    np.testing.assert_allclose(
+        trace.setpoint[:, 1], np.column_stack([-along, along * 0, along * 0 + 0.5, along * 0 + 0.25])
+    )
+    before_the_end = along[:-1]
+    np.testing.assert_allclose(trace.sent.time, before_the_end, atol=1e-6)
+    assert trace.sent.seq.tolist() == list(range(1, 11))
+    assert trace.sent.bytes.tolist() == [150] * 10
+    np.testing.assert_allclose(trace.sent.position[:, :2], np.column_stack([before_the_end, before_the_end * 0 + 0.5]))
+    np.testing.assert_allclose(trace.sent.velocity, np.tile([0.1, 0.2, 0.3], (10, 1)))
+    np.testing.assert_allclose(trace.sent.yaw, 0.4)
+    np.testing.assert_allclose(trace.heard.time, along[1:] - 0.04, atol=1e-6)
+    np.testing.assert_allclose(trace.heard.stamp, along[1:] - 0.05, atol=1e-6)
+    assert set(zip(trace.heard.listener.tolist(), trace.heard.speaker.tolist(), strict=True)) == {(1, 0)}
+    assert trace.heard.seq.tolist() == list(range(1, 11))
+    np.testing.assert_allclose(trace.heard.position[:, 0], along[1:] - 0.05)
+    np.testing.assert_array_equal(trace.heard.velocity, np.tile([1.0, 0.0, 0.0], (10, 1)))
+    assert trace.lost.tolist() == [1, 0]
+    assert trace.ticks.tolist() == [100, 99]
+    assert trace.missed_deadlines.tolist() == [3, 0]
+    assert trace.decisions.tolist() == [10, 9]
+    assert trace.events == (Event(0.0, "start", "conductor", "go"),)
+
+
+def test_what_the_world_said_is_read_back(path):
+    said = [world(-0.5), world(0.5), world(1.5), touched(0.7), touched(-0.1), touched(0.2, second="wall"), touched(1.2)]
+    write(path, *whole_run(), *said)
+    trace = read(path).trace
+    assert [(each.first, each.second, round(each.stamp, 6)) for each in trace.contacts] == [
+        ("TB01", "wall", 0.2),
+        ("TB01", "CF01", 0.7),
+    ]
+    assert (trace.contacts[0].impulse, trace.contacts[0].overlap) == (0.25, 0.001)
+    assert [msgspec.structs.replace(each, stamp=START + 0.5) for each in trace.world] == [world(0.5)]
+    assert trace.world[0].stamp == pytest.approx(0.5)
+    path.write_bytes(path.read_bytes()[:-1])
+    target = path.with_name("whole.mcap")
+    assert recover(path, target).robots == ("TB01", "CF01")
+    assert read(target).trace.contacts == trace.contacts
+    with AnyReader([target]) as reader:
+        seen = {c.topic: reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()}
+    assert seen["/world/contact"].second == "CF01"
+    box, post = seen["/world/state"].obstacles
+    assert (box.name, box.pose.tolist(), post.name) == ("box", [1.0, 0.75, 0.1], "post")
+
+
+@pytest.mark.parametrize(
+    ("said", "contacts"),
+    [([], None), ([world(0.5, "point-mass")], None), ([world(0.5, "nobody-has-it")], None), ([world(0.5)], ())],
+)
+def test_no_contacts_and_nobody_who_looked_are_not_the_same(path, said, contacts):
+    write(path, *whole_run(), *said)
+    assert read(path).trace.contacts == contacts
+
+
+def test_what_kept_robots_off_is_counted_until_the_end(path):
+    counted = [
+        msgspec.structs.replace(status(at=at), interventions=5 * k, avoided=2 * k)
+        for k, at in enumerate((-0.5, 0.5, 1.5, 2.5))
+    ]
+    write(path, *whole_run()[:-2], *counted)
+    trace = read(path).trace
+    assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([10, 0], [4, 0])
+
+
+def test_attitude_is_interpolated_the_short_way_on_the_side_it_was_recorded_on(path):
+    angle = [0.2 * k for k in range(12)]
+    sign = [-1.0 if k in {3, 4, 5} else 1.0 for k in range(12)]
+    turned = [
+        state(at=k / 10 - 0.05, attitude=(s * math.cos(0.5 * a), 0.0, s * math.sin(0.5 * a), 0.0))
+        for k, (a, s) in enumerate(zip(angle, sign, strict=True))
+    ]
+    write(path, begun(), *turned)
+    trace = read(path).trace
+    wanted = np.array([[math.cos(0.1 * (k + 0.5)), 0.0, math.sin(0.1 * (k + 0.5)), 0.0] for k in range(11)])
+    np.testing.assert_allclose(trace.attitude[:, 0], wanted * np.array(sign)[:11, None], atol=1e-6)
+    assert np.isnan(trace.attitude[:, 1]).all()
+
+
+def test_where_the_twin_beside_a_robot_was(path):
+    beside = [
+        state(at=k / 10, x=k / 10, shadow_position=(k / 10, 0.1, 0.0), shadow_yaw=3.0 + k / 10) for k in range(11)
+    ]
+    write(path, begun(), *beside, *[state("CF01", at=k / 10) for k in range(11)])
+    trace = read(path).trace
+    np.testing.assert_allclose(trace.shadow_position[:, 0] - trace.position[:, 0], np.tile([0.0, 0.1, 0.0], (11, 1)))
+    np.testing.assert_allclose(trace.shadow_yaw[:, 0], 3.0 + np.arange(11) / 10, atol=1e-6)
+    assert np.isnan(trace.shadow_position[:, 1]).all()
+    assert trace.attitude is None
+
+
+def test_samples_between_the_grid_are_interpolated(path):
+    write(
+        path,
+        begun(),
+        *[state(at=k / 10 + 0.05, x=k / 10 + 0.05, yaw=math.remainder(k, math.tau)) for k in range(-1, 11)],
+    )
+    trace = read(path).trace
+    np.testing.assert_allclose(trace.position[:, 0, 0], np.arange(11) / 10, atol=1e-6)
+    np.testing.assert_allclose(trace.goal[:, 0, 0], np.arange(11) / 10 + 0.95, atol=1e-6)  # the last one before
+    turned = np.arctan2(np.sin(trace.yaw[:, 0]), np.cos(trace.yaw[:, 0]))
+    np.testing.assert_allclose(turned, [math.remainder(k - 0.5, math.tau) for k in range(11)], atol=1e-4)
+
+
+def test_yaw_keeps_the_branch_it_was_recorded_on(path):
+    yaw = [math.remainder(0.9 * k, math.tau) for k in range(11)]
+    write(path, begun(), *[state(at=k / 10, yaw=value) for k, value in enumerate(yaw)])
+    np.testing.assert_allclose(read(path).trace.yaw[:, 0], yaw, atol=1e-5)
+
+
+def test_silence_is_nan_and_never_extrapolated(path):
+    write(path, begun(), landed(), *[state(at=k / 10, x=k / 10) for k in range(6)])
+    trace = read(path).trace
+    np.testing.assert_allclose(trace.position[:8, 0, 0], [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.5], atol=1e-6)
+    for array in (trace.position, trace.yaw, trace.true_position, trace.goal, trace.setpoint):
+        assert np.isnan(array[8:, 0]).all()
+        assert np.isnan(array[:, 1]).all()  # never reported
+        assert np.isfinite(array[:8, 0]).all()
+
+
+def test_a_long_hole_is_not_interpolated_over(path):
+    times = [0.0, 0.1, 0.6, 0.7, 2.0, 2.1]
+    long = msgspec.structs.replace(PAIR, duration_s=2.0)
+    write(path, begun(), *[state(at=at, x=at) for at in times], experiment=long)
+    x = read(path).trace.position[:, 0, 0]
+    np.testing.assert_allclose(x[:8], np.arange(8) / 10, atol=1e-6)
+    assert np.flatnonzero(np.isnan(x)).tolist() == list(range(10, 18))
+
+
+def test_numbers_that_nobody_knows(path):
+    lost = [
+        state(at=k / 10, x=math.nan if k == 5 else k / 10, goal=None, setpoint=None, yaw=math.nan) for k in range(11)
+    ]
+    write(path, begun(), *lost)
+    trace = read(path).trace
+    np.testing.assert_allclose(trace.position[:, 0, 0], np.arange(11) / 10, atol=1e-6)
+    for array in (trace.goal, trace.setpoint, trace.yaw):
+        assert np.isnan(array).all()
+
+
+@pytest.mark.parametrize(
+    ("messages", "lost"),
+    [
+        ([pose(seq=k, at=k / 10) for k in (1, 2, 5, 6)], 2),  # a gap of two
+        ([pose(seq=s, at=a) for s, a in ((8, 0.1), (9, 0.2), (1, 0.3), (2, 0.4))], 0),  # began anew
+        ([pose(seq=s, at=a) for s, a in ((8, 0.1), (9, 0.2), (3, 0.3), (4, 0.4))], 2),  # anew, the first two lost
+        (
+            [pose(seq=4, at=0.1), pose(seq=4, at=0.1), pose(seq=5, at=0.2)],
+            0,
+        ),  # the same twice: said again to a late one
+        ([pose(seq=1, at=-2.0), pose(seq=9, at=0.1), pose(seq=10, at=0.2)], 0),  # a gap that began before the run
+        ([pose(seq=5, at=0.9), status(sent=8)], 3),  # the last three never came
+        ([pose(seq=5, at=0.9), pose(seq=6, at=1.2), status(sent=5)], 0),
+        ([pose(seq=9, at=0.5), status(sent=2, pid=8)], 0),  # a younger process counts from zero
+        ([status(at=-0.5, sent=4), status(sent=6)], 2),  # none of them recorded
+        ([pose(seq=3, at=-0.2), status(at=-1.0, sent=2), status(sent=4)], 1),
+        ([status("CF01", at=-0.5, lost={"TB01": 4}), status("CF01", lost={"TB01": 6})], 2),  # less what was before
+        ([status("CF01", at=a, lost={"TB01": n}) for a, n in ((0.2, 1), (0.6, 1), (1.0, 3))], 3),  # counters go up
+        (
+            [
+                status("CF01", at=-0.5, lost={"TB01": 4}),
+                status("CF01", at=0.2, lost={"TB01": 5}),
+                status("CF01", at=0.9, lost={"TB01": 2}, pid=8),
+            ],
+            3,  # one before its listener began anew, two after
+        ),
+        ([status("CF01", at=30.0, lost={"TB01": 4})], 0),  # long after the run
+    ],
+)
+def test_lost(path, messages, lost):
+    write(path, begun(), state(), *messages, landed())
+    assert read(path).trace.lost.tolist() == [lost, 0]
+
+
+def test_what_the_modelled_network_dropped_is_no_loss(path):
+    said = [
+        status("CF01", at=at, dropped=dropped) for at, dropped in ((-0.5, {}), (0.4, {"TB01": 3}), (1.0, {"TB01": 7}))
+    ]
+    linked = msgspec.structs.replace(PAIR, formation=Formation(links={"TB01 - CF01": 0.5}))
+    write(path, begun(), state(), *said, landed(), experiment=linked)
+    trace = read(path).trace
+    assert trace.dropped.tolist() == [0, 7]  # TB01 listens to CF01; CF01 to TB01
+    assert trace.lost.tolist() == [0, 0]
+
+
+def test_only_poses_of_the_run_are_sent(path):
+    write(path, begun(), *[pose(seq=k + 5, at=k / 2) for k in range(-2, 5)], pose("XX99", at=0.5))
+    sent = read(path).trace.sent
+    assert sent.time.tolist() == [0.0, 0.5]  # the pose at the end, 1.0, belongs to the landing
+    assert sent.seq.tolist() == [5, 6]
+
+
+def test_what_a_drifting_clock_stamped_is_set_right(path):
+    """50 ppm over an hour are 0.18 s: what CF01 says at 3600 s it stamps 0.18 s later."""
+    long = msgspec.structs.replace(PAIR, duration_s=3600.0, rates=Rates(state_hz=1.0))
+    clocks = [HostClock("lab2", START, 0.2, 1e-4, ["CF01"]), HostClock("lab2", START + 3600.0, 0.38, 1e-4, ["CF01"])]
+    heard = [Heard("CF01", 9, START + 1800.09, START + 1800.01, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))]
+    messages = [begun(), *clocks]
+    for k in range(0, 3601, 10):
+        messages += [state("TB01", k + 1, k, 0.001 * k), state("CF01", k + 1, k * (1 + 50e-6), 0.001 * k)]
+    messages += [state("TB01", 9000, 3600.5, 3.6, heard=heard), pose("CF01", 1, 1800.09), landed(3600.0)]
+    write(path, *messages, experiment=long)
+    trace = read(path).trace
+    asked = [600, 1800, 3600]
+    np.testing.assert_allclose(trace.position[asked, 1, 0], [0.6, 1.8, 3.6], atol=1e-6)
+    np.testing.assert_allclose(trace.position[asked, 0, 0], trace.position[asked, 1, 0], atol=1e-6)
+    assert trace.sent.time[0] == pytest.approx(1800.0, abs=1e-4)
+    assert trace.heard.stamp[0] == pytest.approx(1800.0, abs=1e-4), "on the speaker's clock"
+    assert trace.heard.time[0] == pytest.approx(1800.01, abs=1e-4), "on the listener's"
+    (lie,) = trace.clocks
+    assert lie.drift == pytest.approx(50e-6)
+
+
+def test_the_start_is_the_conductors_else_the_robots(path, tmp_path):
+    write(path, state(at=0.0), state(at=0.5), status(started=START + 0.5), status("CF01", started=0.0), landed(1.5))
+    assert np.isfinite(read(path).trace.position[:, 0, 0]).tolist() == [True] * 3 + [False] * 8
+    both = tmp_path / "both.mcap"
+    write(both, state(at=0.0), begun(0.2), status(started=START + 0.5), state(at=0.5, x=1.0), landed(1.2))
+    np.testing.assert_allclose(read(both).trace.position[3, 0, 0], 1.0)
+    assert read(both).trace.events[0].stamp == 0.0
+
+
+def test_the_trace_of_an_interrupted_run_ends_with_the_interruption(path):
+    sends = [pose(seq=k + 1, at=k / 10, x=k / 10) for k in range(11)]
+    said = [status(at=0.6, sent=7, ticks=60, decisions=6), status(at=2.5, sent=11, ticks=250, decisions=25)]
+    write(path, begun(), *seconds(11), *sends, *said, landed(0.75, "landing (interrupted)"))
+    trace = read(path).trace
+    assert trace.time[-1] == pytest.approx(0.7)
+    assert trace.position.shape == (8, 2, 3)
+    assert np.isfinite(trace.position).all()
+    assert trace.sent.seq.tolist() == list(range(1, 9))
+    assert trace.lost.tolist() == [0, 0]
+    assert trace.events[-1].stamp == pytest.approx(0.75)
+
+
+def test_a_run_that_the_user_ended_after_its_end_is_whole(path):
+    write(path, begun(), *seconds(11), landed(1.3, "landing (interrupted)"))
+    assert read(path).trace.time[-1] == 1.0
+
+
+def test_a_run_in_which_all_came_down_ends_there(path):
+    long = msgspec.structs.replace(PAIR, duration_s=5.0)
+    write(path, begun(), *seconds(31), landed(3.0), experiment=long)
+    assert read(path).trace.time[-1] == 3.0
+
+
+def test_robots_land_a_little_early_by_their_own_clocks(path):
+    write(path, begun(), *seconds(11), landed(0.98))
+    assert read(path).trace.time[-1] == 1.0
+
+
+def test_without_a_word_of_the_conductor_the_run_ends_with_the_robots(path):
+    long = msgspec.structs.replace(PAIR, duration_s=20.0)
+    down = [state("TB01", k, k / 10, phase="landing") for k in range(41, 60)]
+    more = [state("TB01", k, k / 10, phase="running") for k in range(31, 36)]
+    write(path, begun(), *seconds(31), *more, *down, experiment=long)
+    trace = read(path).trace
+    assert trace.time[-1] == pytest.approx(3.0)
+    assert np.isfinite(trace.position).all()
+
+
+def test_a_robot_that_fell_silent_long_before_does_not_end_the_run(path):
+    long = msgspec.structs.replace(PAIR, duration_s=20.0)
+    more = [state("TB01", k, k / 10, phase="running") for k in range(31, 100)]
+    write(path, begun(), *seconds(31), *more, experiment=long)
+    trace = read(path).trace
+    assert trace.time[-1] == pytest.approx(9.9)
+    assert np.isnan(trace.position[-1, 1]).all()
+
+
+@pytest.mark.parametrize("end", [-0.5, 0.0, 0.05])
+def test_a_run_interrupted_before_its_start(path, end):
+    write(path, state(), begun(), landed(end, "landing (interrupted)"))
+    with pytest.raises(NotStarted, match="ended before the common start"):
+        read(path)
+
+
+def test_when_the_run_began(path):
+    write(path, *whole_run())
+    assert read(path).started == START
+
+
+def test_a_run_that_never_started(path):
+    write(path, state(), status(started=0.0))
+    with pytest.raises(RecordingError, match="no robot had started"):
+        read(path)
+
+
+def test_a_run_without_any_message_of_a_robot(path):
+    write(path, begun())
+    trace = read(path).trace
+    assert trace.position.shape == (11, 2, 3)
+    assert np.isnan(trace.position).all()
+    assert (len(trace.sent.time), len(trace.heard.time), trace.lost.tolist()) == (0, 0, [0, 0])
+
+
+def test_what_cannot_be_a_message_is_counted_and_left_out(path):
+    wrong = [state(seq=2**63), state(position=None), state(phase="\ud800"), pose(seq=2**70), status(sent=2**64)]
+    recording = write(path, begun(), *wrong, Event(None, "k", "s", "t"))
+    assert recording.refused == 6
+    assert read(path).messages == 1
+
+
+@pytest.mark.parametrize("stamp", [math.nan, math.inf, -1.0, 1e19])
+def test_a_broken_clock_does_not_stretch_the_time_line(path, stamp):
+    write(path, begun(), landed(), msgspec.structs.replace(state(), stamp=stamp))
+    with path.open("rb") as file:
+        statistics = make_reader(file).get_summary().statistics
+    assert statistics.message_start_time == round(START * 1e9)
+    assert statistics.message_end_time == round((START + 1.0) * 1e9)
+    assert np.isnan(read(path).trace.position).all()
+
+
+def foreign(path, *channels, metadata=None, attachment=None):
+    """A file of another program, with one message on each channel (topic, schema name, schema text, data)."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for topic, name, text, data in channels:
+            schema = writer.register_schema(name, "ros2msg", text) if name else 0
+            writer.add_message(writer.register_channel(topic, "cdr", schema), 1, data, 1)
+        if metadata is not None:
+            writer.add_metadata("zenpark", metadata)
+        if attachment is not None:
+            writer.add_attachment(0, 0, "experiment.json", "application/json", attachment)
+        writer.finish()
+
+
+ABOUT = {"case": "only", "seed": "4", "clock": "real"}
+
+
+def test_channels_of_others_are_passed_over(path, tmp_path):
+    channels = [("/image", "sensor_msgs/msg/Image", b"uint8 data", b"junk"), ("/raw", "", b"", b"more")]
+    foreign(path, *channels, metadata=ABOUT | {"started": repr(START)}, attachment=msgspec.json.encode(PAIR))
+    playback = read(path)
+    assert playback.messages == 2
+    assert np.isnan(playback.trace.position).all()
+    path.write_bytes(path.read_bytes()[:-1])
+    assert recover(path, tmp_path / "target.mcap").messages == 2
+    with (tmp_path / "target.mcap").open("rb") as file:
+        kept = [
+            (schema and schema.name, channel.topic, m.data) for schema, channel, m in make_reader(file).iter_messages()
+        ]
+    assert kept == [("sensor_msgs/msg/Image", "/image", b"junk"), (None, "/raw", b"more")]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "attachment"),
+    [
+        (None, None),
+        (ABOUT, None),
+        (ABOUT, b"{}"),
+        (ABOUT, b'{"title": "pair", "robots": {}, "duration_s": 1.0}'),
+        (ABOUT | {"seed": "four"}, msgspec.json.encode(PAIR)),
+        ({"case": "only"}, msgspec.json.encode(PAIR)),
+    ],
+)
+def test_a_file_without_an_experiment(path, metadata, attachment):
+    foreign(path, metadata=metadata, attachment=attachment)
+    with pytest.raises(RecordingError, match="holds no experiment"):
+        read(path)
+
+
+def test_a_file_of_another_version(path):
+    foreign(path, ("/TB01/state", "zenpark_msgs/msg/State", b"string robot\n", b"\0\1\0\0"))
+    with pytest.raises(RecordingError, match=r"/TB01/state was recorded by a version of zenpark with other fields"):
+        read(path)

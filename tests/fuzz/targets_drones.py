@@ -1,0 +1,210 @@
+"""Bytes from and to Crazyflies and Tellos."""
+
+from __future__ import annotations
+
+import importlib.util
+import struct
+import sys
+import types
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from agents.protocols import crtp
+from agents.protocols.crtp import HighLevel, Log, Misc, Port, Safety, Setpoint
+from tests.fuzz.sockets import Wire
+from tests.fuzz.target import Place, Renewed, Target
+from tests.twins.loopback import request as twin_request
+from twins.device import DeviceRequest, Faults
+
+# ---------------------------------------------------------------------- the Crazyflie
+
+
+def crazyflie_twin() -> Iterator[Target]:
+    """CRTP packets, one or more behind each other (length, bytes), in the air and on the ground."""
+    from twins.crazyflie import open_device  # noqa: PLC0415
+
+    def packet(port: Port, channel: int, data: bytes) -> bytes:
+        return bytes((1 + len(data), crtp.header(port, channel))) + data
+
+    climb = crtp.CLIMB.pack(0.5, 0.0, True, 1.0)
+    pose = crtp.POSE.pack(0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0)
+    full = crtp.FULL_STATE.pack(100, 200, 300, 0, 0, 0, 0, 0, 0, 0xC0000000, 0, 0, 0)
+    arm = packet(Port.SUPERVISOR, 1, bytes((Safety.ARM, 1)))
+    up = arm + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.TAKEOFF, 0)) + climb)
+    examples = [
+        packet(Port.LINK, 1, b"hello"), b"\1\xff", packet(Port.PLATFORM, 1, b"\0"), packet(Port.LINK, 0, b"echo"),
+        *(packet(port, 0, bytes((toc,)) + b"\1\0") for port in (Port.PARAM, Port.LOG) for toc in (2, 3)),
+        packet(Port.PARAM, 1, b"\3\0"), packet(Port.PARAM, 2, b"\3\0" + struct.pack("<f", 1.0)),
+        packet(Port.PARAM, 3, bytes((Misc.SET_BY_NAME,)) + b"stabilizer\0estimator\0\x08\2"),
+        packet(Port.PARAM, 3, bytes((Misc.SET_BY_NAME,)) + b"kalman\0resetEstimation\0\x08\1"),
+        *(packet(Port.PARAM, 3, bytes((kind,)) + b"\5\0") for kind in Misc),
+        packet(Port.LOG, 1, bytes((Log.RESET,))) + packet(Port.LOG, 1, bytes((Log.CREATE, 1, 7, 0, 0, 7, 1, 0)))
+        + packet(Port.LOG, 1, bytes((Log.START, 1, 1))),
+        packet(Port.LOG, 1, bytes((Log.APPEND, 1, 3, 9, 0))), packet(Port.LOG, 1, bytes((Log.STOP, 1))),
+        packet(Port.MEMORY, 0, b"\1"), packet(Port.MEMORY, 0, b"\2\1"),
+        *(packet(Port.MEMORY, 1, crtp.MEMORY.pack(k, 0) + b"\x10") for k in range(4)),
+        *(packet(Port.MEMORY, 2, crtp.MEMORY.pack(k, 0) + bytes(16)) for k in range(4)),
+        up, up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.GO_TO, 0)) + crtp.GO_TO.pack(True, False, 0.1,
+        0.2, 0.3, 1.0, 1.0)),
+        up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.LAND, 0)) + climb), packet(Port.HIGH_LEVEL, 0, b"\3\0"),
+        arm + packet(Port.SETPOINT, 0, bytes((Setpoint.POSITION,)) + crtp.FOUR.pack(0.1, 0.2, 0.5, 90.0)),
+        *(arm + packet(Port.SETPOINT, 0, bytes((kind,)) + crtp.FOUR.pack(0.1, 0.1, 0.1, 0.5)) for kind in Setpoint),
+        arm + packet(Port.SETPOINT, 0, bytes((Setpoint.FULL_STATE,)) + full), packet(Port.SETPOINT, 1, b"\0\0\0\0\0"),
+        arm + packet(Port.COMMANDER, 0, crtp.THRUST.pack(0.0, 0.0, 10.0, 40000)),
+        packet(Port.LOCATION, 0, crtp.VECTOR.pack(0.1, 0.2, 0.3)), packet(Port.LOCATION, 1, b"\x08" + pose),
+        packet(Port.LOCATION, 1, b"\2\1\1" + crtp.VECTOR.pack(0.1, 0.2, 0.3)), packet(Port.LOCATION, 1,
+        b"\x0b\3\0\3\0"),
+        packet(Port.LOCATION, 1, b"\3"), packet(Port.LOCATION, 1, b"\4"),
+        *(packet(Port.SUPERVISOR, 1, bytes((kind, 1))) for kind in Safety), packet(Port.SUPERVISOR, 0, b"\x0c"),
+    ]  # fmt: skip
+
+    def make():
+        nonlocal device
+        if device is not None:
+            device.close()
+        device = open_device(DeviceRequest(twin_request("crazyflie", ["crazyflie-twin"]), Faults()))
+        line, wire = device.lines[0], Wire()
+        own = line.socket
+        line.socket.close()
+        line.socket = wire  # type: ignore[assignment]
+        t = 0.0
+
+        def take(data: bytes) -> None:
+            nonlocal t
+            at = 0
+            while at < len(data) and len(wire.waiting) < 40:
+                wire.waiting.append(data[at + 1 : at + 1 + data[at]] or b"\0")
+                at += 1 + data[at]
+            while wire.waiting:
+                device.serve(own, t)
+            for _ in range(3):
+                t += 0.01
+                device.advance(t)
+            position, _ = device.truth()
+            assert np.isfinite(position).all()
+
+        return take
+
+    device: Any = None
+    yield Target(examples, Renewed(make, 100))
+    device.close()
+
+
+# ---------------------------------------------------------------------- the Tello
+
+
+def tello_twin() -> Iterator[Target]:
+    """Words over UDP, datagrams apart by zero bytes."""
+    from twins.tello import open_device  # noqa: PLC0415
+
+    words = [
+        "command", "takeoff", "land", "emergency", "stop", "rc 10 -20 30 40", "rc 100 100 100 100", "up 50", "back 100",
+        "cw 90", "ccw 360", "go 50 60 70 50", "speed 20", "battery?", "attitude?", "tof?", "sn?", "wifi?", "streamon",
+        "flip l", "curve 1 2 3 4 5 6 20", "jump 1 2 3 4 5 m1 m2", "mon", "time?", "speed?", "height?", "baro?", "sdk?",
+    ]  # fmt: skip
+    examples = [b"command", *(f"command\0takeoff\0\0{word}".encode() for word in words)]
+
+    def make():
+        nonlocal device
+        if device is not None:
+            device.close()
+        device = open_device(DeviceRequest(twin_request("tello", ["tello-twin"]), Faults()))
+        wire = Wire()
+        device._drones[0].wire.close()
+        device._drones[0].wire = wire
+        t = 0.0
+
+        def take(data: bytes) -> None:
+            nonlocal t
+            wire.waiting += data.split(b"\0")[:20]
+            while wire.waiting:
+                device.serve(wire, t)
+                for _ in range(2):
+                    t += 0.01
+                    device.advance(t)
+            assert np.isfinite(device.truth()[0]).all()
+
+        return take
+
+    device: Any = None
+    yield Target(examples, Renewed(make, 100))
+    device.close()
+
+
+class Drone:
+    """What djitellopy shows of a drone, parsed by djitellopy itself."""
+
+    def __init__(self) -> None:
+        self.state: dict[str, Any] = {}
+        self.responses: list[bytes] = []
+
+    def send_rc_control(self, *sticks: int) -> None:
+        assert all(isinstance(stick, int) and -100 <= stick <= 100 for stick in sticks)
+
+    def send_command_without_return(self, command: str) -> None:
+        assert command
+
+    def get_current_state(self) -> dict[str, Any]:
+        return self.state
+
+    def get_own_udp_object(self) -> dict[str, Any]:
+        return {"responses": self.responses, "state": self.state}
+
+    def end(self) -> None:
+        pass
+
+
+def tello_pilot() -> Iterator[Target]:
+    """A drone's state lines and answers: state and answer with a zero byte between them."""
+    from agents.kinds import KINDS  # noqa: PLC0415
+    from agents.protocols.tello import Settings  # noqa: PLC0415
+    from bridges.tello_pilot import Pilot  # noqa: PLC0415
+
+    if "av" not in sys.modules and importlib.util.find_spec("av") is None:
+        sys.modules["av"] = types.ModuleType("av")  # only its video would need it, see `bridges.tello`
+    import djitellopy.tello  # noqa: PLC0415
+
+    djitellopy.tello.Tello.LOGGER.setLevel("CRITICAL")  # it says every line that it cannot read
+    parse = djitellopy.tello.Tello.parse_state
+    line = (
+        b"mid:-1;x:-100;y:-100;z:-100;mpry:0,0,0;pitch:0;roll:0;yaw:12;vgx:0;vgy:0;vgz:0;templ:63;temph:66;tof:50;"
+        b"h:40;bat:80;baro:170.80;time:12;agx:-6.00;agy:1.00;agz:-999.00;\r\n"
+    )
+    examples = [
+        line + b"\0" + answer
+        for answer in (b"ok", b"error", b"out of range", b"unknown command: x", b"error Auto land")
+    ]
+
+    def make():
+        drone = Drone()
+        pilot = Pilot(drone, KINDS["tello"], Settings())
+        pilot.position = (0.0, 0.0, 0.5)
+        now = 100.0
+
+        def take(data: bytes) -> None:
+            nonlocal now
+            now += 0.05
+            state, _, answer = data.partition(b"\0")
+            try:
+                parsed = parse(state.decode("ascii"))
+            except (UnicodeDecodeError, ValueError, IndexError, KeyError, TypeError):
+                parsed = drone.state  # its thread says so and goes on
+            drone.state = parsed
+            drone.responses.append(answer)
+            if len(data) % 8 == 0:
+                pilot.rise(0.5, now)
+            pilot.step(now, now)
+            assert isinstance(pilot.note(now), str)
+
+        return take
+
+    yield Target(examples, Renewed(make, 200))
+
+
+PLACES = {
+    "crazyflie-twin": Place(crazyflie_twin, 40_000, 150),
+    "tello-twin": Place(tello_twin, 20_000, 100),
+    "tello-pilot": Place(tello_pilot, 20_000),
+}

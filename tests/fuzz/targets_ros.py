@@ -1,0 +1,169 @@
+"""Bytes from and to ROS 2 and TurtleBots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from agents.keys import Keys
+from agents.protocols import ros2
+from tests.fuzz.loopnet import Net, Sample
+from tests.fuzz.target import Place, Renewed, Target
+from tests.fuzz.targets_network import request
+from twins.device import DeviceRequest, Faults
+
+# ---------------------------------------------------------------------- ROS 2
+
+
+def ros_messages() -> dict[str, bytes]:
+    """A good message of each type that is read, as CDR."""
+    types = ros2.types("jazzy")
+    make = types.make
+    header = types.header(1.7e9, "map")
+    point, turn = (
+        make("geometry_msgs/msg/Point", x=0.1, y=0.2, z=0.0),
+        make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.1, w=1.0),
+    )
+    pose = make("geometry_msgs/msg/Pose", position=point, orientation=turn)
+    twist = types.twist((0.1, 0.0, 0.0), (0.0, 0.0, 0.2))
+    sides = np.zeros(36)
+    found = {
+        ros2.TWIST: twist,
+        ros2.TWIST_STAMPED: make(ros2.TWIST_STAMPED, header=header, twist=twist),
+        ros2.POSE_STAMPED: make(ros2.POSE_STAMPED, header=header, pose=pose),
+        ros2.ODOMETRY: make(
+            ros2.ODOMETRY, header=header, child_frame_id="base_footprint",
+            pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=sides),
+            twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=sides),
+        ),
+        ros2.LASER_SCAN: make(
+            ros2.LASER_SCAN, header=header, angle_min=0.0, angle_max=6.0, angle_increment=0.5, time_increment=0.001,
+            scan_time=0.2, range_min=0.12, range_max=3.5, ranges=np.full(12, 1.5, np.float32),
+            intensities=np.zeros(12, np.float32),
+        ),
+        ros2.BATTERY_STATE: make(
+            ros2.BATTERY_STATE, header=header, voltage=11.0, temperature=0.0, current=0.0, charge=0.0, capacity=0.0,
+            design_capacity=1.8, percentage=55.0, power_supply_status=0, power_supply_health=0,
+            power_supply_technology=0, present=True, cell_voltage=np.zeros(3, np.float32),
+            cell_temperature=np.zeros(0, np.float32), location="", serial_number="",
+        ),
+    }  # fmt: skip
+    return {kind: types.encode(message, kind) for kind, message in found.items()}
+
+
+def ros() -> Iterator[Target]:
+    """CDR of every type, tokens and attachments: kind and payload with a zero byte between them."""
+    types = ros2.types("jazzy")
+    good = ros_messages()
+    tokens = [
+        ros2.endpoint_token(0, "f00d", 0, 1, "MP", "tb3_0", "node", ros2.endpoint_topic("/tb3_0/odom",
+        ros2.ODOMETRY, ros2.RELIABLE, types)),
+        ros2.dds_token("f00d", "MS", "/tb3_0/cmd_vel", ros2.TWIST),
+    ]  # fmt: skip
+    examples = [kind.encode() + b"\0" + payload for kind, payload in good.items()]
+    examples += [b"token\0" + token.encode() for token in tokens] + [b"attached\0" + ros2.attachment(1, 2, bytes(16))]
+
+    def take(data: bytes) -> None:
+        head, _, rest = data.partition(b"\0")
+        kind = head.decode("utf-8", "replace")
+        if kind == "token":
+            for style in ("rmw", "ros2dds"):
+                ros2.announced(style, rest.decode("utf-8", "replace"))  # type: ignore[arg-type]
+        elif kind == "attached":
+            ros2.attached(rest)
+        elif kind in good:
+            types.decode(rest, kind)
+
+    yield Target(examples, take, (ValueError,))
+
+
+def turtlebot_bridge() -> Iterator[Target]:
+    """Odometry, scans, batteries and tokens of a robot."""
+    from bridges.turtlebot3 import TurtleBot3  # noqa: PLC0415
+
+    good = ros_messages()
+    topics = {"odom": ros2.ODOMETRY, "scan": ros2.LASER_SCAN, "battery_state": ros2.BATTERY_STATE}
+    examples = [f"tb3_0/{topic}\0\0".encode() + good[kind] for topic, kind in topics.items()]
+    examples += [ros2.dds_token("f00d", "MS", "/tb3_0/cmd_vel", ros2.TWIST_STAMPED).encode() + b"\0\0"]
+
+    def make():
+        net.forget()
+        net.first["tb3_0/odom"] = Sample("tb3_0/odom", "", good[ros2.ODOMETRY])
+        body = TurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))
+        body.open()
+        t = 0.0
+
+        def take(data: bytes) -> None:
+            nonlocal t
+            t += 0.01
+            net.deliver(data, gone=len(data) % 16 == 0)
+            state = body.read(t)
+            assert np.isfinite(state.position).all()
+            body.command(np.array([[0.1, 0.2, 0.0, 0.0]]))
+
+        return take
+
+    with Net().worn() as net:
+        yield Target(examples, Renewed(make, 200))
+
+
+def turtlebot_twin() -> Iterator[Target]:
+    """Commands to the twin of a robot."""
+    from twins.turtlebot3 import open_device  # noqa: PLC0415
+
+    good = ros_messages()
+
+    def make():
+        net.forget()
+        device = open_device(DeviceRequest(request("turtlebot3", "turtlebot3-twin"), Faults()))
+        t = 0.0
+
+        def take(data: bytes) -> None:
+            nonlocal t
+            t += 0.01
+            net.deliver(data)
+            device.advance(t)
+            assert np.isfinite(device.truth()[0]).all()
+
+        return take
+
+    with Net().worn() as net:
+        yield Target([b"KH01/cmd_vel\0\0" + good[ros2.TWIST_STAMPED]], Renewed(make, 300))
+
+
+def ros_graph() -> Iterator[Target]:
+    """The bridge to ROS 2: states and statuses of robots, goals from ROS."""
+    from agents.rosnode import Participant  # noqa: PLC0415
+    from bridges.ros2 import Graph  # noqa: PLC0415
+    from tests.fuzz.messages import everything  # noqa: PLC0415
+
+    good = ros_messages()
+    examples = everything("KH01", "KH02", only=("state", "status"))
+
+    def make():
+        net.forget()
+        participant = Participant(net.session, ros2.types("jazzy"), style="rmw")  # type: ignore[arg-type]
+        graph = Graph(net.session, participant, Keys())  # type: ignore[arg-type]
+        net.deliver(b"park/KH01/alive\0\0")
+        graph.poll()
+
+        def take(data: bytes) -> None:
+            net.deliver(data, gone=len(data) % 16 == 0)
+            graph.poll()
+
+        return take
+
+    with Net().worn() as net:
+        make()
+        goals = [channel.key for channel in net.channels if "/goal" in channel.key]
+        examples += [key.encode() + b"\0\0" + good[ros2.POSE_STAMPED] for key in goals]
+        yield Target(examples, Renewed(make, 200))
+
+
+PLACES = {
+    "ros": Place(ros, 40_000),
+    "turtlebot-bridge": Place(turtlebot_bridge, 20_000),
+    "turtlebot-twin": Place(turtlebot_twin, 10_000, 100),
+    "ros-graph": Place(ros_graph, 20_000),
+}
