@@ -282,6 +282,7 @@ def test_a_leader_follows_its_plan(kind):
     np.testing.assert_allclose(swarm.row("L", "truth"), begin + np.array([0.3, 0.0, 0.0]), atol=0.006)
 
 
+@pytest.mark.slow
 def test_a_follower_with_a_plan_is_pulled_by_both():
     robots = {"L": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="khepera4", start=[-0.5, 0.0])}
     plan = {"kind": "hold", "at": [0.0, 0.5]}

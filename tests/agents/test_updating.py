@@ -35,6 +35,7 @@ def test_without_it_every_decision_computes_the_law():
     assert updates(swarm) == {"A": 50, "B": 50, "C": 50}
 
 
+@pytest.mark.slow
 def test_who_stands_still_among_those_who_stand_keeps_its_goal():
     swarm = Swarm(triangle({"kind": "send-on-delta", "threshold": 0.02})).running().run(25.0)
     before = updates(swarm)

@@ -150,6 +150,7 @@ def test_one_robot_alone():
     np.testing.assert_allclose(path[-1, :2], [0.2, -0.1], atol=0.1)
 
 
+@pytest.mark.slow
 def test_three_robots_find_their_triangle():
     robots = {
         "A": Robot(kind="khepera4", start=[-0.6, -0.5]),
