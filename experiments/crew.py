@@ -30,7 +30,8 @@ ALONE_S: Final = 3.0  # a robot that joins a run under way does not wait longer 
 class Death:
     """A process has ended that should not have: what it was, whom it concerns, what is done.
 
-    `kind` is "recorder", "lost" (a robot's process), "host" (the connection to one), or what was started again.
+    `kind` is "recorder", "lost" (a robot's process), "host" (the connection to one), "device" (a protocol twin), or what
+    was started again.
     """
 
     kind: str
@@ -193,11 +194,15 @@ class Crew:
         self._launcher.end(self._standins, grace_s=2.0)
 
     def deaths(self) -> Iterator[Death]:
-        """What has died since the last call; router, world and centre are started again, a few times."""
+        """What has died since the last call; router, world, centre and positioning are started again, a few times."""
         for process in self._launcher.died():
             again = self._servants.again(process, self._case)
             if again is not None:
                 yield Death(again[0], "conductor", again[1])
+            elif process.name in self._standins:
+                what = process.name.removeprefix(f"{self._case}-")
+                text = f"the {what} ended ({process.exit}); robots that need it hold, or land{_because(process)}"
+                yield Death("device", "conductor", text)
             elif process.name == self._recorder:
                 yield Death("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
             elif process.name.startswith(STATION):
@@ -227,7 +232,7 @@ class Crew:
 
     def _stand_in(self, interrupted: Callable[[], bool]) -> None:
         """Starts world, protocol twins and positioning, and writes down at which addresses robots are then."""
-        self._reached, self._standins = standins.start(
+        started = standins.start(
             self._experiment,
             self._file,
             prefix=self._case,
@@ -235,6 +240,9 @@ class Crew:
             connect=self._connect,
             interrupted=interrupted,
         )
+        self._reached, self._standins = started.experiment, started.names
+        if started.positioning is not None:
+            self._servants.keep(*started.positioning)
         if self._standins:
             self._addressed = self._file.with_name(f"{self._case}-addressed.json")
             self._addressed.write_bytes(write_json(self._reached))

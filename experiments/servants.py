@@ -1,4 +1,4 @@
-"""Processes that serve a whole run, and are started again when they die: router, world, centre."""
+"""Processes that serve a whole run, and are started again when they die: router, world, centre, positioning."""
 
 from __future__ import annotations
 
@@ -74,6 +74,11 @@ class Servants:
                 lambda: launcher.start(name, "experiments.centre", str(file), *connect, "--lifeline"),
                 given_up=": the robots that it guides hold, and land at the end",
             )
+
+    def keep(self, name: str, start: Callable[[], object]) -> None:
+        """Starts the process that says where robots are again as well: those who do not know hold, and drones land."""
+        hold = ": robots that do not know where they are hold, drones land"
+        self._known[name] = _Servant(start, hold, hold)
 
     def start_centre(self) -> tuple[str, ...]:
         """Starts the centre, if robots are guided by one; the name of its process."""

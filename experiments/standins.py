@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -63,6 +65,21 @@ def behind_protocols(experiment: Experiment) -> Experiment:
     return msgspec.structs.replace(experiment, robots=robots, positioning=VICON_TWIN)
 
 
+@dataclass(frozen=True)
+class StandIns:
+    """What was started.
+
+    Attributes:
+        experiment: With the addresses at which robots are.
+        names: Of the processes.
+        positioning: The process that says where robots are, by name, and what starts it again; None: there is none.
+    """
+
+    experiment: Experiment
+    names: tuple[str, ...]
+    positioning: tuple[str, Callable[[], Process]] | None
+
+
 def start(
     experiment: Experiment,
     file: Path,
@@ -71,7 +88,7 @@ def start(
     launcher: Launcher,
     connect: Sequence[str],
     interrupted: Callable[[], bool],
-) -> tuple[Experiment, tuple[str, ...]]:
+) -> StandIns:
     """Starts what the experiment asks for, and fills in at which address each robot is.
 
     Args:
@@ -81,9 +98,6 @@ def start(
         launcher: Starts them.
         connect: `--connect` and its endpoints.
         interrupted: Asked while it waits.
-
-    Returns:
-        The experiment with addresses, and the names of the processes that were started.
 
     Raises:
         StandInError: If one does not start in time.
@@ -110,10 +124,10 @@ def start(
         name: msgspec.structs.replace(robot, body=addresses.get(name, robot.body))
         for name, robot in experiment.robots.items()
     }
-    started += _positioning(
+    measuring, positioning = _positioning(
         experiment, robots, prefix=prefix, launcher=launcher, connect=connect, interrupted=interrupted
     )
-    return msgspec.structs.replace(experiment, robots=robots), tuple(started)
+    return StandIns(msgspec.structs.replace(experiment, robots=robots), (*started, *measuring), positioning)
 
 
 def start_world(
@@ -139,12 +153,12 @@ def _positioning(
     launcher: Launcher,
     connect: Sequence[str],
     interrupted: Callable[[], bool],
-) -> list[str]:
-    """Who measures external positions; the names of the processes that were started for it."""
+) -> tuple[list[str], tuple[str, Callable[[], Process]] | None]:
+    """Who measures external positions: the names of the processes that were started for it; see `StandIns`."""
     # where robots of the world are, the world itself says: two who did would contradict each other
     measured = [name for name, robot in robots.items() if robot.position == "external" and robot.body != assign.WORLD]
     if experiment.positioning is None or not measured:
-        return []
+        return [], None
     started = []
     network = [*connect, "--realm", experiment.network.realm, "--lifeline"]
     host = experiment.positioning.removeprefix(VICON)
@@ -156,8 +170,9 @@ def _positioning(
         started.append(twin.name)
         host = _said(twin, r"^vicon (ready on) (\S+)$", 1, interrupted)["ready on"]
     maps = [part for name in measured for part in ("--map", f"{name}={name}")]
-    bridge = launcher.start(f"{prefix}-vicon", "bridges.vicon", host, *maps, *network)
-    return [*started, bridge.name]
+    bridge = partial(launcher.start, f"{prefix}-vicon", "bridges.vicon", host, *maps, *network)
+    name = bridge().name
+    return [*started, name], (name, bridge)
 
 
 def _said(process: Process, pattern: str, count: int, interrupted: Callable[[], bool]) -> dict[str, str]:

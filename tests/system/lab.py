@@ -195,6 +195,10 @@ class Flight:
                 found["router"] = child
             elif "experiments.recorder" in line:
                 found["recorder"] = child
+            elif "bridges.vicon" in line:
+                found["vicon"] = child
+            elif "twins.vicon" in line:
+                found["vicon-twin"] = child
             elif "experiments.world" in line:
                 found["world"] = child
             elif "experiments.centre" in line:

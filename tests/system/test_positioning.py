@@ -1,0 +1,53 @@
+"""Who says where robots are dies in mid-run: it is started again, and what cannot be is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import playback
+from tests.system.lab import Flight, Watcher
+
+pytestmark = pytest.mark.system
+
+PAIR = """
+title = "one leads, measured from outside"
+duration_s = 9.0
+positioning = "vicon-twin"
+trigger = { kind = "periodic", period_s = 0.02 }
+[robots]
+TB01 = { kind = "turtlebot3", body = "turtlebot3-twin", position = "external", start = [0.0, 0.0] }
+KH01 = { kind = "khepera4", start = [-0.5, 0.0] }
+[formation.links]
+"TB01 > KH01" = 0.5
+[[timeline]]
+at_s = 0.5
+robot = "TB01"
+plan = { kind = "line", move_by = [0.8, 0.0], speed = 0.1 }
+"""
+
+
+@pytest.mark.timeout(120)
+def test_positioning_is_started_again_and_the_end_of_a_device_is_told(tmp_path: Path) -> None:
+    file, folder = tmp_path / "pair.toml", tmp_path / "run"
+    file.write_text(PAIR)
+    flight = Flight(folder, str(file), "--json", "--no-report")
+    flight.until_said(r"phase conductor: TB01 under way", 60.0)
+    watcher = Watcher(flight.endpoint())
+    watcher.until(lambda: "TB01" in watcher.state and watcher.state["TB01"].position[0] > 0.1, "the leader drives")
+    flight.children()["vicon"].kill()
+    flight.until_said(r"vicon conductor: the vicon ended \(killed by SIGKILL\); started again: robots that do not know")
+    watcher.until(lambda: watcher.state["TB01"].position[0] > 0.5, "it goes on")
+    flight.children()["vicon-twin"].kill()
+    flight.until_said(r"device conductor: the vicon-twin ended \(killed by SIGKILL\); robots that need it hold, or land")
+    watcher.close()
+    code, said = flight.finish(60.0)
+    assert code == 0, said
+    trace = playback.read(folder / "default.mcap").trace
+    last = trace.true_position if np.isfinite(trace.true_position).all() else trace.position
+    assert 0.5 < np.nanmax(last[:, 0, 0]) < 0.85
+    events = [(event.kind, event.source) for event in trace.events if event.kind in {"vicon", "device"}]
+    assert events[0] == ("vicon", "conductor")
+    assert ("device", "conductor") in events
