@@ -30,8 +30,8 @@ ALONE_S: Final = 3.0  # a robot that joins a run under way does not wait longer 
 class Death:
     """A process has ended that should not have: what it was, whom it concerns, what is done.
 
-    `kind` is "recorder", "lost" (a robot's process), "host" (the connection to one), "device" (a protocol twin), or what
-    was started again.
+    `kind` is "recorder", "lost" (a robot's process), "host" (the connection to one), "device" (a protocol
+    twin), or what was started again.
     """
 
     kind: str
