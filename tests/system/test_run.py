@@ -80,7 +80,7 @@ def test_a_recording_opens_elsewhere_with_typed_messages(tmp_path: Path) -> None
 
 def test_ctrl_c_lands_everybody_and_leaves_a_valid_recording(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    flight = Flight(folder, "triangle", "--case", "event")
+    flight = Flight(folder, "triangle", "--case", "event", "--no-report")
     flight.until_said(r"phase conductor: formation")
     robots = list(flight.children().values())
     flight.signal(signal.SIGINT)
@@ -96,7 +96,7 @@ def test_ctrl_c_lands_everybody_and_leaves_a_valid_recording(tmp_path: Path) -> 
 
 def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    flight = Flight(folder, "triangle", "--case", "event", "--json", *SHORT)
+    flight = Flight(folder, "triangle", "--case", "event", "--json", "--no-report", *SHORT)
     flight.until_said(r"phase conductor: formation")
     everyone = list(flight.children().values())
     flight.children()["KH02"].kill()
@@ -176,7 +176,10 @@ def test_a_killed_recorder_costs_the_rest_of_the_recording_only(tmp_path: Path) 
 
 
 def test_a_robot_that_cannot_start_ends_the_run_or_not_as_the_file_says(tmp_path: Path) -> None:
-    absent = ("--case", "event", "--json", "--set", "robots.CF01.body=udp://127.0.0.1:9", "--set", "duration_s=4")
+    absent = (
+        "--case", "event", "--json", "--no-report",
+        "--set", "robots.CF01.body=udp://127.0.0.1:9", "--set", "duration_s=4",
+    )  # fmt: skip
     flight = Flight(tmp_path / "abort", "triangle", *absent)
     flight.until_said(r"CF01: could not start; nothing has moved")
     said = flight.said()
