@@ -22,7 +22,7 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> N
     folder = tmp_path / "run"
     flight = Flight(
         folder, "robotic-park", "--bodies", "protocol", "--case", "event", "--json", "--no-report",
-        "--set", "duration_s=14", "--set", "timeline=[]", *NEAR,
+        "--set", "duration_s=10", "--set", "timeline=[]", *NEAR,
     )  # fmt: skip
     flight.until_said(r"phase conductor: formation", 60.0)
     children = flight.children()

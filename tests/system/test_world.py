@@ -132,7 +132,7 @@ def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(
         folder, "robotic-park", "--bodies", "world", "--case", "event", "--json", "--no-report",
-        "--set", "duration_s=11", "--set", "timeline=[]", *NEAR,
+        "--set", "duration_s=12", "--set", "timeline=[]", *NEAR,
     )  # fmt: skip
     flight.until_said(r"phase conductor: formation", 60.0)
     everyone = list(flight.children().values())
