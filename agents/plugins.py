@@ -10,8 +10,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Final
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from typing import Any, Final, Protocol
 
 import msgspec
 
@@ -23,6 +23,12 @@ PLANNERS: Final = "zenpark.planners"
 AVOIDANCES: Final = "zenpark.avoidances"
 ENGINES: Final = "zenpark.engines"  # what moves the twins of a world
 DEVICES: Final = "zenpark.devices"  # protocol twins: what stands in for hardware at the far end of a body's wire
+
+
+class _Groups(Protocol):
+    """What `entry_points()` gives, which Python 3.12 has changed."""
+
+    def select(self, *, group: str) -> EntryPoints: ...
 
 
 class PluginError(ValueError):
@@ -119,9 +125,14 @@ def body_name(address: str) -> str:
 
 
 @cache
+def _installed() -> _Groups:
+    """Cached, and all groups at once: reading the metadata of all installed distributions takes milliseconds."""
+    return entry_points()
+
+
+@cache
 def _registered(group: str) -> dict[str, EntryPoint]:
-    """Cached: reading the metadata of all installed distributions takes milliseconds."""
-    return {entry.name: entry for entry in entry_points(group=group)}
+    return {entry.name: entry for entry in _installed().select(group=group)}
 
 
 def _origin(entry: EntryPoint) -> str:

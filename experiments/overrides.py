@@ -21,10 +21,10 @@ from experiments.syntax import endless
 DEEPEST: Final = 20  # names of a path; no value of an experiment lies deeper
 _PART: Final = re.compile(r"\s*+(?:\"([^\"]*)\"|'([^']*)'|([^.\"']++))\s*+(?:\.|$)")
 _SHAPES: Final = frozenset({"box", "radius", "wall"})
-_DEFAULT: Final[dict[Path, Any]] = {
-    ("trigger",): msgspec.structs.fields(Experiment)[Experiment.__struct_fields__.index("trigger")].default,
-    ("world", "engine"): msgspec.structs.fields(World)[World.__struct_fields__.index("engine")].default,
-    ("formation", "law"): msgspec.structs.fields(Formation)[Formation.__struct_fields__.index("law")].default,
+_CHOICES: Final[Mapping[Path, type[msgspec.Struct]]] = {
+    ("trigger",): Experiment,
+    ("world", "engine"): World,
+    ("formation", "law"): Formation,
 }
 
 
@@ -178,10 +178,19 @@ def _known(at: dict[str, Any] | list[Any], step: str | int, path: Path, *, part:
     return str(step)
 
 
+def _default(path: Path) -> Any:  # noqa: ANN401 - whatever a document may say there
+    """What is chosen where nothing is said."""
+    struct = _CHOICES.get(path)
+    if struct is None:
+        return None
+    names = struct.__struct_fields__
+    return struct.__struct_defaults__[names.index(str(path[-1])) - len(names)]
+
+
 def _as_table(value: object, path: Path, *, part: bool = False) -> object:
     """The long form of what may be written short: a choice by its name, a link by its distance."""
     if group_of(path):
-        value = _DEFAULT.get(path) if value is None and not part else value
+        value = _default(path) if value is None and not part else value
         return {"kind": value} if isinstance(value, str) else value
     if path[:-1] == ("formation", "links") and isinstance(value, int | float) and not isinstance(value, bool):
         return {"distance": value}

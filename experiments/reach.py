@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from agents import lab
 from agents.endpoint import EndpointError
-from experiments.experiment import Experiment
+
+if TYPE_CHECKING:  # numpy comes with it, and an emergency stop waits for nothing that it does not need
+    from experiments.experiment import Experiment
 
 
 def folder(experiment: Experiment, file: Path, chosen: str | None = None) -> Path | None:

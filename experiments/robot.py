@@ -1,6 +1,6 @@
 """A robot's process: `python -m experiments.robot FILE NAME ...`. Light to start, for an experiment starts many.
 
-`zenpark agent` is the same for people; the launcher starts this, which needs neither typer nor what typer needs.
+`zenpark agent` is the same for people; launchers start this, which needs neither typer nor what typer needs.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from agents.clock import Clock
 from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.fleet import assemble
 from agents.keys import Keys
+from agents.lab import LabError
 from agents.leaving import end
 from agents.runtime import NameTaken, Runtime
 from agents.session import Unreachable
@@ -176,6 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("names", nargs="+", metavar="ROBOT")
     parser.add_argument("--case", help="which case of the file; the first if left out")
     parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
+    parser.add_argument("--lab", metavar="FOLDER", help="certificates; the file's if left out")
     parser.add_argument("--lifeline", action="store_true", help="land and end when standard input ends or is silent")
     parser.add_argument("--clock-correction", type=float, default=0.0, metavar="SECONDS", help="added to the clock")
     parser.add_argument("--realm", default="park", help="in which to join")
@@ -191,8 +193,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             clock_correction_s=chosen.clock_correction,
             once=chosen.once,
             realm=chosen.realm,
+            lab=chosen.lab,
         )
-    except (DocumentError, BodyError, NameTaken, plugins.PluginError, EndpointError, Unreachable) as error:
+    except (DocumentError, BodyError, NameTaken, plugins.PluginError, EndpointError, LabError, Unreachable) as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2
 

@@ -10,6 +10,7 @@ import math
 import re
 import types
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
@@ -88,7 +89,7 @@ def group_of(path: Path) -> str | None:
 def parameters(group: str, kind: str) -> list[str]:
     """Names of the parameters of a plug-in, none if it cannot be used."""
     try:
-        return [field.encode_name for field in msgspec.structs.fields(plugins.struct(group, kind))]
+        return list(_fields_of(plugins.struct(group, kind)))
     except plugins.PluginError:
         return []
 
@@ -131,7 +132,7 @@ def _table(
         path: Where it stands.
         plugin: Group and kind, if these are a plug-in's parameters.
     """
-    fields = {field.encode_name: field for field in msgspec.structs.fields(struct)}
+    fields = _fields_of(struct)
     found, meant = [], set()
     for key in value:
         if key not in fields:
@@ -146,6 +147,12 @@ def _table(
             hint = _REMEDY.get(name) or f"add {name} = ... ({note})"
             found.append(Fault(path, f"'{name}' is missing{_in(path)}", hint))
     return found or _judged(value, struct, path, "", fields)
+
+
+@cache
+def _fields_of(struct: type[msgspec.Struct]) -> Mapping[str, msgspec.structs.FieldInfo]:
+    """By their names in a file. Cached: working out what annotations mean takes longer than judging a table by them."""
+    return {field.encode_name: field for field in msgspec.structs.fields(struct)}
 
 
 def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) -> Fault:

@@ -42,6 +42,22 @@ def explanation(found: dict[str, Path | None], root: Path) -> str:
     return "\n".join(lines)
 
 
+def _lean(words: list[str]) -> None:
+    """Becomes what a run starts on its hosts, small computers often: typer is for people, and takes as long to import.
+
+    Returns if it is not that.
+    """
+    if words == ["station"]:
+        from experiments.station import serve  # noqa: PLC0415 (not before the check)
+
+        sys.exit(serve())
+    if words[:1] == ["agent"] and "--lifeline" in words:
+        from agents.leaving import end  # noqa: PLC0415
+        from experiments.robot import main as robot  # noqa: PLC0415
+
+        end(robot(words[1:]))
+
+
 def main() -> None:
     """Checks the packages, then hands over to the command line."""
     root = Path(__file__).resolve().parent.parent
@@ -50,6 +66,7 @@ def main() -> None:
         print(explanation(found, root), file=sys.stderr)
         sys.exit(2)
     try:
+        _lean(sys.argv[1:])
         from tools.cli import main as command_line  # noqa: PLC0415 (not before the check)
 
         command_line()

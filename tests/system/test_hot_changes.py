@@ -47,7 +47,7 @@ class Lab:
         text = text.replace('"KH01 - KH02"', '"KH01 > KH03" = 0.60\n"KH03 > KH01" = 0.60\n"KH01 - KH02"', 1)
         self.file.write_text(text)
 
-    def fly(self, *more: str, duration: int = 120, endpoint: str | None = None) -> None:
+    def fly(self, *more: str, duration: int = 60, endpoint: str | None = None) -> None:
         settings = [part for each in (f"duration_s={duration}", *more) for part in ("--set", each)]
         self.flight = Flight(self.folder / "run", str(self.file), "--case", "event", "--no-report", "--json", *settings)
         self.flight.until_said("phase conductor: formation")

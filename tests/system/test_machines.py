@@ -37,10 +37,20 @@ def experiment(lab: Machines, folder: Path, duration_s: float) -> Path:
     """The reference experiment, its robots on the lab's machines."""
     text = entries.path("robotic-park").read_text("utf-8")
     text = text.replace("duration_s = 45.0", f"duration_s = {duration_s}").replace("at_s = 21.0", "at_s = 1.0")
-    for host, robots in ROBOTS.items():
+    return on_hosts(lab, folder, text, ROBOTS)
+
+
+def triangle(lab: Machines, folder: Path, duration_s: float) -> Path:
+    """The first experiment, one robot on each machine: enough for what does not depend on their number."""
+    text = entries.path("triangle").read_text("utf-8").replace("duration_s = 15.0", f"duration_s = {duration_s}")
+    return on_hosts(lab, folder, text, dict(zip(ROBOTS, (["KH01"], ["KH02"], ["CF01"]), strict=True)))
+
+
+def on_hosts(lab: Machines, folder: Path, text: str, robots: dict[str, list[str]]) -> Path:
+    for host, names in robots.items():
         wrong = {"offset_s": OFFSET_S, "drift": DRIFT} if host == "lab2" else {}
         zenpark = lab[host].zenpark(**wrong)
-        text += f'\n[hosts.{host}]\naddress = "{host}"\nzenpark = "{zenpark}"\nrobots = {json.dumps(robots)}\n'
+        text += f'\n[hosts.{host}]\naddress = "{host}"\nzenpark = "{zenpark}"\nrobots = {json.dumps(names)}\n'
     file = folder / "experiment.toml"
     file.write_text(text)
     return file
@@ -108,7 +118,7 @@ def test_one_command_flies_the_reference_experiment_and_brings_everything_back(l
 
 
 def test_a_centre_here_guides_robots_elsewhere_and_all_stamp_by_one_clock(lab: Machines, tmp_path: Path) -> None:
-    file, folder = experiment(lab, tmp_path, 3.0), tmp_path / "run"
+    file, folder = triangle(lab, tmp_path, 3.0), tmp_path / "run"
     options = ["--case", "periodic", "--set", "architecture=centralised", "--anyway", "--no-report"]
     flight = zenpark(lab, "run", str(file), *options, "--out", str(folder))
     out, _ = flight.communicate(timeout=100)
@@ -156,9 +166,9 @@ def said(logs: Path, robot: str) -> str:
 
 
 def test_a_machine_that_is_cut_off_lands_its_robots_and_the_others_go_on(lab: Machines, tmp_path: Path) -> None:
-    file, folder = experiment(lab, tmp_path, 8.0), tmp_path / "run"
+    file, folder = triangle(lab, tmp_path, 8.0), tmp_path / "run"
     flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--anyway", "--no-report")
-    until(lambda: all("running" in said(folder / "logs", robot) for robot in ROBOTS["lab3"]), "it runs", 60.0)
+    until(lambda: "running" in said(folder / "logs", "CF01"), "it runs", 60.0)
     try:
         lab["lab3"].unplug()
         cut = time.monotonic()
@@ -168,8 +178,8 @@ def test_a_machine_that_is_cut_off_lands_its_robots_and_the_others_go_on(lab: Ma
     finally:
         lab["lab3"].plug_in_again()
     assert flight.returncode == 0, out
-    assert "lost CF02: its process ended" in out
-    assert "done (finished)" in said(folder / "logs", "CF01")
+    assert "lost CF01: its process ended" in out
+    assert "done (finished)" in said(folder / "logs", "KH01")
     until(lambda: not busy(lab), "nothing is left", 5.0)
 
 

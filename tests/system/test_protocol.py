@@ -12,7 +12,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from experiments import playback
 from experiments.launcher import LAND_S
-from tests.system.lab import ROOT, Flight, gone, until
+from tests.system.lab import NEAR, ROOT, Flight, gone, until
 
 pytestmark = pytest.mark.system
 
@@ -22,7 +22,7 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> N
     folder = tmp_path / "run"
     flight = Flight(
         folder, "robotic-park", "--bodies", "protocol", "--case", "event", "--json", "--no-report",
-        "--set", "duration_s=24", "--set", "timeline=[]",
+        "--set", "duration_s=10", "--set", "timeline=[]", *NEAR,
     )  # fmt: skip
     flight.until_said(r"phase conductor: formation", 60.0)
     children = flight.children()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +21,28 @@ pytestmark = pytest.mark.system
 SHORT = ("--set", "duration_s=5")
 
 
-def test_a_run_forms_up_loses_nothing_and_reports(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
+@dataclass
+class Whole:
+    """A run of two cases that nothing disturbed."""
+
+    folder: Path
+    code: int
+    out: str
+    said: str
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    folder = tmp_path_factory.mktemp("whole") / "run"
     flight = Flight(folder, "triangle", "--json", *SHORT)
     code, out = flight.finish(90.0)
-    assert code == 0, flight.said
-    document = json.loads(out)
+    return Whole(folder, code, out, flight.said())
+
+
+def test_a_run_forms_up_loses_nothing_and_reports(whole: Whole) -> None:
+    folder = whole.folder
+    assert whole.code == 0, whole.said
+    document = json.loads(whole.out)
     assert document["run"] == str(folder)
     assert list(document["cases"]) == ["periodic", "event"]
     for case in document["cases"].values():
@@ -57,10 +74,8 @@ def test_a_run_forms_up_loses_nothing_and_reports(tmp_path: Path) -> None:
         assert finite.mean() > 0.99
 
 
-def test_a_recording_opens_elsewhere_with_typed_messages(tmp_path: Path) -> None:
-    flight = Flight(tmp_path / "run", "triangle", "--case", "event", "--no-report", "--set", "duration_s=2")
-    assert flight.finish()[0] == 0
-    file = tmp_path / "run" / "event.mcap"
+def test_a_recording_opens_elsewhere_with_typed_messages(whole: Whole) -> None:
+    file = whole.folder / "event.mcap"
     with AnyReader([file]) as bag:
         types = {connection.topic: connection.msgtype for connection in bag.connections}
         assert types["/CF01/true_pose"] == "geometry_msgs/msg/PoseStamped"
@@ -80,7 +95,7 @@ def test_a_recording_opens_elsewhere_with_typed_messages(tmp_path: Path) -> None
 
 def test_ctrl_c_lands_everybody_and_leaves_a_valid_recording(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    flight = Flight(folder, "triangle", "--case", "event")
+    flight = Flight(folder, "triangle", "--case", "event", "--no-report")
     flight.until_said(r"phase conductor: formation")
     robots = list(flight.children().values())
     flight.signal(signal.SIGINT)
@@ -96,7 +111,7 @@ def test_ctrl_c_lands_everybody_and_leaves_a_valid_recording(tmp_path: Path) -> 
 
 def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    flight = Flight(folder, "triangle", "--case", "event", "--json", *SHORT)
+    flight = Flight(folder, "triangle", "--case", "event", "--json", "--no-report", *SHORT)
     flight.until_said(r"phase conductor: formation")
     everyone = list(flight.children().values())
     flight.children()["KH02"].kill()
@@ -176,7 +191,10 @@ def test_a_killed_recorder_costs_the_rest_of_the_recording_only(tmp_path: Path) 
 
 
 def test_a_robot_that_cannot_start_ends_the_run_or_not_as_the_file_says(tmp_path: Path) -> None:
-    absent = ("--case", "event", "--json", "--set", "robots.CF01.body=udp://127.0.0.1:9", "--set", "duration_s=4")
+    absent = (
+        "--case", "event", "--json", "--no-report",
+        "--set", "robots.CF01.body=udp://127.0.0.1:9", "--set", "duration_s=4",
+    )  # fmt: skip
     flight = Flight(tmp_path / "abort", "triangle", *absent)
     flight.until_said(r"CF01: could not start; nothing has moved")
     said = flight.said()

@@ -16,7 +16,7 @@ from agents import wire
 from agents.keys import Keys
 from experiments import orders, playback
 from tests.conftest import RouterProcess
-from tests.system.lab import Flight, Looking, RobotProcess, Watcher, WorldProcess, gone, until
+from tests.system.lab import NEAR, Flight, Looking, RobotProcess, Watcher, WorldProcess, gone, until
 
 pytestmark = pytest.mark.system
 
@@ -132,7 +132,7 @@ def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(
         folder, "robotic-park", "--bodies", "world", "--case", "event", "--json", "--no-report",
-        "--set", "duration_s=18", "--set", "timeline=[]",
+        "--set", "duration_s=12", "--set", "timeline=[]", *NEAR,
     )  # fmt: skip
     flight.until_said(r"phase conductor: formation", 60.0)
     everyone = list(flight.children().values())

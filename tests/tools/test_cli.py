@@ -72,20 +72,33 @@ def test_every_command_has_help(command):
     assert said.stdout.startswith(f"Usage: zenpark {command} ")
 
 
-def test_help_is_light():
+def loaded(*words):
+    """What a command prints, and the modules that it has imported when it ends."""
     program = """
 import sys
-sys.argv = ["zenpark", "--help"]
 from tools.guard import main
 try:
     main()
 finally:
     print(*sys.modules, file=sys.stderr)
 """
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("Usage: zenpark ")
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    return done.stdout, set(done.stderr.split())
+
+
+def test_help_is_light():
+    said, modules = loaded("--help")
+    assert said.startswith("Usage: zenpark ")
     heavy = {"numpy", "zenoh", "matplotlib", "msgspec", "pymunk", "rich", "asyncio", "jinja2", "mcap", "pydantic"}
-    assert not heavy & set(done.stderr.split())
+    assert not heavy & modules
+
+
+def test_an_emergency_stop_waits_for_no_numpy():
+    _, modules = loaded("estop", "--connect", "tcp/127.0.0.1:9")
+    assert "tools.estop" in modules
+    assert not {"numpy", "matplotlib", "mcap"} & modules
 
 
 def test_version():

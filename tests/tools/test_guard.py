@@ -3,6 +3,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tools.guard import PACKAGES, intruders
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,3 +59,21 @@ def test_imports_nothing_of_ours_and_nothing_heavy():
     )
     loaded = set(done.stdout.split())
     assert not loaded & {"agents", "bridges", "twins", "experiments", "tools.cli", "typer", "numpy", "zenoh"}
+
+
+@pytest.mark.parametrize(
+    ("words", "code"), [(["station"], 0), (["agent", "-", "KH01", "--clock-correction=-0.5", "--lifeline"], 2)]
+)
+def test_what_a_run_starts_on_its_hosts_needs_no_typer(words, code):
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "tools.guard", *words],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == code, done.stderr[-500:]
+    loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+    assert "experiments.station" in loaded or "experiments.robot" in loaded
+    assert not loaded & {"typer", "pydantic", "tools.cli"}
