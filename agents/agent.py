@@ -191,6 +191,11 @@ class Agent:
         self.tick += ticks
         self.outside.ticked(ticks, 1.0 / self.assignment.body_hz)
 
+    @property
+    def sinking(self) -> Mask:
+        """Rows (N,) that come down, or are down; not those that look for a place to."""
+        return np.asarray((self.life.phase >= LANDING) & ~self._landing.aside)
+
     def land_here(self) -> None:
         """Something else has made the bodies land: nobody looks for a better place any more."""
         self._landing.hurry()

@@ -59,7 +59,7 @@ class Runtime:
         self._state_slot = 0
         self._stopping: str | None = None
         self._leaving: set[int] = set()  # rows that were told to go while the run goes on
-        self._retired: set[int] = set()  # rows that are down while the run goes on
+        self._retired: set[int] = set()  # rows that come down, or are down, while the run goes on
         self._doubt_until = -np.inf
         self._cut_off = False  # motors were cut by a stop that the loop has not seen yet
         self._slept, self._joined = 0.0, False
@@ -361,7 +361,7 @@ class Runtime:
             self._say(int(row), said, float(state.yaw[row]), t)
         actions = self.agent.act(t, state, said)
         self._act(actions)
-        if self.agent.life.moved or self._leaving or self._retired:
+        if self._retired or not self.agent.life.all_running:
             self._retire(t)
         counts, telemetry = self._counts, self._telemetry
         if not begun and self.agent.decisions:
@@ -378,14 +378,14 @@ class Runtime:
         self._neighbours.changed = False
 
     def _retire(self, t: float) -> None:
-        """Who is told to leave, or came down unasked, takes its token back: none must keep to somebody on the floor.
+        """Who is told to leave, or comes down unasked, takes its token back and is silent: none must follow it down.
 
         When the experiment is over the latter says again that it is there; whoever was ordered down is told about
         elsewhere.
         """
         life = self.agent.life
         during = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
-        for row in np.flatnonzero(life.phase == Phase.DONE).tolist():
+        for row in np.flatnonzero(self.agent.sinking).tolist():
             unasked = during[row] and not life.reason[row].startswith((EMERGENCY, LAND, STOP))
             if (unasked or row in self._leaving) and row not in self._retired:
                 self._retired.add(row)
