@@ -385,7 +385,7 @@ class Runtime:
         """
         life = self.agent.life
         during = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
-        # those who serve robots whose launcher is gone go when the tokens do (`agents.farewell`): not before all are down
+        # those who serve robots whose launcher is gone go when the tokens do (`agents.farewell`)
         down = self.agent.sinking if self._stopping is None else life.phase == Phase.DONE
         for row in np.flatnonzero(down).tolist():
             unasked = during[row] and not life.reason[row].startswith((EMERGENCY, LAND, STOP))
