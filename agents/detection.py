@@ -17,6 +17,8 @@ from agents.rows import Array, Mask, norm, some
 from agents.safety import ESCAPED, Whereabouts
 from agents.separation import Separation
 
+SUNK: Final = 0.15  # [m] so far below its goal,
+SINKS: Final = 0.15  # [m/s] and this fast downward, a row is not flying where it wants to
 LATE_WINDOW_S: Final = 1.0  # over so long it is counted how many ticks were missed,
 LATE_SHARE: Final = 0.9  # and with a larger share of them a control loop is none
 
@@ -58,6 +60,7 @@ class Standing(NamedTuple):
         landing: On their way down.
         alone: Nobody is left that the law could listen to; None: nobody is alone.
         lacking: Run and are guided by nobody; None: nobody is guided.
+        height: Of their goals [m].
         wild: The last setpoint was not made of finite numbers.
         places: Where those that land come down.
     """
@@ -67,6 +70,7 @@ class Standing(NamedTuple):
     landing: Mask
     alone: Mask | None
     lacking: Mask | None
+    height: Array
     wild: Mask
     places: Landing
 
@@ -144,6 +148,14 @@ class Detector:
         fallen = self._flies > state.flying
         if some(fallen) and some(fallen := fallen & rows.cruising):
             seen.append(Sighting(Cause.FALLEN, fallen, lambda _: "its motors are off"))
+        sinks = state.velocity[:, 2] < -SINKS
+        if some(sinks) and some(sinks := sinks & rows.cruising & self._flies):
+            short = rows.height - state.position[:, 2]
+            if some(sinks := sinks & (short > SUNK)):
+                text = "{:.2f} m below its goal, and sinks at {:.2f} m/s"
+                seen.append(
+                    Sighting(Cause.SINKING, sinks, lambda row: text.format(short[row], -state.velocity[row, 2]))
+                )
         if state.attitude is not None:
             leans = leaning(state.attitude, limits.tilt)
             if some(leans) and some(leans := leans & self._flies & state.flying):

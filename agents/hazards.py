@@ -57,6 +57,7 @@ class Cause(IntEnum):
     LATE = 17
     LANDING = 18
     BELOW = 19
+    SINKING = 20
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,8 @@ RULES: Final[Mapping[Cause, Rule]] = {
     ),
     Cause.LATE: Rule("its control loop misses its ticks", Outcome.HOLD, then=Outcome.LAND, then_s=5.0, clears_s=0.5),
     Cause.LANDING: Rule("its landing takes too long", Outcome.CUT, landing=True),
+    # its device lands it, or its battery carries it no more: who hears it must not follow
+    Cause.SINKING: Rule("it comes down by itself", Outcome.LAND, after_s=0.1),
     Cause.BELOW: Rule("a robot is below it", Outcome.WARN, landing=True),
 }
 

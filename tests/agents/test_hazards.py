@@ -69,6 +69,7 @@ EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while th
     Cause.LATE: [(0, "HOLD"), (500, "LAND")],
     Cause.LANDING: [(2000, "CUT")],
     Cause.BELOW: [(0, "WARN")],
+    Cause.SINKING: [(10, "LAND")],
 }
 
 
@@ -229,6 +230,14 @@ UNSAFE = {
     "outside": ({"position": [2.3, 0.0, 0.5]}, "land: it left the arena: 0.30 m outside (limit 0.25 m)", LANDING, 2),
     "flown": ({"position": [2.8, 0.0, 0.5]}, "cut: it flies away: 0.80 m outside (limit 0.75 m)", DONE, 13),
     "beyond": ({"position": [2.1, 0.0, 0.5]}, "warn: it is beyond a wall of the arena: 0.10 m outside", RUNNING, 50),
+    "sinks": (
+        {"position": [0.0, 0.0, 0.3], "velocity": [0.0, 0.0, -0.2]},
+        "land: it comes down by itself: 0.20 m below its goal, and sinks at 0.20 m/s",
+        LANDING,
+        13,
+    ),
+    "low": ({"position": [0.0, 0.0, 0.3], "velocity": [0.0, 0.0, -0.1]}, None, RUNNING, 300),
+    "dips": ({"position": [0.0, 0.0, 0.4], "velocity": [0.0, 0.0, -0.2]}, None, RUNNING, 300),
     "down": ({"flying": False}, "land: it came down by itself: its motors are off", LANDING, 2),
 }
 
