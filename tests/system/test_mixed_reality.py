@@ -20,7 +20,7 @@ pytestmark = pytest.mark.system
 
 WORLD = """
 title = "{real} stands in the way of {twin}"
-duration_s = 11.5
+duration_s = 14.0
 positioning = "vicon-twin"
 [network]
 realm = "{realm}"
@@ -35,7 +35,7 @@ hears = "{hears}"
 [[timeline]]
 at_s = 3.0
 robot = "{twin}"
-plan = {{ kind = "waypoints", points = [[0.6, 0.0]], speed = 0.2 }}
+plan = {{ kind = "waypoints", points = [[0.6, 0.0]], speed = 0.12 }}
 """
 ON_THE_FLOOR = """
 [robots.TB01]
@@ -111,6 +111,6 @@ def test_real_robots_that_stand_in_the_way_of_twins_are_seen_and_avoided(tmp_pat
         mine = KINDS[trace.experiment.robots[twin].kind].radius
         assert np.nanmin(apart) > mine + kind.radius + 0.01, twin
         assert trace.contacts == ()
-        end = truth[trace.time > 11.0, at[twin]]
+        end = truth[trace.time > 13.5, at[twin]]
         assert np.linalg.norm(end - [0.6, 0.0], axis=1).max() < 0.08, twin  # it went around
         assert trace.avoided[at[twin]] > 0
