@@ -48,7 +48,7 @@ class Lab:
         self.file.write_text(text)
 
     def fly(self, *more: str, duration: int = 60, endpoint: str | None = None) -> None:
-        settings = [part for each in (f"duration_s={duration}", *more) for part in ("--set", each)]
+        settings = [part for each in (f"duration_s={duration}", "rates.body_hz=50", *more) for part in ("--set", each)]
         self.flight = Flight(self.folder / "run", str(self.file), "--case", "event", "--no-report", "--json", *settings)
         self.flight.until_said("phase conductor: formation")
         self.endpoint = endpoint or self.flight.endpoint()

@@ -16,7 +16,7 @@ from tools import authority
 
 pytestmark = pytest.mark.system
 
-SHORT = ("--case", "periodic", "--no-report", "--set", "duration_s=3")
+SHORT = ("--case", "periodic", "--no-report", "--set", "duration_s=3", "--set", "rates.body_hz=50")
 
 
 def found(folder: Path, *hosts: str) -> Path:

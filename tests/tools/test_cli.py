@@ -76,6 +76,7 @@ def loaded(*words):
     """What a command prints, and the modules that it has imported when it ends."""
     program = """
 import sys
+sys.argv[0] = "zenpark"
 from tools.guard import main
 try:
     main()
