@@ -40,7 +40,7 @@ from experiments.watched import Watched
 POLL_S: Final = 0.02
 BEGIN_S: Final = 100.0  # to the common start
 FORM_S: Final = 30.0  # a formation that has not come together by then does not
-HEAL_S: Final = 12.0  # after a fault is lifted the formation stands again
+HEAL_S: Final = 30.0  # at the latest so long after a fault is lifted the formation stands again
 SETTLED_S: Final = 0.5  # and stays so
 FRESH_S: Final = 1.6  # a robot that says nothing for longer is not back: statuses come once a second
 HELD_M: Final = 0.25  # a robot that nobody steers goes no farther than this
