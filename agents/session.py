@@ -236,6 +236,10 @@ class Alarm:
         """See `Polled`."""
         return self._waiting.popleft() if self._waiting else None
 
+    def close(self) -> None:
+        """Listens no longer."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
     def _take(self, sample: zenoh.Sample) -> None:
         self._waiting.append(sample)
         self._obey(sample)

@@ -7,11 +7,12 @@ import sys
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from agents import plugins
 from experiments import document, entries, results, verdict
 from experiments.bar import Bar
+from experiments.emergency import Emergency
 from experiments.problem import DocumentError, Problem
 from experiments.progress import shown
 from experiments.realtime import Staging, conduct
@@ -19,6 +20,8 @@ from experiments.records import RecordingError
 from experiments.run import SOURCE, Interrupts, Run, chosen, load, new_folder, read_back, reopen, simulate_seeds
 from experiments.seeds import across_seeds
 from experiments.standins import BODIES
+
+STOPPED: Final = 1  # exit code of a run that an emergency stop has ended
 
 
 def run(
@@ -35,7 +38,7 @@ def run(
     report: bool,
     open_report: bool,
 ) -> int:
-    """`zenpark run`; returns the exit code: 0, 2 if the check finds errors, or 130 after Ctrl-C."""
+    """`zenpark run`; returns the exit code: 0, 1 after an emergency stop, 2 if the check finds errors, 130 if ended."""
     changes = [*settings, *([] if seed is None else [f"seed={seed}"])]
     read = load(file, *changes)
     _refuse(staging, virtual=virtual, seeds=seeds)
@@ -45,7 +48,7 @@ def run(
         return 2
     folder = new_folder(read, out)
     read.keep(folder / SOURCE)
-    interrupted = Interrupts()
+    interrupted, emergency = Interrupts(), Emergency()
     if virtual:
         first = read.experiment.seed
         with Bar(passing=True) as bar:
@@ -60,13 +63,15 @@ def run(
         with interrupted:
             show = shown(quiet=as_json)
             try:
-                runs = [read_back(folder, *conduct(read, folder, staging, show=show, interrupted=interrupted))]
+                flown = conduct(read, folder, staging, show=show, interrupted=interrupted, emergency=emergency)
+                runs = [read_back(folder, *flown)]
             except KeyboardInterrupt:
                 print(f"\nended at once; `zenpark report {folder}` shows what was recorded", file=sys.stderr)
                 return 130
     if not runs[0].traces:
-        print(f"interrupted before the common start: there is nothing to report; logs: {folder / 'logs'}")
-        return 130
+        why = emergency.words or "interrupted"
+        print(f"{why}, before the common start: there is nothing to report; logs: {folder / 'logs'}")
+        return STOPPED if emergency else 130
     again = _command(file, staging, virtual=virtual, changes=changes, seeds=seeds, anyway=anyway)
     page = _keep(runs, folder, again) if report else None
     summary: dict[str, Any] = runs[0].summary()
@@ -78,6 +83,9 @@ def run(
         _tell(runs, summary, page)
     if open_report and page is not None:
         webbrowser.open(page.resolve().as_uri())
+    if emergency:
+        print(f"zenpark: {emergency.words}", file=sys.stderr)
+        return STOPPED
     return 130 if interrupted.asked else 0
 
 

@@ -18,6 +18,7 @@ from experiments.assign import guided
 from experiments.changes import CLIMB_S, HotChanges
 from experiments.crew import Crew
 from experiments.drift import Drift
+from experiments.emergency import Emergency
 from experiments.experiment import Experiment
 from experiments.hosts import Hosts
 from experiments.launcher import LAND_S, Launcher
@@ -70,6 +71,7 @@ class Conductor:
         hosts: Hosts,
         show: Show,
         interrupted: Callable[[], bool],
+        emergency: Emergency | None = None,
     ) -> None:
         """Prepares a case; nothing is started yet.
 
@@ -86,12 +88,14 @@ class Conductor:
             hosts: Other machines, on which robots may be started.
             show: Called with the progress, about ten times a second.
             interrupted: Asked whether the user wants to end it.
+            emergency: Hears emergency stops, which end it as well; one of its own if left out.
         """
         self._experiment, self._case = experiment, case
         self._file, self._identity = file, identity
         self._recording = folder / f"{case}.mcap"
         self._endpoints = list(endpoints)
-        self._hosts, self._show, self._interrupted = hosts, show, interrupted
+        self._hosts, self._show, self._asked = hosts, show, interrupted
+        self._emergency = Emergency() if emergency is None else emergency
         self._keys = Keys(experiment.network.realm)
         steered = guided(experiment)
         self._robots = {
@@ -152,6 +156,10 @@ class Conductor:
             self._crew.end()
         lost = tuple(name for name, seen in self._robots.items() if seen.out == "lost")
         return Result(self._recording, self._interrupted(), start, ready, lost)
+
+    def _interrupted(self) -> bool:
+        """Whether somebody wants the run to end."""
+        return bool(self._emergency) or self._asked()
 
     def _adopt(self) -> None:
         """Finds robots that were started by hand or at boot, which nobody needs to start.
@@ -283,8 +291,11 @@ class Conductor:
         """Everybody down."""
         self._view.close_doors()
         self._changes.close()
-        self._progress.phase = "landing"
-        self._view.say("phase", "conductor", "landing" + (" (interrupted)" if self._interrupted() else ""))
+        self._progress.phase = "stopped" if self._emergency else "landing"
+        if self._emergency:
+            self._view.say("stop", "conductor", f"{self._emergency.words}; the run ends here")
+        how = "emergency stop" if self._emergency else "interrupted" if self._interrupted() else ""
+        self._view.say("phase", "conductor", "landing" + (f" ({how})" if how else ""))
         if any(not (seen.gone or seen.reached("landing")) for seen in self._robots.values()):
             self._order(wire.Order("land"))
         deadline = time.monotonic() + LAND_S
@@ -305,6 +316,7 @@ class Conductor:
         self._view = Overview(
             stack, self._experiment, self._endpoints, self._progress, self._recording.parent, identity=self._identity
         )
+        stack.callback(self._emergency.listen(self._view.session, self._keys).close)
         self._changes = HotChanges(self._experiment, self._crew, self._view, self._keys)
 
     def _look(self) -> None:

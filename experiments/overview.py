@@ -88,6 +88,11 @@ class Overview:
         self._cut_off = -inf
 
     @property
+    def session(self) -> zenoh.Session:
+        """Its session, for whoever hears more by it."""
+        return self._session
+
+    @property
     def connected(self) -> bool:
         return network.connected(self._session)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,12 +11,14 @@ import msgspec
 
 from agents.access import rules
 from agents.endpoint import free_endpoints
+from agents.keys import Keys
 from agents.lab import LabError, register, require, secured
 from agents.lab import of as lab_of
 from agents.topology import from_here
 from experiments import access, document, mesh, reach
 from experiments.conductor import Conductor, Result
 from experiments.document import Document
+from experiments.emergency import Emergency
 from experiments.experiment import Experiment
 from experiments.hosts import Hosts
 from experiments.launcher import Launcher
@@ -53,6 +56,7 @@ def conduct(
     *,
     show: Shown,
     interrupted: Callable[[], bool],
+    emergency: Emergency,
     launching: Callable[[Path], Launcher] = Launcher,
 ) -> tuple[dict[str, Path], list[str]]:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
@@ -63,6 +67,7 @@ def conduct(
         staging: What the file leaves open.
         show: Shows the progress.
         interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
+        emergency: Hears emergency stops; after one no further case begins.
         launching: Makes the launcher of the processes, given the folder of their logs.
 
     Returns:
@@ -99,9 +104,12 @@ def conduct(
         for router in divided(listening, network.routers) if own_router else ():
             router.start(launcher, rights)
         hosts = Hosts(launcher, endpoints if meshed else listening)
-        with show:
+        # of a mesh nobody is there yet: only the session of each case hears it there
+        keys = Keys(network.realm)
+        hears = nullcontext() if meshed else emergency.throughout(endpoints, keys, staging.identity)
+        with show, hears:
             for name, experiment in embodied.items():
-                if interrupted():
+                if interrupted() or emergency:
                     break
                 file = folder / f"{name}.json"
                 file.write_bytes(document.write_json(experiment))
@@ -118,9 +126,14 @@ def conduct(
                     hosts=hosts,
                     show=show,
                     interrupted=interrupted,
+                    emergency=emergency,
                 ).run()
         left = hosts.sweep()
-    notes = [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
+    unflown = ", ".join(name for name in embodied if name not in results)
+    stopped = [emergency.words + (f"; not run: {unflown}" if unflown else "")] if emergency else []
+    notes = (
+        stopped + [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
+    )
     return {case: result.recording for case, result in results.items() if result.start is not None}, notes
 
 

@@ -21,6 +21,7 @@ from agents.endpoint import EndpointError
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
 from experiments.conductor import RunFailed
+from experiments.emergency import Emergency
 from experiments.hosts import HostError
 from experiments.launcher import Launcher, Process
 from experiments.problem import DocumentError
@@ -88,6 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 Staging(cases=chosen.case, bodies=chosen.bodies, here=True),
                 show=Told(),
                 interrupted=over.is_set,
+                emergency=Emergency(),
                 launching=partial(Cabled, cables),
             )
     except (

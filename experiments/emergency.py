@@ -1,0 +1,54 @@
+"""An emergency stop ends the whole run: what stopped robots must not start again by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+
+import zenoh
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from agents.leaving import held
+from agents.settings import ASK_S
+
+
+class Emergency:
+    """Listens for emergency stops as long as a run goes on, between its cases too.
+
+    Attributes:
+        said: The first one that was heard; None: there was none.
+    """
+
+    def __init__(self) -> None:
+        self.said: wire.Stop | None = None
+
+    def __bool__(self) -> bool:
+        return self.said is not None
+
+    @property
+    def words(self) -> str:
+        """Who stopped the run, and why; empty if nobody has."""
+        return "" if self.said is None else f"emergency stop by {self.said.who}: {self.said.reason}"
+
+    def listen(self, session: zenoh.Session, keys: Keys) -> network.Alarm:
+        """Hears stops in a realm, for as long as what is returned is kept."""
+        return network.Alarm(session, keys.estop, self._heed)
+
+    @contextmanager
+    def throughout(self, endpoints: Sequence[str], keys: Keys, identity: str) -> Iterator[None]:
+        """Hears stops by a session of its own: those of the cases are closed between them.
+
+        Raises:
+            Unreachable: If no router answers.
+        """
+        opened = network.open_session(endpoints, name="emergency stops", identity=identity, wait_s=ASK_S)
+        with held(opened) as (session, declared):
+            declared.append(self.listen(session, keys))
+            yield
+
+    def _heed(self, sample: zenoh.Sample) -> None:
+        with suppress(wire.Malformed):
+            stop = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
+            self.said = self.said or stop
