@@ -100,7 +100,7 @@ def files(folder: Path, name: str) -> Files:
         except FileNotFoundError:
             raise LabError(
                 f"{file} is missing: copy it from the lab's own folder, or make it there with "
-                f"`zenpark keys issue {folder} {name}`"
+                f"`zenpark keys issue {folder} {name}`, if it had one before with `zenpark keys renew {folder} {name}`"
             ) from None
         except OSError as error:
             raise LabError(f"{file}: cannot be read: {error.strerror}") from None

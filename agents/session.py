@@ -137,10 +137,14 @@ def _silence(endpoints: Sequence[str], identity: str) -> str:
         if folder is None
         else f", or it refuses the certificate of {identity} (`zenpark keys show {folder}` says until when it is valid)"
     )
+    remedy = "`zenpark router` starts one, --connect names another"
+    if topology.is_mesh(endpoints):
+        remedy = "a mesh lasts as long as its run, --connect names another"
+    elif folder is None:
+        remedy += "; in a lab it needs --lab"
     return (
         f"{'nobody' if topology.is_mesh(endpoints) else 'no router'} answers at "
-        f"{', '.join(topology.bare(endpoints)) or 'no endpoint'}{refused}: "
-        "`zenpark router` starts one, --connect names another"
+        f"{', '.join(topology.bare(endpoints)) or 'no endpoint'}{refused}: {remedy}"
     )
 
 

@@ -80,7 +80,7 @@ def settings(
     connect, listen = topology.bare(connect), topology.bare(listen)
     if folder is None:
         for endpoint in listen:
-            _check_loopback(endpoint)
+            check_loopback(endpoint)
     elif listen and rights is None:
         raise EndpointError(f"who listens in the lab {folder} must know who may do what: name the experiment")
     made: dict[str, object] = {
@@ -140,8 +140,12 @@ def _check_form(endpoint: str) -> None:
         raise EndpointError(why)
 
 
-def _check_loopback(endpoint: str) -> None:
-    """Refuses to listen where others could connect: without a lab there is no authentication."""
+def check_loopback(endpoint: str) -> None:
+    """Refuses to listen where others could connect: without a lab there is no authentication.
+
+    Raises:
+        EndpointError: If the endpoint is not of this machine alone.
+    """
     protocol, _, address = endpoint.partition("/")
     if protocol == UNIX:
         return

@@ -280,7 +280,7 @@ class Flight:
             running.fault,
             running.victim,
             round(self._at, 2),
-            running.note + (f"; {status.reason}" if ended and status is not None else ""),
+            "; ".join(filter(None, (running.note, status.reason if ended and status is not None else ""))),
             not any(text.startswith("not well") for text in running.violations),
             round(well - running.begun, 3),
             round(max(0.0, well - (running.lifted or running.begun)), 3),

@@ -31,7 +31,10 @@ def give_world(session: zenoh.Session, keys: Keys, order: wire.WorldOrder, wait_
 def give_run(session: zenoh.Session, keys: Keys, order: wire.RunOrder, wait_s: float = CHANGE_S) -> wire.RunReply:
     """Gives an order to the conductor and returns its reply when all is done, or that no conductor answers."""
     reply, why = _ask(session, keys.run_order, wire.encode(order), wire.RunReply, wait_s)
-    nobody = "no conductor answers: is `zenpark run` running in this realm?"
+    nobody = (
+        "no conductor answers: is `zenpark run` running in this realm, at this router (--connect), and is this an "
+        "operator (--as)?"
+    )
     return reply or wire.RunReply(reason=why or nobody)
 
 

@@ -50,7 +50,9 @@ class Lines:
         now = time.monotonic()
         if now >= self._next and progress.elapsed is not None:
             self._next = now + LINE_S
-            errors = ", ".join(f"{name} {_metres(seen.error)}" for name, seen in progress.robots.items())
+            errors = ", ".join(
+                f"{name} {'-' if seen.gone else _metres(seen.error)}" for name, seen in progress.robots.items()
+            )
             print(f"{progress.case}: {progress.elapsed:5.1f} s, {progress.phase}; error [m] {errors}", file=sys.stderr)
 
 

@@ -14,6 +14,7 @@ from agents.endpoint import free_endpoints
 from agents.keys import Keys
 from agents.lab import LabError, register, require, secured
 from agents.lab import of as lab_of
+from agents.settings import check_loopback
 from agents.topology import from_here
 from experiments import access, document, mesh, reach
 from experiments.conductor import Conductor, Result
@@ -75,6 +76,7 @@ def conduct(
 
     Raises:
         LabError: If a certificate is missing.
+        EndpointError: If a router would have to listen where others could connect, without a lab.
         RunFailed: If robots are not ready in time, unless the file says to go on without them.
         Unreachable: If the routers of the file do not answer.
         HostError: If a host cannot be reached, or has another zenpark.
@@ -95,6 +97,9 @@ def conduct(
     secure = of_lab is not None
     own = network.listen or free_endpoints(network.routers, protocol="tls" if secure else "tcp")
     listening = reach.routers(read.experiment, read.path, own if own_router else [], staging.lab)
+    if own_router and not secure:
+        for endpoint in listening:
+            check_loopback(endpoint)
     endpoints = list(map(from_here, listening)) if own_router else listening
     if meshed:
         endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)

@@ -73,6 +73,7 @@ def create(
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)
+        (folder / ".gitignore").write_text("*\n", encoding="utf-8")  # keys never go into a repository
     except OSError as error:
         raise LabError(f"{folder}: cannot be made: {error.strerror}") from None
     for host in hosts:

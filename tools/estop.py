@@ -69,7 +69,12 @@ def command(*, connect: Sequence[str], realm: str, reason: str, who: str) -> int
                 if status.phase == STOPPED and keys.robot(str(sample.key_expr)) == status.robot:
                     left.discard(status.robot)
     if not there:
-        print(f"stop was said, but no robot is seen in the realm '{realm}'", file=sys.stderr)
+        where = ", ".join(topology.bare(endpoints))
+        print(
+            f"NOTHING WAS STOPPED: no robot is seen in the realm '{realm}' at {where}. Name the router of the run: "
+            "--connect, which `zenpark run` prints when it starts, or --connect @FOLDER/network.txt of its folder",
+            file=sys.stderr,
+        )
         return 1
     if left:
         print(f"NOT known to have stopped: {', '.join(sorted(left))}", file=sys.stderr)

@@ -145,11 +145,16 @@ def show(folder: Folder, as_json: AsJson = False) -> None:
 
 def _cases(each: str) -> list[Experiment] | None:
     """The cases of an experiment; None if it is a robot that is named."""
+    from difflib import get_close_matches  # noqa: PLC0415
     from pathlib import Path  # noqa: PLC0415
 
+    from agents.lab import LabError  # noqa: PLC0415
     from experiments import document, entries  # noqa: PLC0415
 
-    known = each in {name for name, _ in entries.names()} or Path(each).suffix or Path(each).exists()
+    names = [name for name, _ in entries.names()]
+    known = each in names or Path(each).suffix or Path(each).exists()
+    if not known and (meant := get_close_matches(each, names, n=1, cutoff=0.8)):
+        raise LabError(f"{each} is neither a file nor in the catalogue; did you mean '{meant[0]}'?")
     return list(document.read(each).cases().values()) if known else None
 
 
