@@ -74,7 +74,7 @@ def test_keys_are_for_their_owner_alone(folder):
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     for key in folder.glob("*.key"):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
-    assert not list(folder.glob(".*")), "nothing half-written is left"
+    assert [file.name for file in folder.glob(".*")] == [".gitignore"], "nothing half-written is left"
 
 
 def test_revoking_moves_the_name_that_counts(folder):
