@@ -159,7 +159,10 @@ class HotChanges:
         if not order.robots:
             yield f"name one or more of {', '.join(known)}"
         if self._start is None:
-            yield "robots can be changed between the common start and the landing, and this run is not there: ask again after it has begun"
+            yield (
+                "robots can be changed between the common start and the landing, and this run is not there: "
+                "ask again after it has begun"
+            )
         if len(self._pending) >= MOST:
             yield f"{MOST} orders are under way; wait for them"
         others = (order.spare, order.body, order.at)
