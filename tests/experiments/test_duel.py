@@ -7,6 +7,7 @@ import pytest
 from experiments import commands, report_tables
 from experiments.check import check
 from experiments.document import read
+from experiments.realtime import Staging
 from experiments.run import load, simulate
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
@@ -44,8 +45,8 @@ def file(tmp_path):
 
 def test_it_runs_and_reports_without_links(file, tmp_path, capsys):
     assert commands.run(
-        str(file), virtual=True, cases=[], out=str(tmp_path / "run"), seed=None, settings=[], as_json=False, seeds=1,
-        bodies=None, here=False, anyway=False, report=True, open_report=False,
+        str(file), Staging(), virtual=True, out=str(tmp_path / "run"), seed=None, settings=[], as_json=False, seeds=1,
+        anyway=False, report=True, open_report=False,
     ) == 0  # fmt: skip
     said = capsys.readouterr().out
     assert "no link was measured" in said
