@@ -18,10 +18,8 @@ from typing import Final
 
 import msgspec
 
-from tools import bench_intruders, bench_safety, bench_world
+from tools import bench_intruders, bench_process, bench_safety, bench_world
 from tools.figure import REPEATS, Figure, cpu
-
-FLIGHT_S: Final = 20.0
 
 
 def unit_of_work() -> float:
@@ -83,60 +81,6 @@ def codec() -> Iterator[Figure]:
         )
 
 
-def process() -> Iterator[Figure]:
-    """Robot processes of the reference experiment in flight: CPU, memory, punctuality, time until all are ready."""
-    from agents import wire  # noqa: PLC0415
-    from agents.endpoint import free_endpoint  # noqa: PLC0415
-    from experiments import document  # noqa: PLC0415
-    from experiments.conductor import Conductor  # noqa: PLC0415
-    from experiments.hosts import Hosts  # noqa: PLC0415
-    from experiments.launcher import Launcher  # noqa: PLC0415
-    from experiments.run import SOURCE, load  # noqa: PLC0415
-    from experiments.seen import Progress  # noqa: PLC0415
-    from experiments.servants import start_router  # noqa: PLC0415
-
-    read = load("robotic-park", f"duration_s={FLIGHT_S}", "timeline=[]", "trigger.period_s=0.02")
-    first: dict[str, wire.Status] = {}
-    last: dict[str, wire.Status] = {}
-
-    def look(progress: Progress) -> None:
-        for name, seen in progress.robots.items():
-            if seen.status is not None and seen.status.phase == "running":
-                first.setdefault(name, seen.status)
-                last[name] = seen.status
-
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / SOURCE).write_text(read.text, encoding="utf-8")
-        file = folder / "periodic.json"
-        experiment = read.cases()["periodic"]
-        file.write_bytes(document.write_json(experiment))
-        with Launcher(folder / "logs") as launcher:
-            endpoints = [free_endpoint()]
-            start_router(launcher, endpoints)
-            result = Conductor(
-                experiment,
-                "periodic",
-                file=file,
-                source=folder / SOURCE,
-                folder=folder,
-                endpoints=endpoints,
-                launcher=launcher,
-                hosts=Hosts(launcher, endpoints),
-                show=look,
-                interrupted=lambda: False,
-            ).run()
-    assert result.ready_s is not None
-    yield Figure("process", "seven robots ready after", result.ready_s, "s", result.ready_s / 3.0, "× 3 s")
-    shares = [(last[n].cpu_s - first[n].cpu_s) / (last[n].stamp - first[n].stamp) for n in last]
-    share = 100.0 * statistics.median(shares)
-    yield Figure("process", "CPU of a robot (50 Hz pose, 100 Hz body)", share, "% of a core", share / 5.0, "× 5 %")
-    memory = max(status.rss_mb for status in last.values())
-    yield Figure("process", "largest resident memory of a robot", memory, "MB", memory / 60.0, "× 60 MB")
-    missed = 100.0 * sum(s.missed for s in last.values()) / sum(s.ticks for s in last.values())
-    yield Figure("process", "missed deadlines", missed, "%", missed / 1.0, "× 1 %")
-
-
 def start() -> Iterator[Figure]:
     """How long a command takes to answer."""
 
@@ -158,7 +102,7 @@ BENCHMARKS: Final[dict[str, Callable[[], Iterator[Figure]]]] = {
     "start": start,
     "codec": codec,
     "virtual": virtual,
-    "process": process,
+    "process": bench_process.process,
     "world": bench_world.world,
     "encounters": bench_world.encounters,
     "safety": bench_safety.safety,
