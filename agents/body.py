@@ -6,7 +6,7 @@ The runtime finds bodies by the entry-point group `zenpark.bodies`: the word bef
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -193,7 +193,8 @@ class Body(Protocol):
     """What the runtime drives. `takes` of each row's kind says how a row of `command` is read.
 
     Calls come from one thread, but for `land` and `stop`: these come from others too, more than once, and while another
-    call runs or hangs (`agents.watchdog`, emergency stops). They must neither block nor need the loop to go on.
+    call runs or hangs (`agents.watchdog`, emergency stops). They must neither block nor need the loop to go on. A body
+    of several rows tells all of them, even if one of them fails (`call_all`).
     """
 
     def open(self) -> None:
@@ -235,6 +236,19 @@ class Body(Protocol):
 
 class BodyError(RuntimeError):
     """A body that cannot be opened or driven, with the remedy."""
+
+
+def call_all(calls: Iterable[Callable[[], object]]) -> None:
+    """Makes every call in the given order, whatever the others raise; the last error is raised afterwards.
+
+    For everything that stops robots: a body that fails must not keep the next one from being stopped.
+    """
+    left = iter(calls)
+    for call in left:
+        try:
+            call()
+        finally:
+            call_all(left)
 
 
 BodyFactory = Callable[[BodyRequest], Body]

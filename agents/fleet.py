@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from agents import plugins
-from agents.body import Body, BodyRequest, BodyState, Rays
+from agents.body import Body, BodyRequest, BodyState, Rays, call_all
 from agents.rows import Array, Index
 
 
@@ -32,8 +33,7 @@ class Fleet:
                 body.open()
                 opened.append(body)
         except BaseException:
-            for body in opened:
-                body.close()
+            call_all(body.close for body in opened)
             raise
 
     def read(self, t: float) -> BodyState:
@@ -79,13 +79,11 @@ class Fleet:
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
-        for body, which in self._split(rows):
-            body.land(self._place[rows[which]])
+        call_all(partial(body.land, self._place[rows[which]]) for body, which in self._split(rows))
 
     def stop(self, rows: Index) -> None:
         """See `Body.stop`."""
-        for body, which in self._split(rows):
-            body.stop(self._place[rows[which]])
+        call_all(partial(body.stop, self._place[rows[which]]) for body, which in self._split(rows))
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
         """See `Body.locate`."""
@@ -95,8 +93,7 @@ class Fleet:
 
     def close(self) -> None:
         """Closes every body."""
-        for _, body in self._parts:
-            body.close()
+        call_all(body.close for _, body in self._parts)
 
     def _split(self, rows: Index) -> list[tuple[Body, Index]]:
         """Each body with those entries of `rows` that it carries."""

@@ -6,11 +6,13 @@ One plain loop on the monotonic clock, no asyncio, no callbacks: what arrives wa
 from __future__ import annotations
 
 import gc
+import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from math import ceil, floor, nan
 from typing import Final
 
@@ -21,7 +23,7 @@ from agents import plausibility, wire
 from agents import session as network
 from agents.agent import Actions, Agent
 from agents.assignment import Assignment
-from agents.body import Body
+from agents.body import Body, call_all
 from agents.goals import HeardGoals
 from agents.leaving import leave
 from agents.lifecycle import Phase
@@ -30,13 +32,15 @@ from agents.neighbours import Neighbours
 from agents.orders import EMERGENCY, LAND, STOP, carry_out
 from agents.process import told_to_end
 from agents.ranging import HeardRanges, instead
+from agents.rows import Index, some
 from agents.settings import ASK_S
 from agents.setup import Setup
 from agents.speaking import Said
 from agents.telemetry import Counts, Telemetry
-from agents.watchdog import Watchdog
+from agents.watchdog import AGAIN_S, Watchdog
 
 FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its launcher was lost has its motors cut
+STOPPED_S: Final = 5.0  # a body that does not say that its motors stand is told so long, and then left
 HUSH_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
 DOUBT_S: Final = 1.0  # a robot whose process stood still holds for so long: what it knows is old
 
@@ -62,6 +66,7 @@ class Runtime:
         self._retired: set[int] = set()  # rows that come down, or are down, while the run goes on
         self._doubt_until = -np.inf
         self._cut_off = False  # motors were cut by a stop that the loop has not seen yet
+        self._airborne = False  # a row was in the air when its body said so last, or took off since
         self._slept, self._joined = 0.0, False
         self._utc = self._now = self._next = 0.0
         self._reach = plausibility.reach_of(assignment.limits.low, assignment.limits.high)
@@ -82,28 +87,25 @@ class Runtime:
             rope.start()
         asked = threading.Event()
 
-        with told_to_end(asked.set):
+        # on the way out everything is tried, the last entry first, whatever the others raise
+        with told_to_end(asked.set), ExitStack() as out:
+            session = network.open_session(
+                self._setup.endpoints,
+                name="+".join(self._names),
+                stop=asked,
+                lease_s=network.ROBOT_LEASE_S,
+                identity=self._names[0],
+                rights=self._setup.rights,
+            )
+            out.callback(leave, session, self)
+            self._refuse_doubles(session)
             self._body.open()
-            try:
-                name = "+".join(self._names)
-                session = network.open_session(
-                    self._setup.endpoints,
-                    name=name,
-                    stop=asked,
-                    lease_s=network.ROBOT_LEASE_S,
-                    identity=self._names[0],
-                    rights=self._setup.rights,
-                )
-                try:
-                    self._refuse_doubles(session)
-                    self._join(session)
-                    self._loop(lambda: rope.reason if lost.is_set() else self._told_to_end(asked.is_set()))
-                finally:
-                    leave(session, self)
-            finally:
-                with self._watchdog:
-                    self._come_down()
-                self._body.close()
+            out.callback(self._body.close)
+            out.callback(self._watchdog.end)
+            out.callback(self._order_down, self._body.stop, STOPPED_S)
+            out.callback(self._come_down)
+            self._join(session)
+            self._loop(lambda: rope.reason if lost.is_set() else self._told_to_end(asked.is_set()))
         return 0
 
     def _told_to_end(self, asked: bool) -> str | None:
@@ -112,15 +114,46 @@ class Runtime:
         return "told to leave" if len(self._leaving) == len(self._names) else None
 
     def _come_down(self) -> None:
-        """Motors off; what is still in the air, because something broke on the way, lands first."""
-        if self._body.read(self._now).flying.any():
-            self._body.land(self._everyone)
-            zero, begin = time.monotonic(), self._now
-            while self._body.read(self._now).flying.any() and self._now < begin + FAREWELL_S:
-                time.sleep(self._dt)
-                self._watchdog.beat()
-                self._now = begin + time.monotonic() - zero
-        self._body.stop(self._everyone)
+        """Lands what is still in the air, because something broke on the way, before the motors are switched off."""
+        self._watchdog.start()
+        failures: list[Exception] = []
+        if self._in_the_air(failures):
+            error = sys.exception()
+            why = "it did not land in time" if error is None else f"its control loop broke: {_what(error)}"
+            self._watchdog.call_for_help(why)
+            self._order_down(self._body.land, FAREWELL_S)
+        if failures:
+            raise failures[0]
+
+    def _order_down(self, order: Callable[[Index], object], limit_s: float) -> None:
+        """Gives an order, and again until it is taken and no row is in the air any more, or for so long [s].
+
+        A body that does not say how it is gets all of that time if it was in the air before. The first error is raised
+        at the end.
+        """
+        failures: list[Exception] = []
+        zero, begin, again = time.monotonic(), self._now, -np.inf
+        obeyed = False
+        while True:
+            self._watchdog.beat()
+            if self._now >= again:
+                again = self._now + AGAIN_S
+                obeyed = False
+                with _noted(failures):
+                    order(self._everyone)
+                    obeyed = True
+            if (obeyed and not self._in_the_air(failures)) or self._now > begin + limit_s:
+                break
+            time.sleep(self._dt)
+            self._now = begin + time.monotonic() - zero
+        if failures:
+            raise failures[0]
+
+    def _in_the_air(self, failures: list[Exception]) -> bool:
+        """Whether a row flies, as its body says, or said last: what it raises is noted."""
+        with _noted(failures):
+            self._airborne = some(self._body.read(self._now).flying)
+        return self._airborne
 
     # ------------------------------------------------------------------ the network
 
@@ -185,8 +218,8 @@ class Runtime:
         }
 
     def _call_for_help(self, why: str) -> None:
-        """From the watchdog's thread: neighbours must not count on robots whose loop hangs."""
-        print(f"{', '.join(self._names)}: {why}; the watchdog lands it", flush=True)
+        """From a thread of the watchdog's: neighbours must not count on robots whose loop hangs, or is over."""
+        print(f"{', '.join(self._names)}: {why}; landing it", flush=True)
         if self._joined:
             self._telemetry.alarm(why, self._setup.clock.utc())
             for token in list(self._tokens.values()):
@@ -302,11 +335,8 @@ class Runtime:
         # one reading: a step of the wall clock in mid-run does not move the experiment
         self._utc = self._telemetry.utc = self._setup.clock.utc()
         self._joined = True
-        try:
-            with self._watchdog:
-                self._go_round(zero, stopping)
-        finally:
-            self._joined = False
+        self._watchdog.start()
+        self._go_round(zero, stopping)
 
     def _go_round(self, zero: float, stopping: Callable[[], str | None]) -> None:
         farewell = np.inf
@@ -352,6 +382,7 @@ class Runtime:
         begun = self.agent.decisions > 0
         self._listen(t)
         state = self._body.read(t)
+        self._airborne = some(state.flying)
         if self._ranges is not None:
             refused = self._ranges.malformed
             state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))
@@ -401,11 +432,10 @@ class Runtime:
         duties = actions.duties
         overruled = self._cut_off or self._watchdog.tripped  # another thread has told the body to stop or to land
         if duties is not None:
-            if len(duties.stop):
-                self._body.stop(duties.stop)
-            if len(duties.land):
-                self._body.land(duties.land)
+            told = ((self._body.stop, duties.stop), (self._body.land, duties.land))
+            call_all(partial(order, rows) for order, rows in told if len(rows))
             if len(duties.takeoff) and not overruled:
+                self._airborne = True
                 self._body.takeoff(duties.takeoff, self._assignment.hover[duties.takeoff])
         if not overruled:
             self._body.command(actions.setpoint)
@@ -424,3 +454,16 @@ class Runtime:
         payload = wire.encode(pose, self._setup.encoding)
         self._last[row].hold(payload)
         self._poses[row].put(payload)
+
+
+@contextmanager
+def _noted(failures: list[Exception]) -> Iterator[None]:
+    """The first error inside is kept, to be raised when everything has been tried."""
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001
+        failures[:] = failures or [error]
+
+
+def _what(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"

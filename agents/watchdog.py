@@ -26,7 +26,7 @@ HUNG: Final = 70  # exit code of a process whose loop hung for good
 
 
 class Watchdog:
-    """Watches a loop that says `beat` on every turn; inside a `with`, as often as wanted.
+    """Watches a loop that says `beat` on every turn, from `start` to `end` or inside a `with`, as often as wanted.
 
     When no beat came for too long it has the body land, says so, and after `down_s` without a beat cuts the motors and
     ends the process. Each call is made in a thread of its own: what the loop hangs in may hang here too.
@@ -72,19 +72,32 @@ class Watchdog:
         why, self.tripped = self.tripped, ""
         return why
 
+    def start(self) -> None:
+        """Watches from now on, if it does not already."""
+        if self._thread is None:
+            self._over.clear()
+            self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+            self._thread.start()
+
+    def end(self) -> None:
+        """Watches no longer."""
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def call_for_help(self, why: str) -> None:
+        """Says to the others that the robots come down, without waiting until that has been said."""
+        self._do("alarm", partial(self._alarm, why))
+
     def __enter__(self) -> Self:
-        self._over.clear()
-        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
-        self._thread.start()
+        self.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._over.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        self.end()
 
     def _watch(self) -> None:
         period = self._silence_s / LOOKS
@@ -103,7 +116,7 @@ class Watchdog:
             if not hung:
                 hung = again = looked
                 self.tripped = f"its control loop hangs: no tick for {looked - since:.1f} s"
-                self._do("alarm", partial(self._alarm, self.tripped))
+                self.call_for_help(self.tripped)
             if looked >= again:
                 again = looked + AGAIN_S
                 self._do("land", lambda: self._body.land(self._rows))

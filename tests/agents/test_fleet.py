@@ -98,6 +98,19 @@ def test_when_one_cannot_be_opened_the_others_are_closed_again():
     assert (a.told, b.told, c.told) == (["open", "close"], [], [])
 
 
+@pytest.mark.parametrize("what", ["land", "stop", "close"])
+def test_one_that_fails_keeps_nobody_from_being_told(what):
+    both, a, b = interleaved()
+
+    def fails(*_):
+        raise OSError("its link is gone")
+
+    setattr(a, what, fails)
+    with pytest.raises(OSError, match="its link is gone"):
+        getattr(both, what)(*([] if what == "close" else [np.arange(5)]))
+    assert b.told == (["close"] if what == "close" else [(what, [0, 1, 2])])
+
+
 def request(*addresses):
     robots = {
         f"R{k}": Robot(kind="crazyflie" if k == 1 else "khepera4", start=[0.5 * k, 0.0], body=address, hover=0.5)

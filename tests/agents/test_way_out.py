@@ -1,0 +1,176 @@
+"""A process whose loop has ended lands, stops and closes its bodies, whatever fails on the way."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from agents import runtime, wire
+from agents.body import BodyState, call_all
+from agents.keys import Keys
+from agents.runtime import Runtime
+from agents.setup import Setup
+from experiments import assign
+from experiments.experiment import Formation, Robot
+from tests.agents.few import pair
+from tests.fuzz.loopnet import Net
+from tests.fuzz.messages import sent
+
+TICKS = 5  # that the loop makes before something breaks
+
+
+class Airborne:
+    """A body that flies until `steps` reads after it was told to land, and fails in the calls `broken`."""
+
+    def __init__(self, *broken: str, steps: int = 3) -> None:
+        self.broken, self.steps = broken, steps
+        self.calls: list[str] = []
+        self.reads = 0
+        self.landing = self.stopped = False
+        self.looks = lambda: None
+
+    def open(self) -> None:
+        self.calls.append("open")
+
+    def read(self, t: float) -> BodyState:
+        self.reads += 1
+        if self.reads > TICKS:
+            self.looks()
+            self.fail("read")
+        self.steps -= self.landing
+        nothing, nowhere = np.full(1, np.nan), np.full((1, 3), np.nan)
+        flying = np.array([self.steps > 0 and not self.stopped])
+        return BodyState(np.full(1, t), nowhere, nowhere, nothing, nowhere, nothing, nothing, flying)
+
+    def command(self, setpoint: np.ndarray) -> None:
+        if self.reads == TICKS:
+            raise OSError("the loop breaks")
+
+    def takeoff(self, rows: np.ndarray, height: np.ndarray) -> None: ...
+
+    def locate(self, *_: object) -> None: ...
+
+    def land(self, rows: np.ndarray) -> None:
+        self.landing = True
+        self.tell("land")
+
+    def stop(self, rows: np.ndarray) -> None:
+        self.stopped = True
+        self.tell("stop")
+
+    def close(self) -> None:
+        self.tell("close")
+
+    def tell(self, what: str) -> None:
+        self.calls.append(what)
+        self.fail(what)
+
+    def fail(self, what: str) -> None:
+        if what in self.broken:
+            raise OSError(f"{what} fails")
+
+    @property
+    def order(self) -> list[str]:
+        """The calls, each once, in the order of the first."""
+        return list(dict.fromkeys(self.calls))
+
+
+def run(body: Airborne, silence_s: float = 5.0) -> Net:
+    """Runs a robot with that body to its end, on a network of its own."""
+    experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
+    with Net().worn() as net:
+        body.net = net
+        setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], loop_silence_s=silence_s)
+        Runtime(assign.assign(experiment, ("F",)), body, setup).run()
+    return net
+
+
+@pytest.fixture(autouse=True)
+def short_waits(monkeypatch):
+    monkeypatch.setattr(runtime, "FAREWELL_S", 0.3)
+    monkeypatch.setattr(runtime, "STOPPED_S", 0.1)
+
+
+@pytest.mark.parametrize("broken", [(), ("read",), ("land",), ("stop",), ("close",), ("read", "land", "stop", "close")])
+def test_everything_is_tried_on_the_way_out_and_the_error_is_said(broken):
+    body = Airborne(*broken)
+    with pytest.raises(OSError, match="fails" if broken else "the loop breaks") as error:
+        run(body)
+    assert body.order == ["open", "land", "stop", "close"]
+    chain, one = [], error.value
+    while one is not None:
+        chain, one = [*chain, str(one)], one.__context__
+    assert "the loop breaks" in chain
+
+
+def test_a_robot_is_stopped_when_it_is_down_and_not_before():
+    body = Airborne(steps=10)
+    with pytest.raises(OSError, match="the loop breaks"):
+        run(body)
+    assert body.steps <= 0
+    assert body.calls == ["open", "land", "stop", "close"]
+
+
+def test_a_body_that_does_not_say_how_it_is_gets_the_time_of_a_landing(monkeypatch):
+    monkeypatch.setattr(runtime, "AGAIN_S", 0.02)
+    body = Airborne("read")
+    with pytest.raises(OSError, match="read fails"):
+        run(body)
+    assert body.calls.count("land") > 3  # again and again: the first may have got lost
+    assert body.calls.count("stop") > 1
+
+
+def test_what_does_not_stop_is_told_again(monkeypatch):
+    monkeypatch.setattr(runtime, "AGAIN_S", 0.02)
+    body = Airborne("stop", steps=0)
+    with pytest.raises(OSError, match="stop fails"):
+        run(body)
+    assert "land" not in body.calls
+    assert body.calls.count("stop") > 1
+
+
+def test_an_emergency_stop_is_obeyed_while_a_robot_comes_down(monkeypatch):
+    monkeypatch.setattr(runtime, "FAREWELL_S", 30.0)
+    body = Airborne(steps=10**9)
+
+    def stop() -> None:
+        if body.landing and not body.stopped:
+            body.net.deliver(sent("park/estop", wire.Stop("a test", "to see"))[0])
+
+    body.looks = stop
+    with pytest.raises(OSError, match="the loop breaks"):
+        run(body)
+    assert body.order == ["open", "land", "stop", "close"]
+
+
+def test_a_read_that_hangs_on_the_way_out_is_landed_by_the_watchdog():
+    body, landed = Airborne(), threading.Event()
+    land = body.land
+
+    def told(rows: np.ndarray) -> None:
+        land(rows)
+        landed.set()
+
+    body.land, body.looks = told, lambda: landed.wait(10.0)
+    with pytest.raises(OSError, match="the loop breaks"):
+        run(body, silence_s=0.1)
+    assert landed.is_set()
+    assert body.order == ["open", "land", "stop", "close"]
+
+
+def test_all_calls_are_made_and_the_last_error_is_raised():
+    made = []
+
+    def call(what: str, *, fails: bool = False) -> None:
+        made.append(what)
+        if fails:
+            raise OSError(what)
+
+    with pytest.raises(OSError, match="three") as error:
+        call_all(
+            [lambda: call("one", fails=True), lambda: call("two"), lambda: call("three", fails=True)],
+        )
+    assert made == ["one", "two", "three"]
+    assert str(error.value.__context__) == "one"
