@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import msgspec
 import numpy as np
@@ -222,7 +222,11 @@ class Body(Protocol):
         ...
 
     def stop(self, rows: Index) -> None:
-        """Motors off, at once, wherever the rows are: the emergency stop."""
+        """Motors off, at once, wherever the rows are: the emergency stop.
+
+        A device that may not have heard it is told again until it says that its motors stand, or must be taken for
+        gone; `flying` says until then that a flying row flies, and its note that the stop is not answered.
+        """
         ...
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
@@ -236,6 +240,21 @@ class Body(Protocol):
 
 class BodyError(RuntimeError):
     """A body that cannot be opened or driven, with the remedy."""
+
+
+UNANSWERED: Final = "the emergency stop is not answered"  # in the notes of a robot that was stopped and goes on
+
+# what a body that fails may raise, a plug-in too
+TROUBLE: Final = (
+    AttributeError,
+    TypeError,
+    ValueError,
+    NameError,
+    LookupError,
+    ArithmeticError,
+    RuntimeError,
+    OSError,
+)
 
 
 def call_all(calls: Iterable[Callable[[], object]]) -> None:

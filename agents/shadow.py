@@ -17,22 +17,11 @@ from typing import Final, Protocol
 import numpy as np
 
 from agents import plugins
-from agents.body import Body, BodyRequest, BodyState, Disturbance
+from agents.body import TROUBLE, Body, BodyRequest, BodyState, Disturbance
 from agents.rows import Array, Index, Mask
 
 TWIN: Final = "twin"
 FRESH_S: Final = 0.25  # a pose older than this is not where the robot is
-# what a twin that fails may raise, somebody's own one too; errors of bodies and plug-ins are among them
-TROUBLE: Final = (
-    AttributeError,
-    TypeError,
-    ValueError,
-    NameError,
-    LookupError,
-    ArithmeticError,
-    RuntimeError,
-    OSError,
-)
 
 
 class Placeable(Body, Protocol):

@@ -15,11 +15,12 @@ import sys
 import threading
 import time
 import types
+from functools import partial
 from typing import Final, Protocol
 
 import numpy as np
 
-from agents.body import BodyError, BodyRequest, BodyState
+from agents.body import TROUBLE, BodyError, BodyRequest, BodyState, call_all
 from agents.positioning import External
 from agents.protocols import tello as protocol
 from agents.protocols.settings import settings
@@ -120,14 +121,14 @@ class TelloBody:
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
         with self._lock:
-            for row in rows.tolist():
-                self._pilots[row].land(time.monotonic())
+            now = time.monotonic()
+            call_all(partial(self._pilots[row].land, now) for row in rows.tolist())
 
     def stop(self, rows: Index) -> None:
         """See `Body.stop`."""
         with self._lock:
-            for row in rows.tolist():
-                self._pilots[row].cut(time.monotonic())
+            now = time.monotonic()
+            call_all(partial(self._pilots[row].cut, now) for row in rows.tolist())
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
         """See `Body.locate`."""
@@ -139,9 +140,8 @@ class TelloBody:
         if self._thread is not None:
             self._thread.join()
             self._thread = None
-        for pilot in self._pilots:
-            pilot.leave()
-        self._pilots = []
+        pilots, self._pilots = self._pilots, []
+        call_all(pilot.leave for pilot in pilots)
 
     def _run(self) -> None:
         period = 1.0 / max(chosen.rc_hz for chosen in self._settings)
@@ -149,7 +149,10 @@ class TelloBody:
             with self._lock:
                 now = time.monotonic()
                 for pilot in self._pilots:
-                    pilot.step(now, self._attended)
+                    try:
+                        pilot.step(now, self._attended)
+                    except TROUBLE as error:  # the others fly on
+                        pilot.trouble = f"cannot be driven: {type(error).__name__}: {error}"
 
 
 class _Make(Protocol):

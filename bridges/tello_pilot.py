@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Any, Final, Protocol
 
+from agents.body import UNANSWERED
 from agents.kinds import Kind
 from agents.protocols import tello as protocol
 
@@ -20,7 +21,9 @@ INSIST_S: Final = 1.0  # between two `land` that are not answered
 REPEAT_TAKEOFF_S: Final = 6.0  # likewise of `takeoff`, to which a drone answers when it is up
 QUICKEST_S: Final = 1.0  # no drone is up before
 TAKEOFF_S: Final = 20.0  # then it will not fly any more
-CUTS: Final = 5  # `emergency` is said so many times, for a datagram may be lost
+LAST: Final = 5  # the last command of a process is sent so many times, for a datagram may be lost
+STOOD_S: Final = 1.5  # its motors stand when the seconds that it counts while they run stay the same for so long,
+CUT_S: Final = 2.5  # which is known so long after an emergency stop, if that was heard
 FRESH_S: Final = 0.5  # a setpoint, or a position, that is older is none
 ATTENDED_S: Final = 2.0  # a process that did not read for longer does not drive its robots: they land
 STILL_S: Final = 3.0  # low for this long, motors not running: it is on the ground
@@ -78,14 +81,13 @@ class Pilot:
         self._zero_yaw: int | None = None
         self._height, self._motors = 0, -1
         self._running = self._aloft = -math.inf  # when the motors' clock last moved, when it was last not low
-        self._began = self._said = -math.inf
-        self._count = 0
+        self._began = self._said = self._proof = -math.inf
         self._unsent = ""
 
     @property
     def flying(self) -> bool:
-        """Motors on, as far as we know."""
-        return self.duty not in (Duty.REST, Duty.CUT)
+        """Motors on, as far as is known: until the drone says that they stand."""
+        return self.duty is not Duty.REST
 
     def silent(self, now: float) -> bool:
         """Whether its state has not come for too long."""
@@ -95,8 +97,9 @@ class Pilot:
         """What people should know of it; empty if all is well."""
         if self.heard == -math.inf:
             return self._unsent or "no answer"
+        unanswered = UNANSWERED if self.duty is Duty.CUT and now - self._began > CUT_S else ""
         silence = f"silent for {now - self.heard:.0f} s (off, out of reach, or taken over)" if self.silent(now) else ""
-        return "; ".join(part for part in (self._unsent, silence, self.trouble) if part)
+        return "; ".join(part for part in (unanswered, self._unsent, silence, self.trouble) if part)
 
     # ------------------------------------------------------------------ what is wanted
 
@@ -122,17 +125,22 @@ class Pilot:
             self._begin(Duty.LAND, "land", now)
 
     def cut(self, now: float) -> None:
-        """Motors off."""
-        self._begin(Duty.CUT, "emergency", now)
-        self._count = 1
+        """Motors off: said again until the drone says that they stand, or has been silent for `GONE_S`."""
+        if self.duty is not Duty.CUT:
+            self._proof = -math.inf if self.duty is Duty.REST else now
+            self._began = now
+        self.duty = Duty.CUT
+        self._say("emergency", now)
 
     def leave(self) -> None:
         """Nobody flies it any more: what is in the air is told to land, and the library to forget it."""
         last = "emergency" if self.duty is Duty.CUT else "land" if self.flying else ""
-        for _ in range(CUTS if last else 0):
-            self._send(last)
-            time.sleep(0.02)
-        self._drone.end()
+        try:
+            for _ in range(LAST if last else 0):
+                self._send(last)
+                time.sleep(0.02)
+        finally:
+            self._drone.end()
 
     # ------------------------------------------------------------------ the thread
 
@@ -142,13 +150,13 @@ class Pilot:
         if self.duty is Duty.REST:
             if self.silent(now) and now - self._said >= ASK_S:
                 self._say("command", now)
-        elif self.duty is Duty.CUT:
-            self._send("emergency")
-            self._count += 1
-            if self._count >= CUTS:
-                self.duty = Duty.REST
         elif now - self.heard > GONE_S:
             self.duty, self.trouble = Duty.REST, "it must have landed by itself"
+        elif self.duty is Duty.CUT:
+            if self._stands():
+                self.duty = Duty.REST
+            else:
+                self._send("emergency")
         elif self.duty is Duty.RISE:
             self._rise(now)
         elif self.duty is Duty.LAND:
@@ -158,6 +166,14 @@ class Pilot:
                 self._say("land", now)
         else:
             self._fly(now, attended)
+
+    def _stands(self) -> bool:
+        """Whether a state that came long enough after its motors' clock moved last, and after the stop, shows the same.
+
+        A firmware that does not say that clock must have been low for as long.
+        """
+        ran = self._running if self._motors >= 0 else self._aloft
+        return self.heard - max(ran, self._proof) > STOOD_S
 
     def _down(self, now: float) -> bool:
         """Whether what it says of itself leaves no doubt that it stands on the ground."""

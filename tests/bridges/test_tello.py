@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.body import BodyError
+from agents.body import UNANSWERED, BodyError
 from agents.kinds import TELLO
 from agents.protocols import tello as protocol
 from agents.protocols.settings import settings
@@ -201,15 +201,71 @@ def test_it_lands_when_answered_and_only_when_it_is_low():
     assert cockpit.pilot.duty is Duty.REST
 
 
-def test_the_emergency_stop_is_said_five_times():
+def test_the_emergency_stop_is_said_until_the_motors_stand():
     cockpit = Cockpit().fly()
     cockpit.drone.said.clear()
     cockpit.pilot.cut(cockpit.now)
     assert cockpit.drone.said == ["emergency"]
-    assert not cockpit.pilot.flying
-    cockpit.pass_(1.0)
-    assert cockpit.drone.said == ["emergency"] * 5
+    cockpit.pilot.cut(cockpit.now)  # the loop's own stop, after that of the thread that receives
+    for second in range(4, 9):  # all are lost: the clock of its motors runs on
+        cockpit.pass_(1.0, time=second)
+        assert cockpit.drone.said == ["emergency"] * (2 + 20 * (second - 3))
+        assert cockpit.pilot.flying
+        assert (UNANSWERED in cockpit.pilot.note(cockpit.now)) == (second > 5)
+    cockpit.pass_(0.4, h=0)  # one is heard
+    assert cockpit.pilot.flying
+    cockpit.pass_(0.3)
     assert cockpit.pilot.duty is Duty.REST
+    assert cockpit.pilot.note(cockpit.now) == ""
+    cockpit.drone.said.clear()
+    cockpit.pass_(1.0)
+    assert cockpit.drone.said == []
+
+
+def test_a_silent_drone_is_told_to_stop_until_it_must_have_landed():
+    cockpit = Cockpit().fly()
+    cockpit.speaks = False
+    cockpit.pilot.cut(cockpit.now)
+    cockpit.drone.said.clear()
+    cockpit.pass_(19.0)
+    assert cockpit.drone.said == ["emergency"] * 380
+    assert UNANSWERED in cockpit.pilot.note(cockpit.now)
+    cockpit.pass_(1.2)
+    assert cockpit.pilot.duty is Duty.REST
+    assert "landed by itself" in cockpit.pilot.note(cockpit.now)
+
+
+def test_a_drone_that_stands_answers_a_stop_at_once():
+    cockpit = Cockpit()
+    cockpit.pass_(2.0)
+    cockpit.pilot.cut(cockpit.now)
+    assert cockpit.drone.said[-1] == "emergency"
+    cockpit.pass_(0.05)
+    assert not cockpit.pilot.flying
+
+
+def test_a_take_off_that_is_stopped_at_once_is_told_until_it_stands():
+    cockpit = Cockpit()
+    cockpit.pass_(5.0)
+    cockpit.pilot.position = (1.0, 2.0, 0.0)
+    cockpit.pilot.rise(0.6, cockpit.now)
+    cockpit.pass_(0.1)
+    cockpit.pilot.cut(cockpit.now)  # its motors' clock has not moved yet
+    cockpit.pass_(1.4)
+    assert cockpit.pilot.flying
+    cockpit.pass_(0.5)
+    assert not cockpit.pilot.flying
+
+
+def test_one_that_cannot_be_driven_keeps_nobody_from_being_stopped():
+    body = open_tello(request("tello", ["tello://10.0.0.2", "tello://10.0.0.3"], external=True))
+    lost, good = Cockpit().fly(), Cockpit().fly()
+    body._pilots = [lost.pilot, good.pilot]
+    lost.drone.get_own_udp_object = lambda: {}
+    for what in (body.land, body.stop):
+        with pytest.raises(KeyError, match="responses"):
+            what(np.arange(2))
+    assert good.drone.said[-2:] == ["land", "emergency"]
 
 
 def test_a_process_that_does_nothing_loses_its_drone():
