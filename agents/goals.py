@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from math import nan
 
@@ -14,6 +15,7 @@ from agents.agent import Agent
 from agents.channel import Channel, Conditions
 from agents.guidance import Guidance
 from agents.keys import Keys
+from agents.neighbours import NEWS
 
 
 class HeardGoals:
@@ -47,7 +49,7 @@ class HeardGoals:
         self._rows = np.array(rows, dtype=np.intp)
         self._channel = Channel(conditions or Conditions.ideal(len(rows)))
         self.malformed = 0
-        self.news: list[list[wire.Followed]] = [[] for _ in self._names]
+        self.news = [deque[wire.Followed](maxlen=NEWS) for _ in self._names]
 
     def take(self, t: float, utc: float) -> None:
         """Takes in what has come by `t` [s] of a clock that was 0 at `utc`."""

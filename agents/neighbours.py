@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
+from typing import Final
+
 import numpy as np
 import zenoh
 
@@ -12,13 +15,15 @@ from agents.keys import Keys
 from agents.rows import Index
 from agents.speaker import Said, Speaker
 
+NEWS: Final = 20_000  # newest poses that wait for telemetry, which takes them several times a second: 10 MB
+
 
 class Neighbours:
     """Those whom the rows of a process listen to.
 
     Attributes:
         speakers: One for each name that is heard.
-        news: (n) poses that got through to each row, which telemetry empties.
+        news: (n) the newest poses that got through to each row, which telemetry empties.
         heard: (n) how many that were, ever.
         dropped: (E,) samples that the modelled network dropped.
         changed: Somebody came or went since whoever looks last said so.
@@ -48,7 +53,7 @@ class Neighbours:
         self._channel = Channel(conditions or Conditions.ideal(len(assignment.links)))
         by_speaker = links_by_speaker(assignment.links, assignment.speakers)
         self.speakers = [Speaker(session, keys, name, links, reach=reach) for name, links in by_speaker.items()]
-        self.news: list[list[wire.Heard]] = [[] for _ in assignment.names]
+        self.news = [deque[wire.Heard](maxlen=NEWS) for _ in assignment.names]
         self.heard: Index = np.zeros(len(assignment.names), dtype=np.intp)
         self.dropped = self._channel.dropped
         self.changed = False
@@ -83,7 +88,7 @@ class Neighbours:
             np.full(count, pose.stamp - utc),
             np.full(count, pose.seq),
             np.array([pose.position] * count),
-            np.array([pose.velocity] * count),
+            np.array([pose.velocity or wire.STILL] * count),
         )
         if self._channel.ideal:
             self._believe(said, utc)

@@ -21,7 +21,7 @@ ABSURD: Final = 1e6  # [m, m/s, rad, rad/s] no setpoint is that large
 MAX_RAYS: Final = 720  # of one sweep; the finest scanner here has 360
 MAX_RANGE: Final = 100.0  # [m]; no range sensor here sees farther
 REACH_M: Final = 1.0  # a neighbour said to be farther outside the arena than this is not believed
-MAX_YAW: Final = 1e3  # [rad]; yaw is counted on over full turns
+MAX_YAW: Final = 1e3  # [rad]; ours is within ±π, other programs may count on over full turns
 
 
 def reach_of(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Vector:
@@ -57,7 +57,7 @@ def check_pose(pose: Pose, *, robot: str, now: float, reach: Vector) -> None:
 
 
 def check_state(state: State, *, robot: str, now: float, reach: Vector) -> None:
-    """Refuses telemetry whose pose cannot be true.
+    """Refuses telemetry whose pose cannot be true; it may have none.
 
     Raises:
         Malformed: As `check_pose`.
@@ -65,7 +65,8 @@ def check_state(state: State, *, robot: str, now: float, reach: Vector) -> None:
     if state.robot != robot:
         raise Malformed(f"state of '{state.robot}' on the key of '{robot}'")
     _refuse_stamp(state.stamp, now)
-    _refuse_place(state.position, reach)
+    if state.position is not None:
+        _refuse_place(state.position, reach)
     _refuse_motion(state.velocity, state.yaw)
 
 
@@ -170,6 +171,6 @@ def _refuse_place(position: Vector, reach: Vector) -> None:
         raise Malformed(f"position {position} is outside the arena")
 
 
-def _refuse_motion(velocity: Vector, yaw: float) -> None:
-    if not _within(velocity, MAX_SPEED) or not abs(yaw) <= MAX_YAW:
+def _refuse_motion(velocity: Vector | None, yaw: float | None) -> None:
+    if not _within(velocity or (), MAX_SPEED) or not abs(yaw or 0.0) <= MAX_YAW:
         raise Malformed(f"velocity {velocity} or yaw {yaw} is impossible")

@@ -40,10 +40,17 @@ class Voice:
     ) -> Said:
         """Who speaks at `t` [s], and what; rows that do not know where they are stay silent. See `View`.
 
+        An unknown velocity is said as NaN, and counts as 0 for trigger and smoothing: what the neighbours assume then.
+
         Raises:
             PluginError: If the trigger fails; it is named, for it may be somebody's first.
         """
         trigger = self.trigger
+        unknown: Index | None = None
+        if not every(np.isfinite(velocity)):
+            unknown = np.flatnonzero(~np.isfinite(velocity).all(axis=1))
+            velocity = velocity.copy()
+            velocity[unknown] = 0.0
         if trigger.smoothing_s > 0.0:
             if self._smoothed is None:
                 self._smoothed = LowPass(len(position))
@@ -58,6 +65,9 @@ class Voice:
             if not every(seen):
                 rows = rows[seen.all(axis=1)]
             self.told.tell(rows, view)
+        if unknown is not None:
+            velocity = velocity.copy()  # what neighbours were told of stays with them
+            velocity[unknown] = np.nan
         return Said(rows, position, velocity)
 
 

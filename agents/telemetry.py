@@ -85,7 +85,7 @@ class Telemetry:
         neighbours: Neighbours,
         counts: Counts,
         ranged: Sequence[bool],
-        followed: list[list[wire.Followed]] | None = None,
+        followed: Sequence[deque[wire.Followed]] | None = None,
     ) -> None:
         """Declares the publishers.
 
@@ -111,7 +111,7 @@ class Telemetry:
             for name, own in zip(names, ranged, strict=True)
         ]
         self.utc = self.due = 0.0
-        self._followed: list[list[wire.Followed]] = [[] for _ in names] if followed is None else followed
+        self._followed = [deque[wire.Followed]() for _ in names] if followed is None else followed
         self._told = 0
         self._scanned = [-inf] * len(names)
         self._origin: list[wire.Setpoint | None] = [None] * len(names)
@@ -121,37 +121,35 @@ class Telemetry:
         self._numbers = [0] * len(names)
 
     def tell(self, state: BodyState, actions: Actions, t: float) -> None:
-        """Sends the telemetry of every row that knows where it is."""
+        """Sends the telemetry of every row; one that does not know where it is tells what it heard all the same."""
         self._told += 1
         agent = self._agent
         position, velocity, truth = state.position.tolist(), state.velocity.tolist(), state.true_position.tolist()
         goal, setpoint = agent.goal.tolist(), actions.setpoint.tolist()
         for row, name in enumerate(self._names):
-            if not isfinite(position[row][0]):
-                continue
-            known = isfinite(truth[row][0])
             message = wire.State(
                 name,
                 self._told,
                 self.utc + t,
                 Phase(agent.life.phase[row]).word,
-                tuple(position[row]),
-                tuple(velocity[row]),
-                float(state.yaw[row]),
-                tuple(goal[row]) if isfinite(goal[row][0]) else None,
-                tuple(setpoint[row]) if isfinite(setpoint[row][0]) else None,
-                float(agent.error[row]),
-                tuple(truth[row]) if known else None,
-                float(state.true_yaw[row]) if known else None,
-                self._neighbours.news[row],
+                wire.vector(position[row]),
+                wire.vector(velocity[row]),
+                wire.heading(state.yaw[row]),
+                wire.vector(goal[row]),
+                tuple(setpoint[row]) if all(map(isfinite, setpoint[row])) else None,
+                wire.number(float(agent.error[row])),
+                wire.vector(truth[row]),
+                wire.heading(state.true_yaw[row]),
+                list(self._neighbours.news[row]),
                 _known_row(state.attitude, row),
                 _known_row(state.shadow_position, row),
                 _known_row(state.shadow_yaw, row),
-                self._followed[row],
+                list(self._followed[row]),
             )
-            self._states[row].put(wire.encode(message, self._encoding))
-            self._neighbours.news[row] = []
-            self._followed[row] = []
+            for payload in wire.payloads(message, self._encoding):
+                self._states[row].put(payload)
+            self._neighbours.news[row].clear()
+            self._followed[row].clear()
 
     def scan(self, state: BodyState) -> None:
         """Sends the range readings that are new and the rows' own."""

@@ -133,8 +133,10 @@ class Graph:
                 self.malformed += 1
                 continue
             robot.stamp = state.stamp
-            robot.pose.put(pose(self._types, state))
-            robot.velocity.put(velocity(self._types, state))
+            if state.position is not None:
+                robot.pose.put(pose(self._types, state, state.position))
+            if state.velocity is not None:
+                robot.velocity.put(velocity(self._types, state, state.velocity))
 
     def _reports(self) -> list[Message]:
         """Statuses as diagnostics."""
@@ -170,19 +172,19 @@ def ros_name(robot: str) -> str:
     return f"_{name}" if name[:1].isdigit() else name
 
 
-def pose(types: Types, state: wire.State) -> Message:
-    """A PoseStamped in the arena; only the yaw of the robot is known."""
-    x, y, z = state.position
+def pose(types: Types, state: wire.State, position: wire.Vector) -> Message:
+    """A PoseStamped in the arena; only the yaw of the robot is known, and 0 stands for one that is not."""
+    x, y, z = position
     place = types.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
-    half = 0.5 * state.yaw
+    half = 0.5 * (state.yaw or 0.0)
     toward = types.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin(half), w=cos(half))
     stamped = types.make("geometry_msgs/msg/Pose", position=place, orientation=toward)
     return types.make(ros2.POSE_STAMPED, header=types.header(state.stamp, FRAME), pose=stamped)
 
 
-def velocity(types: Types, state: wire.State) -> Message:
+def velocity(types: Types, state: wire.State, moves: wire.Vector) -> Message:
     """A TwistStamped along the axes of the arena; its angular part is not known and zero."""
-    twist = types.twist(state.velocity, (0.0, 0.0, 0.0))
+    twist = types.twist(moves, (0.0, 0.0, 0.0))
     return types.make(ros2.TWIST_STAMPED, header=types.header(state.stamp, FRAME), twist=twist)
 
 

@@ -119,8 +119,7 @@ class Positions:
 
     def publish(self, robot: str, stamp: float, segment: Segment, yaw: float) -> None:
         """Says where a robot was at UTC time `stamp` [s]."""
-        message = wire.Position(robot, round(stamp, 6), segment.position, yaw)
-        self._publishers[robot].put(wire.encode(message))
+        self._publishers[robot].put(wire.encode(wire.position(robot, stamp, segment.position, yaw)))
 
 
 class Bridge:

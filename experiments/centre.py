@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from math import floor, isfinite
+from math import floor, isfinite, nan
 from typing import Final
 
 import numpy as np
@@ -139,11 +139,11 @@ class CentreProcess:
             np.array([pose.seq]),
             np.array([pose.stamp - self._utc]),
             np.array([pose.position]),
-            np.array([pose.velocity]),
+            np.array([pose.velocity or wire.STILL]),
             start=np.array([start]),
             size=np.array([said.size]),
             now=t,
-            extra=np.array([[pose.yaw]]),
+            extra=np.array([[nan if pose.yaw is None else pose.yaw]]),
         )
 
     def _believe(self, got: Samples) -> None:

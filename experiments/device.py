@@ -98,7 +98,7 @@ class DeviceProcess:
         for name, publisher, where, toward in zip(
             self._names, self._truths, position.tolist(), yaw.tolist(), strict=False
         ):
-            publisher.put(wire.encode(wire.Position(name, stamp, tuple(where), toward)))
+            publisher.put(wire.encode(wire.position(name, stamp, where, toward)))
 
 
 def stand_in(file: str, names: Sequence[str], *, faults: Faults, connect: Sequence[str], lifeline: bool) -> int:

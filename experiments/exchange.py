@@ -144,10 +144,10 @@ class Exchange:
             pause.wait(0.01)
             for name, subscriber in list(waiting.items()):
                 state = self._newest(name, subscriber.handler)
-                if state is None:
+                if state is None or state.position is None:
                     continue
                 flying = state.position[2] > IN_AIR_M and state.phase in UP
-                self._population.put(name, state.position, state.yaw, flying=flying)
+                self._population.put(name, state.position, state.yaw or 0.0, flying=flying)
                 row = self._names.index(name)
                 self._quiet[row] = CLIMB_S if flying and self._population.flies[row] else inf
                 found.append(name)
@@ -249,8 +249,9 @@ class Exchange:
         changed = False
         for name, (row, subscriber) in self._mirrors.items():
             state = self._newest(name, subscriber.handler)
-            if state is not None:
-                self._place[row], self._velocity[row], self._yaw[row] = state.position, state.velocity, state.yaw
+            if state is not None and state.position is not None:
+                self._place[row], self._velocity[row] = state.position, state.velocity or wire.STILL
+                self._yaw[row] = state.yaw or 0.0
                 self._heard[row] = t
                 changed = True
             elif t - self._heard[row] > GONE_S and np.isfinite(self._place[row, 0]):
@@ -264,7 +265,7 @@ class Exchange:
         self._population.body.mirror(rows, self._place[rows], self._yaw[rows], self._velocity[rows])
 
     def _newest(self, name: str, handler: network.Polled[zenoh.Sample]) -> wire.State | None:
-        """The last state that can be believed of those that wait."""
+        """The last state with a position that can be believed of those that wait."""
         found = None
         for sample in network.received(handler):
             try:
@@ -273,7 +274,8 @@ class Exchange:
             except wire.Malformed as error:
                 self._deplore(error)
                 continue
-            found = state
+            if state.position is not None:
+                found = state
         return found
 
     def _heed(self, sample: zenoh.Sample, t: float) -> None:
@@ -334,10 +336,10 @@ class Exchange:
         self, publishers: list[tuple[str, zenoh.Publisher]], position: Array, yaw: Array, stamp: float
     ) -> None:
         encoding = self._encoding
-        for (name, publisher), (x, y, z), heading in zip(
+        for (name, publisher), place, heading in zip(
             publishers, position.round(6).tolist(), yaw.round(6).tolist(), strict=True
         ):
-            publisher.put(wire.encode(wire.Position(name, stamp, (x, y, z), heading), encoding))
+            publisher.put(wire.encode(wire.position(name, stamp, place, heading), encoding))
 
     def _sweep(self, rays: Rays, stamp: float) -> None:
         """The readings of rows that measured since they were told last."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
-from math import inf, isfinite
+from math import inf
 from pathlib import Path
 from typing import Final
 
@@ -110,8 +110,7 @@ class Overview:
             seen = self.robots[state.robot]
             if seen.error is not None:
                 seen.error = state.error
-            place = state.true_position or state.position
-            seen.place = place if all(map(isfinite, place)) else seen.place
+            seen.place = state.true_position or state.position or seen.place
         for sample in network.received(self._watch.handler):
             name = self._keys.whose(str(sample.key_expr))
             if name is not None and (known := self.robots.get(name)) is not None:

@@ -306,11 +306,11 @@ class _Sampled:
         def column(values: list[Any], width: int) -> Array:
             return np.array(values, dtype=float).reshape(-1, width)
 
-        measured = column([state.position for state in states], 3)
+        measured = column([state.position or NOWHERE for state in states], 3)
         truth = column([state.true_position or NOWHERE for state in states], 3)
         return cls(
             position=line(t, measured, *grid),
-            yaw=turn(t, column([state.yaw for state in states], 1), *grid),
+            yaw=turn(t, column([_number(state.yaw) for state in states], 1), *grid),
             true_position=line(t, np.where(np.isfinite(truth), truth, measured), *grid),
             goal=step(t, column([state.goal or NOWHERE for state in states], 3), *grid),
             setpoint=step(t, column([state.setpoint or UNKNOWN for state in states], 4), *grid),
@@ -327,7 +327,10 @@ def _number(value: float | None) -> float:
 def _sent(poses: list[list[SentPose]], start: float, duration: float) -> Sent:
     table = _in_run(
         [
-            (pose.stamp, row, pose.seq, *pose.position, *pose.velocity, pose.yaw, pose.size)
+            (
+                *(pose.stamp, row, pose.seq, *pose.position),
+                *(*(pose.velocity or NOWHERE), _number(pose.yaw), pose.size),
+            )
             for row, own in enumerate(poses)
             for pose in own
         ],

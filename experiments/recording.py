@@ -51,8 +51,8 @@ class SentPose(msgspec.Struct, frozen=True):
     seq: int
     stamp: float
     position: Vector
-    velocity: Vector
-    yaw: float
+    velocity: Vector | None
+    yaw: float | None
     received: float
     size: int
 
@@ -150,12 +150,13 @@ class Recording:
         self._record(self._pose, pose.robot, sent, received, pose.stamp, seq=pose.seq)
 
     def state(self, state: State) -> None:
-        """Records telemetry, and for the viewers where the robot is: the truth of a twin, else as measured.
+        """Records telemetry, and for the viewers where the robot is, if known: the truth of a twin, else as measured.
 
         Raises:
             RecordingError: If it cannot be written; what was written before stays.
         """
-        if self._record(self._state, state.robot, state, state.stamp, state.stamp, seq=state.seq):
+        written = self._record(self._state, state.robot, state, state.stamp, state.stamp, seq=state.seq)
+        if written and (state.true_position or state.position) is not None:
             self._record(self._drawn, state.robot, state, state.stamp, state.stamp, seq=state.seq)
 
     def status(self, status: Status) -> None:
@@ -320,7 +321,8 @@ def _drawing() -> Callable[[State], bytes]:
     def drawn(state: State) -> bytes:
         place = state.position if state.true_position is None else state.true_position
         yaw = state.yaw if state.true_yaw is None else state.true_yaw
-        return encode(state.stamp, place, yaw, state.attitude)
+        assert place is not None
+        return encode(state.stamp, place, yaw or 0.0, state.attitude)
 
     return drawn
 

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.plugins import PluginError
+from agents.prediction import ConstantVelocity
 from agents.speaking import LowPass, Voice
 from agents.triggers import SendOnDelta, Trigger
 
@@ -87,3 +88,15 @@ def test_a_trigger_that_fails_is_named():
 
     with pytest.raises(PluginError, match="the trigger Broken failed: AttributeError"):
         say(Voice(Broken(), 1), 0.0, np.zeros((1, 3)))
+
+
+def test_an_unknown_velocity_is_said_as_unknown_and_counts_as_standing():
+    position, velocity = np.zeros((2, 3)), np.array([[np.nan] * 3, [0.1, 0.0, 0.0]])
+    for trigger in (SendOnDelta(threshold=0.01), SendOnDelta(threshold=0.01, smoothing_s=0.5)):
+        voice = Voice(trigger, 2, ConstantVelocity())
+        said = say(voice, 0.0, position, velocity)
+        assert said.rows.tolist() == [0, 1]
+        np.testing.assert_array_equal(said.velocity, velocity)
+        np.testing.assert_array_equal(voice.told.velocity, [[0.0] * 3, [0.1, 0.0, 0.0]])
+        moved = np.array([[1.0, 0.0, 0.0], [DT * 0.1, 0.0, 0.0]])
+        assert say(voice, DT, moved, velocity).rows.tolist() == [0]

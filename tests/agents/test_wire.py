@@ -114,7 +114,7 @@ def test_fields_of_other_types_are_malformed(value, field):
         pose = wire.decode(payload, MSGPACK, Pose)
     except Malformed:
         return
-    assert isinstance(value, int | float | str | list)
+    assert isinstance(value, int | float | str | list) or (value is None and field in {"velocity", "yaw"})
     try:
         plausibility.check_pose(pose, robot="KH01", now=1000.0, reach=REACH)
     except Malformed:
@@ -172,3 +172,48 @@ def test_the_largest_honest_state_fits():
 def test_a_pose_is_rounded_to_what_sensors_know():
     made = wire.pose("KH01", 7, 1.23456789, [1 / 3, -2 / 3, 0.0], [1e-9, 1.0, -1.0], 2.0000004)
     assert made == Pose("KH01", 7, 1.234568, (0.333333, -0.666667, 0.0), (0.0, 1.0, -1.0), 2.0)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_unknown_numbers_are_left_out(encoding):
+    nothing = [math.nan] * 3
+    for said in (
+        wire.pose("A", 1, 1000.0, [0.1, 0.2, 0.3], nothing, math.nan),
+        State("A", 1, 1000.0, "ready", wire.vector([0.1, 0.2, math.nan]), wire.vector(nothing), wire.heading(math.inf)),
+        wire.position("A", 1000.0, [0.1, 0.2, 0.3], math.nan),
+    ):
+        payload = wire.encode(said, encoding)
+        assert not any(word in payload for word in (b"null", b"velocity", b"yaw", b"heard"))
+        assert wire.decode(payload, wire.MIME[encoding], type(said)) == said
+
+
+def test_a_yaw_is_within_half_a_turn_however_far_a_robot_has_turned():
+    """Yaw of robots on wheels is counted on; beyond 1000 rad every reader refused the pose (159 turns)."""
+    for yaw in (0.0, 3.1, -3.1, 1000.5, -1e6, 1e9):
+        poses = (
+            wire.pose("KH01", 1, 999.0, [0.0] * 3, [0.0] * 3, yaw),
+            wire.position("KH01", 999.0, [0.0] * 3, yaw),
+        )
+        for said in poses:
+            assert abs(said.yaw) <= math.pi
+            assert math.cos(said.yaw - yaw) == pytest.approx(1.0, abs=1e-9)
+        plausibility.check_pose(poses[0], robot="KH01", now=1000.0, reach=REACH)
+        plausibility.check_position(poses[1], robot="KH01", now=1000.0, reach=REACH)
+    assert wire.heading(1.234567890123) == 1.234567890123
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize(("heard", "followed"), [(0, 0), (1, 1), (3000, 0), (0, 3000), (1500, 700)])
+def test_telemetry_that_is_too_long_for_a_payload_goes_in_several(encoding, heard, followed):
+    state = State(
+        "A", 7, 1000.0, "running", (0.1, 0.2, 0.3),
+        heard=[Heard("KH01", k, 1000.0 + k, 1000.1 + k, (0.123456,) * 3, (0.0,) * 3) for k in range(heard)],
+        followed=[wire.Followed(k, 1000.0 + k, 1000.1 + k, 1000.2 + k) for k in range(followed)],
+    )  # fmt: skip
+    payloads = list(wire.payloads(state, encoding))
+    parts = [wire.decode(payload, wire.MIME[encoding], State) for payload in payloads]
+    assert (len(parts) == 1) == (len(wire.encode(state, encoding)) <= wire.MAX_PAYLOAD)
+    assert [each for part in parts for each in part.heard] == state.heard
+    assert [each for part in parts for each in part.followed] == state.followed
+    bare = msgspec.structs.replace(state, heard=[], followed=[])
+    assert all(msgspec.structs.replace(part, heard=[], followed=[]) == bare for part in parts)

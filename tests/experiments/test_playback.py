@@ -344,7 +344,7 @@ def test_a_run_without_any_message_of_a_robot(path):
 
 
 def test_what_cannot_be_a_message_is_counted_and_left_out(path):
-    wrong = [state(seq=2**63), state(position=None), state(phase="\ud800"), pose(seq=2**70), status(sent=2**64)]
+    wrong = [state(seq=2**63), state(position="here"), state(phase="\ud800"), pose(seq=2**70), status(sent=2**64)]
     recording = write(path, begun(), *wrong, Event(None, "k", "s", "t"))
     assert recording.refused == 6
     assert read(path).messages == 1

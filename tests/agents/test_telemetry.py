@@ -1,0 +1,107 @@
+"""Telemetry of robots that hear much, or do not know where they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from agents import session as network
+from agents import wire
+from agents.agent import Agent
+from agents.keys import Keys
+from agents.neighbours import NEWS, Neighbours
+from agents.telemetry import Counts, Telemetry
+from experiments import assign
+from tests.agents.few import pair
+from twins.body import TwinBody
+
+UTC = 1_760_000_000.0
+
+
+class Taken:
+    """In the place of a publisher, or of a subscriber to which nobody speaks."""
+
+    def __init__(self) -> None:
+        self.states: list[wire.State] = []
+
+    def put(self, payload: bytes) -> None:
+        self.states.append(wire.decode(payload, wire.JSON, wire.State))
+
+    @property
+    def handler(self) -> Taken:
+        return self
+
+    def try_recv(self) -> None:
+        return None
+
+
+class Robot:
+    """A of a pair, with what it hears of B put into its ears."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        for name in ("publisher", "pose_publisher", "pose_subscriber", "alive_watch"):
+            monkeypatch.setattr(network, name, lambda *_: Taken())
+        experiment = pair()
+        self.agent = Agent(assign.assign(experiment, ("A",)))
+        self.body = TwinBody(assign.request(experiment, ("A",), [1]))
+        self.body.open()
+        nowhere = None
+        self.neighbours = Neighbours(nowhere, Keys(), self.agent, reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
+        self.telemetry = Telemetry(
+            nowhere, Keys(), "json",  # type: ignore[arg-type]
+            agent=self.agent, neighbours=self.neighbours, counts=Counts.nothing(1), ranged=[True],
+        )  # fmt: skip
+        self.telemetry.utc = UTC
+
+    def hear(self, count: int, first: int = 1) -> None:
+        for seq in range(first, first + count):
+            self.neighbours.news[0].append(
+                wire.Heard("B", seq, UTC + 0.02 * seq, UTC + 0.02 * seq, (0.4, 0.1, 0.0), (0.123456, 0.0, 0.0))
+            )
+
+    def tell(self, t: float, **changed: float) -> list[wire.State]:
+        """One sample of telemetry, some columns of the body's state `changed`."""
+        state = self.body.read(t)
+        for name, value in changed.items():
+            getattr(state, name)[:] = value
+        actions = self.agent.act(t, state, self.agent.speak(t, state))
+        (publisher,) = self.telemetry._states
+        publisher.states.clear()
+        self.telemetry.tell(state, actions, t)
+        return publisher.states
+
+
+@pytest.fixture
+def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
+    return Robot(monkeypatch)
+
+
+def test_who_does_not_know_where_it_is_tells_what_it_heard(robot: Robot) -> None:
+    robot.hear(100)
+    (said,) = robot.tell(0.02, position=np.nan)
+    assert (said.position, len(said.heard)) == (None, 100)
+    assert not robot.neighbours.news[0]
+    (said,) = robot.tell(0.04)
+    assert said.position is not None
+    assert said.heard == []
+
+
+def test_what_waits_for_telemetry_is_bounded(robot: Robot) -> None:
+    robot.hear(NEWS + 500)
+    assert len(robot.neighbours.news[0]) == NEWS
+    states = robot.tell(0.02)
+    assert len(states) > 1
+    assert [each.seq for state in states for each in state.heard] == list(range(501, NEWS + 501))
+    assert {state.seq for state in states} == {1}
+
+
+def test_a_body_that_knows_no_velocity_has_telemetry(robot: Robot) -> None:
+    (said,) = robot.tell(0.02, velocity=np.nan)
+    assert said.velocity is None
+    assert said.position is not None
+
+
+def test_a_robot_that_has_turned_often_looks_where_it_looks(robot: Robot) -> None:
+    (said,) = robot.tell(0.02, yaw=2000.0 * np.pi + 0.5, true_yaw=-2000.0 * np.pi + 0.5)
+    assert said.yaw == pytest.approx(0.5, abs=1e-9)
+    assert said.true_yaw == pytest.approx(0.5, abs=1e-9)
