@@ -1,8 +1,8 @@
-"""Positions that are measured outside of the robots: kept per row, with the velocity that follows from them."""
+"""Velocities that follow from measured positions, and the positions that are measured outside of the robots."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,23 @@ SMOOTHING_S: Final = 0.1  # time constant of the velocity estimate
 FASTEST: Final = 5.0  # [m/s] a jump that would need more is a mistaken marker, not a motion
 FARTHEST: Final = 1e6  # [m] nothing is measured beyond
 PATIENCE_S: Final = 0.5  # after this silence any position is believed again
+
+Number = TypeVar("Number", float, Array)
+
+
+def velocity_after(velocity: Number, moved: Number, since: float) -> Number:
+    """The velocity estimate after one more measured position: a low-pass with `SMOOTHING_S` on the difference quotient.
+
+    The one estimate of this project: motion capture and odometry measure positions, and a velocity is what is left
+    of their differences. White noise σ of the positions makes σ / `SMOOTHING_S` of noise, whatever the rate is.
+
+    Args:
+        velocity: The estimate before, any shape [m/s].
+        moved: Measured position less the one before [m].
+        since: Time between the two, above 0 [s].
+    """
+    share = since / (SMOOTHING_S + since)
+    return velocity + share * (moved / since - velocity)
 
 
 class External:
@@ -43,8 +60,7 @@ class External:
             if float(moved @ moved) > (FASTEST * since + 0.02) ** 2:
                 self.refused += 1
                 return False
-            share = since / (SMOOTHING_S + since)
-            self.velocity[row] += share * (moved / since - self.velocity[row])
+            self.velocity[row] = velocity_after(self.velocity[row], moved, since)
         else:
             self.velocity[row] = 0.0
         self.time[row], self.position[row] = t, position

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Final
 
+from agents.positioning import velocity_after
 from agents.protocols import khepera4 as protocol
-
-SMOOTHING_S: Final = 0.1  # time constant of the velocity estimate
 
 
 class Odometer:
@@ -70,6 +68,5 @@ class Odometer:
         self.x, self.y, self.yaw = self.x + dx, self.y + dy, self.yaw + turn
         since, self._stamp = stamp - self._stamp, stamp
         if since > 0.0:
-            share = since / (SMOOTHING_S + since)
             vx, vy = self.velocity
-            self.velocity = vx + share * (dx / since - vx), vy + share * (dy / since - vy)
+            self.velocity = velocity_after(vx, dx, since), velocity_after(vy, dy, since)

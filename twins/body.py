@@ -8,7 +8,7 @@ import numpy as np
 
 from agents import plugins
 from agents.body import BodyRequest, BodyState
-from agents.positioning import External
+from agents.positioning import PATIENCE_S, External, velocity_after
 from agents.rows import Array, Index, Mask
 from twins.disturbance import Drift, HoverJitter, Latency, Measurement
 from twins.engine import Engine, EngineFactory, Stage, Touch
@@ -67,6 +67,7 @@ class TwinBody:
         self._on_floor = np.flatnonzero(~flies)
         self._outside = np.flatnonzero(request.external)
         self._external = External(rows)
+        self._measured_at, self._measured, self._velocity = -inf, np.zeros((rows, 3)), np.zeros((rows, 3))
         self._state = self._measure()
 
     def open(self) -> None:
@@ -116,6 +117,8 @@ class TwinBody:
         if velocity is not None and isinstance(self.engine, PointMassEngine):
             self.engine.push(rows, velocity)
         self._state = self._measure()
+        self._velocity[rows] = 0.0 if velocity is None else velocity  # the way to the place was no motion
+        self._state.velocity = self._velocity.copy()
 
     def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
         """Where mirrored rows are: (len(rows), 3) [m], (len(rows),) [rad], (len(rows), 3) [m/s]; NaN: not there."""
@@ -149,7 +152,7 @@ class TwinBody:
 
     def _measure(self) -> BodyState:
         engine = self.engine
-        truth, velocity, yaw = engine.position.copy(), engine.velocity.copy(), engine.yaw.copy()
+        truth, yaw = engine.position.copy(), engine.yaw.copy()
         measured, heading = truth, yaw
         if self._measurement.present:
             noise = self._measurement.draw()
@@ -157,11 +160,12 @@ class TwinBody:
         if self._drift.present:
             measured = measured.copy()
             measured[:, :2] += self._drift.error
+        self._estimate(measured)
         rows = len(truth)
         state = BodyState(
             time=np.full(rows, self._t),
             position=measured,
-            velocity=velocity,
+            velocity=self._velocity.copy(),
             yaw=heading,
             true_position=truth,
             true_yaw=yaw,
@@ -174,6 +178,21 @@ class TwinBody:
             state.position, state.yaw = measured.copy(), heading.copy()
             self._external.fill(state, self._outside)
         return state
+
+    def _estimate(self, measured: Array) -> None:
+        """Velocity as robots know theirs: from what they measure, wobble and noise included.
+
+        Motion capture measures positions (`External`), a Khepera's odometry as well. A Crazyflie with a positioning
+        system of its own estimates its velocity on board with its accelerometer too (Mueller, Hamer and D'Andrea,
+        ICRA 2015), hence with less noise; the wobble, which is a motion of its, it knows as well.
+        """
+        since = self._t - self._measured_at
+        if since >= PATIENCE_S:
+            self._velocity[:] = 0.0
+        elif since > 0.0:
+            velocity = velocity_after(self._velocity, measured - self._measured, since)
+            self._velocity = np.where(np.isfinite(velocity), velocity, 0.0)  # a mirrored robot may be out of sight
+        self._measured_at, self._measured = self._t, measured
 
 
 def open_twin(request: BodyRequest) -> TwinBody:

@@ -9,6 +9,7 @@ import pytest
 from agents.body import BodyError, Disturbance, Jitter
 from agents.kinds import KINDS
 from agents.plugins import load
+from agents.positioning import SMOOTHING_S, External
 from experiments import assign
 from experiments.experiment import Experiment, Rates, Robot
 from twins.body import CATCH_UP_S, ENDURANCE_S, TwinBody
@@ -128,8 +129,8 @@ def test_latency_from_command_to_effect(ticks):
     twin = body("khepera4", nature={"all": Disturbance(latency_s=ticks * DT)})
     speed = []
     for tick in range(12):
-        state = twin.read(tick * DT)
-        speed.append(state.velocity[0, 0])
+        twin.read(tick * DT)
+        speed.append(twin.engine.velocity[0, 0])
         twin.command(np.array([[0.01, 0.0, 0.0, 0.0]]))  # at tick 0 first
     np.testing.assert_allclose(speed, [0.0] * (1 + ticks) + [0.01] * (11 - ticks))
 
@@ -142,7 +143,8 @@ def test_silence_stops_the_wheels_with_latency_too(latency):
         twin.command(np.array([[0.2, 0.0, 0.0, 0.0]]))
     moving = 0
     for tick in range(50, 200):
-        moving += twin.read(tick * DT).velocity[0, 0] > 1e-9
+        twin.read(tick * DT)
+        moving += twin.engine.velocity[0, 0] > 1e-9
     assert moving * DT == pytest.approx(0.5 + 0.07 + (latency or 0.0), abs=0.03)
 
 
@@ -185,6 +187,33 @@ def test_measurement_noise_is_not_the_truth_and_ground_robots_have_no_height():
     assert states[-1].time[0] == 1999 * DT
 
 
+def test_velocity_is_measured_as_that_of_robots_in_motion_capture():
+    nature = {"all": Disturbance(position_sigma=0.001, hover_jitter=Jitter(0.01))}
+    twin, seen = body("crazyflie", nature=nature), External(1)
+    seen.update(0, 0.0, twin.read(0.0).position[0], 0.0)
+    twin.takeoff(np.array([0]), np.array([0.5]))
+    for tick in range(1, 800):
+        state = twin.read(tick * DT)
+        seen.update(0, tick * DT, state.position[0], 0.0)
+        np.testing.assert_allclose(state.velocity, seen.velocity, rtol=0.0, atol=1e-12)
+    velocity = np.array([twin.read((800 + tick) * DT).velocity[0] for tick in range(6000)])
+    wobble = 0.01 / SMOOTHING_S * np.sqrt(SMOOTHING_S / (0.5 + SMOOTHING_S))  # of an Ornstein-Uhlenbeck process
+    np.testing.assert_allclose(velocity[:, :2].std(axis=0), np.hypot(wobble, 0.001 / SMOOTHING_S), rtol=0.1)
+    assert velocity[:, 2].std() == pytest.approx(0.001 / SMOOTHING_S, rel=0.1)  # noise alone
+    assert not twin.engine.velocity[:, :2].any()  # its controller holds its place
+
+
+def test_velocity_of_a_robot_that_drives_and_of_one_that_is_put_elsewhere():
+    twin = body("khepera4")
+    for tick in range(200):
+        state = twin.read(tick * DT)
+        twin.command(np.array([[0.2, 0.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(state.velocity, [[0.2, 0.0, 0.0]], atol=1e-6)
+    twin.place(np.array([0]), np.array([[1.0, 1.0, 0.0]]), np.zeros(1), np.zeros(1, dtype=bool))
+    assert not twin.read(199 * DT).velocity.any()
+    assert not twin.read(200 * DT).velocity.any()
+
+
 def test_odometry_drifts_with_the_way():
     errors = []
     for seed in range(40):
@@ -205,8 +234,8 @@ def test_land_and_stop_on_the_ground_halt_the_wheels():
             twin.command(np.array([[0.2, 0.0, 0.0, 0.0]]))
         getattr(twin, order)(np.array([0]))
         for tick in range(50, 80):
-            state = twin.read(tick * DT)
-        assert not state.velocity.any()
+            twin.read(tick * DT)
+        assert not twin.engine.velocity.any()
 
 
 def test_an_emergency_stop_in_the_air_is_a_fall():

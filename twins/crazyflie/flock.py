@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from agents.body import BodyRequest
+from agents.positioning import velocity_after
 from agents.protocols.crazyflie import Lighthouse, Loco, Outside, chosen
 from agents.protocols.crtp import Info, Power
 from agents.rows import Array, Mask
@@ -37,6 +38,7 @@ class Flock:
         charge: (N,) of the batteries, 0 to 1.
         place: (N, 3) where they are [m].
         estimate: (N, 3) where they say to be [m].
+        velocity: (N, 3) that they say, from what they measure [m/s].
         dt: Of a tick [s].
         t: Now [s].
     """
@@ -75,6 +77,8 @@ class Flock:
         self.estimator.error[~self._on_board] = -self.quadrotor.position[~self._on_board]
         self.place = self.quadrotor.position.copy()
         self.estimate = self.place + self.estimator.error
+        self.velocity = np.zeros((rows, 3))
+        self._seen = self.place
 
     def pose(self, row: int) -> Array:
         """(4,) where a row believes to be: x, y, z [m], yaw [rad]."""
@@ -159,9 +163,9 @@ class Flock:
             self.place[:, :2] += share[:, None] * self._jitter.displacement
         np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
         self.estimator.advance(t, self.dt, self.place, self.ready())
-        self.estimate = self.place + self.estimator.error
-        if self._measurement.present:
-            self.estimate = self.estimate + self._measurement.draw()[:, :3]
+        seen = self.place + self._measurement.draw()[:, :3] if self._measurement.present else self.place
+        self.estimate = seen + self.estimator.error
+        self.velocity, self._seen = velocity_after(self.velocity, seen - self._seen, self.dt), seen
         return locked
 
     def _spinning(self) -> Mask:

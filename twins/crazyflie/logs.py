@@ -122,9 +122,9 @@ def _variables(flock: Flock, row: int, parameter: Callable[[str], float]) -> dic
     read: dict[str, Read] = {}
     for i, axis in enumerate("xyz"):
         read[f"stateEstimate.{axis}"] = lambda i=i: float(flock.estimate[row, i])  # type: ignore[misc]
-        read[f"stateEstimate.v{axis}"] = lambda i=i: float(quadrotor.velocity[row, i])  # type: ignore[misc]
+        read[f"stateEstimate.v{axis}"] = lambda i=i: float(flock.velocity[row, i])  # type: ignore[misc]
         read[f"stateEstimateZ.{axis}"] = lambda i=i: flock.estimate[row, i] / crtp.MM  # type: ignore[misc]
-        read[f"stateEstimateZ.v{axis}"] = lambda i=i: quadrotor.velocity[row, i] / crtp.MM  # type: ignore[misc]
+        read[f"stateEstimateZ.v{axis}"] = lambda i=i: flock.velocity[row, i] / crtp.MM  # type: ignore[misc]
         read[f"ctrltarget.{axis}"] = lambda i=i: float(np.nan_to_num(flock.commander.target[row, i]))  # type: ignore[misc]
         read[f"locSrv.{axis}"] = lambda i=i: float(flock.estimator.external[row, i])  # type: ignore[misc]
         read[f"kalman.varP{axis.upper()}"] = lambda: float(flock.estimator.variance[row])
