@@ -117,7 +117,7 @@ class Runtime:
         """Lands what is still in the air, because something broke on the way, before the motors are switched off."""
         self._watchdog.start()
         failures: list[Exception] = []
-        if self._in_the_air(failures):
+        if self._in_the_air(failures) and (self.agent.life.phase < Phase.DONE).any():  # else it was stopped
             error = sys.exception()
             why = "it did not land in time" if error is None else f"its control loop broke: {_what(error)}"
             self._watchdog.call_for_help(why)

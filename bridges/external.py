@@ -17,12 +17,12 @@ import zenoh
 
 from agents import plausibility, wire
 from agents import session as network
-from agents.body import BodyError, BodyRequest, BodyState
+from agents.body import UNANSWERED, BodyError, BodyRequest, BodyState
 from agents.endpoint import EndpointError
 from agents.leaving import leave
 from agents.positioning import External
 from agents.ranging import HeardRanges
-from agents.rows import Array, Index, some
+from agents.rows import Array, Index, Mask, norm, some
 
 Action = Literal["drive", "takeoff", "land", "stop"]
 
@@ -36,6 +36,8 @@ LANDING_S: Final = 10.0  # a robot that was told to land this long ago, and cann
 LAIN_S: Final = 1.0  # one that is seen on the ground for so long, though it was steered, has come down by itself
 AWAY_M: Final = 0.05  # higher above the place of take-off than this it is in the air, lower it is down
 SETTLED: Final = 0.1  # [m/s] slower than this it is down
+ANSWER_S: Final = 2.5  # a stop after which a robot is not seen to stand for so long is worth a word
+FAREWELL_S: Final = 1.0  # how long `close` waits until robots that were stopped are seen to stand
 REACH: Final = (1e3, 1e3, 1e3)  # [m] any room
 
 
@@ -86,6 +88,7 @@ class ExternalBody:
         self._ground = np.zeros(rows)
         self._lain = np.full(rows, np.inf)  # since when it is seen on the ground although it should fly
         self._stopped = np.zeros(rows, dtype=bool)
+        self._stopped_at = np.full(rows, np.inf)
         # so that numbers grow over restarts: a simulator that outlives this process knows new orders from old
         self._sent = [round(1e3 * self._utc)] * rows
         self._standing: dict[int, _Standing] = {}
@@ -165,8 +168,8 @@ class ExternalBody:
                 self._order(row, "takeoff", np.inf, up)
 
     def land(self, rows: Index) -> None:
-        """See `Body.land`."""
-        for row in rows.tolist():
+        """See `Body.land`; a stop is the last word."""
+        for row in rows[~self._stopped[rows]].tolist():
             self._landing[row] = self._now()
             self._order(row, "land", LANDING_S if self._flying[row] else HALT_S)
 
@@ -174,7 +177,9 @@ class ExternalBody:
         """See `Body.stop`; said again for as long as this process lives."""
         for row in rows.tolist():
             if not self._stopped[row]:
-                self._flying[row], self._stopped[row] = False, True
+                now = self._now()
+                self._stopped[row], self._stopped_at[row] = True, now
+                self._landing[row] = min(self._landing[row], now)  # from now on it flies until it is seen to be down
                 self._order(row, "stop", np.inf)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
@@ -183,6 +188,12 @@ class ExternalBody:
     def close(self) -> None:
         """See `Body.close`."""
         if self._session is not None:
+            until, nothing = self._now() + FAREWELL_S, np.full((len(self._names), 4), np.nan)
+            while some(self._unanswered()) and self._now() < until:
+                time.sleep(LOOK_S)
+                self.command(nothing)
+                self._listen()
+                self._settle()
             leave(self._session, self)
             self._session = None
 
@@ -243,6 +254,10 @@ class ExternalBody:
         stands = ~self._flies & (now - self._landing > HALT_S) & (now - self._seen.time > STALE_S)
         return np.where(stands[:, None], 0.0, self._seen.velocity)
 
+    def _unanswered(self) -> Mask:
+        """Rows that were stopped and are not seen to stand."""
+        return self._stopped & (self._flying | (norm(self._velocity()) > SETTLED))
+
     def _settle(self) -> None:
         """Ends the landings that have come to their end, and finds those that nobody here ordered."""
         if not some(self._flying):
@@ -265,11 +280,13 @@ class ExternalBody:
 
     def _notes(self) -> tuple[str, ...]:
         age = self._now() - self._seen.time
-        if not (age > STALE_S).any() and not any(self._malformed) and not self._ranges.malformed:
+        unanswered = self._unanswered() & (self._now() - self._stopped_at > ANSWER_S)
+        if not ((age > STALE_S) | unanswered).any() and not any(self._malformed) and not self._ranges.malformed:
             return ()
         notes = []
         for row, seconds in enumerate(age.tolist()):
-            parts = [f"no position for {seconds:.0f} s"] if seconds > STALE_S else []
+            parts = [UNANSWERED] if unanswered[row] else []
+            parts += [f"no position for {seconds:.0f} s"] if seconds > STALE_S else []
             if self._malformed[row]:
                 parts.append(f"{self._malformed[row]} positions refused, the last because {self._trouble[row]}")
             if self._ranges.malformed:

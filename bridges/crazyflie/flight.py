@@ -12,6 +12,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Final
 
+from agents.body import UNANSWERED
 from agents.kinds import CRAZYFLIE
 from agents.protocols.crazyflie import Settings
 from agents.protocols.crtp import HighLevel, Info, Status
@@ -23,7 +24,8 @@ SHORTEST_S: Final = 1.5  # of a take-off or landing
 REPLY_S: Final = 0.15  # to the answer to a high-level command; asked again after that
 TRIES: Final = 12
 ARMING_S: Final = 2.0
-STOPPING_S: Final = 2.0
+STOPPING_S: Final = 2.0  # a Crazyflie that was stopped and does not say that it is locked says so long that it flies
+ANSWER_S: Final = 2.5  # an emergency stop that is not answered for so long is worth a word
 POLL_S: Final = 0.02
 FRESH_S: Final = 1.0  # a status older than this says nothing
 LOOP_SILENCE_S: Final = 1.0  # the robot's loop must command at least this often while it flies
@@ -46,10 +48,11 @@ class Phase(Enum):
     CLIMBING = "taking off"
     FLYING = "flying"
     LANDING = "landing"
+    STOPPING = "told to stop, not answered yet"
     STOPPED = "stopped"
 
 
-AIRBORNE: Final = (Phase.CLIMBING, Phase.FLYING, Phase.LANDING)
+AIRBORNE: Final = (Phase.CLIMBING, Phase.FLYING, Phase.LANDING, Phase.STOPPING)
 
 
 class Flight:
@@ -121,29 +124,36 @@ class Flight:
         self._enter(Phase.LANDING)
 
     def stop(self) -> None:
-        """Motors off. One that stands is left alone: an emergency stop locks it until it is switched off and on."""
+        """Motors off; `guide` says it again until it is answered.
+
+        One that stands is left alone: an emergency stop locks it until it is switched off and on.
+        """
         telemetry = self._telemetry
         fresh = time.monotonic() - telemetry.told < FRESH_S
         if not self.airborne and fresh and Info.FLYING not in telemetry.info:
             return
-        self._enter(Phase.STOPPED)
-        deadline = time.monotonic() + STOPPING_S
-        while time.monotonic() < deadline and self.link.error is None:
-            self.link.cf.supervisor.send_emergency_stop()
-            time.sleep(POLL_S)
-            if Info.LOCKED in telemetry.info:
-                return
+        if self.phase is not Phase.STOPPING:
+            self._enter(Phase.STOPPING)
+        self.link.cf.supervisor.send_emergency_stop()
 
     # ------------------------------------------------------------------ in the air
 
     def guide(self, now: float) -> None:
         """Sends what is due at `now` on the monotonic clock [s]."""
+        if self.phase is Phase.STOPPING:
+            if now - self._since > ANSWER_S:
+                self.trouble = UNANSWERED
+            self.link.cf.supervisor.send_emergency_stop()
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
         if now - max(self._aimed, self._since) > LOOP_SILENCE_S:
             self.trouble = "landed it: nobody commanded it any more"
             self.land()
             return
+        self._stream(now)
+
+    def _stream(self, now: float) -> None:
+        """Sends the setpoint, if one is due."""
         target = self._target
         if target is None or now - self._sent < 1.0 / self._settings.stream_hz - 0.5 * POLL_S:
             return
@@ -168,9 +178,13 @@ class Flight:
             return
         info, flying = telemetry.info, Info.FLYING in telemetry.info
         since = now - self._since
-        if Info.LOCKED in info and self.airborne:
+        if self.airborne and Info.LOCKED in info:
+            self.trouble = "" if self.phase is Phase.STOPPING else "it cut its motors"
             self._enter(Phase.STOPPED)
-            self.trouble = "it cut its motors"
+        elif self.phase is Phase.STOPPING:
+            if not flying and since > STOPPING_S:
+                self.trouble = ""
+                self._enter(Phase.STOPPED)
         elif self.phase is Phase.STOPPED and not flying and Info.LOCKED not in info and since > STOPPING_S:
             self._enter(Phase.GROUND)  # it was switched off and on
             self.trouble = ""
@@ -186,14 +200,18 @@ class Flight:
     def doubt(self) -> None:
         """The link has been gone for so long that the firmware has cut the motors, if setpoints were streamed."""
         if self.airborne:
-            alone = self.phase is Phase.FLYING and self._settings.control == "high-level"
+            stopping = self.phase is Phase.STOPPING
+            alone = (stopping or self.phase is Phase.FLYING) and self._settings.control == "high-level"
             self.trouble = (
                 "out of reach: it may still hover, by itself" if alone else "out of reach: its motors are off"
             )
-            self._enter(Phase.GROUND)
+            if not (alone and stopping):  # it is stopped as soon as it is in reach again
+                self._enter(Phase.GROUND)
 
     def resume(self) -> bool:
         """A new link after a loss; True if it is found in the air."""
+        if self.phase is Phase.STOPPING:
+            return True
         if Info.FLYING in self._telemetry.info and self.phase is not Phase.STOPPED:
             if not self.airborne:
                 self._enter(Phase.FLYING)
@@ -243,6 +261,8 @@ class Flight:
             deadline = time.monotonic() + REPLY_S
             while time.monotonic() < deadline:
                 self._pause(0.25 * POLL_S)
+                if self.phase is Phase.FLYING:  # or the firmware cuts the motors while a landing is not answered
+                    self._stream(time.monotonic())
                 count, code = self.link.reply(command)
                 if count > before:
                     return code

@@ -7,7 +7,7 @@ import time
 from math import cos, inf, isfinite, sin
 from typing import Final
 
-from agents.body import BodyError
+from agents.body import TROUBLE, BodyError
 from agents.protocols.crazyflie import Outside, Settings
 from agents.rows import Array
 from bridges.crazyflie.flight import Flight, Phase, Target
@@ -121,24 +121,23 @@ class Pilot:
                 self._prepare(link)
                 self._serve(link)
                 break
-            except LinkError as error:
-                lost = time.monotonic()
-                self._news = f"link lost: {error}; connecting again"
-                self._fail(error)
-                if self._flight.airborne:
-                    self.give("land")
-                elif self._flight.phase is Phase.STOPPED:
-                    self.give("stop")  # once more: it may not have arrived
             except BodyError as error:
                 self._news = str(error)
                 self._fail(error)
                 self._ending.wait(RETRY_S)
+            except TROUBLE as error:  # whatever it is, the robot must be landed
+                lost = time.monotonic()
+                what = str(error) if isinstance(error, LinkError) else f"{type(error).__name__}: {error}"
+                self._news = f"link lost: {what}; connecting again"
+                self._fail(error)
+                if self._flight.airborne:
+                    self.give("land")
             finally:
                 self._discard(link)
         for closer in self._closers:
             closer.join()
 
-    def _fail(self, error: RuntimeError) -> None:
+    def _fail(self, error: Exception) -> None:
         """The first connection was none; it is tried on, in case others of the body were had."""
         if not self.opened.is_set():
             self.failure = BodyError(f"{self._name}: {error}")

@@ -13,7 +13,7 @@ import pytest
 
 from agents import session as network
 from agents import wire
-from agents.body import BodyError, BodyRequest, Disturbance
+from agents.body import UNANSWERED, BodyError, BodyRequest, Disturbance
 from agents.endpoint import free_endpoint
 from agents.keys import Keys
 from agents.kinds import KINDS
@@ -351,9 +351,15 @@ def test_orders_are_repeated_until_they_are_seen_to_be_obeyed(body: ExternalBody
     assert drive.state.flying.tolist() == [False, True, False]
 
     body.stop(np.array([1, 2]))
+    body.land(np.array([1, 2]))  # a stop is the last word
     moving = np.ones((3, 4))
     drive.until(lambda: len(far.actions("TE01", "stop")) >= 5, "stop is repeated", moving)
-    assert not drive.state.flying.any()
+    assert drive.state.flying.tolist() == [False, True, False]  # it is seen where it was
+    drive.until(lambda: UNANSWERED in drive.state.notes[1] if drive.state.notes else False, "it is said", moving)
+    assert UNANSWERED not in drive.state.notes[2]  # it stands
+    far.place["TE01"] = [0.0, 0.0, 0.0]
+    drive.until(lambda: not drive.state.flying.any(), "it has come down", moving)
+    assert not any(drive.state.notes)
     assert {c.seq for c in far.actions("TE01", "stop")} == {first + 2}
     assert len(far.actions("KH01", "stop")) >= 5
     assert far.actions("TE01", "drive") == far.actions("KH01", "drive") == []  # a stop is the last word

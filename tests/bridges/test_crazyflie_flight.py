@@ -1,0 +1,118 @@
+"""Flying one Crazyflie, against a link and a clock made by hand: what is sent when answers are lost."""
+
+import types
+
+import numpy as np
+import pytest
+
+from agents.body import UNANSWERED
+from agents.protocols.crazyflie import Settings
+from agents.protocols.crtp import Info
+from bridges.crazyflie import flight as module
+from bridges.crazyflie.flight import Flight, Phase
+from bridges.crazyflie.telemetry import Board, Telemetry
+
+PLACE = (0.1, 0.2, 0.5, 0.0)
+LEVELS_S = 0.5  # without a setpoint the firmware levels after this, and cuts the motors after 2 s
+
+
+class Air:
+    """A clock, and a Crazyflie that notes what is sent and when; no answer ever comes from it."""
+
+    def __init__(self, monkeypatch, **chosen):
+        self.now, self.sent = 100.0, []
+        monkeypatch.setattr(module, "time", types.SimpleNamespace(monotonic=lambda: self.now))
+        self.board = Board(1)
+        self.telemetry = Telemetry(self.board, 0, lighthouse=False)
+        self.flight = Flight(Settings(**chosen), self.telemetry, self.pause)
+        self.flight.link = types.SimpleNamespace(cf=self, error=None, reply=lambda _command: (0, 0))
+        self.supervisor = self.commander = self.high_level_commander = self
+        self.flying, self.info = True, Info.ARMED | Info.CAN_FLY
+
+    def __getattr__(self, what):
+        if what.startswith("_"):
+            raise AttributeError(what)
+        return lambda *_args, **_named: self.sent.append((self.now, what))
+
+    def pause(self, seconds):
+        self.now += seconds
+
+    def fly(self):
+        self.board.placed[:], self.board.pose[0] = True, [0.1, 0.2, 0.5, 0.0, 0.0, 0.0, 0.0]
+        self.flight._enter(Phase.CLIMBING)
+        return self.pass_(0.1)
+
+    def pass_(self, seconds):
+        """As the pilot's thread goes round, its loop commanding."""
+        end = self.now + seconds
+        while self.now < end:
+            self.now += 0.02
+            self.board.told[0] = self.now
+            self.board.info[0] = int(self.info | (Info.FLYING if self.flying else 0))
+            self.flight.aim(self.now, PLACE)
+            self.flight.watch(self.now)
+            self.flight.guide(self.now)
+        return self
+
+    def times(self, *whats):
+        return [at for at, what in self.sent if what in whats]
+
+
+@pytest.fixture
+def air(monkeypatch):
+    return Air(monkeypatch).fly()
+
+
+def test_setpoints_go_on_while_a_landing_is_not_answered(air):
+    begin = air.now
+    air.flight.land()
+    assert air.flight.phase is Phase.LANDING
+    assert len(air.times("land")) == module.TRIES
+    told = [begin, *(at for at in air.times("send_position_setpoint", "send_notify_setpoint_stop") if at >= begin)]
+    assert air.now - begin > 1.8  # which would have been just short of the 2 s after which the firmware cuts
+    assert np.diff(told).max() < LEVELS_S
+    assert air.sent[-1][1] == "send_notify_setpoint_stop"
+
+
+def test_an_emergency_stop_is_said_until_it_is_answered(air):
+    air.flight.stop()
+    before = air.now
+    air.pass_(10.0)
+    assert len(air.times("send_emergency_stop")) > 400
+    assert not [at for at in air.times("send_position_setpoint") if at > before]
+    assert air.flight.airborne
+    assert air.flight.trouble == UNANSWERED
+    air.info |= Info.LOCKED
+    air.pass_(0.04)
+    assert air.flight.phase is Phase.STOPPED
+    assert not air.flight.airborne
+    assert air.flight.trouble == ""
+    air.sent.clear()
+    air.pass_(5.0)
+    assert air.sent == []
+
+
+def test_a_firmware_that_does_not_say_that_it_is_locked_says_that_it_does_not_fly(air):
+    air.flight.stop()
+    air.flying = False
+    air.pass_(2.2)
+    assert air.flight.phase is Phase.STOPPED
+
+
+def test_a_stop_outlives_the_link(monkeypatch):
+    air = Air(monkeypatch, control="high-level").fly()
+    air.flight.stop()
+    air.flight.doubt()
+    assert air.flight.airborne
+    assert air.flight.resume()
+    air.sent.clear()
+    air.pass_(0.1)
+    assert air.times("send_emergency_stop")
+
+
+def test_one_that_stands_is_not_locked(monkeypatch):
+    air = Air(monkeypatch)
+    air.flying = False
+    air.pass_(0.1)
+    air.flight.stop()
+    assert air.sent == []
