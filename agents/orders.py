@@ -13,7 +13,6 @@ from agents.wire import Order
 SOON_S: Final = 3600.0  # a common start further ahead than this is a mistake of somebody's clock
 LAND: Final = "ordered to land"
 STOP: Final = "ordered to stop"
-EMERGENCY: Final = "emergency stop"
 OWN: Final = ("clamp", "tracking_gain")
 PAUSED: Final = "told to hold"
 

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from math import ceil, floor, nan
@@ -29,7 +29,7 @@ from agents.leaving import leave
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
 from agents.neighbours import Neighbours
-from agents.orders import EMERGENCY, LAND, STOP, carry_out
+from agents.orders import LAND, STOP, carry_out
 from agents.process import told_to_end
 from agents.ranging import HeardRanges, instead
 from agents.rows import Index, some
@@ -176,7 +176,6 @@ class Runtime:
         self._poses = [network.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]
-        wire.decode(wire.encode(wire.Stop("", "")), wire.JSON, wire.Stop)  # or the first would wait for its decoder
         self._estop = network.Alarm(session, keys.estop, self._cut)
         self._conductor = network.alive_watch(session, keys.conductor)
         self._located = [
@@ -278,24 +277,17 @@ class Runtime:
         yaw = nan if measured.yaw is None else measured.yaw
         self._body.locate(row, measured.stamp - self._utc, np.array(measured.position), yaw)
 
-    def _cut(self, sample: zenoh.Sample) -> None:
+    def _cut(self, _stop: wire.Stop) -> None:
         """Motors off as soon as an emergency stop is heard, in the thread that receives; the loop does the rest."""
-        with suppress(wire.Malformed):  # counted by the loop
-            wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
-            self._cut_off = True
-            self._body.stop(self._everyone)
+        self._cut_off = True
+        self._body.stop(self._everyone)
 
     def _heed_stops(self) -> None:
         """Emergency stops of everybody, after `_cut`."""
-        for sample in network.received(self._estop):
-            try:
-                stop = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
-            except wire.Malformed:
-                self._counts.malformed += 1
-                continue
+        for stop in network.received(self._estop):
             self._cut_off = False  # the phases say it from now on
             for row in range(len(self._names)):
-                self.agent.life.stop(row, f"{EMERGENCY} by {stop.who}: {stop.reason}")
+                self.agent.life.stop(row, stop.words)
 
     def _obey(self, row: int, query: zenoh.Query, t: float) -> None:
         """One order to one row; it always gets a reply."""
@@ -419,7 +411,7 @@ class Runtime:
         # those who serve robots whose launcher is gone go when the tokens do (`agents.farewell`)
         down = self.agent.sinking if self._stopping is None else life.phase == Phase.DONE
         for row in np.flatnonzero(down).tolist():
-            unasked = during[row] and not life.reason[row].startswith((EMERGENCY, LAND, STOP))
+            unasked = during[row] and not life.reason[row].startswith((wire.EMERGENCY, LAND, STOP))
             if (unasked or row in self._leaving) and row not in self._retired:
                 self._retired.add(row)
                 self._tokens.pop(row).undeclare()  # type: ignore[no-untyped-call]

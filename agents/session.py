@@ -27,7 +27,7 @@ from zenoh.ext import (
 )
 from zenoh.handlers import Callback, Handler, RingChannel
 
-from agents import access, lab, topology
+from agents import access, lab, topology, wire
 from agents.endpoint import EndpointError
 from agents.promptness import prompt_threads
 from agents.settings import LEASE_S, config, reason, settings
@@ -222,21 +222,22 @@ def subscriber(session: zenoh.Session, key: str, depth: int = 256) -> zenoh.Subs
 
 
 class Alarm:
-    """Samples that are obeyed as they come, without waiting for a control loop that may hang; it polls them later.
+    """Emergency stops, obeyed as they come, without waiting for a control loop that may hang; it polls them later.
+
+    Everything that is put on the key is a stop (`wire.read_stop`). A DELETE is none, and takes none back: it is what
+    clears a storage.
 
     The callback runs in the thread that receives, without one of its own: what it calls must be quick, and must not
     ask this session anything.
     """
 
-    def __init__(
-        self, session: zenoh.Session, key: str, obey: Callable[[zenoh.Sample], object], depth: int = 256
-    ) -> None:
-        """Listens on a key: each sample is given to `obey`; the newest `depth` wait besides."""
+    def __init__(self, session: zenoh.Session, key: str, obey: Callable[[wire.Stop], object], depth: int = 256) -> None:
+        """Listens on a key: each stop is given to `obey`; the newest `depth` wait besides, from then on."""
         self._obey = obey
-        self._waiting: deque[zenoh.Sample] = deque(maxlen=depth)
+        self._waiting: deque[wire.Stop] = deque(maxlen=depth)
         self._subscriber = session.declare_subscriber(key, Callback(self._take, indirect=False))
 
-    def try_recv(self) -> zenoh.Sample | None:
+    def try_recv(self) -> wire.Stop | None:
         """See `Polled`."""
         return self._waiting.popleft() if self._waiting else None
 
@@ -245,8 +246,13 @@ class Alarm:
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     def _take(self, sample: zenoh.Sample) -> None:
-        self._waiting.append(sample)
-        self._obey(sample)
+        if sample.kind == zenoh.SampleKind.DELETE:
+            return
+        stop = wire.read_stop(sample.payload.to_bytes(), str(sample.encoding))
+        try:
+            self._obey(stop)
+        finally:  # not before: a loop that polls in between would take it for obeyed already
+            self._waiting.append(stop)
 
 
 class LastValue:

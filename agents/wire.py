@@ -1,14 +1,15 @@
 """What goes over the network: the structs, their two encodings, and the check of what arrives.
 
-JSON is the default (every Zenoh tool prints it), MessagePack a setting for thin links; a reader tells them apart by
-the sample's encoding. What arrives is checked before it is believed: `decode` raises `Malformed` for anything that is
-not the struct, `agents.plausibility` for one that cannot be true. Unknown numbers are left out of messages: JSON has no
-NaN.
+JSON is the default (every Zenoh tool prints it), MessagePack a setting for thin links: a sample is MessagePack if its
+encoding says so, and JSON otherwise, since many tools set no encoding, or another one. What arrives is checked before
+it is believed: `decode` raises `Malformed` for anything that is not the struct, `agents.plausibility` for one that
+cannot be true. Unknown numbers are left out of messages: JSON has no NaN.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from math import inf, isfinite, remainder, tau
 from typing import Final, Literal, TypeVar
 
@@ -24,6 +25,9 @@ JSON: Final = "application/json"  # plain, without a schema suffix: REST and com
 MSGPACK: Final = "application/msgpack"
 MIME: Final[dict[Encoding, str]] = {"json": JSON, "msgpack": MSGPACK}
 
+EMERGENCY: Final = "emergency stop"
+UNKNOWN: Final = "an unknown sender"
+MAX_WORDS: Final = 200  # characters of a stop that are shown
 MAX_PAYLOAD: Final = 64 * 1024  # [bytes]; `payloads` splits what is longer
 STILL: Final[Vector] = (0.0, 0.0, 0.0)
 
@@ -332,10 +336,15 @@ class RunReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Emergency stop for everyone, with who asks and why."""
+    """Emergency stop for everyone, with who asks and why; see `read_stop`."""
 
     who: str
     reason: str
+
+    @property
+    def words(self) -> str:
+        """The stop as robots and runs give it for their reason."""
+        return f"{EMERGENCY} by {self.who}" + (f": {self.reason}" if self.reason else "")
 
 
 class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -451,13 +460,11 @@ def decode(payload: bytes, mime: str, kind: type[M]) -> M:
     """The message in a payload, by its MIME type.
 
     Raises:
-        Malformed: If the payload is too large, of another encoding, or not a `kind`.
+        Malformed: If the payload is too large, or not a `kind`.
     """
     if len(payload) > MAX_PAYLOAD:
         raise Malformed(f"{len(payload)} bytes are more than a {kind.__name__} can have")
     packed = mime.startswith(MSGPACK)
-    if not packed and not mime.startswith(JSON):
-        raise Malformed(f"encoding '{mime}' is neither {JSON} nor {MSGPACK}")
     decoder = _decoders.get((kind, packed))
     if decoder is None:
         decoder = msgspec.msgpack.Decoder(kind) if packed else msgspec.json.Decoder(kind)
@@ -468,3 +475,24 @@ def decode(payload: bytes, mime: str, kind: type[M]) -> M:
         raise Malformed(f"not a {kind.__name__}: {error}") from None
     assert isinstance(message, kind)
     return message
+
+
+def read_stop(payload: bytes, mime: str) -> Stop:
+    """The emergency stop in any payload: JSON or MessagePack with or without its fields, text, garbage, or nothing.
+
+    Sender and reason are read as far as possible, on one line of at most `MAX_WORDS` characters each.
+    """
+    said: object = None
+    with suppress(Exception):  # unreadable is a stop as well
+        said = (msgspec.msgpack if mime.startswith(MSGPACK) else msgspec.json).decode(payload[:MAX_PAYLOAD])
+    who, reason = "", payload[:MAX_PAYLOAD].decode(errors="replace")
+    if isinstance(said, str):
+        reason = said
+    elif isinstance(said, dict) and not said.keys().isdisjoint(Stop.__struct_fields__):
+        who, reason = (text if isinstance(text := said.get(field), str) else "" for field in Stop.__struct_fields__)
+    return Stop(_shown(who) or UNKNOWN, _shown(reason))
+
+
+def _shown(text: str) -> str:
+    """Text of others on one line, without what could steer a terminal."""
+    return "".join(letter if letter.isprintable() else " " for letter in text[:MAX_WORDS]).strip()

@@ -38,7 +38,7 @@ MEANT: Final = (
     ("delay", "50 to 300 ms more in both directions for 3 s, for one robot."),
     ("clock", "The wall clock of all processes steps by 0.5 to 5 s, forward or back."),
     ("disk", "The recording can grow no more."),
-    ("corrupt", "Payloads of nonsense on every key that a robot believes, and on the emergency stop's."),
+    ("corrupt", "Payloads of nonsense on every key that a robot believes."),
     ("bits", "One bit is wrong in 5 % of a robot's segments for 1 s: its connection breaks."),
 )  # fmt: skip
 BUSY: Final = 0.05  # share of the ticks that a machine may miss which is to be trusted with the rest

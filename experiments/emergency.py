@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 import zenoh
 
@@ -30,7 +30,7 @@ class Emergency:
     @property
     def words(self) -> str:
         """Who stopped the run, and why; empty if nobody has."""
-        return "" if self.said is None else f"emergency stop by {self.said.who}: {self.said.reason}"
+        return "" if self.said is None else self.said.words
 
     def listen(self, session: zenoh.Session, keys: Keys) -> network.Alarm:
         """Hears stops in a realm, for as long as what is returned is kept."""
@@ -48,7 +48,5 @@ class Emergency:
             declared.append(self.listen(session, keys))
             yield
 
-    def _heed(self, sample: zenoh.Sample) -> None:
-        with suppress(wire.Malformed):
-            stop = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Stop)
-            self.said = self.said or stop
+    def _heed(self, stop: wire.Stop) -> None:
+        self.said = self.said or stop

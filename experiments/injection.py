@@ -138,9 +138,9 @@ class Injector:
         self._cables.set(GOOD)
 
     def spoil(self, victim: str, session: zenoh.Session, keys: Keys) -> int:
-        """Nonsense on every key that a robot and its body believe, and on that of the emergency stop; how many."""
+        """Nonsense on every key that a robot and its body believe; how many. On the emergency stop's it would stop."""
         listening = (keys.pose, keys.position, keys.setpoint, keys.state, keys.status, keys.goal, keys.ranges)
-        targets = [*(key(victim) for key in listening), keys.estop, keys.everything]
+        targets = [key(victim) for key in listening]
         for key in targets:
             for _ in range(GARBAGE):
                 session.put(key, self._nonsense(victim), encoding=wire.JSON)

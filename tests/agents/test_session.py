@@ -25,9 +25,10 @@ from agents.session import (
     subscriber,
 )
 from agents.settings import config, settings
+from agents.wire import JSON, MSGPACK, Stop
+from tests.fuzz.loopnet import Net
 
 ROOT = Path(__file__).resolve().parents[2]
-JSON = "application/json"
 POSE = "park/CF01/pose"
 
 
@@ -256,13 +257,52 @@ def test_a_killed_robot_is_noticed(router, eventually):
 
 @pytest.mark.system
 def test_an_alarm_is_obeyed_at_once_and_keeps_what_came(router, eventually):
+    whole = b'{"who": "ana", "reason": "fire"}'
+    said = [  # by zenpark; by z_put and zenoh-cli; by `curl -X PUT -d`, with a header, with --json; by anything at all
+        (whole, JSON, "by ana: fire"),
+        (whole, "zenoh/bytes", "by ana: fire"),
+        (whole, "application/x-www-form-urlencoded", "by ana: fire"),
+        (b"stop", "application/x-www-form-urlencoded", "by an unknown sender: stop"),
+        (b"stop it", "text/plain", "by an unknown sender: stop it"),
+        (b'"stop"', JSON, "by an unknown sender: stop"),
+        (b'{"who": "ana"}', JSON, "by ana"),
+        (b"{}", JSON, "by an unknown sender: {}"),
+        (b"", "zenoh/bytes", "by an unknown sender"),
+        (b"\x81\xa3who\xa3ana", MSGPACK, "by ana"),
+        (b"\xff\x00\x1b[2J", "image/png", "by an unknown sender: \N{REPLACEMENT CHARACTER}  [2J"),
+    ]
     with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
         obeyed = []
         alarm = Alarm(robot, "park/estop", obeyed.append, depth=2)
         speaker = publisher(ui, "park/estop", JSON)
         eventually(lambda: speaker.matching_status.matching)
-        for payload in (b"1", b"2", b"3"):
-            speaker.put(payload)
-        eventually(lambda: len(obeyed) == 3)
-        assert payloads(alarm) == [b"2", b"3"]  # the newest two
+        ui.delete("park/estop")  # no stop
+        ui.delete("park/**")
+        for payload, encoding, _ in said:
+            ui.put("park/estop", payload, encoding=encoding)
+        ui.put("park/**", b"everybody", encoding="text/plain")
+        eventually(lambda: len(obeyed) > len(said))
+        words = [f"emergency stop {text}" for *_, text in said]
+        assert [stop.words for stop in obeyed] == [*words, "emergency stop by an unknown sender: everybody"]
+        kept = []
+        eventually(lambda: kept.extend(received(alarm)) or kept[-2:] == obeyed[-2:])
+        assert len(kept) <= 3  # the newest two, and one that came while they were polled
         assert alarm.try_recv() is None
+
+
+def test_a_stop_waits_for_the_loop_only_after_it_was_obeyed():
+    """A loop that polls in between would think that its motors are off, and then they are cut for ever."""
+    seen = []
+    net = Net()
+    alarm = Alarm(net.session, "park/estop", lambda _stop: seen.append(alarm.try_recv()))
+    net.deliver(b"park/estop\0text/plain\0stop")
+    assert seen == [None]
+    assert alarm.try_recv() == Stop("an unknown sender", "stop")
+
+    def fails(_stop):
+        raise OSError("a body that cannot be told")
+
+    alarm = Alarm(net.session, "park/estop", fails)
+    with pytest.raises(OSError, match="cannot be told"):
+        net.deliver(b"park/estop\0text/plain\0stop")
+    assert alarm.try_recv() == Stop("an unknown sender", "stop")

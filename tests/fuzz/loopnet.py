@@ -10,6 +10,7 @@ from typing import Any
 from unittest import mock
 
 import zenoh
+from zenoh.handlers import Callback
 
 
 class Payload:
@@ -120,8 +121,11 @@ class Session:
     def liveliness(self) -> Session:
         return self
 
-    def declare_subscriber(self, key: str, *_: object, **__: object) -> Channel:
-        return self._net.listen(key)
+    def declare_subscriber(self, key: str, handler: object = None, **_: object) -> Channel:
+        made = self._net.listen(key)
+        if isinstance(handler, Callback):
+            made.obey = handler
+        return made
 
     def get(self, *_: object, **__: object) -> list[Reply]:
         return list(self._net.replies)
@@ -188,18 +192,12 @@ class Net:
         def heard(_session: object, key: str, *_: object, **__: object) -> Channel:
             return self.listen(key)
 
-        def alarm(_session: object, key: str, obey: Callable[[Sample], object]) -> Channel:
-            made = self.listen(key)
-            made.obey = obey
-            return made
-
         def mute(*_: object, **__: object) -> Mute:
             return Mute()
 
         made: dict[str, Any] = {
             "pose_subscriber": heard,
             "subscriber": heard,
-            "Alarm": alarm,
             "orders": lambda _session, key: self.listen(key, asked=True),
             "pose_publisher": mute,
             "publisher": mute,

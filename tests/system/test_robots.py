@@ -106,6 +106,17 @@ def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, wa
         assert "known: clamp" in watcher.order("CF01", wire.Order("set", name="clmp", value=1.0)).reason
         assert not watcher.order("CF01", wire.Order("set", name="trigger.period_s", value=0.0)).ok
         assert watcher.order("nobody", wire.Order("land")).reason == "no answer"
+        bare = [b'{"order": "get", "name": "clamp"}', b'{"order": "hold"}']  # as z_get sends them: without an encoding
+        answers = [
+            wire.decode(reply.ok.payload.to_bytes(), wire.JSON, wire.Reply)
+            for payload in bare
+            for reply in watcher.session.get("park/*/order", payload=payload, timeout=2.0)
+            if reply.ok is not None
+        ]
+        assert sorted((answer.robot, answer.value, answer.reason) for answer in answers if answer.ok) == [
+            ("CF01", 0.05, ""), ("KH01", 0.05, ""), ("KH02", 0.05, "")
+        ]  # fmt: skip
+        assert {answer.reason for answer in answers if not answer.ok} == {"cannot hold while ready"}
         for name in TRIANGLE:
             assert watcher.order(name, wire.Order("takeoff")).ok
         watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in TRIANGLE), "all are up")
@@ -172,9 +183,8 @@ def test_nonsense_on_every_key_is_counted_and_moves_nobody(router: RouterProcess
         watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in TRIANGLE), "all are up")
         expected = 0
         for payload, mime in nonsense():
-            for key in (watcher.keys.pose("KH02"), watcher.keys.estop):
-                watcher.session.put(key, payload, encoding=mime)
-                expected += 1
+            watcher.session.put(watcher.keys.pose("KH02"), payload, encoding=mime)
+            expected += 1
             for key in (watcher.keys.state("KH02"), watcher.keys.alive("KH02"), watcher.keys.event):
                 watcher.session.put(key, payload, encoding=mime)
             for reply in watcher.session.get(watcher.keys.order("CF01"), payload=payload, encoding=mime, timeout=2.0):
