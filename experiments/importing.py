@@ -10,7 +10,7 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -18,10 +18,11 @@ import numpy as np
 
 from agents.kinds import KINDS
 from experiments import catalogue, document, entries
-from experiments.importing_links import Described, Notes, described, tasks
+from experiments.importing_links import Described, Notes, described, named, tasks
 from experiments.importing_shape import Heights, heights_of
 from experiments.problem import DocumentError, Problem
 from experiments.robotic_park import Park, Robot, Threshold, read
+from experiments.robotic_park_older import is_older, read_older, starts_from
 from experiments.syntax import content, decoded
 from experiments.yaml_tree import Tree
 
@@ -40,7 +41,7 @@ class Rates:
     coordination_hz: float
 
 
-def command(file: str, target: str | None, duration_s: float) -> int:
+def command(file: str, target: str | None, duration_s: float, poses: str | None = None) -> int:
     """`zenpark import`; returns the exit code.
 
     Raises:
@@ -52,7 +53,7 @@ def command(file: str, target: str | None, duration_s: float) -> int:
     except FileNotFoundError:
         hint = "name an experiment file of Robotic Park's authors (.yaml)"
         raise DocumentError([Problem(file, 0, 0, "there is no such file", hint)]) from None
-    made, notes = imported(text, file, duration_s)
+    made, notes = imported(text, file, duration_s, poses)
     path = entries.write_new(made, Path(target) if target else Path(f"{source.stem}.toml"))
     document.read(path)
     print(f"{path}: from {file}; `zenpark check {path}`, `zenpark run {path} --virtual`")
@@ -63,13 +64,26 @@ def command(file: str, target: str | None, duration_s: float) -> int:
     return 0
 
 
-def imported(text: str, label: str, duration_s: float) -> tuple[str, list[str]]:
+def imported(text: str, label: str, duration_s: float, poses: str | None = None) -> tuple[str, list[str]]:
     """The text of the experiment file, and what was not carried over.
+
+    Args:
+        text: Of theirs.
+        label: Its name; the files that an index names are looked for beside it.
+        duration_s: How long the experiment is to run [s].
+        poses: A file with starts, see `starts_from`; they go before those of theirs.
 
     Raises:
         DocumentError: With everything that is wrong with theirs, each with its place.
     """
-    park, notes = read(Tree(label, text)), Notes()
+    tree, notes = Tree(label, text), Notes()
+    starts = {} if poses is None else starts_from(poses)
+    if is_older(tree, tree.root()):
+        park = read_older(tree, Path(label).parent, starts)
+    else:
+        park = read(tree)
+        robots = tuple(replace(robot, pose=starts.get(robot.name, robot.pose)) for robot in park.robots)
+        park = replace(park, robots=robots)
     _tools(park, notes)
     rates = _rates(park, notes)
     trigger, update = _trigger(park, rates, notes), _update(park, notes)
@@ -142,8 +156,10 @@ def _arena(park: Park, found: Heights) -> list[float]:
 def _robot(robot: Robot, found: Heights, row: int) -> str:
     body, process = _body(robot)
     x, y = found.start[row, :2].tolist()
-    parts = [f'kind = "{robot.kind}"', f"start = [{x:g}, {y:g}]"]
-    if KINDS[robot.kind].flies:
+    flies = KINDS[robot.kind].flies
+    yaw = 0.0 if flies or robot.pose is None else robot.pose[2]
+    parts = [f'kind = "{robot.kind}"', f"start = [{x:g}, {y:g}{f', {yaw:g}' if yaw else ''}]"]
+    if flies:
         parts.append(f"hover = {found.hover[row]:g}")
     if body:
         parts.append(f'body = "{body}"')
@@ -153,7 +169,7 @@ def _robot(robot: Robot, found: Heights, row: int) -> str:
         parts.append('position = "external"')
     if robot.place == "digital_twin":
         parts.append("shadow = {}")
-    return f"{robot.name} = {{ {', '.join(parts)} }}"
+    return f"{robot.name} = {{ {', '.join(parts)} }}{'  # start made up' if robot.pose is None else ''}"
 
 
 def _body(robot: Robot) -> tuple[str, str]:
@@ -180,20 +196,24 @@ def _tools(park: Park, notes: Notes) -> None:
         notes.say(f"{', '.join(park.others)}: zenpark records, watches and reports by itself")
     away = [robot.name for robot in park.robots if robot.place != "virtual" and not _body(robot)[0]]
     if away:
-        notes.say(f"{_some(away)} {_is(away)} real, but no address of a kind that is known is given: twins instead")
+        notes.say(f"{named(away)} {_is(away)} real, but no address of a kind that is known is given: twins instead")
     if len(away) < sum(robot.place != "virtual" for robot in park.robots):
         notes.say("real robots keep their addresses; try the file with --virtual or --bodies twin first")
     if any(robot.external for robot in park.robots):
         notes.say("positioning Extern: the motion capture's address is not in their file; positioning is a twin of it")
     gated = [robot.name for robot in park.robots if robot.control.event]
     if gated:
-        notes.say(f"{_some(gated)}: position controllers that act on events; zenpark's run at every tick")
+        notes.say(f"{named(gated)}: position controllers that act on events; zenpark's run at every tick")
     roles = Counter(task.role for _, task in tasks(park) if task.role != "consensus")
     if roles:
         notes.say(f"task.role: {', '.join(roles)}; who leads follows from who listens to nobody")
-    tilted = [robot.name for robot in park.robots if robot.pose[2] and not KINDS[robot.kind].flies]
-    if tilted:
-        notes.say(f"{_some(tilted)}: the third number of the pose; robots on wheels stand on the floor")
+    idle = [robot for robot in park.robots if robot.idle]
+    if idle:
+        count = sum(robot.idle for robot in idle)
+        names = named([robot.name for robot in idle])
+        notes.say(f"task.enable is False for {names}: {count} relations are left out, and these robots hear nobody")
+    for remark in park.remarks:
+        notes.say(remark)
 
 
 def _rates(park: Park, notes: Notes) -> Rates:
@@ -256,10 +276,6 @@ def _most(what: str, given: Sequence[float], default: float, notes: Notes) -> fl
     if len(counted) > 1:
         notes.say(f"{what}: {', '.join(f'{each:g}' for each in sorted(counted))} s among the robots; all get {value:g}")
     return value
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names) if len(names) <= 3 else f"{', '.join(names[:2])} and {len(names) - 2} more"
 
 
 def _is(names: Sequence[str]) -> str:

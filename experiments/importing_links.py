@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
 from experiments.importing_shape import Heights, Notes, tasks
-from experiments.robotic_park import SURFACES, Park, Relation, Robot, Task
+from experiments.robotic_park import CENTRAL, SURFACES, Park, Relation, Robot, Task
 
-__all__ = ["Described", "Notes", "described", "tasks"]
+__all__ = ["Described", "Notes", "described", "named", "tasks"]
 
 SAME: Final = 1e-6  # [m] two ends of a link mean the same
 LEVEL: Final = 0.02  # [m] heights that differ by less are the same
@@ -31,9 +31,10 @@ class Described:
 def described(park: Park, found: Heights, notes: Notes) -> Described:
     """Links, anchors, law and gains.
 
-    Their law, u = k (d² − ‖x‖²) x/‖x‖ for each neighbour with x = p_i − p_j, is that of zenpark near d with μ = 2k/d;
-    their PID controller, u = k (d − ‖x‖) x/‖x‖, with μ = k/d². One μ serves all links, that at the mean distance:
-    only links of robots with another k than most get one of their own.
+    The gradient law of their drivers is u = k (d² − ‖x‖²) x for each neighbour with x = p_i − p_j, which is zenpark's
+    with μ = 2k. Some of their drivers (`_divides`) divide by ‖x‖: near d that is zenpark's with μ = 2k/d. Their PID
+    controller, u = k (d − ‖x‖) x/‖x‖, is zenpark's near d with μ = k/d². One μ serves all links, that at the mean
+    distance: only links of robots with another μ than most get one of their own.
     """
     jobs = list(tasks(park))
     made = Described()
@@ -52,7 +53,7 @@ def described(park: Park, found: Heights, notes: Notes) -> Described:
         if task.kind == "distance" and _is_robot(relation)
     ]
     mean = float(np.mean(distances)) if distances else 1.0
-    gains = {robot.name: _gain(task, mean) for robot, task in jobs}
+    gains = {robot.name: _gain(park, robot, task, mean) for robot, task in jobs}
     usual = {kind: _usual([gains[robot.name] for robot, task in jobs if task.kind == kind]) for kind in
              ("distance", "pose")}  # fmt: skip
     clamps = Counter(task.clamp for _, task in jobs)
@@ -61,10 +62,12 @@ def described(park: Park, found: Heights, notes: Notes) -> Described:
     made.settings.append(f'law = "{law}"')
     if usual["distance"] is not None:
         made.settings.append(f"gain = {usual['distance']:.4g}")
-        notes.say(
-            "the pull of their law is that of zenpark's near the distance that is wanted; away from it theirs is"
-            " divided by the distance"
-        )
+        scaled = [robot.name for robot, task in jobs if task.law == "pid" or _divides(park, robot)]
+        if scaled:
+            notes.say(
+                f"gain of {named(scaled)}: their driver divides by the distance, so its pull is zenpark's near"
+                " the distance that is wanted and weaker beyond"
+            )
     if usual["pose"] is not None:
         made.settings.append(f"stiffness = {usual['pose']:.4g}")
         if any(task.kind == "pose" and task.law != "pid" for _, task in jobs):
@@ -76,20 +79,40 @@ def described(park: Park, found: Heights, notes: Notes) -> Described:
     return made
 
 
-def _rows(park: Park) -> Iterator[tuple[int, tuple[Robot, Task]]]:
-    for row, robot in enumerate(park.robots):
-        if robot.task is not None:
-            yield row, (robot, robot.task)
-
-
 def _is_robot(relation: Relation) -> bool:
     return relation.name not in ("origin", "line", *SURFACES)
 
 
-def _gain(task: Task, distance: float) -> float:
+def _divides(park: Park, robot: Robot) -> bool:
+    """Whether the driver of a robot divides the pull of a neighbour by its distance.
+
+    The driver on real Kheperas does, and so do the Webots drivers of the files that `recent` tells; those before, the
+    driver of real Crazyflies and the central controller do not.
+    """
+    if park.architecture == CENTRAL:
+        return False
+    return park.recent if robot.place == "virtual" else robot.kind == "khepera4"
+
+
+def _weight(park: Park, robot: Robot) -> float:
+    """How much more the origin pulls than a neighbour, which is written into the same drivers."""
+    if park.architecture == CENTRAL or robot.place != "virtual":
+        return 2.0
+    return 1.0 if park.recent else 4.0
+
+
+def _gain(park: Park, robot: Robot, task: Task, distance: float) -> float:
+    """The gain of zenpark's law at a distance [m]: μ [1/m²] for distances, the stiffness for poses."""
     if task.kind == "pose":
         return task.gain if task.law == "pid" else 2.0 * task.gain
-    return task.gain / distance**2 if task.law == "pid" else 2.0 * task.gain / distance
+    if task.law == "pid":
+        return task.gain / distance**2
+    return 2.0 * task.gain / (distance if _divides(park, robot) else 1.0)
+
+
+def named(names: Sequence[str]) -> str:
+    """Names for a sentence, the first ones of many."""
+    return ", ".join(names) if len(names) <= 3 else f"{', '.join(names[:2])} and {len(names) - 2} more"
 
 
 def _usual(gains: Sequence[float]) -> float | None:
@@ -145,7 +168,7 @@ def _line(name: str, other: str, relation: Relation, task: Task, gain: float | N
 
 def _anchors(park: Park, found: Heights, gains: dict[str, float], notes: Notes) -> list[str]:
     lines = []
-    for row, (robot, task) in _rows(park):
+    for robot, task in tasks(park):
         places = [relation for relation in task.relations if not _is_robot(relation)]
         if surfaces := [relation.name for relation in places if relation.name in SURFACES]:
             notes.say(f"{robot.name}: {', '.join(surfaces)}; zenpark has points, lines and planes")
@@ -155,17 +178,18 @@ def _anchors(park: Park, found: Heights, gains: dict[str, float], notes: Notes) 
         for relation in there[:1]:
             if relation.name == "origin" and len(relation.values) == 1 and not found.anchored:
                 continue
-            lines.append(f"{robot.name} = {{ {_anchor(relation, task, found, row, gains[robot.name])} }}")
+            lines.append(f"{robot.name} = {{ {_anchor(park, robot, relation, found, gains[robot.name])} }}")
     return lines
 
 
-def _anchor(relation: Relation, task: Task, found: Heights, row: int, gain: float) -> str:
+def _anchor(park: Park, robot: Robot, relation: Relation, found: Heights, gain: float) -> str:
     values = relation.values
     if relation.name == "line":
         point, along = (", ".join(f"{each:g}" for each in part) for part in (values[:3], values[3:]))
         return f"to = [{point}], along = [{along}]"
     if len(values) == 3:
-        return f"to = [{values[0]:g}, {values[1]:g}, {found.hover[row]:g}], gain = {gain:.4g}"
+        return f"to = [{values[0]:g}, {values[1]:g}, {found.hover[park.robots.index(robot)]:g}], gain = {gain:.4g}"
     x, y, z = relation.centre or found.centre
-    own = task.gain / values[0] ** 2 if task.law == "pid" else 2.0 * task.gain / values[0]
+    assert robot.task is not None
+    own = _weight(park, robot) * _gain(park, robot, robot.task, values[0])
     return f"distance = {values[0]:g}, to = [{x:g}, {y:g}, {z:g}], gain = {own:.4g}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -17,6 +17,7 @@ MET: Final = 0.01  # [m] what is missed by more is another shape
 LOWEST: Final = 0.3  # [m] of a drone
 ALOFT: Final = 0.7  # [m] where drones hover whose pose has no height, as in the authors' files
 MOVED: Final = 0.02  # [m] a height that is another than at the start
+SPACING: Final = 0.6  # [m] between robots whose start is made up
 
 
 @dataclass
@@ -60,45 +61,43 @@ def tasks(park: Park) -> Iterator[tuple[Robot, Task]]:
 def heights_of(park: Park, notes: Notes) -> Heights:
     """The heights, from the shape in space if links tell one.
 
-    Their drones climb while they follow distances in all axes, and the origin of their files is a point about which
-    they spread: where no robot stands on the floor and the origin is not told otherwise, the whole is lifted so that
-    the lowest drone keeps the height at which it starts.
+    The origin of their files is a point about which drones spread while they climb: where the shape is not flat, no
+    robot stands on the floor and the origin is not told otherwise, the whole is lifted so that the lowest drone keeps
+    the height at which it starts.
     """
     flies = np.array([KINDS[robot.kind].flies for robot in park.robots])
-    start = np.array([robot.pose for robot in park.robots], dtype=float)
+    start = _starts(park, notes)
     start[~flies, 2] = 0.0
     start[flies & (start[:, 2] < LOWEST), 2] = ALOFT
     wanted = _wanted(park, start, flies)
-    plain = Heights(start, start, np.round(start[:, 2], 3), False, (0.0, 0.0, 0.0))
+    plain = Heights(start, start, np.round(start[:, 2], 3), len(wanted.pairs) == 0, (0.0, 0.0, 0.0))
     if not len(wanted.pairs):
         return plain
     told = any(relation.centre is not None for _, task in tasks(park) for relation in task.relations)
-    without = Wanted(
-        wanted.pairs, wanted.distance, wanted.relative, wanted.row[:0], wanted.point[:0], wanted.radius[:0]
-    )
     found, anchored = placed(wanted, start, flies), len(wanted.row) > 0
     off = found.worst
     if anchored and off > MET:
-        found, anchored = placed(without, start, flies, found.position), False  # upright over the origin as well
+        found, anchored = placed(wanted.without_points(), start, flies), False
         if found.links <= MET:
             notes.say(
-                f"distances to the origin: they and those between robots contradict one another by {1e3 * off:.0f} mm;"
-                " left out"
+                "distances to the origin: no shape was found that meets them and those between robots; the best one"
+                f" misses by {1e3 * off:.0f} mm, so those to the origin are left out"
             )
     if found.links > MET:
         notes.say(
-            f"the distances contradict one another by {1e3 * max(off, found.links):.0f} mm even in space; drones hold"
-            " the heights at which they start"
+            f"the distances: no shape was found that meets them, even in space; the best one misses by"
+            f" {1e3 * found.links:.0f} mm, so drones hold the heights at which they start"
         )
         return plain
     shape, lift = found.position, 0.0
-    if flies.all() and not told:
+    flat = not (np.abs(shape[:, 2] - start[:, 2])[flies] > MOVED).any()
+    if flies.all() and not told and not flat:
         lift = float(start[:, 2].min() - shape[:, 2].min())
         shape = shape + np.array([0.0, 0.0, lift])
     hover = np.where(flies, np.round(shape[:, 2], 3), 0.0)
     if hover[flies].min(initial=LOWEST) < LOWEST:
         notes.say(f"the shape needs a drone at {hover[flies].min():.2f} m: drones hold the heights of their starts")
-        return plain
+        return replace(plain, anchored=False)
     if (np.abs(hover - start[:, 2])[flies] > MOVED).any():
         notes.say(
             "their drones climb while they form the shape, zenpark's hold a height: each takes off to that which it has"
@@ -107,6 +106,21 @@ def heights_of(park: Park, notes: Notes) -> Heights:
     if anchored and abs(lift) > MOVED:
         notes.say(f"the origin: lifted to {lift:.2f} m, so that the lowest drone hovers where it was to start")
     return Heights(start, shape, hover, anchored, (0.0, 0.0, round(lift, 3)))
+
+
+def _starts(park: Park, notes: Notes) -> Array:
+    """Starts (N, 3) [m]; robots whose start is not told stand on a ring, in the order of the file."""
+    count = len(park.robots)
+    angle = 2.0 * np.pi * np.arange(count) / max(count, 1)
+    radius = max(SPACING, count * SPACING / (2.0 * np.pi))
+    ring = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)]).round(2)
+    lost = [robot.name for robot in park.robots if robot.pose is None]
+    if lost:
+        notes.say(
+            f"starts: the file has none for {', '.join(lost)}; MADE UP here, on a ring; name a file that has them with"
+            " --poses (an index of robots, a Webots world or a table)"
+        )
+    return np.array([ring[row] if robot.pose is None else robot.pose for row, robot in enumerate(park.robots)])
 
 
 def _wanted(park: Park, start: Array, flies: Mask) -> Wanted:

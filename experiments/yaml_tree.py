@@ -94,6 +94,14 @@ class Tree:
         for key, value in item.node.value:
             yield Item(value, (*item.path, str(key.value) if isinstance(key, yaml.ScalarNode) else "?"))
 
+    def is_table(self, item: Item) -> bool:
+        """Whether a value is a table."""
+        return isinstance(item.node, yaml.MappingNode)
+
+    def tables(self, item: Item) -> Iterator[Item]:
+        """The values of a table that are tables themselves, in the order of the text."""
+        return (each for each in self.entries(item) if self.is_table(each))
+
     def get(self, item: Item, key: str) -> Item:
         """The value of a key."""
         if isinstance(item.node, yaml.MappingNode):

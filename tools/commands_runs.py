@@ -260,11 +260,15 @@ def import_(
     file: Annotated[str, typer.Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
     duration: Annotated[float, typer.Option(min=1.0, help="Their files do not say how long [s].")] = 60.0,
+    poses: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), a Webots world (.wbt), or a table."),
+    ] = None,
 ) -> None:
     """Turn an experiment file of Robotic Park's authors into one of zenpark."""
     from experiments.importing import command  # noqa: PLC0415
 
-    raise typer.Exit(command(file, target, duration))
+    raise typer.Exit(command(file, target, duration, poses))
 
 
 @app.command(name="list")

@@ -7,6 +7,7 @@ from experiments import assign, document, virtual
 from experiments.check import check, figures
 from experiments.importing import command, imported
 from experiments.problem import DocumentError
+from experiments.robotic_park_older import starts_from
 from tests.experiments.robotic_park_files import column, dome, file, robot
 
 FILES = {
@@ -53,8 +54,7 @@ def test_a_distance_task(tmp_path):
     assert (experiment.rates.pose_hz, experiment.rates.coordination_hz) == (20.0, 10.0)
     assert experiment.formation.law == "distance"
     assert experiment.formation.clamp == 0.1
-    distances = list(experiment.formation.links.values())
-    assert experiment.formation.gain == pytest.approx(2.0 * 0.25 / np.mean(distances), rel=1e-3)
+    assert experiment.formation.gain == 0.5  # 2 k: their simulator's driver of that time does not divide
     assert all(" - " in link for link in experiment.formation.links)
     assert {robot.body for robot in experiment.robots.values()} == {"twin"}
 
@@ -126,7 +126,7 @@ def test_who_has_another_gain_keeps_it(tmp_path):
     robots = three(TRIANGLE)
     robots[0] = robot(1, "khepera01", (0, 0, 0), TRIANGLE[0], gain=0.4)
     links = converted(tmp_path, file(robots))[0].experiment.formation.links
-    assert links["khepera02 > khepera01"].gain == pytest.approx(1.0)  # 2 · 0.4 / 0.8
+    assert links["khepera02 > khepera01"].gain == pytest.approx(0.8)  # 2 · 0.4
     assert links["khepera01 > khepera02"] == 0.8
     assert links["khepera03 - khepera02"] == 0.8
 
@@ -158,7 +158,7 @@ def test_an_origin_that_contradicts_the_distances_is_left_out(tmp_path):
     relations = [[*each, "origin_2.0"] for each in TRIANGLE]
     read, notes = converted(tmp_path, file(three(relations)))
     assert not read.experiment.formation.anchors
-    assert any("contradict" in note for note in notes)
+    assert any("no shape was found that meets them" in note for note in notes)
 
 
 def test_everything_that_is_left_behind_is_told(tmp_path):
@@ -169,9 +169,92 @@ def test_everything_that_is_left_behind_is_told(tmp_path):
     read, notes = converted(tmp_path, text)
     assert read.experiment.architecture == "centralised"
     told = " | ".join(notes)
-    for word in ("simulator", "Data_Logging", "khepera02 is real", "leader", "third number", "commonest",
-                 "6.66667 Hz become"):  # fmt: skip
+    for word in ("simulator", "Data_Logging", "khepera02 is real", "leader", "commonest", "6.66667 Hz become"):
         assert word in told
+    assert read.experiment.robots["khepera02"].start == [0.9, 0.0, 0.3]  # the third number of robots on wheels: yaw
+
+
+@pytest.mark.parametrize(("spelt", "noted"), [("centralized", False), ("Centralized", True)])
+def test_a_central_controller_reads_the_relations_of_robots_whose_own_task_is_off(tmp_path, spelt, noted):
+    text = file(three([[*each, "origin_0.4619"] for each in TRIANGLE]), architecture=spelt)
+    text = text.replace("enable: True\n      T: 100", "enable: False\n      T: 100")
+    read, notes = converted(tmp_path, text)
+    assert read.experiment.architecture == "centralised"
+    assert len(read.experiment.formation.links) == 3
+    assert {anchor.gain for anchor in read.experiment.formation.anchors.values()} == {1.0}  # twice that of a link
+    assert any("starts a centre" in note for note in notes) == noted
+
+
+def test_tasks_that_are_off_are_counted(tmp_path):
+    text = file(three(TRIANGLE)).replace("enable: True\n      T: 100", "enable: False\n      T: 100")
+    read, notes = converted(tmp_path, text)
+    assert not read.experiment.formation.links
+    assert any("khepera01, khepera02, khepera03: 6 relations are left out" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "recent", "expected"),
+    [
+        ("virtual", "khepera", False, (0.5, 4.0)),
+        ("virtual", "khepera", True, (0.5 / 0.8, 1.0)),
+        ("physical", "khepera", False, (0.5 / 0.8, 2.0)),
+        ("virtual", "dron", False, (0.5, 4.0)),
+        ("virtual", "dron", True, (0.5 / 0.8, 1.0)),
+        ("physical", "dron", False, (0.5, 2.0)),
+        ("physical", "dron", True, (0.5, 2.0)),
+    ],
+)
+def test_gains_by_the_driver_that_the_file_is_for(tmp_path, place, name, recent, expected):
+    gain, weight = expected
+    radius = 0.8 / np.sqrt(3.0)
+    relations = [[*each, f"sphere_{radius:.4f}-0.4-0.2309-0.7"] for each in TRIANGLE]
+    text = file(three(relations, place=place)).replace("khepera", name)
+    text = text.replace("pose: 0.00, 0.00, 0.00", "pose: 0.01, 0.00, 0.00")
+    if recent:
+        text = text.replace("    local_pose:", "    mars_data:\n      enable: True\n    local_pose:")
+    formation = converted(tmp_path, text)[0].experiment.formation
+    assert formation.gain == pytest.approx(gain, rel=1e-3)
+    if name == "dron":  # on the floor a sphere about 0.7 m is out of reach
+        divided = 1.0 if gain == 0.5 else radius
+        gains = [anchor.gain for anchor in formation.anchors.values()]
+        assert gains == pytest.approx([0.5 / divided * weight] * 3, rel=1e-3)
+
+
+def test_a_law_that_gives_a_velocity_becomes_a_step(tmp_path):
+    text = file(three(TRIANGLE)).replace("type: gradient", "type: gradient_v").replace("period: 0.1\n", "period: 0.2\n")
+    formation = converted(tmp_path, text)[0].experiment.formation
+    assert (formation.gain, formation.clamp) == (pytest.approx(0.1), pytest.approx(0.02))
+
+
+def test_the_address_may_be_called_ip(tmp_path):
+    text = file(three(TRIANGLE, place="physical"), "physical").replace("agent_ip:", "ip:")
+    robots = converted(tmp_path, text)[0].experiment.robots
+    assert robots["khepera02"].body == "khepera4://192.168.0.22:50000"
+
+
+def test_a_flat_formation_stays_flat_whatever_the_origin_says(tmp_path):
+    place = [(0.8, 0.0), (0.25, 0.76), (-0.65, 0.47), (-0.65, -0.47), (0.25, -0.76)]
+    names = [f"dron0{k + 1}" for k in range(5)]
+    robots = []
+    for k, (x, y) in enumerate(place):
+        apart = [(names[j], np.hypot(x - place[j][0], y - place[j][1])) for j in range(5) if j != k]
+        relations = [*(f"{name}_{distance:.4f}" for name, distance in apart), "origin_0.5"]
+        robots.append(robot(k + 1, names[k], (1.2 * x, 1.1 * y, 0.7), relations))
+    text = file(robots)
+    read, notes = converted(tmp_path, text)
+    assert [each.hover for each in read.experiment.robots.values()] == [0.7] * 5
+    assert not read.experiment.formation.anchors
+    assert figures(read.experiment).residual_mm < 0.2
+    assert not any("climb" in note for note in notes)
+
+
+def test_the_tools_that_are_switched_on_are_told_and_no_others(tmp_path):
+    off = "  Agent00:\n    enable: False\n  Agent01:\n    enable: True\n  Reconfiguration:\n    enable: True\n"
+    notes = converted(tmp_path, file(three(TRIANGLE)) + off)[1]
+    told = " | ".join(notes)
+    assert "Agent00" not in told
+    assert "Other.Agent01: zenpark records" in told
+    assert "the shape changes in flight" in told
 
 
 @pytest.mark.parametrize(
@@ -243,3 +326,177 @@ def test_the_command(tmp_path, capsys):
     source.write_bytes(b"\0\0")
     with pytest.raises(DocumentError, match="binary"):
         command(str(source), None, 20.0)
+
+
+FLAT = """{name}:
+  {naming}: {name}
+  {address}
+  controller_type: PID_Continuous
+  communication:
+    type: {speaks}
+    threshold:
+      type: Constant
+      co: 0.02
+      ai: Null
+  task:
+    enable: True
+    T: 200
+    Onboard: False
+    role: consensus
+    type: distance
+    relationship: '{relations}'
+"""
+OTHERS = {
+    "dron01": ("khepera01", "khepera02"),
+    "khepera01": ("dron01", "khepera02"),
+    "khepera02": ("dron01", "khepera01"),
+}
+
+
+def flat(name, speaks="EvenBased", **changed):
+    """One robot of a file of 2023, as text: a triangle of 0.8 m with a drone 0.7 m above its base."""
+    wheels = name.startswith("khepera")
+    address = (
+        f"agent_ip: '192.168.0.{name[-1]}'\n  port_number: 50000\n  init_theta: -1.5"
+        if wheels
+        else "control_mode: HighLevel"
+    )
+    relations = ", ".join(f"{other}_{0.8 if wheels and other[0] == 'k' else 0.9}" for other in OTHERS[name])
+    given = {
+        "name": name,
+        "naming": "id" if wheels else "name",
+        "address": address,
+        "speaks": speaks,
+        "relations": relations,
+    }
+    return FLAT.format(**(given | changed))
+
+
+def test_a_flat_file_of_2023_with_starts_from_a_table(tmp_path):
+    marker = "dron09:\n  name: khepera01\n  control_mode: None\n  task:\n    enable: False\n    relationship: Null\n"
+    poses = tmp_path / "poses.txt"
+    poses.write_text("# name x y\ndron01 0.1 0.5\nkhepera01, -0.4, 0.0\nkhepera02 0.5 0.1 3.1\n")
+    made, notes = imported("".join(map(flat, OTHERS)) + marker, "AA.yaml", 20.0, str(poses))
+    (tmp_path / "aa.toml").write_text(made)
+    experiment = document.read(tmp_path / "aa.toml").experiment
+    assert list(experiment.robots) == ["dron01", "khepera01", "khepera02"]
+    assert [each.start for each in experiment.robots.values()] == [[0.1, 0.5], [-0.4, 0.0], [0.5, 0.1, 3.1]]
+    assert {each.body for each in experiment.robots.values()} == {"twin"}
+    assert experiment.formation.links == {
+        "khepera01 - dron01": 0.9,
+        "khepera02 - dron01": 0.9,
+        "khepera02 - khepera01": 0.8,
+    }
+    assert (experiment.formation.gain, experiment.formation.clamp) == (0.5, 0.08)
+    assert experiment.rates.coordination_hz == 5.0
+    assert experiment.trigger == {"kind": "send-on-delta", "threshold": 0.02}
+    told = " | ".join(notes)
+    assert "khepera01 192.168.0.1:50000, khepera02 192.168.0.2:50000" in told
+    assert "dron09: the marker" in told
+    assert "MADE UP" not in told
+
+
+def test_starts_that_nobody_tells_are_marked(tmp_path):
+    made, notes = imported("".join(map(flat, OTHERS)), "AA.yaml", 20.0)
+    assert made.count("# start made up") == 3
+    assert any("MADE UP" in note and "--poses" in note for note in notes)
+    (tmp_path / "aa.toml").write_text(made)
+    assert [found.code for found in check(document.read(tmp_path / "aa.toml")) if found.severity == "error"] == []
+
+
+def index(tmp_path, **settings):
+    """An index with the files of its robots beside it."""
+    lines = []
+    for number, (name, place) in enumerate(
+        {"dron01": "0.1, 0.5", "khepera01": "-0.4 0.0", "khepera02": "0.5, 0.1"}.items()
+    ):
+        (tmp_path / f"AC_{name}.yaml").write_text(flat(name, **settings))
+        kind = ("virtual", "digital_twin", "virtual")[number]
+        lines.append(f"{name}:\n  name: {name}\n  config_path: AC_{name}.yaml\n  pose: {place}\n  type: {kind}\n")
+    return "\n".join(lines)
+
+
+def test_an_index_of_2023_follows_the_files_that_it_names(tmp_path):
+    made, _ = imported(index(tmp_path), str(tmp_path / "AC.yaml"), 20.0)
+    (tmp_path / "ac.toml").write_text(made)
+    experiment = document.read(tmp_path / "ac.toml").experiment
+    assert experiment.robots["khepera01"].body == "khepera4://192.168.0.1:50000"
+    assert experiment.robots["khepera01"].shadow is not None
+    assert experiment.robots["khepera01"].start == [-0.4, 0.0, -1.5]
+    assert experiment.robots["khepera02"].body == "twin"
+    links = experiment.formation.links
+    assert links["khepera02 - dron01"] == 0.9
+    assert links["dron01 > khepera01"].gain == pytest.approx(
+        0.5 / 0.8667, rel=1e-3
+    )  # the real Khepera's driver divides
+
+
+@pytest.mark.parametrize(
+    ("broken", "said", "where"),
+    [
+        (lambda folder: (folder / "AC_dron01.yaml").unlink(), "there is no file 'AC_dron01.yaml'", "AC.yaml"),
+        (lambda folder: (folder / "AC_dron01.yaml").write_text("- 1\n"), "is no table", "AC_dron01.yaml"),
+        (lambda folder: (folder / "AC_dron01.yaml").write_text("{}\n"), "has no robot", "AC_dron01.yaml"),
+        (
+            lambda folder: (folder / "AC_dron01.yaml").write_text(flat("dron01", speaks="Loud")),
+            "'Loud'",
+            "AC_dron01.yaml",
+        ),
+        (lambda folder: (folder / "AC_dron01.yaml").write_text(flat("dron01", relations="dron07_1.0")), "dron07", ""),
+    ],
+)
+def test_what_is_wrong_in_an_index_is_said_with_its_file(tmp_path, broken, said, where):
+    text = index(tmp_path)
+    broken(tmp_path)
+    with pytest.raises(DocumentError) as raised:
+        imported(text, str(tmp_path / "AC.yaml"), 20.0)
+    assert said in str(raised.value)
+    assert raised.value.problems[0].file.endswith(where)
+
+
+def test_one_robot_of_an_experiment_names_what_to_import(tmp_path):
+    with pytest.raises(DocumentError, match="is one robot of an experiment"):
+        imported(flat("dron01"), "AC_dron01.yaml", 20.0)
+
+
+WORLD = """#VRML_SIM R2023a utf8
+WorldInfo { title "a { brace in a name" }
+DEF dron01 Crazyflie {
+  translation 0.1 0.5 0.015
+  children [ Camera { name "camera" translation 9 9 9 } ]
+  name "dron01"
+}
+KheperaIV {
+  translation -0.4 0 0.01
+  rotation 0 0 -1 1.5
+  name "khepera01"  # at the wall
+}
+"""
+
+
+def test_starts_from_a_webots_world_and_an_index(tmp_path):
+    (tmp_path / "park.wbt").write_text(WORLD)
+    found = starts_from(str(tmp_path / "park.wbt"))
+    assert found["dron01"] == (0.1, 0.5, 0.015)
+    assert found["khepera01"] == (-0.4, 0.0, -1.5)
+    assert "camera" not in found
+    (tmp_path / "AC.yaml").write_text(index(tmp_path))
+    assert starts_from(str(tmp_path / "AC.yaml"))["khepera02"] == (0.5, 0.1, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("poses.txt", "dron01 0.1\n", "is no start"),
+        ("poses.txt", "dron01 0.1 nan\n", "is no start"),
+        ("poses.txt", "# nothing\n", "tells the start of no robot"),
+        ("park.wbt", "Robot {", "tells the start of no robot"),
+        ("park.wbt", 'Robot { name "dron01" translation 1 x 2 }', "cannot be read near '1 x 2'"),
+        ("park.wbt", 'Robot { name "dron01" translation', "cannot be read"),
+        ("park.wbt", "Robot { name", "tells the start of no robot"),
+    ],
+)
+def test_starts_that_cannot_be_read(tmp_path, name, text, said):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(DocumentError, match=said):
+        starts_from(str(tmp_path / name))

@@ -3,6 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from experiments import layouts
+from experiments.feasibility import ENOUGH
 from experiments.placing import Wanted, placed
 
 NOWHERE = np.zeros(0)
@@ -30,7 +32,7 @@ def test_a_shape_is_found_again_from_nearby(seed, rows, relative):
     shape = rng.uniform(-1.0, 1.0, (rows, 3))
     start = shape + rng.uniform(-0.02, 0.02, shape.shape)
     found = placed(asked(shape, points=[0, 1], relative=relative), start, np.ones(rows, dtype=bool))
-    assert found.worst < 1e-4
+    assert found.worst < ENOUGH
 
 
 def test_drones_from_one_plane_find_their_dome_and_robots_stay_on_the_floor():
@@ -53,3 +55,26 @@ def test_what_contradicts_itself_is_measured():
     found = placed(wanted, start, np.zeros(3, dtype=bool))
     assert found.links == pytest.approx(0.1, abs=1e-3)  # 0.3 m, shared by three
     assert found.points == 0.0
+
+
+def test_a_shape_that_is_met_at_the_heights_of_the_starts_is_not_folded():
+    ring = np.array([(np.cos(a), np.sin(a), 0.7) for a in 2.0 * np.pi * np.arange(6) / 6])
+    wanted = asked(ring)
+    sparse = Wanted(
+        wanted.pairs[::2], wanted.distance[::2], wanted.relative[::2], *(wanted.row, wanted.point, wanted.radius)
+    )
+    found = placed(sparse, ring * [1.3, 0.8, 1.0], np.ones(6, dtype=bool))
+    assert found.worst < ENOUGH
+    assert found.position[:, 2] == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_shapes_in_space_are_found_from_starts_in_one_plane(seed):
+    """Twelve drones on a hemisphere, linked to their nearest: a single beginning misses most of them."""
+    made = layouts.hemisphere(12, 0.6, 0.25)
+    pairs, shape = made.pairs, made.position
+    apart = shape[pairs[:, 0]] - shape[pairs[:, 1]]
+    none = np.zeros(0, dtype=np.intp)
+    wanted = Wanted(pairs, np.linalg.norm(apart, axis=1), apart, none, np.zeros((0, 3)), NOWHERE)
+    start = shape * [1.2, 1.2, 0.0] + np.random.default_rng(seed).normal(0.0, [0.25, 0.25, 0.0], shape.shape)
+    assert placed(wanted, start, np.ones(12, dtype=bool)).worst < ENOUGH
