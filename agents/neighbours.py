@@ -52,7 +52,10 @@ class Neighbours:
         self._links, self._names = assignment.links, assignment.speakers
         self._channel = Channel(conditions or Conditions.ideal(len(assignment.links)))
         by_speaker = links_by_speaker(assignment.links, assignment.speakers)
-        self.speakers = [Speaker(session, keys, name, links, reach=reach) for name, links in by_speaker.items()]
+        rate = assignment.body_hz / assignment.pose_every
+        self.speakers = [
+            Speaker(session, keys, name, links, reach=reach, rate=rate) for name, links in by_speaker.items()
+        ]
         self.news = [deque[wire.Heard](maxlen=NEWS) for _ in assignment.names]
         self.heard: Index = np.zeros(len(assignment.names), dtype=np.intp)
         self.dropped = self._channel.dropped

@@ -149,6 +149,20 @@ def check_command(command: Command, *, robot: str) -> None:
         raise Malformed(f"takeoff with the height {command.height}")
 
 
+def missed(last: int, seq: int, since: float, rate: float) -> int:
+    """Poses of a robot that never came between two that did, by their running numbers.
+
+    Args:
+        last: Number of the former. One that does not grow is of a process that began anew at 1.
+        seq: Number of the latter.
+        since: Time between their stamps [s].
+        rate: Poses that a robot says in a second at most [1/s]. A gap counts only as far as that allows: one forged
+            number must not become a hundred million lost poses.
+    """
+    gap = seq - last - 1 if seq > last else seq - 1
+    return min(gap, math.ceil(since * rate))
+
+
 def _counted(seq: int) -> bool:
     return 0 < seq < 2**53  # what JSON carries exactly
 

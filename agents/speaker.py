@@ -45,6 +45,7 @@ class Speaker:
         links: Index,
         *,
         reach: wire.Vector,
+        rate: float,
         depth: int = network.POSES,
     ) -> None:
         """Listens.
@@ -55,9 +56,10 @@ class Speaker:
             name: Of the robot.
             links: (K,) on which it is heard.
             reach: Largest |x|, |y|, |z| that is believed [m].
+            rate: Poses that it says in a second at most [1/s].
             depth: Newest poses that may wait.
         """
-        self.name, self.links, self._reach = name, links, reach
+        self.name, self.links, self._reach, self._rate = name, links, reach, rate
         self._poses = network.pose_subscriber(session, keys.pose(name), depth)
         self._alive = network.alive_watch(session, keys.alive(name))
         self._seq, self._stamp = 0, 0.0
@@ -75,7 +77,8 @@ class Speaker:
                 continue
             if pose.stamp <= self._stamp:
                 continue  # known already: told again after a reconnection
-            missed = pose.seq - self._seq - 1 if 0 < self._seq < pose.seq else 0
+            since = pose.stamp - self._stamp
+            missed = plausibility.missed(self._seq, pose.seq, since, self._rate) if self._seq else 0
             self._seq, self._stamp = pose.seq, pose.stamp
             yield Said(pose, len(payload), missed)
 

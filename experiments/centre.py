@@ -66,9 +66,9 @@ class CentreProcess:
         # what robots say on the tick of a decision is on its way then: half a tick more, and it counts
         self._patience = 0.5 / assignment.body_hz
         names, rows = self._names, centre.listens.tolist()
-        reach = reach_of(assignment.limits.low, assignment.limits.high)
+        reach, rate = reach_of(assignment.limits.low, assignment.limits.high), experiment.rates.pose_hz
         self._speakers = [
-            Speaker(session, keys, names[row], np.array([link]), reach=reach, depth=DEPTH)
+            Speaker(session, keys, names[row], np.array([link]), reach=reach, rate=rate, depth=DEPTH)
             for link, row in enumerate(rows)
         ]
         self._heard: Index = np.zeros(len(rows), dtype=np.intp)

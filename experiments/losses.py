@@ -1,12 +1,16 @@
-"""What was lost or dropped of poses, by their numbers and by what robots counted."""
+"""What was sent, lost or dropped of poses, by their numbers and by what robots counted."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
+from itertools import pairwise
+from math import ceil
 from typing import Final, Literal
 
 import numpy as np
 
+from agents.plausibility import missed
 from agents.rows import Index
 from agents.wire import Status
 from experiments import assign
@@ -17,33 +21,48 @@ from experiments.recording import SentPose
 STATUS_S: Final = 1.0  # what happened in the run is counted by a status at most this much after its end
 
 
+def unrecorded(poses: Iterable[tuple[float, int]], rate: float) -> int:
+    """How many poses a robot sent between those that are recorded, by stamp [s] and number, in order of time.
+
+    A robot says at most `rate` poses in a second [1/s]; see `agents.plausibility.missed`.
+    """
+    return sum(missed(last, seq, then - before, rate) for (before, last), (then, seq) in pairwise(poses))
+
+
 def lost(
-    robots: tuple[str, ...], poses: list[list[SentPose]], statuses: list[list[Status]], run: tuple[float, float]
+    robots: tuple[str, ...],
+    poses: list[list[SentPose]],
+    statuses: list[list[Status]],
+    run: tuple[float, float],
+    rate: float,
 ) -> Index:
-    """(N,) what was lost of each robot, as `playback.read` defines it; `run` is its beginning and end in UTC [s]."""
-    missed: Counter[str] = Counter()
-    for robot, own, said in zip(robots, poses, statuses, strict=True):
-        missed[robot] += _gaps(own, run) + _tail(own, said, run)
-        missed.update(_by_speaker(said, run, "lost"))
-    return np.array([missed[robot] for robot in robots], dtype=np.intp)
+    """(N,) what was lost of each robot, as `playback.read` defines it.
 
-
-def _gaps(poses: list[SentPose], run: tuple[float, float]) -> int:
+    Args:
+        robots: Names.
+        poses: Of each, in order of time.
+        statuses: Of each, in order of time.
+        run: Its beginning and end in UTC [s].
+        rate: Poses that a robot says in a second at most [1/s].
+    """
+    total: Counter[str] = Counter()
     begin, end = run[0] - ROUNDING_S, run[1] + ROUNDING_S
-    seq = np.array([pose.seq for pose in poses if begin <= pose.stamp <= end], dtype=np.intp)
-    step = np.diff(seq)
-    anew = seq[1:][step < 0]
-    return int((step[step > 0] - 1).sum() + (anew - 1).sum())
+    for robot, own, said in zip(robots, poses, statuses, strict=True):
+        mine = [(pose.stamp, pose.seq) for pose in own if begin <= pose.stamp <= end]
+        total[robot] += unrecorded(mine, rate) + _tail(own, said, run, rate)
+        total.update(_by_speaker(said, run, "lost"))
+    return np.array([total[robot] for robot in robots], dtype=np.intp)
 
 
-def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float]) -> int:
+def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float], rate: float) -> int:
     said = [status for status in statuses if run[0] < status.stamp <= run[1] + STATUS_S]
     if not said:
         return 0
     last = said[-1]
-    recorded = [pose.seq for pose in poses if pose.stamp <= last.stamp + ROUNDING_S]
-    before = [status.sent for status in statuses if status.stamp <= run[0] and status.pid == last.pid]
-    return max(0, last.sent - max(recorded[-1:] + before[-1:], default=0))
+    recorded = [(pose.seq, pose.stamp) for pose in poses if pose.stamp <= last.stamp + ROUNDING_S]
+    before = [(status.sent, run[0]) for status in statuses if status.stamp <= run[0] and status.pid == last.pid]
+    number, stamp = max(recorded[-1:] + before[-1:], default=(0, run[0]))
+    return max(0, min(last.sent - number, ceil((last.stamp - stamp) * rate)))
 
 
 def dropped(experiment: Experiment, statuses: list[list[Status]], run: tuple[float, float]) -> Index:

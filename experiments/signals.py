@@ -18,6 +18,7 @@ from agents.rows import Array, Index, Mask, norm
 from experiments import assign
 from experiments.experiment import Experiment
 from experiments.formation import Pattern, errors
+from experiments.losses import unrecorded
 from experiments.trace import Trace
 
 
@@ -227,11 +228,9 @@ def gaps(trace: Trace) -> list[Array]:
 
 def transmissions(trace: Trace) -> tuple[Index, Index]:
     """Per robot: how many poses it sent, by its running numbers, and how many of them are in the recording."""
-    rows = len(trace.robots)
-    recorded = np.bincount(trace.sent.robot, minlength=rows)
-    low = np.full(rows, np.iinfo(np.intp).max)
-    high = np.full(rows, np.iinfo(np.intp).min)
-    np.minimum.at(low, trace.sent.robot, trace.sent.seq)
-    np.maximum.at(high, trace.sent.robot, trace.sent.seq)
-    span = np.where(recorded > 0, high - np.where(recorded > 0, low, high) + 1, 0)
-    return np.maximum(span, recorded), recorded  # numbers begin anew when a robot's process is started again
+    sent, rate = trace.sent, trace.experiment.rates.pose_hz
+    own: list[list[tuple[float, int]]] = [[] for _ in trace.robots]
+    for row, time, seq in zip(sent.robot.tolist(), sent.time.tolist(), sent.seq.tolist(), strict=True):
+        own[row].append((time, seq))
+    recorded = np.array([len(poses) for poses in own], dtype=np.intp)
+    return recorded + np.array([unrecorded(poses, rate) for poses in own], dtype=np.intp), recorded

@@ -121,3 +121,19 @@ def test_an_honest_goal_passes():
 def test_a_goal_that_no_robot_can_follow(changes, says):
     with pytest.raises(Malformed, match=says):
         check_goal(**changes)
+
+
+@pytest.mark.parametrize(
+    ("last", "seq", "since", "lost"),
+    [
+        (1, 2, 0.02, 0),
+        (1, 5, 0.08, 3),
+        (1, 5, 10.0, 3),  # it speaks when it has something to say
+        (7, 1, 3.0, 0),  # began anew
+        (7, 3, 3.0, 2),
+        (7, 99_999_999, 0.02, 1),  # forged: at 50 Hz one can have been said in that time
+        (99_999_999, 9, 0.02, 1),
+    ],
+)
+def test_a_gap_counts_as_far_as_the_time_allows(last: int, seq: int, since: float, lost: int) -> None:
+    assert plausibility.missed(last, seq, since, 50.0) == lost

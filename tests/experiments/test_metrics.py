@@ -152,6 +152,24 @@ def test_what_the_recorder_lost_is_counted_by_the_running_numbers():
     assert (leader.messages, leader.recorded) == (19, 7)
 
 
+@pytest.mark.parametrize(
+    ("seq", "messages"),
+    [
+        ([*range(401, 451), *range(1, 61)], 110),  # began anew at 1
+        ([*range(401, 451, 2), *range(1, 61, 2)], 108),  # and the recorder missed every second one
+        ([*range(1, 10), 300_000_000, *range(10, 20)], 22),  # a forged number: two more fit into the time beside it
+    ],
+)
+def test_transmissions_of_a_robot_that_began_anew_and_of_one_with_a_forged_number(seq: list[int], messages: int):
+    known = moving()
+    time = 0.04 * np.arange(len(seq))
+    place = np.zeros((len(seq), 3))
+    row = np.zeros(len(seq), dtype=np.intp)
+    sent = type(known.sent)(time, row, np.array(seq), place, place, time, row)
+    leader = metrics.measure(dataclasses.replace(known, sent=sent)).robots[0]
+    assert (leader.messages, leader.recorded) == (messages, len(seq))
+
+
 def test_benchmark_cost_by_hand():
     known = pair(1.0 + np.exp(-T), sent={"F": [0.0, 1.0, 2.0]})
     settle = round(math.log(50.0) / STEP + 0.5) * STEP

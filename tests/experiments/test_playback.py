@@ -193,6 +193,9 @@ def test_numbers_that_nobody_knows(path):
         ([pose(seq=k, at=k / 10) for k in (1, 2, 5, 6)], 2),  # a gap of two
         ([pose(seq=s, at=a) for s, a in ((8, 0.1), (9, 0.2), (1, 0.3), (2, 0.4))], 0),  # began anew
         ([pose(seq=s, at=a) for s, a in ((8, 0.1), (9, 0.2), (3, 0.3), (4, 0.4))], 2),  # anew, the first two lost
+        # a forged number: no more than 50 poses a second can have been said
+        ([pose(seq=s, at=a) for s, a in ((8, 0.1), (99_999_999, 0.12), (9, 0.14), (10, 0.16))], 2),
+        ([pose(seq=8, at=0.1), status(at=0.9, sent=99_999_999)], 40),
         (
             [pose(seq=4, at=0.1), pose(seq=4, at=0.1), pose(seq=5, at=0.2)],
             0,
