@@ -173,6 +173,7 @@ class Runtime:
     def _join(self, session: zenoh.Session) -> None:
         keys, names = self._setup.keys, self._names
         self._session = session
+        self._router = network.RouterWatch(session, keys.alive(names[0]))
         self._poses = [network.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]
@@ -264,7 +265,7 @@ class Runtime:
         """Since when nobody can be believed: the routers are gone, or this process has just stood still."""
         if t < self._doubt_until:  # long enough ago to hold, and not long enough to land
             return min(before, t - self._assignment.limits.link_silence_s - self._dt)
-        return np.inf if network.connected(self._session) else min(before, t)
+        return self._router.silent_since(t)
 
     def _locate(self, row: int, sample: zenoh.Sample, t: float) -> None:
         """Where a row is, as something outside of it says."""

@@ -12,6 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from math import inf
 from typing import Final, Protocol, Self, TypeVar
 
 import zenoh
@@ -42,6 +43,10 @@ GHOST_S: Final = 2.5  # so long may the token of somebody who hangs stand after 
 ROBOT_LEASE_S: Final = 1.2  # of robots: neighbours of one that hangs must know within 1.5 s
 HEARTBEAT_S: Final = 0.5  # how long the loss of the last pose before a silence goes unnoticed
 POSES: Final = 16  # of one robot that wait to be polled
+ASK_EVERY_S: Final = 0.4  # between two questions whether the router still answers
+ANSWER_S: Final = 0.3  # a question without an answer for so long begins a silence
+ASKED: Final = 8  # questions that are waited for at once
+LOOK_S: Final = 0.1  # between two looks for an answer no more than this is held against the router
 EVENTS: Final = 64  # of a run that are said again to who was cut off: without a router much happens at once
 
 
@@ -151,6 +156,75 @@ def _silence(endpoints: Sequence[str], identity: str) -> str:
 def connected(session: zenoh.Session) -> bool:
     """Whether the session has a router now, or a neighbour in a mesh. Costs 0.6 µs: poll it in the control loop."""
     return bool(session.info.routers_zid() or session.info.peers_zid())
+
+
+class RouterWatch:
+    """Detection of a router that is silent, by questions of our own.
+
+    Zenoh closes a link after the lease that the *other* end announces: 2 s with our router, 10 s with a plain zenohd,
+    60 s with rmw_zenohd. Until then a frozen router, or a pulled cable, looks like a quiet one. A router answers a
+    liveliness query from its own tables, so the end of its answer is a sign of life. Nothing waits for it: an answer
+    is polled. A member of a mesh is not asked, for its lease is ours.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        """Begins with the first `silent_since`.
+
+        Args:
+            session: Whose router is watched.
+            key: What is asked for; in a lab, a liveliness key that this session may watch.
+        """
+        self._session, self._key = session, key
+        self._waiting: deque[tuple[float, Polled[zenoh.Reply]]] = deque(maxlen=ASKED)
+        # Times of a clock that stands while nobody looks: a process that gets no processor cannot blame the router.
+        self._now, self._asked, self._unanswered = 0.0, -inf, inf  # the latter: when the oldest question was asked
+        self._looked = inf
+        self._silent_since = inf
+        self._answers = 0  # since the silence began
+
+    def silent_since(self, t: float) -> float:
+        """When the silence of the router began, or when the last link was lost; infinity while it answers.
+
+        Args:
+            t: Now, on any clock that does not go back [s]. Call it in each round of a loop, at 10 Hz or more.
+        """
+        self._now += max(0.0, min(t - self._looked, LOOK_S))
+        self._looked = t
+        info = self._session.info
+        if not info.routers_zid():
+            self._waiting.clear()
+            self._asked, self._unanswered, self._answers = -inf, inf, 0
+            self._silent_since = inf if info.peers_zid() else min(self._silent_since, t)
+            return self._silent_since
+        if self._answered():
+            self._answers += 1
+            # A link that is closed ends its questions as an answer does: after a silence the second one counts.
+            if self._answers > 1:
+                self._silent_since = inf
+            else:
+                self._asked = -inf
+        if self._now - self._unanswered > ANSWER_S and self._silent_since == inf:
+            self._silent_since, self._answers = t - (self._now - self._unanswered), 0
+        if self._now - self._asked >= ASK_EVERY_S:
+            handler = self._session.liveliness().get(self._key, RingChannel(1), timeout=10.0 * ASKED * ASK_EVERY_S)
+            self._waiting.append((self._now, handler))
+            self._asked = self._now
+            self._unanswered = min(self._unanswered, self._now)
+        return self._silent_since
+
+    def _answered(self) -> bool:
+        """Whether an answer has come since the last look."""
+        for number in reversed(range(len(self._waiting))):
+            _, handler = self._waiting[number]
+            try:
+                while handler.try_recv() is not None:
+                    pass
+            except zenoh.ZError:  # the answer is complete
+                for _ in range(number + 1):
+                    self._waiting.popleft()
+                self._unanswered = self._waiting[0][0] if self._waiting else inf
+                return True
+        return False
 
 
 def links(session: zenoh.Session) -> int:

@@ -17,7 +17,8 @@ from agents.topology import Mode
 
 LEASE_S: Final = 2.0  # whoever is silent for so long is held for dead
 ASK_S: Final = 2.0  # whoever asks waits no longer for an answer
-OPEN_S: Final = 3.0  # a router that answers nothing for so long is passed over for the next one
+OPEN_S: Final = 3.0  # a handshake that takes longer has failed,
+NEXT_S: Final = 1.0  # or longer than this where there is another router to go to
 MOST_BYTES: Final = 4 * 1024 * 1024  # of a message that a router of a lab puts together; the largest is an experiment
 
 # 4 threads instead of 7 in each client and a sixth less CPU at 50 Hz. Zenoh reads it once, at the first open.
@@ -96,7 +97,8 @@ def settings(
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": round(lease_s * 1000),
-        "transport/unicast/open_timeout": round(OPEN_S * 1000),
+        # A client that has lost its router seeks them in the order of the list: one that is frozen holds it up so long.
+        "transport/unicast/open_timeout": round((NEXT_S if mode == "client" and len(connect) > 1 else OPEN_S) * 1000),
         "transport/unicast/accept_timeout": round(OPEN_S * 1000),
         "transport/shared_memory/enabled": False,
         "queries_default_timeout": round(ASK_S * 1000),

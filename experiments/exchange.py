@@ -64,6 +64,7 @@ class Exchange:
         self.utc = time.time()
         self.contacts = self.refused = self.malformed = 0
         self.trouble = ""
+        self._router = network.RouterWatch(session, keys.world_alive)
         self._setpoints = network.subscriber(session, keys.setpoint("*"), DEPTH)
         self._statuses = network.pose_subscriber(session, keys.status("*"), 1024)
         self._contacts = network.publisher(session, keys.contact, wire.JSON)
@@ -192,7 +193,7 @@ class Exchange:
     def act(self, t: float) -> None:
         """Passes on what robots were told; those that are told nothing hold, and land after a while."""
         population = self._population
-        if not network.connected(self._session):  # nobody can be heard: they hold, but need not land for that
+        if self._router.silent_since(t) < inf:  # nobody can be heard: they hold, but need not land for that
             self._quiet = np.maximum(self._quiet, t - HOLD_S - 1e-3)
         silent = t - self._quiet > HOLD_S
         if some(silent):

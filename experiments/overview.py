@@ -32,7 +32,6 @@ class Overview:
     Attributes:
         robots: What is known of each.
         recording_begun: Whether the recorder is there.
-        connected: Whether there is a router.
         orders: Asked of the conductor.
     """
 
@@ -86,15 +85,14 @@ class Overview:
         self._recorder_watch = network.alive_watch(self._session, keys.recorder)
         self.recording_begun = False
         self._cut_off = -inf
+        self._router = network.RouterWatch(self._session, keys.conductor)
+        self._safety, self._mesh = experiment.safety, topology.is_mesh(endpoints)
+        self._silent_since = inf  # of the silence that was said
 
     @property
     def session(self) -> zenoh.Session:
         """Its session, for whoever hears more by it."""
         return self._session
-
-    @property
-    def connected(self) -> bool:
-        return network.connected(self._session)
 
     def close_doors(self) -> None:
         """Who joins from now on waits for the next run."""
@@ -144,12 +142,25 @@ class Overview:
     def _missed(self) -> list[str]:
         """Robots whose token has been missing for long: where there is another router, it comes back at once."""
         now = time.monotonic()
-        if not self.connected:
-            self._cut_off = now
+        self._watch_router(now)
         missed = [name for name, seen in self.robots.items() if now - max(seen.vanished, self._cut_off) > MISSED_S]
         for name in missed:
             self.robots[name].vanished = inf
         return missed
+
+    def _watch_router(self, now: float) -> None:
+        """Says once that the router is silent for as long as robots wait before they hold, and once that it is back."""
+        since = self._router.silent_since(now)
+        if since < inf:
+            self._cut_off = now
+            safety, said = self._safety, self._silent_since < inf
+            if not said and not self._mesh and now - since > safety.link_silence_s:
+                self._silent_since = since
+                what = f"robots hold, and land after {safety.offline_s:g} s"
+                self.say("router", "conductor", f"no router answers for {now - since:.1f} s: {what}")
+        elif self._silent_since < inf:
+            away_s, self._silent_since = now - self._silent_since, inf
+            self.say("router", "conductor", f"a router answers again, after {away_s:.1f} s")
 
     def _heed(self, status: wire.Status) -> None:
         seen = self.robots[status.robot]

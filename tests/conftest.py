@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -17,17 +19,33 @@ from agents.endpoint import free_endpoint
 ROOT = Path(__file__).resolve().parent.parent
 
 
-class RouterProcess:
-    """A router in a process of its own, on a free loopback port that it keeps over restarts."""
+PATIENT = """
+import signal, sys, zenoh
+from agents.settings import config, settings
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+endpoint, lease_s = sys.argv[1:]
+with zenoh.open(config(settings("router", listen=[endpoint], name="router", lease_s=float(lease_s)))):
+    print("router ready on", endpoint, flush=True)
+    signal.sigwait([signal.SIGTERM])
+"""
 
-    def __init__(self) -> None:
+
+class RouterProcess:
+    """A router in a process of its own, on a free loopback port that it keeps over restarts.
+
+    With a `lease_s`, its clients wait as long for a sign of life [s]: rmw_zenohd has 60 s.
+    """
+
+    def __init__(self, lease_s: float | None = None) -> None:
         self.endpoint = free_endpoint(preferred_port=0)
+        own = ["-m", "agents.router", "--listen", self.endpoint]
+        self._command = own if lease_s is None else ["-c", PATIENT, self.endpoint, str(lease_s)]
         self.process: subprocess.Popen[str]
         self.start()
 
     def start(self) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "agents.router", "--listen", self.endpoint],
+            [sys.executable, *self._command],
             cwd=ROOT,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -39,6 +57,15 @@ class RouterProcess:
     def kill(self) -> None:
         self.process.kill()
         self._reap()
+
+    @contextmanager
+    def frozen(self) -> Iterator[float]:
+        """Stops the process with SIGSTOP, from now [s, UTC] until the end of the block."""
+        self.process.send_signal(signal.SIGSTOP)
+        try:
+            yield time.time()
+        finally:
+            self.process.send_signal(signal.SIGCONT)
 
     def stop(self) -> int:
         self.process.terminate()
@@ -58,6 +85,14 @@ def router() -> Iterator[RouterProcess]:
     yield made
     assert made.process.returncode is not None or made.stop() == 0
     assert not psutil.pid_exists(made.process.pid)
+
+
+@pytest.fixture
+def patient_router() -> Iterator[RouterProcess]:
+    """A router whose clients wait 60 s for a sign of life, as those of rmw_zenohd do."""
+    made = RouterProcess(lease_s=60.0)
+    yield made
+    assert made.process.returncode is not None or made.stop() == 0
 
 
 @pytest.fixture

@@ -1,7 +1,11 @@
+from __future__ import annotations
+
 import socket
 import subprocess
 import sys
 import threading
+import time
+from math import inf
 from pathlib import Path
 
 import pytest
@@ -10,7 +14,10 @@ import zenoh
 from agents.endpoint import EndpointError, free_endpoint
 from agents.router import serve_router
 from agents.session import (
+    ANSWER_S,
+    ASK_EVERY_S,
     Alarm,
+    RouterWatch,
     Unreachable,
     alive_token,
     alive_watch,
@@ -152,6 +159,116 @@ def test_client_fails_over_to_the_second_router(router, eventually):
         router.kill()
         eventually(lambda: connected(session) and session.info.routers_zid() != first)
     assert second.stop() == 0
+
+
+@pytest.mark.system
+def test_a_frozen_router_is_silent_whatever_its_lease(patient_router, eventually):
+    with open_session([patient_router.endpoint], name="CF01") as session:
+        watch, begun = RouterWatch(session, "park/CF01/alive"), time.monotonic()
+
+        def silent_since() -> float:
+            return watch.silent_since(time.monotonic() - begun)
+
+        eventually(lambda: silent_since() == inf and time.monotonic() - begun > 4 * ASK_EVERY_S)
+        for _ in range(2):
+            with patient_router.frozen():
+                stopped = time.monotonic() - begun
+                eventually(lambda: silent_since() < inf)
+                assert stopped - ANSWER_S < silent_since() < stopped + ASK_EVERY_S + 0.1
+                assert connected(session), "Zenoh notices nothing"
+                since = silent_since()
+                eventually(lambda since=since: time.monotonic() - begun > since + 10 * ASK_EVERY_S)
+                assert silent_since() == since
+            eventually(lambda: silent_since() == inf)
+        patient_router.kill()
+        eventually(lambda: silent_since() < inf)
+        patient_router.start()
+        eventually(lambda: silent_since() == inf)
+
+
+@pytest.mark.system
+def test_a_router_that_waits_for_another_is_not_silent(patient_router):
+    linked = zenoh.open(
+        config(settings("router", listen=[near := free_endpoint(0)], connect=[patient_router.endpoint]))
+    )
+    with linked, open_session([near], name="CF01") as session, patient_router.frozen():
+        watch, begun = RouterWatch(session, "park/CF01/alive"), time.monotonic()
+        while (t := time.monotonic() - begun) < 4 * ASK_EVERY_S:
+            assert watch.silent_since(t) == inf
+
+
+class Asked:
+    """What `RouterWatch` needs of a session: who is linked, and questions that are answered by hand."""
+
+    def __init__(self) -> None:
+        self.info = self
+        self.routers, self.peers = ["router"], []
+        self.questions: list[Question] = []
+
+    def routers_zid(self) -> list[str]:
+        return self.routers
+
+    def peers_zid(self) -> list[str]:
+        return self.peers
+
+    def liveliness(self) -> Asked:
+        return self
+
+    def get(self, *_: object, **__: object) -> Question:
+        self.questions.append(Question())
+        return self.questions[-1]
+
+
+class Question:
+    answered = False
+
+    def try_recv(self) -> None:
+        if self.answered:
+            raise zenoh.ZError("the answer is complete")
+
+
+def looks(watch: RouterWatch, begin: float, end: float) -> float:
+    """What a watch says at last that is looked at 50 times a second."""
+    ticks = range(round(begin * 50), round(end * 50) + 1)
+    return [watch.silent_since(tick / 50) for tick in ticks][-1]
+
+
+def test_one_answer_after_a_silence_may_be_a_link_that_closes():
+    session = Asked()
+    watch = RouterWatch(session, "park/CF01/alive")
+    assert looks(watch, 0.0, ANSWER_S) == inf
+    silent = pytest.approx(0.0)
+    assert looks(watch, 0.32, 0.46) == silent
+    assert len(session.questions) == 2
+    for question in session.questions:
+        question.answered = True
+    assert watch.silent_since(0.5) == silent
+    session.routers = []
+    assert watch.silent_since(0.52) == silent, "it goes on, and does not begin anew"
+    session.routers = ["another"]
+    for t in (0.54, 0.56):
+        assert watch.silent_since(t) == silent
+        session.questions[-1].answered = True
+    assert watch.silent_since(0.58) == inf
+
+
+def test_a_process_that_gets_no_processor_does_not_blame_the_router():
+    session = Asked()
+    watch = RouterWatch(session, "park/CF01/alive")
+    stalls = [0.0, 5.0, 5.5]
+    assert [watch.silent_since(t) for t in stalls] == [inf] * len(stalls)
+    assert looks(watch, 5.52, 5.56) == inf
+    assert looks(watch, 5.58, 5.7) == pytest.approx(5.3, abs=0.03)
+
+
+def test_members_of_a_mesh_are_not_asked():
+    session = Asked()
+    session.routers, session.peers = [], ["KH01"]
+    watch = RouterWatch(session, "park/CF01/alive")
+    assert [watch.silent_since(t) for t in (0.0, 1.0, 2.0)] == [inf] * 3
+    session.peers = []
+    assert [watch.silent_since(t) for t in (3.0, 4.0)] == [3.0] * 2
+    assert not session.questions
 
 
 @pytest.mark.system

@@ -19,7 +19,8 @@ from agents.access import Rights
 from agents.endpoint import free_endpoint
 from agents.settings import config, settings
 from experiments.run import reopen
-from tests.system.lab import ENVIRONMENT, ROOT, Flight, Watcher
+from tests.conftest import RouterProcess
+from tests.system.lab import ENVIRONMENT, ROOT, Flight, Watcher, typed, until
 from tests.system.secured import FLOWN, Laboratory
 
 pytestmark = pytest.mark.system
@@ -126,3 +127,25 @@ def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[L
         assert after[name].phase == "running"
         assert (after[name].malformed, after[name].refused) == (before[name].malformed, before[name].refused)
         assert after[name].lost == before[name].lost
+
+
+def test_robots_hold_while_a_router_with_a_long_lease_is_frozen(patient_router: RouterProcess, tmp_path: Path) -> None:
+    changes = ("--set", f'network.connect=["{patient_router.endpoint}"]', "--set", "duration_s=8", "--no-report")
+    flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", *changes)
+    flight.until_said("phase conductor: formation")
+    with patient_router.frozen() as stopped:
+        flight.until_said(r"router conductor: no router answers for \d\.\d s")
+        until(lambda: time.time() > stopped + 3.0, "every robot has had the time to hold")
+    flight.until_said(r"router conductor: a router answers again, after \d\.\d s")
+    code, _ = flight.finish()
+    assert code == 0, flight.logs()
+    run = reopen(flight.folder)
+    said = [event.text for event in run.traces["periodic"].events if event.source == "conductor"]
+    assert sum("no router answers" in text for text in said) == 1
+    silence_s = run.traces["periodic"].experiment.safety.link_silence_s
+    for name in ("CF01", "KH01", "KH02"):
+        status = typed(flight.folder / "periodic.mcap", f"/{name}/status")[-1]
+        holds, overs = status.incidents  # stamped by the robot itself
+        assert holds.text.startswith("hold: no connection to a router")
+        assert stopped < holds.stamp < stopped + silence_s + 1.0
+        assert overs.text.startswith("over: no connection to a router")
