@@ -12,7 +12,6 @@ from agents import wire
 from agents.agent import Agent, links_by_speaker
 from agents.channel import Channel, Conditions, Samples
 from agents.keys import Keys
-from agents.rows import Index
 from agents.speaker import Said, Speaker
 
 NEWS: Final = 20_000  # newest poses that wait for telemetry, which takes them several times a second: 10 MB
@@ -49,7 +48,9 @@ class Neighbours:
         """
         assignment = agent.assignment
         self._agent = agent
-        self._links, self._names = assignment.links, assignment.speakers
+        self._links = assignment.links
+        names = [assignment.speakers[speaker] for speaker in assignment.links.speaker.tolist()]
+        self._ends = list(zip(assignment.links.listener.tolist(), names, strict=True))
         self._channel = Channel(conditions or Conditions.ideal(len(assignment.links)))
         by_speaker = links_by_speaker(assignment.links, assignment.speakers)
         rate = assignment.body_hz / assignment.pose_every
@@ -57,7 +58,7 @@ class Neighbours:
             Speaker(session, keys, name, links, reach=reach, rate=rate) for name, links in by_speaker.items()
         ]
         self.news = [deque[wire.Heard](maxlen=NEWS) for _ in assignment.names]
-        self.heard: Index = np.zeros(len(assignment.names), dtype=np.intp)
+        self.heard = [0] * len(assignment.names)
         self.dropped = self._channel.dropped
         self.changed = False
 
@@ -68,10 +69,14 @@ class Neighbours:
 
     def listen(self, t: float, utc: float) -> None:
         """Takes in what has arrived at `t` [s] of the process's clock, which stood at 0 at `utc` [s]."""
+        arrived: list[tuple[int, Said]] = []
         for speaker in self.speakers:
             for said in speaker.news(utc + t):
                 speaker.lost += said.missed
-                self._send(speaker.links, said, t, utc)
+                arrived += [(link, said) for link in speaker.links.tolist()]
+        if arrived:
+            self._send(arrived, t, utc)
+        for speaker in self.speakers:
             for came in speaker.comings():
                 self.changed = True
                 if came:
@@ -82,32 +87,34 @@ class Neighbours:
         if (got := self._channel.due(t)) is not None:
             self._believe(got, utc)
 
-    def _send(self, links: Index, heard: Said, t: float, utc: float) -> None:
-        """One pose has come: it is given to the modelled network."""
-        pose, count = heard.pose, len(links)
-        said = Samples(
-            links,
-            np.full(count, t),
-            np.full(count, pose.stamp - utc),
-            np.full(count, pose.seq),
-            np.array([pose.position] * count),
-            np.array([pose.velocity or wire.STILL] * count),
+    def _send(self, arrived: list[tuple[int, Said]], t: float, utc: float) -> None:
+        """Gives poses, each with the link on which it arrived, to the modelled network, all of a tick at once."""
+        poses = [heard.pose for _, heard in arrived]
+        got = Samples(
+            np.array([link for link, _ in arrived]),
+            np.array([t] * len(arrived)),
+            np.array([pose.stamp - utc for pose in poses]),
+            np.array([pose.seq for pose in poses]),
+            np.array([pose.position for pose in poses]),
+            np.array([pose.velocity or wire.STILL for pose in poses]),
         )
         if self._channel.ideal:
-            self._believe(said, utc)
+            self._believe(got, utc)
             return
-        start = self._agent.life.start_at[self._links.listener[links]]
-        size = np.full(count, heard.size)
-        self._channel.send(links, said.seq, said.stamp, said.position, said.velocity, start=start, size=size, now=t)
+        start = self._agent.life.start_at[self._links.listener[got.link]]
+        sizes = np.array([heard.size for _, heard in arrived])
+        for at in range(len(arrived)):  # the queue of a link counts one sample after the other
+            one = slice(at, at + 1)
+            self._channel.send(
+                got.link[one], got.seq[one], got.stamp[one], got.position[one], got.velocity[one],
+                start=start[one], size=sizes[one], now=t,
+            )  # fmt: skip
 
     def _believe(self, got: Samples, utc: float) -> None:
         """Poses have got through."""
         self._agent.hear(got.link, got.position, got.velocity, got.stamp, got.arrival)
-        columns = (self._links.listener[got.link], self._links.speaker[got.link], got.seq, got.stamp, got.arrival)
-        pose = (got.position.tolist(), got.velocity.tolist())
-        for row, who, seq, stamp, arrival, position, velocity in zip(
-            *(c.tolist() for c in columns), *pose, strict=True
-        ):
-            news = wire.Heard(self._names[who], seq, utc + stamp, utc + arrival, tuple(position), tuple(velocity))
-            self.news[row].append(news)
+        columns = (got.link, got.seq, got.stamp, got.arrival, got.position, got.velocity)
+        for link, seq, stamp, arrival, position, velocity in zip(*(c.tolist() for c in columns), strict=True):
+            row, who = self._ends[link]
+            self.news[row].append(wire.Heard(who, seq, utc + stamp, utc + arrival, tuple(position), tuple(velocity)))
             self.heard[row] += 1

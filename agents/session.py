@@ -11,7 +11,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import chain
 from math import inf
 from typing import Final, Protocol, Self, TypeVar
 
@@ -424,7 +425,7 @@ def alive_watch(session: zenoh.Session, keyexpr: str) -> AliveWatch:
     return AliveWatch(session, keyexpr)
 
 
-def received(handler: Polled[T_co]) -> Iterator[T_co]:
-    """What waits in a handler, oldest first, without blocking."""
-    while (item := handler.try_recv()) is not None:
-        yield item
+def received(handler: Polled[T_co]) -> Iterable[T_co]:
+    """Items that wait in a handler, oldest first, without blocking. Nearly always there are none."""
+    first = handler.try_recv()
+    return () if first is None else chain((first,), iter(handler.try_recv, None))

@@ -198,7 +198,7 @@ class Telemetry:
                 body=state.notes[row] if state is not None and state.notes else "",
                 battery=battery if isfinite(battery) else None,
                 sent=counts.sent[row],
-                heard=int(self._neighbours.heard[row]),
+                heard=self._neighbours.heard[row],
                 lost={speaker.name: speaker.lost for speaker in mine},
                 dropped=self._dropped_of(row),
                 malformed=counts.malformed + self._neighbours.malformed,
