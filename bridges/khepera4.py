@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.body import BodyError, BodyRequest, BodyState, RangeScan, Rays
+from agents.body import UNANSWERED, BodyError, BodyRequest, BodyState, RangeScan, Rays
 from agents.positioning import External
 from agents.protocols import khepera4 as protocol
 from agents.protocols.settings import settings
@@ -80,15 +80,16 @@ class KheperaBody:
         now = time.monotonic()
         for link, (v, turn, _, _) in zip(self._links, setpoint.tolist(), strict=True):
             if math.isfinite(v + turn):
-                link.wanted = (v, turn, now)
+                link.drive(v, turn, now)
 
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Body.takeoff`: it stays on the ground."""
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
-        for row in rows.tolist():
-            self._links[row].wanted = (0.0, 0.0, time.monotonic())
+        now = time.monotonic()
+        for row in rows.tolist() if self._links else ():
+            self._links[row].halt(now)
 
     def stop(self, rows: Index) -> None:
         """See `Body.stop`."""
@@ -100,14 +101,21 @@ class KheperaBody:
 
     def close(self) -> None:
         """See `Body.close`."""
+        now = time.monotonic()
         for link in self._links:
-            link.wanted = (0.0, 0.0, time.monotonic())
-        for link in self._links:
+            link.halt(now)
             link.end()
+        for link in self._links:
+            link.join()
         self._links = []
 
     @staticmethod
     def _note(link: Link, now: float) -> str:
+        unanswered = UNANSWERED if link.unanswered(now) else ""
+        return "; ".join(part for part in (unanswered, KheperaBody._trouble(link, now)) if part)
+
+    @staticmethod
+    def _trouble(link: Link, now: float) -> str:
         if link.trouble and link.heard.stamp > -math.inf:
             return f"silent for {now - link.heard.stamp:.1f} s: {link.trouble}"
         return link.trouble or (f"battery at {link.battery:.0%}: it does not drive on" if link.exhausted else "")

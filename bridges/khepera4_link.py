@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from agents.body import BodyError
+from agents.body import TROUBLE, BodyError
 from agents.protocols import khepera4 as protocol
 from agents.rows import Array
 from bridges.odometry import Odometer
@@ -26,6 +26,10 @@ RETRY_S: Final = 0.5  # between the end of a connection and the next
 STOPS: Final = 3  # said when the link is let go
 RANGES_S: Final = 0.2
 BATTERY_S: Final = 5.0
+FAREWELL_S: Final = 3.0  # so long it is tried to stop a robot whose connection broke while it moved
+AGAIN_S: Final = 0.1  # between two such attempts
+STANDING: Final = 0.02  # [m/s] slower than this it stands
+ANSWER_S: Final = 2.5  # a robot that was told to halt and is not known to stand after this is worth a word
 FRESH_S: Final = 0.5  # a setpoint that is older is none: the wheels stop
 
 
@@ -272,6 +276,7 @@ class Link:
         scan: When the range sensors were read, their bearings and distances; None before.
         battery: Charge, 0 to 1, or NaN.
         wanted: v [m/s], ω [rad/s], and when they were given, monotonic [s].
+        halted: Since when it must stand, monotonic [s]; infinity if it need not.
         trouble: Why there is no connection, for people; empty if there is one.
     """
 
@@ -282,9 +287,12 @@ class Link:
         self.scan: tuple[float, Array, Array] | None = None
         self.battery = math.nan
         self.wanted = (0.0, 0.0, -math.inf)
+        self.halted = math.inf
         self.trouble = f"{address}: not connected yet"
         self._address, self._settings = address, chosen
         self._odometer = Odometer(*start)
+        self._stands = True  # as far as it was told, and that was answered
+        self._until = math.inf
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"{name} link", daemon=True)
 
@@ -292,10 +300,30 @@ class Link:
         """Connects, in the background and for ever."""
         self._thread.start()
 
+    def drive(self, v: float, turn: float, now: float) -> None:
+        """Must move at v [m/s], ω [rad/s] until told otherwise, or until nobody has said so for `FRESH_S`."""
+        if v or turn:
+            self.halted = math.inf
+        self.wanted = (v, turn, now)
+
+    def halt(self, now: float) -> None:
+        """Must stand."""
+        self.halted = min(self.halted, now)
+        self.wanted = (0.0, 0.0, now)
+
+    def unanswered(self, now: float) -> bool:
+        """Whether it was told to stand, and is not known to."""
+        return now - self.halted > ANSWER_S and not (self._stands and math.hypot(*self.heard.velocity) < STANDING)
+
     def end(self) -> None:
-        """Stops the wheels and lets go of the robot."""
+        """Has the thread stop the wheels and let go of the robot; `join` waits for it."""
+        self._until = time.monotonic() + FAREWELL_S
         self._ending.set()
-        self._thread.join()
+
+    def join(self) -> None:
+        """Waits until the robot was let go of."""
+        if self._thread.ident is not None:
+            self._thread.join()
 
     @property
     def exhausted(self) -> bool:
@@ -303,7 +331,7 @@ class Link:
         return self.battery < self._settings.low_battery
 
     def _run(self) -> None:
-        while not self._ending.is_set():
+        while not self._over:
             try:
                 wire = self._address.connect()
             except OSError as error:
@@ -311,14 +339,23 @@ class Link:
             else:
                 try:
                     self._converse(KTeam(wire, self._settings) if self._address.kteam else Park(wire, self._settings))
-                except OSError as error:
-                    self.trouble = f"{self._address}: {error.strerror or error}"
+                except TROUBLE as error:  # whatever it is, the wheels must stop
+                    why = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+                    self.trouble = f"{self._address}: {why or error}"
                     if isinstance(error, TimeoutError):
                         self.trouble += "; another program may hold it, or it speaks the other protocol"
                 finally:
                     wire.close()
                 self._odometer.reconnected()
-            self._ending.wait(RETRY_S)
+            if not self._ending.wait(RETRY_S):
+                continue
+            if not self._over:
+                time.sleep(AGAIN_S)
+
+    @property
+    def _over(self) -> bool:
+        """Whether it is let go of, which must not move then."""
+        return self._ending.is_set() and (self._stands or time.monotonic() > self._until)
 
     def _remedy(self, error: OSError) -> str:
         if self._address.serial:
@@ -332,12 +369,16 @@ class Link:
         driver.begin()
         driver.drive(0.0, 0.0)
         driver.move(self._odometer)  # before it moves: one that counts from zero has been switched on anew
+        self._stands = True
         period = 1.0 / self._settings.poll_hz
         ranges_due = battery_due = due = time.monotonic()
         while not self._ending.wait(max(0.0, due - time.monotonic())):
             due = max(due + period, time.monotonic())
-            driver.drive(*self._due_twist())
+            twist = self._due_twist()
+            self._stands = self._stands and not any(twist)
+            driver.drive(*twist)
             driver.move(self._odometer)
+            self._stands = not any(twist)
             now, at = time.monotonic(), self._odometer
             self.heard = Heard(now, at.x, at.y, at.yaw, at.velocity)
             self.trouble = ""
@@ -350,6 +391,7 @@ class Link:
                 self.battery = driver.battery()
         for _ in range(STOPS):
             driver.drive(0.0, 0.0)
+        self._stands = True
 
     def _due_twist(self) -> tuple[float, float]:
         v, turn, since = self.wanted

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from math import nan
 from typing import Final
 
@@ -11,7 +12,7 @@ import numpy as np
 import zenoh
 
 from agents import session as network
-from agents.body import Body, BodyError, BodyRequest, BodyState, Rays
+from agents.body import Body, BodyError, BodyRequest, BodyState, Rays, call_all
 from agents.endpoint import EndpointError
 from agents.leaving import leave
 from agents.positioning import External
@@ -23,7 +24,7 @@ from bridges.turtlebot3_robot import SILENCE_S, Robot
 OPEN_S: Final = 4.5  # from the first attempt to reach the router to odometry of every robot
 DIAGNOSIS_S: Final = 0.3  # how long `open` asks who else is there before it gives up
 POLL_S: Final = 0.01
-FAREWELL_S: Final = 0.5  # how long `close` waits for the robots to stand
+FAREWELL_S: Final = 3.0  # how long `close` waits for the robots to stand
 
 Clock = Callable[[], float]
 
@@ -160,8 +161,8 @@ class TurtleBot3:
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
         now = self._clock()
-        for row in rows.tolist() if self._sessions else ():
-            self._robots[row].halt(now)
+        if self._sessions:
+            call_all(partial(self._robots[row].halt, now) for row in rows.tolist())
 
     def stop(self, rows: Index) -> None:
         """See `Body.stop`."""
@@ -176,16 +177,17 @@ class TurtleBot3:
         if not self._sessions:
             return
         until = self._clock() + FAREWELL_S
-        for robot in self._robots:
-            robot.halt(self._clock())
-        while (now := self._clock()) < until:
-            for robot in self._robots:
-                robot.hear(robot.time, now)
-                robot.speak(now)
-            if all(robot.settled for robot in self._robots):
-                break
-            time.sleep(POLL_S)
-        self._close()
+        try:
+            self.stop(np.arange(len(self._robots)))
+            while (now := self._clock()) < until:
+                for robot in self._robots:
+                    robot.hear(robot.time, now)
+                call_all(partial(robot.speak, now) for robot in self._robots)
+                if all(robot.settled for robot in self._robots):
+                    break
+                time.sleep(POLL_S)
+        finally:
+            self._close()
 
     def _close(self) -> None:
         for session in self._sessions.values():

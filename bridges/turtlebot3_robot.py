@@ -14,7 +14,7 @@ import numpy as np
 import zenoh
 
 from agents import session as network
-from agents.body import BodyError, BodyRequest, RangeScan
+from agents.body import UNANSWERED, BodyError, BodyRequest, RangeScan
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
 from agents.protocols.settings import settings
@@ -24,6 +24,7 @@ SILENCE_S: Final = 0.5  # odometry older than this: the robot is out of reach an
 REPEAT_S: Final = 0.05  # commands are sent at least this often while the robot is to move,
 BETWEEN_S: Final = 0.02  # and at most this often when they change
 ZEROS: Final = 20  # so often a zero is repeated, and longer while odometry says that it moves
+ANSWER_S: Final = 2.5  # a robot that was told to halt and is not known to stand after this is worth a word
 BLOCKED_S: Final = 1.5  # a robot that was told to move for so long and did not has something in its way
 STANDING: Final = (0.005, 0.02)  # [m/s, rad/s] slower than this is standing
 FASTEST: Final = 0.5  # [m/s] odometry that jumps farther than this was started anew
@@ -66,6 +67,7 @@ class Robot:
         self._restarted = False
         self._wanted = self._sent = (0.0, 0.0)
         self._commanded = self._sent_at = self._moved = -np.inf
+        self._halted = np.inf  # since when it must stand
         self._zeros = ZEROS  # nothing to repeat: no robot is spoken to before it is commanded
         self._listeners: dict[str, tuple[str, str]] = {}
 
@@ -152,10 +154,13 @@ class Robot:
     def drive(self, v: float, w: float, now: float) -> None:
         """Must move at v [m/s], ω [rad/s] until told otherwise, or until nobody has commanded it for `SILENCE_S`."""
         self._commanded = now
+        if v or w:
+            self._halted = np.inf
         self._want((turtlebot3.whole(v, self._top[0]), turtlebot3.whole(w, self._top[1])), now)
 
     def halt(self, now: float) -> None:
         """Must stand; says so at once, and again."""
+        self._halted = min(self._halted, now)
         self._zeros = 0
         self._sent_at = -np.inf
         self._want((0.0, 0.0), now)
@@ -191,6 +196,10 @@ class Robot:
 
     def note(self, now: float, linked: bool) -> str:
         """What is wrong with it, for people; empty if nothing."""
+        unanswered = UNANSWERED if now - self._halted > ANSWER_S and not self.standing else ""
+        return "; ".join(part for part in (unanswered, self._trouble(now, linked)) if part)
+
+    def _trouble(self, now: float, linked: bool) -> str:
         if not linked:
             return "no router"
         if now - self.heard > SILENCE_S:

@@ -20,7 +20,7 @@ from agents.kinds import KHEPERA4
 from agents.protocols import khepera4 as protocol
 from bridges import khepera4
 from bridges.khepera4 import OPEN_S, open_khepera4
-from bridges.khepera4_link import Address
+from bridges.khepera4_link import Address, Heard, Link
 from bridges.odometry import Odometer
 from tests.twins.loopback import Served, reached, request
 from twins import khepera4 as twin
@@ -350,6 +350,51 @@ def test_park_never_gets_two_commands_at_once():
     assert reads[-3:] == ["stop"] * 3
     assert scan.distance == pytest.approx([0.37, np.nan, np.nan, 0.32, 1.07], nan_ok=True)
     assert scan.bearing[0] == pytest.approx(np.pi / 2)
+
+
+@pytest.mark.system
+def test_wheels_whose_link_breaks_at_the_end_are_stopped_over_another():
+    """A server that hangs up when it is told to stop, once."""
+    lives = []
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve():
+            while len(lives) < 2:
+                client, _ = listener.accept()
+                reads = []
+                lives.append(reads)
+                with client:
+                    while data := client.recv(255):
+                        reads.append(data.decode())
+                        if data == b"p":
+                            client.sendall(b"0.0,0.0,0.0")
+                        elif data == b"stop" and len(lives) == 1 and any(text[0] == "d" for text in reads):
+                            break
+
+        server = threading.Thread(target=serve, daemon=True)
+        server.start()
+        place = f"khepera4://127.0.0.1:{listener.getsockname()[1]}"
+        with opened(open_khepera4(request("khepera4", [place], device={"ranges": False}))) as body:
+            drive = Drive(body, np.array([[1.0, 0.0]]))
+            drive.until(lambda: any(text[0] == "d" for text in lives[0]))
+        server.join(2.0)
+    assert len(lives) == 2
+    assert lives[1][-1] == "stop"
+
+
+def test_a_stop_that_is_not_answered_is_said():
+    link = Link("KH01", Address.of("KH01", "khepera4://127.0.0.1"), protocol.Settings(), (0.0, 0.0, 0.0))
+    link.drive(0.2, 0.0, 100.0)
+    link.heard = Heard(100.0, 0.0, 0.0, 0.0, (0.2, 0.0))
+    link.halt(100.0)
+    link.halt(101.0)  # again, by the watchdog
+    assert not link.unanswered(102.0)
+    assert link.unanswered(103.0)
+    link.heard = Heard(103.0, 0.0, 0.0, 0.0, (0.0, 0.0))
+    assert not link.unanswered(103.0)
+    link.drive(0.2, 0.0, 104.0)
+    link.heard = Heard(110.0, 0.0, 0.0, 0.0, (0.2, 0.0))
+    assert not link.unanswered(110.0)
 
 
 @pytest.mark.system

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from zenoh.handlers import RingChannel
 
-from agents.body import BodyError
+from agents.body import UNANSWERED, BodyError
 from agents.kinds import KHEPERA4
 from agents.protocols import ros2, turtlebot3
 from agents.session import open_session
@@ -368,6 +368,36 @@ def test_a_silent_robot_gets_zeros_until_it_hears_them(hub, watchdog):
         stage.run(0.3)
         assert stage.moved(0.5)[0] == 0.0
         assert stage.moved(1.0, stage.constant(0.2))[0] > 0.1
+
+
+@pytest.mark.system
+def test_a_stop_that_is_not_answered_is_said(hub):
+    with Stage(request(hub.endpoint), faults=Faults(silent_from_s=2.0, silent_for_s=8.0)) as stage:
+        stage.body.open()
+        while stage.run(0.1, stage.constant(0.2)).notes[0] == "":
+            assert stage.t < 6.0
+        stage.body.stop(np.array([0]))
+        stage.run(1.0, stage.constant(0.0))
+        assert stage.state.notes[0].startswith("odometry silent")
+        while not stage.run(0.1).notes[0].startswith(f"{UNANSWERED}; odometry silent"):
+            assert stage.t < 9.0
+        while stage.run(0.1).notes[0]:
+            assert stage.t < 15.0
+        assert stage.moved(0.5)[0] == 0.0
+
+
+def test_one_that_cannot_be_told_keeps_nobody_from_being_stopped():
+    body = open_turtlebot3(request("tcp/127.0.0.1:1", start=((0.0, 0.0), (1.0, 0.0)), addresses=("rmw://a", "rmw://b")))
+    told = []
+
+    def fails(_now):
+        raise OSError("its session is closed")
+
+    body._robots[0].halt, body._robots[1].halt, body._sessions = fails, told.append, {(): None}
+    for what in (body.land, body.stop):
+        with pytest.raises(OSError, match="its session is closed"):
+            what(np.arange(2))
+    assert len(told) == 2
 
 
 TWIN = """
