@@ -31,6 +31,38 @@ class Keys:
         """Liveliness token."""
         return f"{self.realm}/{robot}/alive"
 
+    @staticmethod
+    def lives(alive: str) -> str:
+        """A liveliness key and all tokens below it: the lives and claims of its name."""
+        return f"{alive}/**"
+
+    @staticmethod
+    def life(alive: str, session: str) -> str:
+        """Token of the session that owns the name of a liveliness key: a new session is a new life."""
+        return f"{alive}/life/{session}"
+
+    @staticmethod
+    def rank(began: float, session: str) -> str:
+        """Order of claims: the earlier start [s, UTC] first, then the smaller session."""
+        return f"{round(began * 1e6):020d}/{session}"
+
+    @staticmethod
+    def claim(alive: str, rank: str) -> str:
+        """Token of a claim to the name of a liveliness key."""
+        return f"{alive}/claim/{rank}"
+
+    @staticmethod
+    def rank_of(alive: str, token: str) -> str | None:
+        """The `rank` in the token of a claim; None of any other token."""
+        begin = Keys.claim(alive, "")
+        return token.removeprefix(begin) if token.startswith(begin) else None
+
+    @staticmethod
+    def life_of(token: str) -> str | None:
+        """The session in the token of a life; None of any other token."""
+        before, _, session = token.rpartition("/")
+        return session if before.endswith("/life") else None
+
     def position(self, robot: str) -> str:
         """Pose of this robot, measured from outside (motion capture, a twin service)."""
         return f"{self.realm}/{robot}/position"

@@ -28,6 +28,7 @@ from agents.goals import HeardGoals
 from agents.leaving import leave
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
+from agents.naming import NameTaken, claim
 from agents.neighbours import Neighbours
 from agents.orders import LAND, STOP, carry_out
 from agents.process import told_to_end
@@ -43,10 +44,6 @@ FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its laun
 STOPPED_S: Final = 5.0  # a body that does not say that its motors stand is told so long, and then left
 HUSH_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
 DOUBT_S: Final = 1.0  # a robot whose process stood still holds for so long: what it knows is old
-
-
-class NameTaken(RuntimeError):
-    """A robot of the same name is on the network already."""
 
 
 class Runtime:
@@ -71,7 +68,11 @@ class Runtime:
         self._utc = self._now = self._next = 0.0
         self._reach = plausibility.reach_of(assignment.limits.low, assignment.limits.high)
         self._everyone = np.arange(len(self._names))
-        self._tokens: dict[int, zenoh.LivelinessToken] = {}
+        self._began = setup.clock.utc()
+        self._owned: list[zenoh.LivelinessToken] = []
+        self._tokens: dict[int, zenoh.LivelinessToken] = {}  # of rows on which neighbours count
+        self._tokens_lock = threading.Lock()  # the watchdog's alarm takes them back from another thread
+        self._coming_down = False  # for good: the loop is over
         self._watchdog = Watchdog(body, self._everyone, alarm=self._call_for_help, silence_s=setup.loop_silence_s)
 
     def run(self) -> int:
@@ -79,6 +80,7 @@ class Runtime:
 
         Raises:
             BodyError: If the body cannot be opened.
+            NameTaken: If another process owns the name of a robot.
             network.Unreachable: If no router answers.
         """
         lost = threading.Event()
@@ -98,7 +100,7 @@ class Runtime:
                 rights=self._setup.rights,
             )
             out.callback(leave, session, self)
-            self._refuse_doubles(session)
+            self._take_names(session, asked)
             self._body.open()
             out.callback(self._body.close)
             out.callback(self._watchdog.end)
@@ -115,6 +117,7 @@ class Runtime:
 
     def _come_down(self) -> None:
         """Lands what is still in the air, because something broke on the way, before the motors are switched off."""
+        self._coming_down = True
         self._watchdog.start()
         failures: list[Exception] = []
         if self._in_the_air(failures) and (self.agent.life.phase < Phase.DONE).any():  # else it was stopped
@@ -157,18 +160,23 @@ class Runtime:
 
     # ------------------------------------------------------------------ the network
 
-    def _refuse_doubles(self, session: zenoh.Session) -> None:
-        """Two robots of one name would speak with one voice.
+    def _take_names(self, session: zenoh.Session, stop: threading.Event) -> None:
+        """Takes the ownership of the robots' names, before any body is touched.
 
         Raises:
-            NameTaken: If one is on the network already. One that was killed is given the time until that is noticed.
+            NameTaken: If another process owns one of them.
+            network.Unreachable: If no router answers who does.
         """
-        taken = [name for name in self._names if network.taken(session, self._setup.keys.alive(name))]
-        if taken:
+        keys, setup = self._setup.keys, self._setup
+        tokens = [keys.alive(name) for name in self._names]
+        try:
+            self._owned = claim(session, tokens, began=self._began, endpoints=setup.endpoints, stop=stop)
+        except NameTaken as taken:
+            names = ", ".join(keys.whose(token) or token for token in str(taken).split(", "))
             raise NameTaken(
-                f"{', '.join(taken)}: a robot of this name is on the network already; end it first "
+                f"{names}: a robot of this name is on the network already; end it first "
                 "(`zenpark keys` shows who is there), or choose another router with --connect"
-            )
+            ) from None
 
     def _join(self, session: zenoh.Session) -> None:
         keys, names = self._setup.keys, self._names
@@ -210,19 +218,21 @@ class Runtime:
 
     def _be_there(self) -> None:
         """Neighbours count on these robots from now on."""
-        keys = self._setup.keys
-        self._tokens = {
-            row: network.alive_token(self._session, keys.alive(name))
-            for row, name in enumerate(self._names)
-            if row not in self._retired
-        }
+        with self._tokens_lock:
+            for row, name in enumerate(self._names):
+                if row not in self._retired and row not in self._tokens:
+                    self._tokens[row] = network.alive_token(self._session, self._setup.keys.alive(name))
 
     def _call_for_help(self, why: str) -> None:
         """From a thread of the watchdog's: neighbours must not count on robots whose loop hangs, or is over."""
         print(f"{', '.join(self._names)}: {why}; landing it", flush=True)
         if self._joined:
             self._telemetry.alarm(why, self._setup.clock.utc())
-            for token in list(self._tokens.values()):
+            with self._tokens_lock:
+                # tokens of a loop that has recovered meanwhile stay
+                hangs = self._coming_down or bool(self._watchdog.tripped)
+                tokens = [self._tokens.pop(row) for row in list(self._tokens)] if hangs else []
+            for token in tokens:
                 token.undeclare()  # type: ignore[no-untyped-call]
 
     def _recover(self, why: str) -> None:
@@ -415,10 +425,13 @@ class Runtime:
             unasked = during[row] and not life.reason[row].startswith((wire.EMERGENCY, LAND, STOP))
             if (unasked or row in self._leaving) and row not in self._retired:
                 self._retired.add(row)
-                self._tokens.pop(row).undeclare()  # type: ignore[no-untyped-call]
-        for row in [row for row in self._retired if not (during[row] or row in self._leaving)]:
-            self._retired.remove(row)
-            self._tokens[row] = network.alive_token(self._session, self._setup.keys.alive(self._names[row]))
+                with self._tokens_lock:
+                    token = self._tokens.pop(row, None)
+                if token is not None:  # else the watchdog has taken it back
+                    token.undeclare()  # type: ignore[no-untyped-call]
+        if back := [row for row in self._retired if not (during[row] or row in self._leaving)]:
+            self._retired.difference_update(back)
+            self._be_there()
 
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""

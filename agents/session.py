@@ -32,7 +32,7 @@ from zenoh.handlers import Callback, Handler, RingChannel
 from agents import access, lab, topology, wire
 from agents.endpoint import EndpointError
 from agents.promptness import prompt_threads
-from agents.settings import LEASE_S, config, reason, settings
+from agents.settings import ASK_S, LEASE_S, config, reason, settings
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -40,7 +40,6 @@ RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `c
 GATHER_S: Final = 1.0
 LINK_S: Final = 0.01
 FREED_S: Final = 3.0  # so long may an endpoint of a mesh stay taken by a robot that is started again
-GHOST_S: Final = 2.5  # so long may the token of somebody who hangs stand after his end
 ROBOT_LEASE_S: Final = 1.2  # of robots: neighbours of one that hangs must know within 1.5 s
 HEARTBEAT_S: Final = 0.5  # how long the loss of the last pose before a silence goes unnoticed
 POSES: Final = 16  # of one robot that wait to be polled
@@ -383,14 +382,14 @@ def alive_token(session: zenoh.Session, key: str) -> zenoh.LivelinessToken:
     return session.liveliness().declare_token(key)
 
 
-def taken(session: zenoh.Session, key: str) -> bool:
-    """Whether somebody else holds this liveliness token; one who was killed is given the time until that is noticed."""
-    deadline = time.monotonic() + GHOST_S
-    while list(session.liveliness().get(key, timeout=1.0)):
-        if time.monotonic() > deadline:
-            return True
-        time.sleep(RETRY_S)
-    return False
+def here(session: zenoh.Session, keyexpr: str, wait_s: float = ASK_S) -> set[str] | None:
+    """Liveliness tokens that match; None if the question was not answered within `wait_s`."""
+    found = set()
+    for reply in session.liveliness().get(keyexpr, timeout=wait_s):
+        if reply.ok is None:
+            return None
+        found.add(str(reply.ok.key_expr))
+    return found
 
 
 class AliveWatch:

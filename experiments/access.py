@@ -68,7 +68,13 @@ def _rights(experiment: Experiment) -> Rights:
             hear=[*told, *map(keys.pose, others), keys.estop, keys.experiment, *foreign],
             answer=own,
             be=[*own, *tokens],
-            watch=[*own, *map(keys.alive, others), keys.conductor, *([keys.centre_alive] if led else []), *tokens],
+            watch=[
+                *own,
+                *(keys.lives(keys.alive(other)) for other in others),
+                keys.conductor,
+                *([keys.lives(keys.centre_alive)] if led else []),
+                *tokens,
+            ],
         )
         robots |= dict.fromkeys(group, grant)
     network = experiment.network
@@ -104,7 +110,7 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
             hear=[keys.setpoint("*"), keys.status("*"), keys.state("*"), keys.estop],
             answer=[keys.world_order],
             be=[keys.below("world")],
-            watch=[keys.alive("*"), keys.below("world")],
+            watch=[keys.lives(keys.alive("*")), keys.below("world")],
         ),
         "positioning": Grant(say=_each(located, keys.position), watch=_each(measured, keys.alive)),
         "twin": Grant(
@@ -116,8 +122,8 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
         "centre": Grant(
             say=[keys.centre, *goals],
             hear=[keys.pose("*"), keys.status("*")],
-            be=[keys.centre_alive],
-            watch=[keys.alive("*"), keys.centre_alive],
+            be=[keys.lives(keys.centre_alive)],
+            watch=[keys.lives(keys.alive("*")), keys.lives(keys.centre_alive)],
         ),
         "ros2": Grant(
             say=[*goals, *foreign],

@@ -30,6 +30,7 @@ from agents.keys import Keys
 from agents.leaving import end, held
 from agents.lifecycle import IDLE, Phase
 from agents.lifeline import Lifeline
+from agents.naming import NameTaken, claim
 from agents.plausibility import reach_of
 from agents.process import told_to_end
 from agents.rows import Index
@@ -224,6 +225,7 @@ def serve(
         CentreTaken: If a centre is on the network already.
         Unreachable: If no router answers.
     """
+    began = time.time()
     read = document.read(file)
     experiment = chosen_case(read, case)
     steered = guided(experiment)
@@ -238,11 +240,13 @@ def serve(
         opened = network.open_session(endpoints, name="centre", stop=over, rights=mesh.rights(experiment, endpoints))
         with held(opened) as (session, declared):
             keys = Keys(experiment.network.realm)
-            if network.taken(session, keys.centre_alive):
+            try:
+                declared.append(claim(session, [keys.centre_alive], began=began, endpoints=endpoints, stop=over))
+            except NameTaken:
                 raise CentreTaken(
                     f"a centre guides the robots of the realm '{keys.realm}' already: end it first, choose another "
                     "router with --connect, or another network.realm in the experiment file"
-                )
+                ) from None
             process = CentreProcess(experiment, session, keys)
             declared.append(process)
             heard = [name for name in experiment.robots if name not in steered]

@@ -25,7 +25,8 @@ from agents.fleet import assemble
 from agents.keys import Keys
 from agents.lab import LabError
 from agents.leaving import end
-from agents.runtime import NameTaken, Runtime
+from agents.naming import NameTaken
+from agents.runtime import Runtime
 from agents.session import Unreachable
 from agents.setup import Ranging, Setup
 from agents.shadow import shadowed

@@ -26,6 +26,7 @@ from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.leaving import end, held
 from agents.lifeline import Lifeline
+from agents.naming import NameTaken, claim
 from agents.process import told_to_end
 from experiments import document, mesh
 from experiments.assign import WORLD
@@ -226,6 +227,7 @@ def serve(
         WorldTaken: If a world is on the network already.
         Unreachable: If no router answers.
     """
+    began = time.time()
     read = document.read(file)
     experiment = chosen_case(read, case)
     robots = experiment.robots.values()
@@ -248,11 +250,13 @@ def serve(
         opened = network.open_session(endpoints, name="world", stop=lost, rights=mesh.rights(experiment, endpoints))
         with held(opened) as (session, declared):
             keys = Keys(experiment.network.realm)
-            if network.taken(session, keys.world_alive):
+            try:
+                declared.append(claim(session, [keys.world_alive], began=began, endpoints=endpoints, stop=lost))
+            except NameTaken:
                 raise WorldTaken(
                     f"a world runs in the realm '{keys.realm}' already: end it first, choose another router with "
                     "--connect, or another network.realm in the experiment file"
-                )
+                ) from None
             # before anything watches those tokens: a session that has begun to watch answers from what it has heard
             there = _alive(session, keys)
             world = WorldProcess(experiment, population, session, lost)

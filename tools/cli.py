@@ -30,7 +30,7 @@ EXPLAINED: Final = (
     ("agents.lab", "LabError"),
     ("agents.session", "Unreachable"),
     ("agents.body", "BodyError"),
-    ("agents.runtime", "NameTaken"),
+    ("agents.naming", "NameTaken"),
     ("agents.plugins", "PluginError"),
     ("experiments.problem", "DocumentError"),
     ("experiments.records", "RecordingError"),

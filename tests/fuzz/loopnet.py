@@ -25,7 +25,7 @@ class Payload:
 
 
 class Sample:
-    timestamp = attachment = None
+    timestamp = attachment = source_info = None
 
     def __init__(self, key: str, mime: str, data: bytes, *, gone: bool = False) -> None:
         self.key_expr, self.encoding, self.payload = key, mime, Payload(data)

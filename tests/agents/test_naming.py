@@ -1,0 +1,243 @@
+"""Exactly one process owns a name, whatever the order in which several claim it."""
+
+from __future__ import annotations
+
+import random
+import signal
+import threading
+from typing import ClassVar
+
+import pytest
+
+from agents import naming
+from agents import session as network
+from agents.keys import Keys
+from agents.naming import NameTaken, claim
+from agents.runtime import Runtime
+from agents.setup import Setup
+from experiments import assign
+from experiments.experiment import Formation, Robot
+from tests.agents.few import pair
+from tests.agents.test_way_out import Airborne
+from tests.conftest import RouterProcess
+from tests.fuzz.loopnet import Net, Reply, Sample
+
+KEY = Keys().alive("CF01")
+
+
+class Table:
+    """A router's tokens. Each step of a process waits for its turn, and the turns are drawn by chance."""
+
+    def __init__(self, seed: int) -> None:
+        self.tokens: list[str] = []
+        self.answers = True
+        self._chance = random.Random(seed)
+        self._turn = threading.Condition()
+        self._waiting: set[str] = set()
+        self._running: set[str] = set()
+        self._next: str | None = None
+        self.now = 0.0
+
+    def step(self, who: str) -> None:
+        """Waits for the turn of a process."""
+        with self._turn:
+            self._waiting.add(who)
+            self._draw()
+            self._turn.wait_for(lambda: self._next == who, 10.0)
+            self._next = None
+            self._waiting.discard(who)
+            self.now += 0.02
+
+    def _draw(self) -> None:
+        if self._next is None and self._waiting == self._running and self._waiting:
+            self._next = self._chance.choice(sorted(self._waiting))
+            self._turn.notify_all()
+
+    def run(self, starts: dict[str, float]) -> dict[str, object]:
+        """The outcome of the claims of some sessions, by their starts."""
+        self._running = set(starts)
+        results: dict[str, object] = {}
+
+        def work(who: str, began: float) -> None:
+            try:
+                results[who] = claim(Session(self, who), [KEY], began=began)
+            except NameTaken as taken:
+                results[who] = taken
+            with self._turn:
+                self._running.discard(who)
+                self._draw()
+
+        threads = [threading.Thread(target=work, args=each) for each in starts.items()]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        return results
+
+
+class Token:
+    def __init__(self, session: Session, key: str) -> None:
+        self.session, self.key = session, key
+
+    def undeclare(self) -> None:
+        self.session.table.step(self.session.who)
+        self.session.table.tokens.remove(self.key)
+
+
+class Session:
+    def __init__(self, table: Table, who: str) -> None:
+        self.table, self.who = table, who
+
+    def zid(self) -> str:
+        return self.who
+
+
+@pytest.fixture
+def faked(monkeypatch):
+    """Makes `naming` use a table in place of a network, and its clock."""
+
+    def fake(table: Table) -> Table:
+        def declared(session: Session, key: str) -> Token:
+            table.step(session.who)
+            table.tokens.append(key)
+            return Token(session, key)
+
+        def here(session: Session, _key: str) -> set[str] | None:
+            table.step(session.who)
+            return set(table.tokens) if table.answers else None
+
+        monkeypatch.setattr(network, "alive_token", declared)
+        monkeypatch.setattr(network, "here", here)
+        monkeypatch.setattr(network, "connected", lambda _session: True)
+        monkeypatch.setattr(naming.time, "monotonic", lambda: table.now)
+        monkeypatch.setattr(network, "RETRY_S", 0.0)
+        return table
+
+    return fake
+
+
+@pytest.mark.parametrize("seed", range(120))
+def test_of_several_that_claim_a_name_together_exactly_one_owns_it(seed, faked):
+    starts = {"a": 1.0, "b": 2.0, "c": 2.0}
+    results = faked(Table(seed)).run({who: starts[who] for who in ("a", "b", "c")[: 2 + seed % 2]})
+    assert sorted(isinstance(result, list) for result in results.values()) == [False] * (len(results) - 1) + [True]
+
+
+def test_an_owner_keeps_its_name_although_its_clock_is_ahead(faked):
+    table = faked(Table(0))
+    first = table.run({"owner": 100.0})
+    assert isinstance(first["owner"], list)
+    assert isinstance(table.run({"later": 1.0})["later"], NameTaken)
+    assert Keys.life(KEY, "owner") in table.tokens
+    assert not any("later" in token for token in table.tokens)  # it leaves nothing behind
+
+
+def test_the_name_of_a_dead_owner_is_free_once_its_tokens_are_gone(faked, monkeypatch):
+    table = faked(Table(0))
+    table.run({"dead": 1.0})
+    step = table.step
+
+    def vanish(who: str) -> None:
+        step(who)
+        if table.now > 1.0:
+            table.tokens = [token for token in table.tokens if "dead" not in token]
+
+    monkeypatch.setattr(table, "step", vanish)
+    assert isinstance(table.run({"next": 2.0})["next"], list)
+
+
+def test_a_robot_of_another_make_that_shows_its_plain_token_keeps_its_name(faked):
+    table = faked(Table(0))
+    table.tokens.append(KEY)
+    assert isinstance(table.run({"next": 2.0})["next"], NameTaken)
+
+
+def test_the_silence_of_a_router_is_not_taken_for_a_free_name(faked):
+    table = faked(Table(0))
+    table.answers = False
+    table._running = {"a"}
+    with pytest.raises(network.Unreachable, match="no router answers who owns the name"):
+        claim(Session(table, "a"), [KEY], began=1.0)
+
+
+@pytest.mark.parametrize(
+    ("reply", "error"),
+    [
+        (Reply(Sample(Keys().alive("F"), "", b""), good=True), NameTaken),
+        (Reply(Sample("", "", b"Timeout"), good=False), network.Unreachable),
+    ],
+)
+def test_a_process_without_its_name_touches_no_body(reply, error, monkeypatch):
+    monkeypatch.setattr(naming, "GHOST_S", 0.0)
+    monkeypatch.setattr(naming, "ANSWER_S", 0.0)
+    experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
+    body = Airborne()
+    with Net().worn() as net:
+        net.replies = [reply]
+        robot = Runtime(assign.assign(experiment, ("F",)), body, setup)
+        with pytest.raises(error):
+            robot.run()
+    assert body.calls == []
+
+
+class CountedToken:
+    """A liveliness token that may be undeclared once, as Zenoh's."""
+
+    live: ClassVar[list[str]] = []
+
+    def __init__(self, _session: object, key: str) -> None:
+        self.key = key
+        self.live.append(key)
+
+    def undeclare(self) -> None:
+        self.live.remove(self.key)
+
+
+def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_is_undeclared_twice(monkeypatch):
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False, False])
+    with Net().worn() as net, monkeypatch.context() as patched:
+        patched.setattr(network, "alive_token", CountedToken)
+        robot = Runtime(assign.assign(pair(), ("A", "B")), Airborne(), setup)
+        robot._join(net.session)
+        robot._joined = True
+        shown = [Keys().alive("A"), Keys().alive("B")]
+        assert CountedToken.live == shown
+        robot._watchdog.tripped = "it hangs"
+        robot._call_for_help("it hangs")
+        robot._call_for_help("it hangs")
+        assert CountedToken.live == []
+        robot._recover(robot._watchdog.forgive())
+        assert CountedToken.live == shown
+        robot._call_for_help("it hung")  # by a thread that was held up until the loop had recovered
+        assert CountedToken.live == shown
+        robot._recover("it hung")
+        assert CountedToken.live == shown
+        robot._leaving.add(0)
+        robot.agent.life.land(0, "told to leave")
+        robot._watchdog.tripped = "it hangs"
+        robot._call_for_help("it hangs")
+        robot._retire(0.0)  # of a row whose token the alarm has taken back
+        robot._recover(robot._watchdog.forgive())
+        assert CountedToken.live == shown[1:]
+
+
+@pytest.mark.system
+def test_a_real_router_knows_who_owns_a_name_and_a_frozen_one_says_nothing(router: RouterProcess, monkeypatch):
+    monkeypatch.setattr(naming, "ANSWER_S", 0.5)
+    with (
+        network.open_session([router.endpoint], name="one") as one,
+        network.open_session([router.endpoint], name="two") as two,
+    ):
+        owned = claim(one, [KEY], began=2.0)
+        monkeypatch.setattr(naming, "GHOST_S", 0.0)
+        with pytest.raises(NameTaken):
+            claim(two, [KEY], began=1.0)
+        for token in owned:
+            token.undeclare()
+        router.process.send_signal(signal.SIGSTOP)
+        try:
+            with pytest.raises(network.Unreachable):
+                claim(two, [KEY], began=1.0)
+        finally:
+            router.process.send_signal(signal.SIGCONT)
