@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -98,6 +99,16 @@ class Mute:
 
     def __exit__(self, *_: object) -> None:
         pass
+
+
+class Attentive:
+    """A router that always answers."""
+
+    def __init__(self, *_: object) -> None: ...
+
+    @staticmethod
+    def silent_since(_t: float) -> float:
+        return math.inf
 
 
 class Session:
@@ -205,6 +216,7 @@ class Net:
             "last_value": mute,
             "alive_token": mute,
             "connected": lambda _session: True,
+            "RouterWatch": Attentive,
             "open_session": lambda *_, **__: self.session,
         }
         with mock.patch.multiple("agents.session", **made):
