@@ -16,8 +16,8 @@ from agents.keys import Keys
 from agents.protocols import turtlebot3
 from agents.protocols.settings import settings
 from experiments import assign
+from experiments.assign import VICON_TWIN
 from experiments.experiment import Experiment, Robot
-from experiments.standins import VICON_TWIN
 
 FAR: Final = ("external", assign.WORLD)  # bodies whose poses come from the process that carries them
 MANY: Final = 16  # who hears so many, and all there are, hears "*": a router reads N² keys for minutes
@@ -86,7 +86,7 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
     names = experiment.robots
     far = [name for name, robot in names.items() if robot.body in FAR]
     ranged = [name for name, robot in names.items() if robot.body in FAR or robot.ranges == assign.WORLD]
-    located = [name for name, robot in names.items() if robot.position == "external" and robot.body != assign.WORLD]
+    located = assign.measured(experiment)
     twins = [name for name, robot in names.items() if robot.body in plugins.names(plugins.DEVICES)]
     measured = sorted({*located, *twins})
     goals = _each(assign.guided(experiment), keys.goal)

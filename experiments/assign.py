@@ -30,6 +30,7 @@ from twins.world import World
 TRIES: Final = 200  # places that are drawn for a robot before it stays where the file puts it
 CLEAR: Final = 0.02  # [m] between robots that are scattered
 WORLD: Final = "world"  # the body of a robot that lives in the twin service
+VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
 
 
 def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
@@ -40,6 +41,20 @@ def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
 def all_links(experiment: Experiment) -> Links:
     """Every link that the formation may have, with the targets of the beginning; rows in the order of the file."""
     return Pattern.of(experiment, tuple(experiment.robots)).links
+
+
+def measured(experiment: Experiment) -> list[str]:
+    """Robots whose positions motion capture says.
+
+    Where robots of the world are, the world itself says, as two that did would contradict each other; but a simulated
+    motion capture sees them, and then the world leaves it to that.
+    """
+    simulated = experiment.positioning == VICON_TWIN
+    return [
+        name
+        for name, robot in experiment.robots.items()
+        if robot.position == "external" and (simulated or robot.body != WORLD)
+    ]
 
 
 def guided(experiment: Experiment) -> tuple[str, ...]:

@@ -39,10 +39,9 @@ def run(
 
 
 def again(faults: Sequence[Fault]) -> list[Round]:
-    """Faults that had no time, in rounds of their own."""
+    """Faults that had no time, in rounds of their own: those that need a stage of their own on that."""
     rounds = []
-    for several in (False, True):
-        chosen = [fault for fault in faults if (fault.kind == "failover") == several]
-        if chosen:
-            rounds.append(Round(sorted(chosen, key=lambda fault: fault.kind == "conductor"), 2 if several else 1))
+    for stage in dict.fromkeys(fault.nature.stage for fault in faults):
+        chosen = [fault for fault in faults if fault.nature.stage == stage]
+        rounds.append(Round(sorted(chosen, key=lambda fault: fault.kind == "conductor"), stage))
     return rounds

@@ -21,18 +21,22 @@ class Eyes:
     """Looks, and keeps what was said last.
 
     Attributes:
+        session: Of the laboratory.
+        keys: Of the realm.
         invariants: Fed with where robots really are.
         status: The last of each robot, and `heard` when it came (monotonic [s]).
         heard: See `status`.
         alive: Whose token stands.
         truth: When the true place of each robot was last heard (monotonic [s]).
         told: The last command to each body, and when it came.
+        orders: Commands to bodies that were not to drive, since whoever reads it emptied it.
+        listened: When a listener last said that it heard a speaker (monotonic [s]), by both.
         wrong: Violations that have been seen since the last `judge`.
         connected: Whether a router is there.
     """
 
     def __init__(self, session: zenoh.Session, experiment: Experiment) -> None:
-        keys = self._keys = Keys(experiment.network.realm)
+        keys = self.keys = Keys(experiment.network.realm)
         self._session = session
         self.session = session
         self.invariants = Invariants(experiment)
@@ -47,6 +51,8 @@ class Eyes:
         self.alive: set[str] = set()
         self.truth: dict[str, float] = {}
         self.told: dict[str, tuple[wire.Command, float]] = {}
+        self.orders: list[wire.Command] = []
+        self.listened: dict[tuple[str, str], float] = {}
         self.wrong: list[str] = []
         self.connected = True
 
@@ -54,17 +60,20 @@ class Eyes:
         """Takes in what was said since the last look."""
         now, names = time.monotonic(), self.invariants.names
         self.connected = network.connected(self._session)
-        for status in by_robots(self._statuses.handler, wire.Status, keys=self._keys, robots=names):
+        for status in by_robots(self._statuses.handler, wire.Status, keys=self.keys, robots=names):
             self.status[status.robot], self.heard[status.robot] = status, now
-        for truth in by_robots(self._truths.handler, wire.Position, keys=self._keys, robots=names):
+        for truth in by_robots(self._truths.handler, wire.Position, keys=self.keys, robots=names):
             self.invariants.place(truth.robot, truth.position)
             self.truth[truth.robot] = now
-        for state in by_robots(self._states.handler, wire.State, keys=self._keys, robots=names):
+        for state in by_robots(self._states.handler, wire.State, keys=self.keys, robots=names):
+            self.listened |= {(state.robot, heard.speaker): now for heard in state.heard}
             if state.true_position is not None:
                 self.invariants.place(state.robot, state.true_position)
                 self.truth[state.robot] = now
-        for command in by_robots(self._commands.handler, wire.Command, keys=self._keys, robots=names):
+        for command in by_robots(self._commands.handler, wire.Command, keys=self.keys, robots=names):
             self.told[command.robot] = command, now
+            if command.action != "drive":
+                self.orders.append(command)
             if insane := self.invariants.insane(command):
                 self.wrong.append(insane)
         for sample in network.received(self._contacts.handler):
@@ -73,7 +82,7 @@ class Eyes:
                 if sample.kind == zenoh.SampleKind.PUT:
                     self.wrong.append(f"{contact.first} and {contact.second} touched")
         for sample in network.received(self._watch.handler):
-            name = self._keys.whose(str(sample.key_expr))
+            name = self.keys.whose(str(sample.key_expr))
             if name is not None:
                 (self.alive.discard if sample.kind == zenoh.SampleKind.DELETE else self.alive.add)(name)
         self.wrong += self.invariants.violations()

@@ -25,14 +25,15 @@ import numpy as np
 from agents import session as network
 from agents import wire
 from agents.endpoint import free_endpoint
-from agents.keys import Keys
+from agents.kinds import KINDS
 from agents.rows import Array
 from experiments.cables import Cables
 from experiments.chaos_eyes import Eyes
 from experiments.chaos_outcome import Ended, Outcome, line, misrecorded
 from experiments.experiment import Experiment
 from experiments.fault_script import Fault, Round
-from experiments.injection import Injector, WallClock
+from experiments.faulty import Switch
+from experiments.injection import Injector
 from experiments.launcher import Launcher
 from experiments.links import one_way_links
 from experiments.watched import Watched
@@ -49,7 +50,11 @@ FEWEST: Final = 3  # running robots with which a round goes on
 LATEST_S: Final = 4.0  # before the end no fault is begun that could not heal
 LEAD_S: Final = 1.0  # the start is announced not longer before
 CABLES: Final = "cables.json"
+SWITCHES: Final = "switches"
+LEASE_S: Final = 60.0  # of a patient router, as ROS 2 sets it
+NOTICED_S: Final = 1.0  # a robot that hears no router holds `link_silence_s` and so much later
 SAYS: Final = {"router": "router", "failover": "router", "disk": "recorder"}  # who ends, and is said to
+REFUSED: Final = 2  # exit code of a process whose name is taken
 LANDED_S: Final = 40.0  # after the launcher's death or the end everything is gone
 LAST_BREATH_S: Final = 5.0  # from when a process cannot be found any more to when its exit code is known
 END_S: Final = 60.0  # and no round takes longer than this after its time
@@ -93,7 +98,16 @@ class _Running:
     lifted: float | None = None
     well_since: float | None = None
     held_at: Array | None = None
+    utc: float = field(default_factory=time.time)
+    there: set[str] = field(default_factory=set)  # who was under way before
+    told: dict[str, int] = field(default_factory=dict)  # the last incident of each robot before
+    restarted: float | None = None
     violations: list[str] = field(default_factory=list)
+
+    def deplore(self, text: str) -> None:
+        """What must not happen, once."""
+        if text not in self.violations:
+            self.violations.append(text)
 
 
 class Flight:
@@ -111,6 +125,7 @@ class Flight:
         self._wrong: list[str] = []
         self._events: list[wire.Event] = []
         self._dead: dict[str, float] = {}  # killed by us, and when
+        self._off: set[str] = set()  # robots whose clock is not that of the others
         self._conductor_dead = self._disk_full = False
         self._now: _Running | None = None
         self._started: float | None = None
@@ -129,17 +144,23 @@ class Flight:
         random = np.random.default_rng([setting.seed, self._number])
         experiment = setting.experiment
         groups = {name: robot.process or name for name, robot in experiment.robots.items()}
-        routers = [free_endpoint(preferred_port=0) for _ in range(self._script.routers)]
+        stage = self._script.stage
+        routers = [free_endpoint(preferred_port=0) for _ in range(2 if stage == "two routers" else 1)]
         recording = folder / f"{setting.case}.mcap"
         with ExitStack() as stack:
-            clock = WallClock(folder)
-            stack.callback(clock.close)
+            switches = folder / SWITCHES
+            switches.mkdir()
+            Switch(switches / "lease").write(LEASE_S if stage == "patient router" else 0.0)
             cables = stack.enter_context(Cables(random))
             laid = {group: {end: cables.lay(group, end) for end in routers} for group in dict.fromkeys(groups.values())}
             (folder / CABLES).write_bytes(msgspec.json.encode(laid))
             launcher = stack.enter_context(Launcher(folder / "logs"))
             own = [*setting.changes, f"network.listen={json.dumps(routers)}"]
             own.append(f"network.routers={len(routers)}")
+            if stage == "motion capture":
+                flying = [name for name, robot in experiment.robots.items() if KINDS[robot.kind].flies]
+                own += [f'robots.{name}.position="external"' for name in flying or experiment.robots]
+                own.append('positioning="vicon-twin"')
             watched = Watched(
                 launcher,
                 setting.file,
@@ -147,16 +168,16 @@ class Flight:
                 cases=[setting.case],
                 changes=own,
                 bodies=setting.bodies,
-                environment=clock.environment,
                 cables=folder / CABLES,
+                switches=switches,
             )
             stack.callback(self._sweep, watched)
-            injector = Injector(watched, cables, clock, random, groups=groups, recording=recording)
+            injector = Injector(watched, launcher, cables, switches, random, groups=groups, recording=recording)
             nearest, missed = math.inf, 0.0
             try:
                 with network.open_session(routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
                     eyes = Eyes(session, experiment)
-                    self._follow(watched, injector, eyes, Keys(experiment.network.realm))
+                    self._follow(watched, injector, eyes)
                     nearest, missed = eyes.invariants.nearest, self._missed(eyes)
             except network.Unreachable as error:
                 self._wrong.append(f"it never began: {error}; {watched.process.tail()}")
@@ -173,7 +194,7 @@ class Flight:
 
     # ------------------------------------------------------------------ the run
 
-    def _follow(self, watched: Watched, injector: Injector, eyes: Eyes, keys: Keys) -> None:
+    def _follow(self, watched: Watched, injector: Injector, eyes: Eyes) -> None:
         """Until the script is through, or the run ends."""
         duration = self._setting.experiment.duration_s
         began = time.monotonic()
@@ -195,7 +216,7 @@ class Flight:
             self._judge(eyes, now)
             if self._now is not None:
                 self._heal(self._now, injector, eyes, t, now)
-            elif self._through(t, duration) or not self._next(injector, eyes, keys, t, now):
+            elif self._through(t, duration) or not self._next(injector, eyes, t, now):
                 return
             if t > duration + END_S:
                 self._wrong.append(f"it does not end {END_S:g} s after its time")
@@ -203,7 +224,10 @@ class Flight:
 
     def _through(self, t: float, duration: float) -> bool:
         """Whether nothing more can be done in this round."""
-        return not self._left or self._interrupted() or t > duration - self._left[0].lasts_s - LATEST_S
+        if not self._left or self._interrupted():
+            return True
+        nature = self._left[0].nature
+        return t > duration - nature.lasts_s - max(LATEST_S, nature.heals_s)
 
     def _judge(self, eyes: Eyes, now: float) -> None:
         """Gives what is wrong to the fault that is under way, or to the round."""
@@ -215,7 +239,7 @@ class Flight:
         target = self._wrong if self._now is None else self._now.violations
         target += [each for each in wrong if each not in target]
 
-    def _next(self, injector: Injector, eyes: Eyes, keys: Keys, t: float, now: float) -> bool:
+    def _next(self, injector: Injector, eyes: Eyes, t: float, now: float) -> bool:
         """Does the next fault when its time has come; False if there is nothing more to be done in this round."""
         if self._well is None:
             live = eyes.running()
@@ -227,9 +251,9 @@ class Flight:
                 self._wrong.append(f"not in formation {FORM_S:g} s after the start: no fault was done")
                 return False
             return True
-        return now < self._well + self._left[0].after_s or self._begin(injector, eyes, keys, t, now)
+        return now < self._well + self._left[0].after_s or self._begin(injector, eyes, t, now)
 
-    def _begin(self, injector: Injector, eyes: Eyes, keys: Keys, t: float, now: float) -> bool:
+    def _begin(self, injector: Injector, eyes: Eyes, t: float, now: float) -> bool:
         """Does the next fault; False if there are too few robots left for it."""
         running = eyes.running() - self._dead.keys()
         if len(running) < FEWEST:
@@ -240,12 +264,14 @@ class Flight:
             order = [*eyes.invariants.names, *eyes.invariants.names]
             victim = next(name for name in order[order.index(victim) :] if name in running)
         before = eyes.invariants.position.copy()
-        note = injector.begin(fault, victim, eyes.session, keys)
+        note = injector.begin(fault, victim, eyes.session, eyes.keys)
         if fault.kind == "kill":
             self._dead[victim] = now
         self._disk_full |= fault.kind == "disk"
         self._conductor_dead = fault.kind == "conductor"
-        self._now = _Running(fault, victim, now, note, before)
+        eyes.orders.clear()
+        told = {name: status.incidents[-1].seq for name, status in eyes.status.items() if status.incidents}
+        self._now = _Running(fault, victim, now, note, before, there=running, told=told)
         self._at = t
         if fault.kind == "conductor":
             self._watch_landing(eyes, self._now)
@@ -261,30 +287,32 @@ class Flight:
             running.lifted = time.monotonic()
         if running.lifted is None:
             return
-        why = self._unwell(running, eyes, t, now)
+        why = self._unwell(running, injector, eyes, t, now)
         running.well_since = None if why else (running.well_since or now)
         settled = running.well_since is not None and now - running.well_since >= SETTLED_S
-        if not settled and now < running.lifted + HEAL_S:
+        if not settled and now < running.lifted + HEAL_S + fault.nature.heals_s:
             return
         if not settled:
-            running.violations.append(f"not well {HEAL_S:g} s later: {why}")
+            running.violations.append(f"not well {now - running.lifted:.0f} s later: {why}")
         self._close(running, running.well_since, eyes)
 
     def _close(self, running: _Running, well: float | None, eyes: Eyes) -> None:
         now = time.monotonic()
         well = now if well is None else well
-        status = eyes.status.get(running.victim)
-        ended = running.fault.kind != "kill" and status is not None and status.phase in ("landing", "done")
+        if running.fault.kind == "read-error":
+            self._dead[running.victim] = now
+        down = [name for name in sorted(running.there - self._dead.keys()) if self._down(name, eyes)]
+        reasons = [f"{name}: {eyes.status[name].reason}" for name in down]
         outcome = Outcome(
             self._number,
             running.fault,
             running.victim,
             round(self._at, 2),
-            "; ".join(filter(None, (running.note, status.reason if ended and status is not None else ""))),
+            "; ".join(filter(None, (running.note, *reasons))),
             not any(text.startswith("not well") for text in running.violations),
             round(well - running.begun, 3),
             round(max(0.0, well - (running.lifted or running.begun)), 3),
-            ended,
+            bool(down),
             list(running.violations),
         )
         self.outcomes.append(outcome)
@@ -304,39 +332,111 @@ class Flight:
             return
         if running.held_at is None:
             running.held_at = eyes.invariants.where(running.victim)
-        moved = eyes.moved(running.victim, running.held_at)
-        text = f"{running.victim} moved although nobody steered it"
-        if moved > HELD_M and text not in running.violations:
-            running.violations.append(text)
+        if eyes.moved(running.victim, running.held_at) > HELD_M:
+            running.deplore(f"{running.victim} moved although nobody steered it")
 
-    def _unwell(self, running: _Running, eyes: Eyes, t: float, now: float) -> str:
+    def _unwell(self, running: _Running, injector: Injector, eyes: Eyes, t: float, now: float) -> str:
         """Why the run is not yet as it was; empty if it is."""
         live = eyes.running() - self._dead.keys()
-        return self._unsettled(running, eyes, live, now) or self._apart(
-            eyes, live, max(running.lifted or now, now - FRESH_S), t
+        check = getattr(self, f"_after_{running.fault.kind.replace('-', '_')}", self._after_any)
+        away = running.there - live - self._dead.keys() - {running.victim}
+        away = {name for name in away if eyes.invariants.up(name) or not self._down(name, eyes)}
+        return (
+            check(running, injector, eyes, live)
+            or (f"{', '.join(sorted(away))}: not back" if away else "")
+            or self._apart(eyes, live, max(running.lifted or now, now - FRESH_S), t)
         )
 
-    def _unsettled(self, running: _Running, eyes: Eyes, live: Set[str], now: float) -> str:
-        """What of the effect of a fault has still to come, or to pass."""
-        kind, victim = running.fault.kind, running.victim
-        if kind == "kill":
-            blind = [name for name in live if victim in self._hears[name] and victim not in eyes.status[name].missing]
-            if victim in eyes.alive:
-                return f"{victim} is killed, and its token still stands"
-            return f"{', '.join(blind)}: not noticed that {victim} is gone" if blind else ""
-        if victim:
-            return self._absent(victim, eyes, live, running.lifted or now)
+    # what of the effect of a fault has still to come, or to pass
+
+    def _after_any(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        kind = running.fault.kind
+        if running.victim:
+            return self._absent(running.victim, eyes, live, running.lifted or running.begun)
         if kind in SAYS and not any(e.kind.startswith(SAYS[kind]) and "ended" in e.text for e in self._events):
             return f"nobody has said that the {SAYS[kind]} ended"
         return ""
 
+    def _after_kill(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        victim = running.victim
+        if victim in eyes.alive:
+            return f"{victim} is dead, and its token still stands"
+        blind = [name for name in live if victim in self._hears[name] and victim not in eyes.status[name].missing]
+        return f"{', '.join(blind)}: not noticed that {victim} is gone" if blind else ""
+
+    def _after_read_error(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        victim = running.victim
+        if not any(order.robot == victim and order.action in ("land", "stop") for order in eyes.orders):
+            return f"the body of {victim} was told neither to land nor to stop"
+        if eyes.invariants.up(victim):
+            return f"{victim} has not come down yet"
+        return self._after_kill(running, injector, eyes, live)
+
+    def _after_clock_behind(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        victim = running.victim
+        if running.restarted is None:
+            if victim in eyes.alive or not any(e.kind == "lost" and e.source == victim for e in self._events):
+                return f"nobody has said that {victim} is lost"
+            self._off.add(victim)
+            running.restarted = time.monotonic()
+            injector.restart(victim, eyes.session, eyes.keys)
+        if why := injector.answer.reason or injector.answer.refused.get(victim):
+            running.deplore(f"{victim} is not let in again: {why}")
+            return ""
+        if victim not in live:
+            return f"{victim} is not back"
+        deaf = [name for name in live if victim in self._hears[name]]
+        deaf = [name for name in deaf if eyes.listened.get((name, victim), 0.0) < running.restarted]
+        return f"{', '.join(deaf)}: has not heard {victim} again" if deaf else ""
+
+    def _after_double(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        victim, second = running.victim, injector.second
+        assert second is not None
+        for order in eyes.orders:
+            if order.robot == victim:
+                running.deplore(f"the body of {victim} was told to {order.action}")
+        if second.alive:
+            return f"the second process of {victim} is not refused yet"
+        if second.handle.returncode != REFUSED:
+            running.deplore(f"the second process of {victim}: {second.exit}, {second.tail()[-200:]}")
+        return "" if victim in live else f"{victim} is not running any more"
+
+    def _after_frozen_router(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        limit = self._setting.experiment.safety.link_silence_s + NOTICED_S
+        free = []
+        for name in live - self._off:
+            since = [each.stamp - running.utc for each in self._held(name, "router", running, eyes)]
+            if not since:
+                free.append(name)
+            elif min(since) > limit:
+                running.deplore(f"{name} held only {min(since):.1f} s after the router had frozen")
+        return f"{', '.join(free)}: never held while the router was frozen" if free else ""
+
+    def _after_mocap_clock(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        for name in eyes.status:
+            for incident in self._held(name, "position", running, eyes):
+                running.deplore(f"{name}: {incident.text}")
+        return ""
+
+    @staticmethod
+    def _down(name: str, eyes: Eyes) -> bool:
+        """Whether a robot says that it comes down, or is down."""
+        status = eyes.status.get(name)
+        return status is not None and status.phase in ("landing", "done")
+
+    @staticmethod
+    def _held(name: str, what: str, running: _Running, eyes: Eyes) -> list[wire.Incident]:
+        """Since the fault began: what made a robot hold, or worse, of which `what` is part of the words."""
+        told = running.told.get(name, 0)
+        happened = [each for each in eyes.status[name].incidents if each.seq > told and what in each.text]
+        return [each for each in happened if each.text.startswith(("hold", "land", "cut"))]
+
     @staticmethod
     def _absent(victim: str, eyes: Eyes, live: Set[str], lifted: float) -> str:
         """Why a victim that lives is not back, and not down either."""
-        status = eyes.status.get(victim)
         if eyes.heard.get(victim, 0.0) < lifted:
             return f"{victim} says nothing yet"
-        if status is not None and status.phase in ("landing", "done"):
+        if Flight._down(victim, eyes):
             return f"{victim} has not come down yet" if eyes.invariants.up(victim) else ""
         return "" if victim in live else f"{victim} is not back"
 

@@ -27,7 +27,7 @@ class Outcome(msgspec.Struct, frozen=True):
         recovered: Whether all healed in time.
         begin_s: From its begin until then [s].
         end_s: From its end [s]; 0 if the formation had healed while it lasted.
-        ended: Whether the victim came down safely instead of coming back.
+        ended: Whether robots came down instead of going on, the dead not counted.
         violations: What must not have happened.
     """
 
@@ -93,7 +93,7 @@ def misrecorded(recording: Path, outcomes: Sequence[Outcome], *, disk_full: bool
     if not disk_full:
         for outcome in outcomes:
             kind = outcome.fault.kind
-            if kind == "kill" and ("lost", outcome.victim) not in said:
+            if kind in ("kill", "read-error", "clock-behind") and ("lost", outcome.victim) not in said:
                 wrong.append(f"the recording does not say that {outcome.victim} was lost")
             elif kind in ("router", "failover") and "router" not in kinds:
                 wrong.append("the recording does not say that the router ended")

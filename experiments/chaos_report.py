@@ -12,7 +12,7 @@ import msgspec
 
 from experiments import drawing
 from experiments.chaos_outcome import Ended, Outcome, line
-from experiments.fault_script import KINDS, Round
+from experiments.fault_script import KINDS, NATURES, Round
 from experiments.page import Section, date_of, numbered, render
 from experiments.report_tables import Row as Line
 from experiments.report_tables import Table
@@ -27,20 +27,6 @@ CAPTION: Final = (
     "Time from the begin of each fault until all was well again, by kind; the bar is how long the fault itself lasted. "
     "Crosses: not well in time. Hollow: the victim came down safely instead of coming back."
 )
-MEANT: Final = (
-    ("kill", "SIGKILL to a robot's process; its body stays in the room and must come down."),
-    ("freeze", "SIGSTOP for 5 s, then SIGCONT."),
-    ("partition", "Nothing passes between a robot and the router for 3 s; what was said meanwhile comes afterwards."),
-    ("router", "SIGKILL to the only router; the conductor starts it again."),
-    ("failover", "SIGKILL to the first of two routers."),
-    ("conductor", "SIGKILL to the launcher: robots land by themselves, and everything ends."),
-    ("loss", "20 % of the segments of every robot are lost for 3 s and sent again after TCP's timeouts."),
-    ("delay", "50 to 300 ms more in both directions for 3 s, for one robot."),
-    ("clock", "The wall clock of all processes steps by 0.5 to 5 s, forward or back."),
-    ("disk", "The recording can grow no more."),
-    ("corrupt", "Payloads of nonsense on every key that a robot believes."),
-    ("bits", "One bit is wrong in 5 % of a robot's segments for 1 s: its connection breaks."),
-)  # fmt: skip
 BUSY: Final = 0.05  # share of the ticks that a machine may miss which is to be trusted with the rest
 SMALL: Final = 20  # so many rows stand open
 
@@ -124,7 +110,7 @@ def write(folder: Path, result: Result, command: str) -> Path:
                 tables=(Table(("What",), rows, words=True),),
                 folded="Show the list" if len(rows) > SMALL else "",
             ),
-            Section("Definitions", terms=MEANT),
+            Section("Definitions", terms=tuple((kind, nature.meant) for kind, nature in NATURES.items())),
         ],
     )
 

@@ -21,7 +21,7 @@ from agents import session as network
 from agents.body import RangeScan, Rays
 from agents.keys import Keys
 from agents.rows import Array, some
-from experiments.assign import WORLD
+from experiments.assign import WORLD, measured
 from experiments.experiment import Experiment
 from experiments.population import Population
 
@@ -61,6 +61,7 @@ class Exchange:
         self._truth_every = max(1, round(experiment.rates.body_hz / TRUTH_HZ))
         # robots with another body have another simulator, or none, to tell things to
         self._elsewhere = {keys.setpoint(name) for name, robot in experiment.robots.items() if robot.body != WORLD}
+        self._measured = frozenset(measured(experiment))
         self.utc = time.time()
         self.contacts = self.refused = self.malformed = 0
         self.trouble = ""
@@ -106,14 +107,17 @@ class Exchange:
         for name in old.keys() - set(names):
             self._done.pop(name, None)
         self._strangers -= set(names)
-        wanted = {keys.position(names[row]) for row in self._carried.tolist()}
+        self._placed = np.array(
+            [row for row in self._carried.tolist() if names[row] not in self._measured], dtype=np.intp
+        )
+        wanted = {keys.position(names[row]) for row in self._placed.tolist()}
         wanted |= {keys.truth(names[row]) for row in self._carried.tolist()}
         wanted |= {keys.ranges(names[row]) for row in np.flatnonzero(population.seen).tolist()}
         for key in self._publishers.keys() - wanted:
             self._publishers.pop(key).undeclare()  # type: ignore[no-untyped-call]
         for key in wanted - self._publishers.keys():
             self._publishers[key] = network.publisher(session, key, self._mime)
-        self._positions = [(names[row], self._publishers[keys.position(names[row])]) for row in self._carried.tolist()]
+        self._positions = [(names[row], self._publishers[keys.position(names[row])]) for row in self._placed.tolist()]
         self._truths = [(names[row], self._publishers[keys.truth(names[row])]) for row in self._carried.tolist()]
         mirrored = np.flatnonzero(~population.carried)
         self._mirrored = mirrored
@@ -305,7 +309,7 @@ class Exchange:
         """Where everybody is, what touched and what sensors see."""
         state, rows = self._population.state, self._carried
         stamp = round(self.utc + t, 6)
-        self._publish(self._positions, state.position[rows], state.yaw[rows], stamp)
+        self._publish(self._positions, state.position[self._placed], state.yaw[self._placed], stamp)
         if self._ticks % self._truth_every == 0:
             self._publish(self._truths, state.true_position[rows], state.true_yaw[rows], stamp)
         self._ticks += 1

@@ -2,40 +2,105 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final, Literal, get_args
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
 
 import msgspec
 import numpy as np
 
-Kind = Literal[
-    "kill",
-    "freeze",
-    "partition",
-    "router",
-    "failover",
-    "conductor",
-    "loss",
-    "delay",
-    "clock",
-    "disk",
-    "corrupt",
-    "bits",
-]
+Stage = Literal["plain", "two routers", "patient router", "motion capture"]
 
-KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 FORM_S: Final = (
     15.0  # what a formation takes to come together, so that a round gets about as many faults as it has time for
 )
 GAP_S: Final = (0.5, 2.0)  # from when a fault has healed to the next
-HEAL_S: Final = 1.5  # what that takes
 LAST_S: Final = 6.0  # before the end of the run nothing new begins
-MOST: Final = {"kill": 2, "router": 3, "failover": 1, "disk": 1, "conductor": 1}  # of one round
-LASTING: Final = {"freeze": 5.0, "partition": 3.0, "loss": 3.0, "delay": 3.0, "corrupt": 1.0, "bits": 1.0}  # [s]
-WITHOUT_VICTIM: Final = ("router", "failover", "conductor", "loss", "clock", "disk")
-DELAY_S: Final = (0.05, 0.3)
-STEP_S: Final = (0.5, 5.0)
-LOSS: Final = 0.2
+CONDUCTOR_AFTER: Final = 3  # nothing can befall a run after the death of its launcher: it had better be late
+
+
+@dataclass(frozen=True)
+class Nature:
+    """What all faults of a kind have in common.
+
+    Attributes:
+        meant: What is done, for the report.
+        lasts_s: Until it is lifted [s]; 0 if it cannot be.
+        heals_s: What it takes about until all is well again [s].
+        victim: Whether it befalls one robot; else the whole run.
+        most: In one round.
+        stage: The only one on which it can be done; "plain": on each.
+        never: A stage on which it cannot be done.
+        size: Between which numbers its size is drawn.
+        signed: Whether the size may be negative as well.
+    """
+
+    meant: str
+    lasts_s: float = 0.0
+    heals_s: float = 1.5
+    victim: bool = True
+    most: int = 1_000
+    stage: Stage = "plain"
+    never: Stage | None = None
+    size: tuple[float, float] = (0.0, 0.0)
+    signed: bool = False
+
+
+NATURES: Final[Mapping[str, Nature]] = {
+    "kill": Nature("SIGKILL to a robot's process; its body stays in the room and must come down.", most=2),
+    "freeze": Nature("SIGSTOP for 5 s, then SIGCONT.", 5.0),
+    "partition": Nature(
+        "Nothing passes between a robot and the router for 3 s; what was said meanwhile comes afterwards.", 3.0
+    ),
+    "router": Nature(
+        "SIGKILL to the only router; the conductor starts it again.", victim=False, most=3, never="two routers"
+    ),
+    "failover": Nature("SIGKILL to the first of two routers.", victim=False, most=1, stage="two routers"),
+    "frozen-router": Nature(
+        "SIGSTOP for 5 s to a router whose lease is 60 s: robots must notice by themselves, and hold.",
+        5.0,
+        victim=False,
+        most=2,
+        stage="patient router",
+    ),
+    "conductor": Nature(
+        "SIGKILL to the launcher: robots land by themselves, and everything ends.", victim=False, most=1
+    ),
+    "loss": Nature(
+        "20 % of the segments of every robot are lost for 3 s and sent again after TCP's timeouts.",
+        3.0,
+        victim=False,
+        size=(0.2, 0.2),
+    ),
+    "delay": Nature("50 to 300 ms more in both directions for 3 s, for one robot.", 3.0, size=(0.05, 0.3)),
+    "bits": Nature("One bit is wrong in 5 % of a robot's segments for 1 s: its connection breaks.", 1.0),
+    "clock": Nature(
+        "The wall clock of all processes steps by 0.5 to 5 s, forward or back.",
+        victim=False,
+        size=(0.5, 5.0),
+        signed=True,
+    ),
+    "clock-behind": Nature(
+        "SIGKILL to a robot's process; it is started again with a clock that is 3 to 4.5 s behind, and must be heard.",
+        heals_s=12.0,
+        most=2,
+        size=(3.0, 4.5),
+    ),
+    "mocap-clock": Nature(
+        "The wall clock of motion capture steps by 0.5 to 4.5 s, and back after 3 s: no robot may lose its position.",
+        3.0,
+        victim=False,
+        most=3,
+        stage="motion capture",
+        size=(0.5, 4.5),
+        signed=True,
+    ),
+    "double": Nature("A second process of a robot's name is started: it must be refused, and touch nothing."),
+    "read-error": Nature("Reading a robot's body raises: it must be told to land or to stop all the same.", most=1),
+    "disk": Nature("The recording can grow no more.", victim=False, most=1),
+    "corrupt": Nature("Payloads of nonsense on every key that a robot believes.", 1.0),
+}
+KINDS: Final = tuple(NATURES)
 
 
 class Fault(msgspec.Struct, frozen=True):
@@ -46,25 +111,30 @@ class Fault(msgspec.Struct, frozen=True):
         after_s: So long after all was well again (or, of the first, after the formation had come together) [s].
         lasts_s: Until it is lifted [s]; 0 if it cannot be.
         victim: A robot; if it is gone by then, the next one that is there. Empty: the whole run.
-        size: Of a delay or a step of the clock [s], of a loss as a share.
+        size: Of a delay or a step of a clock [s], of a loss as a share.
     """
 
-    kind: Kind
+    kind: str
     after_s: float
     lasts_s: float = 0.0
     victim: str = ""
     size: float = 0.0
 
+    @property
+    def nature(self) -> Nature:
+        """Of its kind."""
+        return NATURES[self.kind]
+
 
 class Round(msgspec.Struct, frozen=True):
-    """One run of the experiment and what befalls it, with so many routers."""
+    """One run of the experiment, on which stage, and what befalls it."""
 
     faults: list[Fault]
-    routers: int = 1
+    stage: Stage = "plain"
 
 
 def script(
-    robots: Sequence[str], duration_s: float, count: int, seed: int, kinds: Sequence[Kind] = KINDS
+    robots: Sequence[str], duration_s: float, count: int, seed: int, kinds: Sequence[str] = KINDS
 ) -> list[Round]:
     """Rounds that hold so many faults, each kind as often as any other; the same seed gives the same script.
 
@@ -84,13 +154,13 @@ def script(
     return rounds
 
 
-def _deal(deck: list[Kind], robots: Sequence[str], duration_s: float, random: np.random.Generator) -> Round:
+def _deal(deck: list[str], robots: Sequence[str], duration_s: float, random: np.random.Generator) -> Round:
     """Takes the faults of one round off the deck."""
-    several = deck[0] == "failover"
+    stage = NATURES[deck[0]].stage
     t, faults = FORM_S, list[Fault]()
-    dealt: list[Kind] = []
+    dealt: list[str] = []
     while True:
-        fitting = (k for k, kind in enumerate(deck) if _fits(kind, dealt, several=several))
+        fitting = (k for k, kind in enumerate(deck) if _fits(kind, dealt, stage))
         place = next(fitting, None)
         if place is None:
             if faults:
@@ -100,28 +170,22 @@ def _deal(deck: list[Kind], robots: Sequence[str], duration_s: float, random: np
         dealt.append(kind)
         gap = round(float(random.uniform(*GAP_S)), 2)
         faults.append(_fault(kind, gap, robots, random))
-        t += gap + LASTING.get(kind, 0.0) + HEAL_S
+        t += gap + NATURES[kind].lasts_s + NATURES[kind].heals_s
         if kind == "conductor" or t > duration_s - LAST_S:
             break
-    return Round(faults, 2 if several else 1)
+    return Round(faults, stage)
 
 
-def _fits(kind: Kind, dealt: Sequence[Kind], *, several: bool) -> bool:
+def _fits(kind: str, dealt: Sequence[str], stage: Stage) -> bool:
     """Whether a kind may come next in a round."""
-    if dealt.count(kind) >= MOST.get(kind, len(KINDS)):
+    nature = NATURES[kind]
+    if dealt.count(kind) >= nature.most or nature.never == stage or nature.stage not in ("plain", stage):
         return False
-    if kind == "conductor":
-        return len(dealt) >= 3  # nothing can befall the run after it: it had better be late
-    return kind != ("router" if several else "failover")
+    return kind != "conductor" or len(dealt) >= CONDUCTOR_AFTER
 
 
-def _fault(kind: Kind, after_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:
-    victim = "" if kind in WITHOUT_VICTIM else str(random.choice(list(robots)))
-    size = 0.0
-    if kind == "loss":
-        size = LOSS
-    elif kind == "delay":
-        size = round(float(random.uniform(*DELAY_S)), 3)
-    elif kind == "clock":
-        size = round(float(random.uniform(*STEP_S) * random.choice([-1.0, 1.0])), 3)
-    return Fault(kind, after_s, LASTING.get(kind, 0.0), victim, size)
+def _fault(kind: str, after_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:
+    nature = NATURES[kind]
+    victim = str(random.choice(list(robots))) if nature.victim else ""
+    size = round(float(random.uniform(*nature.size) * random.choice([-1.0, 1.0] if nature.signed else [1.0])), 3)
+    return Fault(kind, after_s, nature.lasts_s, victim, size)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import mmap
 import os
 import resource
 import signal
-import struct
-import textwrap
-from collections.abc import Mapping
+import threading
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -18,55 +17,38 @@ import zenoh
 
 from agents import wire
 from agents.keys import Keys
+from experiments import orders, processes
 from experiments.cables import GOOD, Cables, Condition
 from experiments.fault_script import Fault
+from experiments.faulty import Switch
+from experiments.launcher import Launcher, Process
+from experiments.processes import PROC
 from experiments.watched import Watched
 
+# which process gets which signal, if it is not a robot's, and on which robots' cables what happens
+SIGNALS: Final[Mapping[str, tuple[str, signal.Signals]]] = {
+    "kill": ("", signal.SIGKILL),
+    "freeze": ("", signal.SIGSTOP),
+    "clock-behind": ("", signal.SIGKILL),
+    "router": ("router", signal.SIGKILL),
+    "failover": ("router", signal.SIGKILL),
+    "frozen-router": ("router", signal.SIGSTOP),
+    "conductor": ("conductor", signal.SIGKILL),
+}
+CABLES: Final[Mapping[str, Callable[[float], Condition]]] = {
+    "partition": lambda _: Condition(cut=True),
+    "loss": lambda share: Condition(loss=share),
+    "delay": lambda seconds: Condition(delay_s=seconds),
+    "bits": lambda _: Condition(flips=FLIPS),
+}
+# which switch, with the role of the victim's process, and in which direction
+CLOCKS: Final[Mapping[str, tuple[str, float]]] = {
+    "clock": ("clock", 1.0),
+    "mocap-clock": ("clock-positioning", 1.0),
+    "clock-behind": ("clock-{}", -1.0),
+}
 FLIPS: Final = 0.05  # share of segments with a wrong bit
 GARBAGE: Final = 20  # payloads of nonsense at a time, on each key of a victim
-STEP_FILE: Final = "clock-step"
-SITE: Final = "site"
-STEPPED: Final = """\
-# The wall clock of every process of this run reads as much more as a file says: a step as it sees it.
-import mmap
-import struct
-import time
-
-with open({file!r}, "rb") as _file:
-    _step = mmap.mmap(_file.fileno(), 8, access=mmap.ACCESS_READ)
-_utc, _read = time.time, struct.Struct("d").unpack_from
-time.time = lambda: _utc() + _read(_step)[0]
-"""
-
-
-class WallClock:
-    """The wall clock of a run's processes, which can be stepped without that of the machine.
-
-    Python imports `sitecustomize` from the first folder on its path, in every process of the run: `time.time` there
-    reads a step from a file that they all share. What the network library stamps by itself is not reached.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        """Makes what `environment` refers to."""
-        site = folder / SITE
-        site.mkdir()
-        file = folder / STEP_FILE
-        file.write_bytes(struct.pack("d", 0.0))
-        (site / "sitecustomize.py").write_text(textwrap.dedent(STEPPED.format(file=str(file.absolute()))))
-        self._file = file.open("r+b")
-        self._step = mmap.mmap(self._file.fileno(), 8)
-        path = [str(site.absolute()), *filter(None, [os.environ.get("PYTHONPATH")])]
-        self.environment = [f"PYTHONPATH={os.pathsep.join(path)}"]
-
-    def step(self, seconds: float) -> None:
-        """From now on the clocks read that much more than they would."""
-        (before,) = struct.unpack_from("d", self._step)
-        struct.pack_into("d", self._step, 0, before + seconds)
-
-    def close(self) -> None:
-        """The run is over."""
-        self._step.close()
-        self._file.close()
 
 
 class Injector:
@@ -75,18 +57,31 @@ class Injector:
     def __init__(
         self,
         watched: Watched,
+        launcher: Launcher,
         cables: Cables,
-        clock: WallClock,
+        folder: Path,
         random: np.random.Generator,
         *,
         groups: Mapping[str, str],
         recording: Path,
     ) -> None:
-        """`groups` names the process of each robot, `recording` is where it is recorded."""
-        self._recording = recording
-        self._watched, self._cables, self._clock, self._random = watched, cables, clock, random
-        self._groups = groups
+        """Before anything is done.
+
+        Args:
+            watched: The run.
+            launcher: Starts second processes of a name.
+            cables: Of its robots.
+            folder: Of its switches (`experiments.faulty`).
+            random: Of nonsense.
+            groups: The process of each robot.
+            recording: Where it is recorded.
+        """
+        self._watched, self._launcher, self._cables = watched, launcher, cables
+        self._folder, self._random, self._groups, self._recording = folder, random, groups, recording
         self._stopped: list[int] = []
+        self._switches: dict[str, Switch] = {}
+        self.second: Process | None = None  # of a name that is taken
+        self.answer = wire.RunReply()  # to the last restart
 
     def begin(self, fault: Fault, victim: str, session: zenoh.Session, keys: Keys) -> str:
         """Does it; what there is to say of it.
@@ -97,37 +92,40 @@ class Injector:
             session: For nonsense.
             keys: Of the realm.
         """
-        group = self._groups.get(victim, "")
-        match fault.kind:
-            case "kill":
-                self._send(group, signal.SIGKILL)
-            case "freeze":
-                self._stopped = self._send(group, signal.SIGSTOP)
-            case "partition":
-                self._cables.set(Condition(cut=True), group)
-            case "loss":
-                self._cables.set(Condition(loss=fault.size))
-            case "delay":
-                self._cables.set(Condition(delay_s=fault.size), group)
-            case "bits":
-                self._cables.set(Condition(flips=FLIPS), group)
-            case "router" | "failover":
-                self._send("router", signal.SIGKILL, most=1)
-            case "conductor":
-                os.kill(self._watched.process.handle.pid, signal.SIGKILL)
-            case "clock":
-                self._clock.step(fault.size)
-                return f"{fault.size:+g} s"
-            case "disk":
-                return self._fill()
-            case "corrupt":
-                return f"{self.spoil(victim, session, keys)} payloads of nonsense"
-        return ""
+        kind, size = fault.kind, fault.size
+        if kind in SIGNALS:
+            role, number = SIGNALS[kind]
+            sent = self._send(victim or role, number, most=1)
+            self._stopped = sent if number == signal.SIGSTOP else []
+        if kind in CABLES:
+            self._cables.set(CABLES[kind](size), self._groups.get(victim))
+        if kind == "read-error":
+            self._switch(f"read-{victim}").write(1.0)
+        if kind == "double":
+            self.second = self._again(victim)
+        if kind in CLOCKS:
+            whose, direction = CLOCKS[kind]
+            return self._step(whose.format("+".join(self._companions(victim))), direction * size)
+        if kind == "disk":
+            return self._fill()
+        return f"{self.spoil(victim, session, keys)} payloads of nonsense" if kind == "corrupt" else ""
 
     def end(self, fault: Fault) -> None:
         """Lifts it."""
-        if fault.lasts_s:
+        if fault.kind == "mocap-clock":
+            self._step(CLOCKS[fault.kind][0], -fault.size)
+        elif fault.lasts_s:
             self.release()
+
+    def restart(self, victim: str, session: zenoh.Session, keys: Keys) -> None:
+        """Has the conductor start a robot again; does not wait for that."""
+        order = wire.RunOrder("restart", [victim], who="chaos")
+
+        def ask() -> None:
+            self.answer = orders.give_run(session, keys, order)
+
+        self.answer = wire.RunReply()
+        threading.Thread(target=ask, name="restart", daemon=True).start()
 
     def release(self) -> None:
         """Nothing is stopped or cut any more, whatever was under way."""
@@ -159,19 +157,42 @@ class Injector:
         whole = wire.encode(wire.pose(victim, 1, 0.0, [9e9, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
         return whole[: int(self._random.integers(len(whole)))]
 
+    def _switch(self, name: str) -> Switch:
+        return self._switches.setdefault(name, Switch(self._folder / name))
+
+    def _step(self, name: str, seconds: float) -> str:
+        """From now on a clock reads that much more than it would."""
+        switch = self._switch(name)
+        switch.write(switch.read() + seconds)
+        return f"{seconds:+g} s"
+
+    def _again(self, victim: str) -> Process:
+        """A second process of a name: the same command again."""
+        pid = self._running(victim)[0]
+        words = (PROC / str(pid) / "cmdline").read_bytes().decode().rstrip("\0").split("\0")
+        tag = [f"{name}={value}" for name, value in processes.tag(self._watched.run).items()]
+        return self._launcher.spawn(f"double-{victim}-{pid}-{time.monotonic_ns()}", ["env", *tag, *words])
+
     def _fill(self) -> str:
         """The recording may not grow any more: the recorder gets the error of a disk that is full."""
         full = self._recording.stat().st_size
-        for pid, name in self._watched.processes().items():
-            if name == "recorder":
-                with contextlib.suppress(ProcessLookupError):
-                    resource.prlimit(pid, resource.RLIMIT_FSIZE, (full, resource.RLIM_INFINITY))
-                return f"at {full} bytes"
+        for pid in self._running("recorder"):
+            with contextlib.suppress(ProcessLookupError):
+                resource.prlimit(pid, resource.RLIMIT_FSIZE, (full, resource.RLIM_INFINITY))
+            return f"at {full} bytes"
         return "no recorder"
 
+    def _companions(self, victim: str) -> list[str]:
+        """The robots of a victim's process."""
+        return [name for name, group in self._groups.items() if group == self._groups.get(victim)]
+
+    def _running(self, role: str) -> list[int]:
+        """The processes of a role, or of a robot."""
+        return [pid for pid, name in sorted(self._watched.processes().items()) if role in name.split("+")]
+
     def _send(self, role: str, number: signal.Signals, most: int | None = None) -> list[int]:
-        found = [pid for pid, name in sorted(self._watched.processes().items()) if role in name.split("+")]
-        for pid in found[:most]:
+        found = self._running(role)[:most]
+        for pid in found:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
-        return found[:most]
+        return found

@@ -9,8 +9,8 @@ from agents import lab, topology
 from agents.access import Rights
 from agents.endpoint import Endpoint, free_endpoint
 from experiments import access, assign
+from experiments.assign import VICON_TWIN
 from experiments.experiment import Experiment
-from experiments.standins import VICON_TWIN
 
 ENDPOINTS: Final = "network.txt"  # what to say behind --connect to look at a run: @FOLDER/network.txt
 

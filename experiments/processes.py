@@ -21,6 +21,7 @@ ROLES: Final = {  # by the module that a process runs
     "experiments.world": "world",
     "experiments.centre": "centre",
     "experiments.unattended": "conductor",
+    "bridges.vicon": "positioning",
 }
 ROBOT: Final = "experiments.robot"
 OTHER: Final = "other"

@@ -19,7 +19,6 @@ from experiments.launcher import Launcher, Process
 
 READY_S: Final = 15.0
 POLL_S: Final = 0.02
-VICON_TWIN: Final = "vicon-twin"
 VICON: Final = "vicon://"
 
 # what `--bodies protocol` makes of each kind: its protocol twin, the process that its robots share (several Crazyflies
@@ -49,8 +48,11 @@ def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
         return experiment
     if bodies == "protocol":
         return behind_protocols(experiment)
+    seen = bodies == assign.WORLD and experiment.positioning == assign.VICON_TWIN
     robots = {
-        name: msgspec.structs.replace(robot, body=bodies, position="body", ranges="body", device={})
+        name: msgspec.structs.replace(
+            robot, body=bodies, position=robot.position if seen else "body", ranges="body", device={}
+        )
         for name, robot in experiment.robots.items()
     }
     return msgspec.structs.replace(experiment, robots=robots)
@@ -62,7 +64,7 @@ def behind_protocols(experiment: Experiment) -> Experiment:
     for name, robot in experiment.robots.items():
         body, process, position = PROTOCOL[robot.kind]
         robots[name] = msgspec.structs.replace(robot, body=body, process=process, position=position)
-    return msgspec.structs.replace(experiment, robots=robots, positioning=VICON_TWIN)
+    return msgspec.structs.replace(experiment, robots=robots, positioning=assign.VICON_TWIN)
 
 
 @dataclass(frozen=True)
@@ -155,18 +157,17 @@ def _positioning(
     interrupted: Callable[[], bool],
 ) -> tuple[list[str], tuple[str, Callable[[], Process]] | None]:
     """Who measures external positions: the names of the processes that were started for it; see `StandIns`."""
-    # where robots of the world are, the world itself says: two who did would contradict each other
-    measured = [name for name, robot in robots.items() if robot.position == "external" and robot.body != assign.WORLD]
+    measured = assign.measured(msgspec.structs.replace(experiment, robots=robots))
     if experiment.positioning is None or not measured:
         return [], None
     started = []
     network = [*connect, "--realm", experiment.network.realm, "--lifeline"]
     host = experiment.positioning.removeprefix(VICON)
-    if experiment.positioning == VICON_TWIN:
+    if experiment.positioning == assign.VICON_TWIN:
         sigma = max(assign.disturbance(experiment, name).position_sigma or 0.0 for name in measured)
         noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
         arguments = ["--listen", "127.0.0.1:0", "--robots", *measured, *noise, *network]
-        twin = launcher.start(f"{prefix}-{VICON_TWIN}", "twins.vicon", *arguments)
+        twin = launcher.start(f"{prefix}-{assign.VICON_TWIN}", "twins.vicon", *arguments)
         started.append(twin.name)
         host = _said(twin, r"^vicon (ready on) (\S+)$", 1, interrupted)["ready on"]
     maps = [part for name in measured for part in ("--map", f"{name}={name}")]

@@ -20,6 +20,7 @@ from agents import session as network
 from agents.endpoint import EndpointError
 from agents.lifeline import Lifeline
 from agents.process import told_to_end
+from experiments import faulty
 from experiments.conductor import RunFailed
 from experiments.emergency import Emergency
 from experiments.hosts import HostError
@@ -33,18 +34,23 @@ from experiments.standins import BODIES, StandInError
 
 
 class Cabled(Launcher):
-    """Starts robots so that each finds its routers at the ends of cables of its own."""
+    """Starts robots that find their routers at the ends of cables of their own, and processes that can be spoiled."""
 
-    def __init__(self, cables: Mapping[str, Mapping[str, str]], logs: Path) -> None:
-        """`cables` has, for each process of robots, the endpoint to use instead of each router's."""
+    def __init__(self, cables: Mapping[str, Mapping[str, str]], switches: Path | None, logs: Path) -> None:
+        """`cables` has, for each process of robots, the endpoint to use instead of each router's.
+
+        `switches` is for `experiments.faulty`; None: processes are as they are.
+        """
         super().__init__(logs)
-        self._cables = cables
+        self._cables, self._switches = cables, switches
 
     def start(self, name: str, module: str, *arguments: str) -> Process:
         """See `Launcher.start`."""
         own = next((ends for process, ends in self._cables.items() if name.endswith(f"-{process}")), {})
         if module == ROBOT:
             arguments = tuple(own.get(word, word) for word in arguments)
+        if self._switches is not None:
+            module, arguments = faulty.MODULE, (str(self._switches), module, *arguments)
         return super().start(name, module, *arguments)
 
 
@@ -76,6 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", dest="changes")
     parser.add_argument("--bodies", choices=BODIES, help="what every robot is put into")
     parser.add_argument("--cables", type=Path, help="JSON: for each process of robots, where it finds each router")
+    parser.add_argument("--switches", type=Path, help="folder, with which `experiments.faulty` spoils processes")
     chosen = parser.parse_args(arguments)
     cables: dict[str, dict[str, str]] = json.loads(chosen.cables.read_text("utf-8")) if chosen.cables else {}
     over = threading.Event()
@@ -90,7 +97,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 show=Told(),
                 interrupted=over.is_set,
                 emergency=Emergency(),
-                launching=partial(Cabled, cables),
+                launching=partial(Cabled, cables, chosen.switches),
             )
     except (
         DocumentError,

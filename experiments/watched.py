@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from agents import wire
-from experiments import processes
+from experiments import faulty, processes
 from experiments.launcher import Launcher, Process
 
 NAME: Final = "conductor"
@@ -33,8 +33,8 @@ class Watched:
         cases: Sequence[str] = (),
         changes: Sequence[str] = (),
         bodies: str | None = None,
-        environment: Sequence[str] = (),
         cables: Path | None = None,
+        switches: Path | None = None,
     ) -> None:
         """Starts it.
 
@@ -45,18 +45,20 @@ class Watched:
             cases: Of the file; all if none is named.
             changes: As behind `--set`.
             bodies: As behind `--bodies`.
-            environment: NAME=VALUE each, for all of its processes.
             cables: Where robots find their routers (`experiments.unattended`).
+            switches: With which its processes can be spoiled (`experiments.faulty`).
         """
         self._launcher = launcher
         self.run = secrets.token_hex(8)
-        words = [sys.executable, "-m", "experiments.unattended", str(file), str(folder)]
+        spoilt = [] if switches is None else [faulty.MODULE, str(switches)]
+        words = [sys.executable, "-m", *spoilt, "experiments.unattended", str(file), str(folder)]
         words += [part for case in cases for part in ("--case", case)]
         words += [part for change in changes for part in ("--set", change)]
         words += ["--bodies", bodies] if bodies is not None else []
         words += ["--cables", str(cables)] if cables is not None else []
+        words += ["--switches", str(switches)] if switches is not None else []
         variables = [f"{name}={value}" for name, value in processes.tag(self.run).items()]
-        self.process: Process = launcher.spawn(NAME, ["env", *variables, *environment, *words])
+        self.process: Process = launcher.spawn(NAME, ["env", *variables, *words])
         self.said: list[str] = []
 
     def news(self) -> Iterator[wire.Event]:

@@ -2,7 +2,9 @@ from collections import Counter
 
 import pytest
 
-from experiments.fault_script import KINDS, MOST, WITHOUT_VICTIM, script
+from experiments import chaos_flight, injection
+from experiments.chaos import again
+from experiments.fault_script import KINDS, NATURES, script
 
 ROBOTS = ("TB01", "KH01", "CF01", "CF02")
 
@@ -25,19 +27,40 @@ def test_every_kind_comes_as_often_as_any_other(count):
 
 
 def test_rounds_can_be_flown():
-    for each in script(ROBOTS, 45.0, 200, 3):
+    for each in script(ROBOTS, 90.0, 300, 3):
         kinds = [fault.kind for fault in each.faults]
-        assert all(kinds.count(kind) <= most for kind, most in MOST.items())
+        assert all(kinds.count(kind) <= NATURES[kind].most for kind in kinds)
         assert "conductor" not in kinds[:-1], "nothing comes after the death of the launcher"
-        assert ("failover" in kinds) <= (each.routers == 2)
-        assert not (each.routers == 2 and "router" in kinds)
+        assert {NATURES[kind].stage for kind in kinds} <= {"plain", each.stage}
+        assert not (each.stage == "two routers" and "router" in kinds)
         for fault in each.faults:
-            assert (fault.victim == "") == (fault.kind in WITHOUT_VICTIM)
+            assert bool(fault.victim) == fault.nature.victim
             assert fault.victim in ("", *ROBOTS)
             assert fault.after_s > 0.0
+            low, high = fault.nature.size
+            assert low <= abs(fault.size) <= high
+            assert fault.size >= 0.0 or fault.nature.signed
+
+
+def test_faults_without_time_get_the_stage_that_they_need():
+    left = faults(script(ROBOTS, 90.0, 100, 3))
+    rounds = again(left)
+    assert sorted(map(repr, faults(rounds))) == sorted(map(repr, left))
+    for each in rounds:
+        assert {fault.nature.stage for fault in each.faults} == {each.stage}
 
 
 def test_only_the_kinds_that_were_asked_for():
     drawn = faults(script(ROBOTS, 45.0, 30, 1, ["kill", "conductor"]))
     assert {fault.kind for fault in drawn} == {"kill", "conductor"}
     assert len(drawn) == 30
+
+
+def test_every_kind_is_known_to_those_that_do_it_and_that_look_after_it():
+    tables = {*injection.SIGNALS, *injection.CABLES, *injection.CLOCKS}
+    assert tables <= set(KINDS)
+    assert set(KINDS) - tables == {"double", "read-error", "disk", "corrupt"}, "done by functions of their own"
+    looked_after = {name.removeprefix("_after_").replace("_", "-") for name in vars(chaos_flight.Flight)}
+    assert {kind for kind in KINDS if kind in looked_after} == {
+        "kill", "read-error", "clock-behind", "double", "frozen-router", "mocap-clock"
+    }  # fmt: skip
