@@ -301,7 +301,8 @@ class Flight:
         well = now if well is None else well
         if running.fault.kind == "read-error":
             self._dead[running.victim] = now
-        down = [name for name in sorted(running.there - self._dead.keys()) if self._down(name, eyes)]
+        left = set() if self._conductor_dead else running.there - self._dead.keys()
+        down = [name for name in sorted(left) if self._down(name, eyes)]
         reasons = [f"{name}: {eyes.status[name].reason}" for name in down]
         outcome = Outcome(
             self._number,
