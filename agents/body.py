@@ -172,6 +172,8 @@ class BodyState:
         shadow_position: (n, 3) of the twin that runs beside each row [m], NaN for rows without one; None if there is
             none at all (see `agents.shadow`).
         shadow_yaw: (n,) of that twin [rad].
+        ahead: (n,) how far ahead of its arrival the last position was stamped that something outside measured [s],
+            negative where behind; None if there is none.
     """
 
     time: Array
@@ -187,6 +189,7 @@ class BodyState:
     attitude: Array | None = None
     shadow_position: Array | None = None
     shadow_yaw: Array | None = None
+    ahead: Array | None = None
 
 
 class Body(Protocol):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import asin, degrees, expm1, hypot, sin
 from typing import Final, NamedTuple
 
@@ -19,6 +21,8 @@ from agents.separation import Separation
 
 SUNK: Final = 0.15  # [m] so far below its goal,
 SINKS: Final = 0.15  # [m/s] and this fast downward, a row is not flying where it wants to
+AHEAD_S: Final = 0.1  # no network here is later than this: what is stamped further ahead is from a clock that is ahead
+BEHIND: Final = 0.5  # share of the time after which a robot is blind; what is stamped so far behind is worth a warning
 LATE_WINDOW_S: Final = 1.0  # over so long it is counted how many ticks were missed,
 LATE_SHARE: Final = 0.9  # and with a larger share of them a control loop is none
 
@@ -156,6 +160,8 @@ class Detector:
                 seen.append(
                     Sighting(Cause.SINKING, sinks, lambda row: text.format(short[row], -state.velocity[row, 2]))
                 )
+        if state.ahead is not None and some(off := misstamped(state.ahead, limits.own_silence_s)):
+            seen.append(Sighting(Cause.CLOCK, off, partial(stamped, self._assignment.names, state.ahead)))
         if state.attitude is not None:
             leans = leaning(state.attitude, limits.tilt)
             if some(leans) and some(leans := leans & self._flies & state.flying):
@@ -216,6 +222,17 @@ class Detector:
             seen.append(Sighting(Cause.CONDUCTOR, everybody, lambda _: f"for {since:.1f} s"))
         if outside.failing:
             seen.append(Sighting(Cause.LATE, everybody, lambda _: f"{outside.late:.0%} of the last second's"))
+
+
+def misstamped(ahead: Array, silence_s: float) -> Mask:
+    """Rows whose positions come from a clock that is off; `ahead` (N,) as in `BodyState`, blind after `silence_s`."""
+    return np.asarray((ahead > AHEAD_S) | (ahead < -BEHIND * silence_s))
+
+
+def stamped(names: Sequence[str], ahead: Array, row: int) -> str:
+    """How far off the stamps of a row's positions are, in words; `ahead` (N,) as in `BodyState`."""
+    seconds = float(ahead[row])
+    return f"positions of {names[row]} are stamped {abs(seconds):.3g} s {'ahead' if seconds > 0.0 else 'behind'}"
 
 
 def leaning(attitude: Array, limit: float) -> Mask:

@@ -81,8 +81,7 @@ class HeardGoals:
             self.malformed += 1
             return
         self._seq[row] = goal.seq
-        # a clock that is ahead must not keep a goal fresh for longer than it is
-        stamp, sent = min(goal.stamp - utc, t), goal.stamp - utc
+        stamp, sent = plausibility.taken(goal.stamp - utc, t), goal.stamp - utc
         start = self._agent.life.start_at[[row]]
         self._channel.send(
             np.array([link]),

@@ -35,6 +35,14 @@ def reach_of(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Vec
     return float(x), float(y), float(z)
 
 
+def taken(stamp: float, now: float) -> float:
+    """When something was measured, by its `stamp` [s]: not after `now` [s], at which it has arrived.
+
+    A clock that is ahead must not make anything look fresh for longer than it is.
+    """
+    return min(stamp, now)
+
+
 def check_pose(pose: Pose, *, robot: str, now: float, reach: Vector) -> None:
     """Refuses a pose that cannot be true.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from agents.assignment import Assignment
 from agents.body import BodyState
-from agents.detection import Outside, lean, leaning
+from agents.detection import Outside, lean, leaning, misstamped, stamped
 from agents.hearing import Hearing
 from agents.rows import Array, Index, Mask, some
 from agents.safety import Whereabouts
@@ -82,9 +82,15 @@ class Preflight:
     ) -> Iterator[Failing]:
         """Where it is, and who else is there."""
         known = np.isfinite(state.position).all(axis=1) & (t - state.time <= self._limits.own_silence_s)
-        nowhere = "no position of its own"
-        heading = "it does not know which way it looks"
-        yield where.blind, lambda row: heading if np.isnan(state.yaw[row]) and known[row] else nowhere
+        ahead = np.zeros(len(known)) if state.ahead is None else state.ahead
+
+        def nowhere(row: int) -> str:
+            if np.isnan(state.yaw[row]) and known[row]:
+                return "it does not know which way it looks"
+            off = misstamped(ahead, self._limits.own_silence_s)[row]
+            return "no position of its own" + (f": {stamped(self._assignment.names, ahead, row)}" if off else "")
+
+        yield where.blind, nowhere
         waits, whom = lacking
         yield waits, lambda row: "never heard " + ", ".join(whom(row))
         if outside.offline_since < np.inf:

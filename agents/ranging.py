@@ -77,8 +77,7 @@ class HeardRanges:
             self.malformed += 1
             self.trouble = str(error)
             return False
-        # a clock that is ahead must not make a sweep look fresh for longer than it is
-        time = min(said.stamp - utc, now)
+        time = plausibility.taken(said.stamp - utc, now)
         known = self._scans[row]
         if known is not None and time <= known.time:
             return False

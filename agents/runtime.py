@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
-from math import ceil, floor, nan
+from math import ceil, floor
 from typing import Final
 
 import numpy as np
@@ -28,6 +28,7 @@ from agents.goals import HeardGoals
 from agents.leaving import leave
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
+from agents.measured import MeasuredPositions
 from agents.naming import NameTaken, claim
 from agents.neighbours import Neighbours
 from agents.orders import LAND, STOP, carry_out
@@ -187,11 +188,8 @@ class Runtime:
         self._orders = [network.orders(session, keys.order(name)) for name in names]
         self._estop = network.Alarm(session, keys.estop, self._cut)
         self._conductor = network.alive_watch(session, keys.conductor)
-        self._located = [
-            (row, network.subscriber(session, keys.position(name), 32))
-            for row, name in enumerate(names)
-            if self._setup.located[row]
-        ]
+        located = np.flatnonzero(self._setup.located).tolist()
+        self._located = MeasuredPositions(session, keys, names, located, self._reach) if located else None
         ranging = tuple(self._setup.ranging) or ("body",) * len(names)
         seen_by_world = [row for row, source in enumerate(ranging) if source == "world"]
         self._from_world = np.array(seen_by_world, dtype=np.intp)
@@ -262,9 +260,11 @@ class Runtime:
             self._goals.take(t, self._utc)
             self._counts.malformed += self._goals.malformed - refused
         self._heed_stops()
-        for row, positions in self._located:
-            for sample in network.received(positions.handler):
-                self._locate(row, sample, t)
+        if (located := self._located) is not None:
+            refused = sum(located.malformed)
+            for row, taken, position, yaw in located.take(self._utc, t):
+                self._body.locate(row, taken, position, yaw)
+            self._counts.malformed += sum(located.malformed) - refused
         for row, queryable in enumerate(self._orders):
             for query in network.received(queryable.handler):
                 self._obey(row, query, t)
@@ -276,17 +276,6 @@ class Runtime:
         if t < self._doubt_until:  # long enough ago to hold, and not long enough to land
             return min(before, t - self._assignment.limits.link_silence_s - self._dt)
         return self._router.silent_since(t)
-
-    def _locate(self, row: int, sample: zenoh.Sample, t: float) -> None:
-        """Where a row is, as something outside of it says."""
-        try:
-            measured = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
-            plausibility.check_position(measured, robot=self._names[row], now=self._utc + t, reach=self._reach)
-        except wire.Malformed:
-            self._counts.malformed += 1
-            return
-        yaw = nan if measured.yaw is None else measured.yaw
-        self._body.locate(row, measured.stamp - self._utc, np.array(measured.position), yaw)
 
     def _cut(self, _stop: wire.Stop) -> None:
         """Motors off as soon as an emergency stop is heard, in the thread that receives; the loop does the rest."""
@@ -386,6 +375,9 @@ class Runtime:
         self._listen(t)
         state = self._body.read(t)
         self._airborne = some(state.flying)
+        if (located := self._located) is not None:
+            known = np.isfinite(located.ahead)
+            state.ahead = located.ahead if state.ahead is None else np.where(known, located.ahead, state.ahead)
         if self._ranges is not None:
             refused = self._ranges.malformed
             state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))

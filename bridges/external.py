@@ -15,11 +15,12 @@ import msgspec
 import numpy as np
 import zenoh
 
-from agents import plausibility, wire
 from agents import session as network
+from agents import wire
 from agents.body import UNANSWERED, BodyError, BodyRequest, BodyState
 from agents.endpoint import EndpointError
 from agents.leaving import leave
+from agents.measured import MeasuredPositions
 from agents.positioning import External
 from agents.ranging import HeardRanges
 from agents.rows import Array, Index, Mask, norm, some
@@ -93,8 +94,6 @@ class ExternalBody:
         self._sent = [round(1e3 * self._utc)] * rows
         self._standing: dict[int, _Standing] = {}
         self._repeat = 0.0
-        self._trouble = [""] * rows
-        self._malformed = [0] * rows
         self._lock = threading.Lock()  # of the numbers: `land` and `stop` come from other threads too
         self._session: zenoh.Session | None = None
 
@@ -109,8 +108,9 @@ class ExternalBody:
         except (network.Unreachable, EndpointError) as error:
             raise BodyError(f"{', '.join(self._names)}: {error}") from None
         session, keys, mime = self._session, self._keys, wire.MIME["json"]
-        self._positions = [network.subscriber(session, keys.position(name), 32) for name in self._names]
-        self._ranges = HeardRanges(session, keys, self._names, range(len(self._names)))
+        rows = range(len(self._names))
+        self._positions = MeasuredPositions(session, keys, self._names, rows, REACH)
+        self._ranges = HeardRanges(session, keys, self._names, rows)
         self._setpoints = [network.publisher(session, keys.setpoint(name), mime) for name in self._names]
         self._orders = [network.urgent_publisher(session, keys.setpoint(name), mime) for name in self._names]
         pause = threading.Event()
@@ -139,6 +139,7 @@ class ExternalBody:
             flying=self._flying.copy(),
             notes=self._notes(),
             rays=None if rays is None else replace(rays, time=rays.time - self._shift),
+            ahead=self._positions.ahead,
         )
 
     def command(self, setpoint: Array) -> None:
@@ -206,22 +207,8 @@ class ExternalBody:
         return round(self._utc + self._now(), 6)
 
     def _listen(self) -> None:
-        for row, subscriber in enumerate(self._positions):
-            for sample in network.received(subscriber.handler):
-                self._take(row, sample)
-
-    def _take(self, row: int, sample: zenoh.Sample) -> None:
-        now = self._now()
-        try:
-            measured = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
-            plausibility.check_position(measured, robot=self._names[row], now=self._utc + now, reach=REACH)
-        except wire.Malformed as error:
-            self._malformed[row] += 1
-            self._trouble[row] = str(error)
-            return
-        yaw = np.nan if measured.yaw is None else measured.yaw
-        # a clock that is ahead must not make a pose look fresh for longer than it is
-        self._seen.update(row, min(measured.stamp - self._utc, now), np.array(measured.position), yaw)
+        for row, taken, position, yaw in self._positions.take(self._utc, self._now()):
+            self._seen.update(row, taken, position, yaw)
 
     def _missing(self) -> list[str]:
         """What every row lacks before it can be driven, and what to do."""
@@ -231,8 +218,8 @@ class ExternalBody:
             key, age = self._keys.position(name), now - float(self._seen.time[row])
             if not isfinite(age):
                 found.append(
-                    f"{name}: what is published on {key} is no position: {self._trouble[row]}"
-                    if self._malformed[row]
+                    f"{name}: what is published on {key} is no position: {self._positions.trouble[row]}"
+                    if self._positions.malformed[row]
                     else f"{name}: nothing is published on {key}: is {self._far_end(row)} running and connected to "
                     f"{', '.join(self._endpoints)}?"
                 )
@@ -279,16 +266,16 @@ class ExternalBody:
                     self._standing.pop(row, None)
 
     def _notes(self) -> tuple[str, ...]:
-        age = self._now() - self._seen.time
+        age, positions = self._now() - self._seen.time, self._positions
         unanswered = self._unanswered() & (self._now() - self._stopped_at > ANSWER_S)
-        if not ((age > STALE_S) | unanswered).any() and not any(self._malformed) and not self._ranges.malformed:
+        if not ((age > STALE_S) | unanswered).any() and not any(positions.malformed) and not self._ranges.malformed:
             return ()
         notes = []
         for row, seconds in enumerate(age.tolist()):
             parts = [UNANSWERED] if unanswered[row] else []
             parts += [f"no position for {seconds:.0f} s"] if seconds > STALE_S else []
-            if self._malformed[row]:
-                parts.append(f"{self._malformed[row]} positions refused, the last because {self._trouble[row]}")
+            if positions.malformed[row]:
+                parts.append(f"{positions.malformed[row]} positions refused, the last because {positions.trouble[row]}")
             if self._ranges.malformed:
                 parts.append(f"{self._ranges.malformed} sweeps refused, the last because {self._ranges.trouble}")
             notes.append("; ".join(parts))
@@ -324,7 +311,7 @@ class ExternalBody:
             publishers = self._setpoints if command.action == "drive" else self._orders
             publishers[row].put(wire.encode(command))
         except zenoh.ZError as error:
-            self._trouble[row] = f"cannot be told anything: {error}"
+            self._positions.trouble[row] = f"cannot be told anything: {error}"
 
 
 def open_external(request: BodyRequest) -> ExternalBody:

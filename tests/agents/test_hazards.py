@@ -70,6 +70,7 @@ EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while th
     Cause.LANDING: [(2000, "CUT")],
     Cause.BELOW: [(0, "WARN")],
     Cause.SINKING: [(10, "LAND")],
+    Cause.CLOCK: [(50, "WARN")],
 }
 
 

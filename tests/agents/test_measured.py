@@ -1,0 +1,105 @@
+"""Positions by a clock that is off: what is stamped ahead hides no silence, and people are told how far it is off."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from agents import wire
+from agents.detection import stamped
+from agents.fleet import assemble
+from agents.keys import Keys
+from agents.measured import MeasuredPositions
+from agents.runtime import Runtime
+from agents.setup import Setup
+from experiments import assign
+from experiments.experiment import Formation, Robot
+from tests.agents.few import pair
+from tests.fuzz.loopnet import Net
+from tests.fuzz.messages import sent
+
+KEYS = Keys("park")
+UTC = 1.8e9
+DT = 0.01
+PLACE = (0.1, 0.2, 0.0)
+
+
+def position(stamp: float, robot: str = "T") -> bytes:
+    return sent(KEYS.position("T"), wire.Position(robot, stamp, PLACE, 0.3))[0]
+
+
+def test_a_position_stamped_ahead_counts_as_now_and_one_that_is_refused_is_told_of_as_well() -> None:
+    net = Net()
+    with net.worn():
+        heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0))  # type: ignore[arg-type]
+        assert np.isnan(heard.ahead).all()
+        for ahead, taken in ((-0.02, [7.98]), (2.3, [8.0]), (3600.0, []), (-7.0, [1.0])):
+            net.deliver(position(UTC + 8.0 + ahead))
+            assert [(row, when) for row, when, *_ in heard.take(UTC, 8.0)] == [
+                (1, pytest.approx(when, abs=1e-6)) for when in taken
+            ]
+            assert heard.ahead[1] == pytest.approx(ahead, abs=1e-6)
+        net.deliver(position(UTC, robot="A"))
+        assert not list(heard.take(UTC, 8.0))
+        assert heard.ahead[1] == pytest.approx(-7.0, abs=1e-6), "of another robot"
+        assert heard.malformed == [0, 2]
+        assert heard.trouble[1] == "position of 'A' on the key of 'T'"
+
+
+def test_the_text_names_robot_and_size() -> None:
+    assert stamped(("CF01", "CF02"), np.array([0.0, 2.3]), 1) == "positions of CF02 are stamped 2.3 s ahead"
+    assert stamped(("CF01",), np.array([-0.4]), 0) == "positions of CF01 are stamped 0.4 s behind"
+
+
+def flown(ahead: Callable[[float], float | None], seconds: float) -> tuple[Runtime, list[tuple[float, str]]]:
+    """A Tello at 100 Hz whose positions are stamped so far ahead of `t` (None: there are none); what was said, when."""
+    few = pair(
+        robots={"T": Robot(kind="tello", start=[0.1, 0.2], hover=0.5, position="external")}, formation=Formation()
+    )
+    said: list[tuple[float, str]] = []
+    net = Net()
+    with net.worn():
+        body = assemble(assign.request(few, ("T",), [1]))
+        setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True])
+        runtime = Runtime(assign.assign(few, ("T",)), body, setup)
+        body.open()
+        runtime._join(net.session)  # type: ignore[arg-type]
+        runtime._utc = runtime._telemetry.utc = UTC
+        agent = runtime.agent
+        for tick in range(1, round(seconds / DT)):
+            t = tick * DT
+            if (off := ahead(t)) is not None:
+                place = wire.Position("T", UTC + t + off, (0.1, 0.2, 0.5 if agent.life.phase[0] > 1 else 0.0), 0.0)
+                net.deliver(sent(KEYS.position("T"), place)[0])
+            runtime._tick(t)
+            if agent.life.phase[0] == 1:
+                agent.life.takeoff(0)
+            worst = agent.hazards.worst(0)
+            if worst and (not said or said[-1][1] != worst):
+                said.append((t, worst))
+    return runtime, said
+
+
+@pytest.mark.parametrize("ahead", [0.0, 2.0, 4.5])
+def test_a_robot_is_blind_in_time_however_far_ahead_its_positions_were_stamped(ahead: float) -> None:
+    silent = 3.0
+    _, said = flown(lambda t: ahead if t < silent else None, 4.5)
+    blind, text = next((t, text) for t, text in said if "its own position is lost" in text)
+    assert blind == pytest.approx(silent + 0.5, abs=0.03)
+    assert text.startswith("hold: its own position is lost: the last is 0.5")
+    warned = [text for _, text in said if "clock" in text and text.startswith("warn")]
+    told = f"warn: the clock that stamps its positions is off: positions of T are stamped {ahead:g} s ahead"
+    assert warned == ([told] if ahead else [])
+
+
+def test_positions_stamped_behind_are_told_of_before_they_are_too_old() -> None:
+    _, said = flown(lambda t: 0.0 if t < 2.0 else -0.4, 4.0)
+    (t, text), *_ = [each for each in said if "clock" in each[1]]
+    assert t == pytest.approx(2.5, abs=0.03)
+    assert text == "warn: the clock that stamps its positions is off: positions of T are stamped 0.4 s behind"
+    assert not any("position is lost" in text for _, text in said)
+
+
+def test_who_waits_for_take_off_says_that_its_positions_are_of_another_clock() -> None:
+    runtime, _ = flown(lambda _: -3600.0, 0.5)
+    assert runtime.agent.life.reason[0] == "no position of its own: positions of T are stamped 3.6e+03 s behind"
