@@ -34,6 +34,8 @@ class Grant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
         say: Publish. To delete is no one's right.
         hear: Subscribe, and ask for the last value that a publisher keeps.
         answer: Be asked.
+        reached: Be reached by a query on this wildcard, which others have the right to ask; an answer to it stays
+            within `say` and `answer`.
         ask: Query.
         be: Hold a liveliness token.
         watch: See liveliness tokens.
@@ -42,6 +44,7 @@ class Grant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     say: list[str] = []
     hear: list[str] = []
     answer: list[str] = []
+    reached: list[str] = []
     ask: list[str] = []
     be: list[str] = []
     watch: list[str] = []
@@ -96,7 +99,7 @@ def _messages(grant: Grant, realm: str) -> Iterator[tuple[Flow, tuple[str, ...],
     yield "egress", ("put", "reply"), [*grant.hear, *heard]
     yield "egress", ("liveliness_token",), heard
     yield "ingress", ("declare_queryable", "reply"), grant.answer
-    yield "egress", ("query",), grant.answer
+    yield "egress", ("query",), [*grant.answer, *grant.reached]
     yield "ingress", ("query",), grant.ask
     yield "egress", ("reply",), grant.ask
     yield "ingress", ("liveliness_token",), grant.be

@@ -47,6 +47,7 @@ ASK_EVERY_S: Final = 0.4  # between two questions whether the router still answe
 ANSWER_S: Final = 0.3  # a question without an answer for so long begins a silence
 ASKED: Final = 8  # questions that are waited for at once
 LOOK_S: Final = 0.1  # between two looks for an answer no more than this is held against the router
+NO_ORDER: Final = 'an order is a query with a payload, such as {"order": "land"}'
 EVENTS: Final = 64  # of a run that are said again to who was cut off: without a router much happens at once
 
 
@@ -369,12 +370,44 @@ def last_value(session: zenoh.Session, key: str, mime: str) -> LastValue:
     return LastValue(session, key, mime)
 
 
-def orders(session: zenoh.Session, key: str) -> zenoh.Queryable[Handler[zenoh.Query]]:
-    """A queryable whose orders wait in `.handler`; reply inside `with query:` and on `key`, or the asker waits.
+class Orders:
+    """Queries that carry an order, as they wait in `handler`.
+
+    Reply inside `with query:` and on the key, or the asker waits.
+
+    A query without payload is no order. Tools that read all keys (`get park/**`) send such: they get no answer. One
+    on the key itself is told what an order is.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._queryable = session.declare_queryable(key, RingChannel(8), complete=True)
+
+    @property
+    def handler(self) -> Self:
+        """See `Polled`."""
+        return self
+
+    def try_recv(self) -> zenoh.Query | None:
+        """See `Polled`."""
+        for query in received(self._queryable.handler):
+            if query.payload is not None and query.payload.to_bytes():
+                return query
+            with query:
+                if "*" not in str(query.key_expr):
+                    query.reply_err(NO_ORDER, encoding="text/plain")
+        return None
+
+    def close(self) -> None:
+        """Takes no more orders."""
+        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+
+
+def orders(session: zenoh.Session, key: str) -> Orders:
+    """The orders on a key.
 
     Declare it before the liveliness token: whoever sees the token can then give orders.
     """
-    return session.declare_queryable(key, RingChannel(8), complete=True)
+    return Orders(session, key)
 
 
 def alive_token(session: zenoh.Session, key: str) -> zenoh.LivelinessToken:

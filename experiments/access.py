@@ -67,6 +67,7 @@ def _rights(experiment: Experiment) -> Rights:
             say=[*own, *foreign],
             hear=[*told, *map(keys.pose, others), keys.estop, keys.experiment, *foreign],
             answer=own,
+            reached=[keys.pose("*"), keys.order("*")],
             be=[*own, *tokens],
             watch=[
                 *own,

@@ -87,7 +87,6 @@ class Overview:
         self._cut_off = -inf
         self._router = network.RouterWatch(self._session, keys.conductor)
         self._safety, self._mesh = experiment.safety, topology.is_mesh(endpoints)
-        self._silent_since = inf  # of the silence that was said
 
     @property
     def session(self) -> zenoh.Session:
@@ -150,16 +149,16 @@ class Overview:
 
     def _watch_router(self, now: float) -> None:
         """Says once that the router is silent for as long as robots wait before they hold, and once that it is back."""
-        since = self._router.silent_since(now)
+        since, progress = self._router.silent_since(now), self._progress
         if since < inf:
             self._cut_off = now
-            safety, said = self._safety, self._silent_since < inf
-            if not said and not self._mesh and now - since > safety.link_silence_s:
-                self._silent_since = since
+            safety = self._safety
+            if progress.silent_since == inf and not self._mesh and now - since > safety.link_silence_s:
+                progress.silent_since = since
                 what = f"robots hold, and land after {safety.offline_s:g} s"
                 self.say("router", "conductor", f"no router answers for {now - since:.1f} s: {what}")
-        elif self._silent_since < inf:
-            away_s, self._silent_since = now - self._silent_since, inf
+        elif progress.silent_since < inf:
+            away_s, progress.silent_since = now - progress.silent_since, inf
             self.say("router", "conductor", f"a router answers again, after {away_s:.1f} s")
 
     def _heed(self, status: wire.Status) -> None:

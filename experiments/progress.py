@@ -53,7 +53,8 @@ class Lines:
             errors = ", ".join(
                 f"{name} {'-' if seen.gone else _metres(seen.error)}" for name, seen in progress.robots.items()
             )
-            print(f"{progress.case}: {progress.elapsed:5.1f} s, {progress.phase}; error [m] {errors}", file=sys.stderr)
+            what = _silence(progress) or f"error [m] {errors}"
+            print(f"{progress.case}: {progress.elapsed:5.1f} s, {progress.phase}; {what}", file=sys.stderr)
 
 
 class Table:
@@ -96,7 +97,8 @@ def _table(progress: Progress) -> RenderableType:
     from rich.text import Text  # noqa: PLC0415
 
     elapsed = "" if progress.elapsed is None else f"  {progress.elapsed:5.1f} / {progress.duration:g} s"
-    grid = Grid(title=f"{progress.case}: {progress.phase}{elapsed}", box=box.SIMPLE_HEAD, title_justify="left")
+    silence = _silence(progress) and f"; {_silence(progress)}"
+    grid = Grid(title=f"{progress.case}: {progress.phase}{elapsed}{silence}", box=box.SIMPLE_HEAD, title_justify="left")
     for heading in ("robot", "phase", "error, m", "sent", "1/s", "lost", "late", "CPU", "battery", ""):
         grid.add_column(heading, justify="left" if heading in ("robot", "phase", "") else "right", no_wrap=True)
     now = time.time()
@@ -104,6 +106,12 @@ def _table(progress: Progress) -> RenderableType:
         grid.add_row(name, *_cells(seen, now))
     news = [event for event in progress.events if event.kind not in (*QUIET, OUTPUT)][-EVENTS:]
     return Group(grid, *(Text(f"  {event.kind} {event.source}: {event.text}", style="dim") for event in news))
+
+
+def _silence(progress: Progress) -> str:
+    """That nothing is known of the robots at the moment; empty while a router answers."""
+    silent_s = time.monotonic() - progress.silent_since
+    return f"no router answers for {silent_s:.1f} s" if silent_s > 0.0 else ""
 
 
 def _cells(seen: Seen, now: float) -> tuple[str, ...]:

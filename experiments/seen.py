@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import inf
 from typing import Final, Literal
 
 from agents import wire
@@ -39,8 +40,8 @@ class Seen:
     alive: bool = False
     out: Out = ""
     counted: tuple[float, int] = (0.0, 0)
-    vanished: float = float("inf")
-    behind: float = float("inf")
+    vanished: float = inf
+    behind: float = inf
     told: int = 0
     place: wire.Vector | None = None
     former: int | None = None
@@ -61,13 +62,13 @@ class Seen:
     def forget(self) -> None:
         """The process that it had is over: what it said last holds no more, but for where it was."""
         self.former = self.status.pid if self.status is not None else self.former
-        self.status, self.alive, self.vanished = None, False, float("inf")
-        self.rate, self.counted, self.behind, self.told = 0.0, (0.0, 0), float("inf"), 0
+        self.status, self.alive, self.vanished = None, False, inf
+        self.rate, self.counted, self.behind, self.told = 0.0, (0.0, 0), inf, 0
 
 
 @dataclass
 class Progress:
-    """What there is to show of a run."""
+    """What there is to show of a run; `silent_since` says when the routers fell silent [s, monotonic], if they have."""
 
     case: str
     phase: str
@@ -75,6 +76,7 @@ class Progress:
     duration: float
     robots: dict[str, Seen]
     events: list[wire.Event] = field(default_factory=list)
+    silent_since: float = inf
 
 
 class News:

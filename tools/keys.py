@@ -120,8 +120,10 @@ def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
 
     _tell(Path(folder), made(Path(folder), names, days=days), names)
     typer.echo(
-        "The old keys have no rights from now on, at every router that reads this lab.json: one that runs notices it "
-        "in a second, elsewhere copy the file. Who was connected with them is no longer heard: give it the new files"
+        "The old keys have no rights at a `zenpark router` that reads this lab.json: one that runs notices it in a "
+        "second; copy the file to routers elsewhere. Their owners are no longer heard: give them the new files. "
+        "A zenohd notices nothing, and the old keys go on working: print its file again (zenpark router FILE --lab LAB "
+        "--print-config) and restart it"
     )
 
 

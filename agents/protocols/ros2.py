@@ -218,7 +218,7 @@ def announced(style: Style, token: str) -> Endpoint:
     chunks = token.split("/")
     if style == "ros2dds" and len(chunks) >= 6:
         return Endpoint("/" + chunks[4].replace("§", "/"), chunks[5].replace("§", "/"))
-    if style == "rmw" and len(chunks) == 13:
+    if style == "rmw" and len(chunks) >= 13:  # rmw_zenoh 0.10.5 adds one for topics with a uint8[]
         kind = chunks[10].replace("::dds_::", "/").replace("::", "/").removesuffix("_")
         return Endpoint(chunks[9].replace("%", "/"), kind, chunks[11], int(chunks[1]))
     raise ValueError(f"'{token}' announces no publisher or subscriber")

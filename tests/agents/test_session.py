@@ -16,6 +16,7 @@ from agents.router import serve_router
 from agents.session import (
     ANSWER_S,
     ASK_EVERY_S,
+    NO_ORDER,
     Alarm,
     RouterWatch,
     Unreachable,
@@ -304,6 +305,21 @@ def test_orders_wait_until_they_are_polled(router, eventually):
             assert order.payload.to_bytes() == b"land"
             order.reply("park/CF01/order", b"ok")
         assert [reply.ok.payload.to_bytes() for reply in asked] == [b"ok"]
+
+
+@pytest.mark.system
+def test_a_query_without_payload_is_no_order(router, eventually):
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
+        taken = orders(robot, "park/CF01/order")
+        asker = ui.declare_querier("park/CF01/order")
+        eventually(lambda: asker.matching_status.matching)
+        for key, told in (("park/**", []), ("park/*/order", []), ("park/CF01/order", [NO_ORDER])):
+            asked, waiting, replies = ui.get(key, timeout=5.0), [], []
+            ended = threading.Thread(target=lambda asked=asked, replies=replies: replies.extend(asked))
+            ended.start()
+            eventually(lambda w=waiting, e=ended: w.extend(received(taken.handler)) or not e.is_alive())
+            assert [reply.err.payload.to_string() for reply in replies] == told
+            assert not waiting
 
 
 @pytest.mark.system

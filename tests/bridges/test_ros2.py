@@ -139,6 +139,7 @@ def test_tokens_are_those_of_rmw_zenoh():
     assert ros2.announced("rmw", token) == ros2.Endpoint(
         "/chatter", "std_msgs/msg/String", f"RIHS01_{HASHES['std_msgs/msg/String']}", 2
     )
+    assert ros2.announced("rmw", f"{token}/cpu%pub") == ros2.announced("rmw", token), "one more since 0.10.5"
     assert (ros2.RELIABLE, ros2.SENSOR_DATA, ros2.qos(depth=42)) == ("::,10:,:,:,,", "2::,5:,:,:,,", "::,:,:,:,,")
     assert zenoh.KeyExpr(ros2.endpoints("rmw", "MP", "/chatter", domain=2)).includes(zenoh.KeyExpr(token))
     assert not zenoh.KeyExpr(ros2.endpoints("rmw", "MS", "/chatter", domain=2)).intersects(zenoh.KeyExpr(token))

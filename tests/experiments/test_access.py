@@ -16,7 +16,7 @@ from experiments import access
 from experiments.experiment import Experiment, Formation, Hybrid, Network, Robot
 from experiments.run import load
 from experiments.standins import choose_bodies
-from tests.agents.acl import ACTIONS, may
+from tests.agents.acl import ACTIONS, held, may, permitted
 
 KEYS = Keys()
 OUTSIDER = "mallory"
@@ -168,6 +168,19 @@ BROAD = (KEYS.estop, "park/**", "park/*/pose", "park/*", "**", "*/*/*", "park/R3
 )  # fmt: skip
 def test_what_would_do_harm_is_denied(who, action, key):
     assert not may(control(experiment({(1, 0)})), who, action, key)
+
+
+@pytest.mark.parametrize(("who", "part"), [("observer", "pose"), ("operator", "pose"), ("operator", "order")])
+def test_a_wildcard_that_may_be_asked_reaches_every_robot(who, part):
+    made, key = control(experiment({(0, 1)})), f"park/*/{part}"
+    assert may(made, who, "ask", key)
+    for robot in ("R0", "R3"):
+        assert permitted(held(made, robot), "egress", "query", key)
+        assert permitted(held(made, robot), "ingress", "reply", f"park/{robot}/{part}")
+        assert not permitted(held(made, robot), "ingress", "query", key)
+        assert not permitted(held(made, robot), "ingress", "reply", key)
+        assert not permitted(held(made, robot), "ingress", "declare_queryable", key)
+        assert not permitted(held(made, robot), "egress", "query", "park/*/state")
 
 
 def test_routers_that_are_linked_pass_on_what_either_has_let_in():

@@ -172,6 +172,15 @@ def test_orders_are_the_operators(laboratory: Laboratory, who: str) -> None:
     assert laboratory.watcher.order("CF01", wire.Order("get", name="clamp")).ok, "the operator is heard"
 
 
+@pytest.mark.parametrize(("who", "part"), [("observer", "pose"), ("operator", "pose"), ("operator", "order")])
+def test_a_wildcard_that_may_be_asked_is_answered_by_all(laboratory: Laboratory, who: str, part: str) -> None:
+    order = {} if part == "pose" else {"payload": wire.encode(wire.Order("get", name="clamp")), "encoding": wire.JSON}
+    with laboratory.session(who) as session:
+        replies = list(session.get(f"park/*/{part}", timeout=5.0, **order))
+        assert {str(reply.ok.key_expr) for reply in replies if reply.ok} == {f"park/{name}/{part}" for name in FLOWN}
+        assert not list(session.get("park/**", timeout=1.0))
+
+
 @pytest.mark.parametrize("who", ["KH03", "observer", "recorder", "world"])
 def test_robots_are_changed_by_operators_only(laboratory: Laboratory, who: str) -> None:
     """Somebody else neither asks the conductor for a change, nor answers in its place."""
@@ -181,13 +190,13 @@ def test_robots_are_changed_by_operators_only(laboratory: Laboratory, who: str) 
         reply = orders.give_run(laboratory.watcher.session, KEYS, order, 0.5)
         assert "no conductor answers" in reply.reason
         assert false.handler.try_recv() is None, "and it does not even hear of it"
-        false.undeclare()  # type: ignore[no-untyped-call]
+        false.close()
         asked = network.orders(laboratory.watcher.session, KEYS.run_order)
         settled(laboratory)
         for key in (KEYS.run_order, "park/run/*", "park/**"):
             assert not list(session.get(key, payload=wire.encode(order), encoding=wire.JSON, timeout=0.5))
         assert asked.handler.try_recv() is None
-        asked.undeclare()  # type: ignore[no-untyped-call]
+        asked.close()
 
 
 def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory: Laboratory) -> None:

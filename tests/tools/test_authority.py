@@ -155,7 +155,9 @@ def test_the_commands(tmp_path):
     assert "zenpark run FILE --lab" in first.stdout
     assert said("keys", "issue", folder, "ana", "--role", "operator").exit_code == 0
     assert register(folder).identities["ana"].role == "operator"
-    assert said("keys", "revoke", folder, "ana").stdout.count("as ana.2") == 1
+    revoked = said("keys", "revoke", folder, "ana").stdout
+    assert revoked.count("as ana.2") == 1
+    assert "A zenohd notices nothing" in revoked
     assert said("keys", "renew", folder, "--authority").exit_code == 0
     assert said("keys", "show", folder).exit_code == 0
     assert '"ana.2"' in said("keys", "show", folder, "--json").stdout

@@ -1,0 +1,26 @@
+"""What the terminal shows of a run."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from experiments.progress import Lines, Table
+from experiments.seen import Progress, Seen
+
+
+@pytest.mark.parametrize("kind", [Lines, Table])
+def test_errors_from_before_the_router_fell_silent_are_not_printed_as_news(
+    kind: type[Lines | Table], capsys: pytest.CaptureFixture[str]
+) -> None:
+    progress = Progress("event", "formation", 4.0, 15.0, {"KH01": Seen(error=0.123)})
+    with kind() as show:
+        show(progress)
+    assert "0.123" in capsys.readouterr().err or kind is Table
+    progress.silent_since = time.monotonic() - 2.0
+    with kind() as show:
+        show(progress)
+    said = capsys.readouterr().err
+    assert "no router answers for 2.0 s" in said
+    assert "error [m]" not in said
