@@ -167,8 +167,12 @@ def missed(last: int, seq: int, since: float, rate: float) -> int:
         rate: Poses that a robot says in a second at most [1/s]. A gap counts only as far as that allows: one forged
             number must not become a hundred million lost poses.
     """
-    gap = seq - last - 1 if seq > last else seq - 1
-    return min(gap, math.ceil(since * rate))
+    return min(seq - last - 1 if seq > last else seq - 1, said_within(since, rate))
+
+
+def said_within(since: float, rate: float) -> int:
+    """Poses that a robot can have said in `since` [s] at `rate` [1/s]; UTC stamps are exact to a microsecond."""
+    return math.ceil(since * rate - 1e-3)
 
 
 def _counted(seq: int) -> bool:

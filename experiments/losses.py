@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from itertools import pairwise
-from math import ceil
 from typing import Final, Literal
 
 import numpy as np
 
-from agents.plausibility import missed
+from agents.plausibility import missed, said_within
 from agents.rows import Index
 from agents.wire import Status
 from experiments import assign
@@ -62,7 +61,7 @@ def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float
     recorded = [(pose.seq, pose.stamp) for pose in poses if pose.stamp <= last.stamp + ROUNDING_S]
     before = [(status.sent, run[0]) for status in statuses if status.stamp <= run[0] and status.pid == last.pid]
     number, stamp = max(recorded[-1:] + before[-1:], default=(0, run[0]))
-    return max(0, min(last.sent - number, ceil((last.stamp - stamp) * rate)))
+    return max(0, min(last.sent - number, said_within(last.stamp - stamp, rate)))
 
 
 def dropped(experiment: Experiment, statuses: list[list[Status]], run: tuple[float, float]) -> Index:

@@ -162,7 +162,7 @@ def test_what_the_recorder_lost_is_counted_by_the_running_numbers():
 )
 def test_transmissions_of_a_robot_that_began_anew_and_of_one_with_a_forged_number(seq: list[int], messages: int):
     known = moving()
-    time = 0.04 * np.arange(len(seq))
+    time = 0.02 * np.arange(len(seq))
     place = np.zeros((len(seq), 3))
     row = np.zeros(len(seq), dtype=np.intp)
     sent = type(known.sent)(time, row, np.array(seq), place, place, time, row)
