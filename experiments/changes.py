@@ -227,7 +227,7 @@ class HotChanges:
         for name in names:
             if self._robots[name].gone:
                 raise Refused(f"{name} is not in the run: {self._robots[name].out}")
-            reply = self._view.order(name, order)
+        for name, reply in self._view.order(names, order).items():
             if not reply.ok:
                 raise Refused(f"{name}: {reply.reason}")
         return done
@@ -240,8 +240,7 @@ class HotChanges:
         """Robots land, and are gone from the network; their process ends if no other robot needs it."""
         there = [name for name in names if self._robots[name].alive or self._crew.runs(name)]
         self._leaving |= {*there}
-        for name in there:
-            reply = self._view.order(name, wire.Order("leave"))
+        for name, reply in self._view.order(there, wire.Order("leave")).items():
             if not reply.ok and name in self._crew.adopted:
                 raise Refused(f"{name} does not answer, and was not started from here: end its process where it runs")
             if not reply.ok:
@@ -329,22 +328,22 @@ class HotChanges:
             yield from self._reach(names, "running", FROZEN_S)
         except Refused:
             self._leaving |= {*names}
+            self._view.order(names, wire.Order("leave"))
             for name in names:
-                self._view.order(name, wire.Order("leave"))
                 self._crew.release(name)
                 robots[name].out = "removed"
             raise
 
     def _insist(self, names: Sequence[str], order: wire.Order) -> Generator[None]:
         """An order that may be repeated: a robot may not be ready just then, and a busy machine lose an answer."""
-        for name in names:
-            began = time.monotonic()
-            while not (reply := self._view.order(name, order)).ok:
-                asked = time.monotonic()
-                if asked - began > INSIST_S:
-                    raise Refused(f"{name}, {order.order}: {reply.reason}")
-                while time.monotonic() - asked < AGAIN_S:
-                    yield
+        began, left = time.monotonic(), list(names)
+        while refused := {name: reply for name, reply in self._view.order(left, order).items() if not reply.ok}:
+            asked = time.monotonic()
+            if asked - began > INSIST_S:
+                raise Refused("; ".join(f"{name}, {order.order}: {reply.reason}" for name, reply in refused.items()))
+            left = list(refused)
+            while time.monotonic() - asked < AGAIN_S:
+                yield
 
     def _reach(self, names: Sequence[str], phase: str, limit_s: float) -> Generator[None]:
         began = time.monotonic()

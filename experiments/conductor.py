@@ -22,11 +22,12 @@ from experiments.emergency import Emergency
 from experiments.experiment import Experiment
 from experiments.hosts import Hosts
 from experiments.launcher import LAND_S, Launcher
+from experiments.orders import lead
 from experiments.overview import Overview
 from experiments.seen import Progress, Seen, Show
 
 POLL_S: Final = 0.05
-LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then
+TARDY_S: Final = 0.05  # who begins later than this after the common start is named
 GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
 
 ADOPT_S: Final = 0.5
@@ -103,6 +104,7 @@ class Conductor:
             for name, robot in experiment.robots.items()
         }
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
+        self._starting: set[str] = set()
         self._crew = Crew(
             experiment,
             case,
@@ -245,11 +247,11 @@ class Conductor:
             if not (seen.gone or AHEAD_S < seen.behind < BEHIND_S):
                 remedy = "set it (NTP), or let zenpark start the robot: [hosts]"
                 self._view.say("clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}")
-        at = time.time() + LEAD_S
+        there = [name for name, seen in self._robots.items() if seen.reached("airborne") and not seen.gone]
+        at = time.time() + lead(len(there))
         self._view.say("start", "conductor", "common start", stamp=at)
-        self._order(
-            wire.Order("start", at=at), [name for name, seen in self._robots.items() if seen.reached("airborne")]
-        )
+        self._order(wire.Order("start", at=at), there)
+        self._starting = {*there}
         return at
 
     def _walk(self, start: float) -> None:
@@ -266,6 +268,7 @@ class Conductor:
             self._look()
             self._view.tell_drift(*self._drift.news())
             self._progress.elapsed = now - start
+            self._tell_tardy(start)
             self._start_late(start)
             while reached + 1 < len(times) and now - start >= times[reached + 1]:
                 reached += 1
@@ -280,12 +283,27 @@ class Conductor:
     def _start_late(self, start: float) -> None:
         """Repeats the start to robots that still wait: a busy machine may have lost the order, or its answer."""
         now, busy = time.time(), self._changes.under_way
-        for name, seen in self._robots.items():
-            waits = seen.status is not None and seen.status.phase == "airborne" and seen.status.stamp > start + LATE_S
-            if waits and not seen.gone and name not in busy and now > self._repeat_at:
-                self._repeat_at = now + LATE_S
+        late = [
+            name
+            for name, seen in self._robots.items()
+            if seen.status is not None and seen.status.phase == "airborne" and seen.status.stamp > start + LATE_S
+            if not seen.gone and name not in busy
+        ]
+        if late and now > self._repeat_at:
+            self._repeat_at = now + LATE_S
+            for name in late:
                 self._view.say("late", name, "still waits for the start; told again")
-                self._view.order(name, wire.Order("start", at=start))
+            self._view.order(late, wire.Order("start", at=start))
+
+    def _tell_tardy(self, start: float) -> None:
+        """Names robots that were told of the common start and began after it."""
+        for name in list(self._starting):
+            seen = self._robots[name]
+            if seen.began is None and not seen.gone and name not in self._changes.under_way:
+                continue
+            self._starting.remove(name)
+            if seen.began is not None and (tardy := seen.began - start) > TARDY_S:
+                self._view.say("late", name, f"began {tardy:.2f} s after the common start")
 
     def _land(self) -> None:
         """Everybody down."""
@@ -360,15 +378,12 @@ class Conductor:
 
     def _order(self, order: wire.Order, to: Sequence[str] | None = None) -> list[str]:
         """Gives an order to all robots that are left, or to some of them; says and returns who refused."""
-        refused = []
-        for name, seen in self._robots.items():
-            if seen.gone or seen.status is None or (to is not None and name not in to):
-                continue
-            reply = self._view.order(name, order)
-            if not reply.ok:
-                refused.append(name)
-                self._view.say("refused", name, f"{order.order}: {reply.reason}")
-        return refused
+        left = [name for name, seen in self._robots.items() if not (seen.gone or seen.status is None)]
+        replies = self._view.order([name for name in left if to is None or name in to], order)
+        refused = {name: reply.reason for name, reply in replies.items() if not reply.ok}
+        for name, reason in refused.items():
+            self._view.say("refused", name, f"{order.order}: {reason}")
+        return list(refused)
 
     # ------------------------------------------------------------------ words
 

@@ -40,6 +40,7 @@ from experiments.trace import Trace
 
 WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
 BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
+TROUBLES: Final = ("late", "unread")  # kinds of events that tell of the run itself, not of a robot's doing
 KNOWN: Final = 0.95  # a robot whose position is known for less of the run counts as died
 
 
@@ -131,6 +132,7 @@ def measure(trace: Trace) -> CaseMetrics:
         intervened_share=_share(trace.interventions.sum(), ticks),
         avoided_share=_share(trace.avoided.sum(), ticks),
         world_factor=_slowest(trace),
+        troubles=tuple(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
         network_messages=sum(robot.messages + robot.goals for robot in robots),
         network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
         deliveries=guiding.deliveries(trace, np.array([robot.messages for robot in robots], dtype=np.intp)),

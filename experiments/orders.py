@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Final, TypeVar
 
 import zenoh
@@ -10,27 +11,47 @@ from agents import wire
 from agents.keys import Keys
 
 REPLY_S: Final = 1.0
+LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then,
+LEAD_EACH_S: Final = 0.01  # with so much more for each robot
 CHANGE_S: Final = 90.0  # a robot lands, its process ends, another starts, is ready, and climbs
 
 R = TypeVar("R", wire.Reply, wire.WorldReply, wire.RunReply)
 
 
-def give(session: zenoh.Session, keys: Keys, robot: str, order: wire.Order, wait_s: float = REPLY_S) -> wire.Reply:
-    """Gives an order to a robot and returns its reply; one that says no, and why, when the robot does not answer."""
-    reply, why = _ask(session, keys.order(robot), wire.encode(order), wire.Reply, wait_s)
-    return reply or wire.Reply(robot, ok=False, phase="unknown", reason=why or "no answer")
+def lead(robots: int) -> float:
+    """How far ahead of the order a common start of so many robots lies [s]."""
+    return LEAD_S + LEAD_EACH_S * robots
+
+
+def give(
+    session: zenoh.Session, keys: Keys, robots: Sequence[str], order: wire.Order, wait_s: float = REPLY_S
+) -> dict[str, wire.Reply]:
+    """Gives an order to robots, to all at once, and returns their replies; a refusal, with why, for one that is silent.
+
+    A robot that hangs costs the others no time: each has the order before the first answer is waited for.
+    """
+    payload = wire.encode(order)
+    asked = {robot: session.get(keys.order(robot), payload=payload, encoding=wire.JSON, timeout=wait_s)
+             for robot in robots}  # fmt: skip
+    replies = {}
+    for robot, answers in asked.items():
+        reply, why = _read(answers, wire.Reply)
+        replies[robot] = reply or wire.Reply(robot, ok=False, phase="unknown", reason=why or "no answer")
+    return replies
 
 
 def give_world(session: zenoh.Session, keys: Keys, order: wire.WorldOrder, wait_s: float = REPLY_S) -> wire.WorldReply:
     """Gives an order to the world and returns its reply; one that says no, and why, when it does not answer."""
-    reply, why = _ask(session, keys.world_order, wire.encode(order), wire.WorldReply, wait_s)
+    asked = session.get(keys.world_order, payload=wire.encode(order), encoding=wire.JSON, timeout=wait_s)
+    reply, why = _read(asked, wire.WorldReply)
     nobody = "no world answers: is `zenpark world` running in this realm?"
     return reply or wire.WorldReply(ok=False, paused=False, time=0.0, reason=why or nobody)
 
 
 def give_run(session: zenoh.Session, keys: Keys, order: wire.RunOrder, wait_s: float = CHANGE_S) -> wire.RunReply:
     """Gives an order to the conductor and returns its reply when all is done, or that no conductor answers."""
-    reply, why = _ask(session, keys.run_order, wire.encode(order), wire.RunReply, wait_s)
+    asked = session.get(keys.run_order, payload=wire.encode(order), encoding=wire.JSON, timeout=wait_s)
+    reply, why = _read(asked, wire.RunReply)
     nobody = (
         "no conductor answers: is `zenpark run` running in this realm, at this router (--connect), and is this an "
         "operator (--as)?"
@@ -38,10 +59,10 @@ def give_run(session: zenoh.Session, keys: Keys, order: wire.RunOrder, wait_s: f
     return reply or wire.RunReply(reason=why or nobody)
 
 
-def _ask(session: zenoh.Session, key: str, payload: bytes, kind: type[R], wait_s: float) -> tuple[R | None, str]:
+def _read(asked: Iterable[zenoh.Reply], kind: type[R]) -> tuple[R | None, str]:
     """The reply, or why there is none; empty if nobody said anything."""
     why = ""
-    for reply in session.get(key, payload=payload, encoding=wire.JSON, timeout=wait_s):
+    for reply in asked:
         if reply.ok is not None:
             try:
                 return wire.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), kind), ""

@@ -16,6 +16,7 @@ from agents import session as network
 from agents.endpoint import DEFAULT_ENDPOINT
 from agents.keys import Keys
 from agents.leaving import held
+from agents.lifecycle import Phase
 from experiments import hosts as machines
 from experiments import mesh, orders
 from experiments.experiment import Experiment
@@ -115,9 +116,9 @@ class Overview:
                 known.vanished = inf if known.alive else time.monotonic()
         return self._missed()
 
-    def order(self, name: str, order: wire.Order) -> wire.Reply:
-        """Gives an order to a robot; a refusal, with why, if it does not answer."""
-        return orders.give(self._session, self._keys, name, order)
+    def order(self, names: Sequence[str], order: wire.Order) -> dict[str, wire.Reply]:
+        """Gives an order to robots, see `orders.give`."""
+        return orders.give(self._session, self._keys, names, order)
 
     def say(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
         """An event of the run, now or at `stamp` [s, UTC]."""
@@ -177,5 +178,7 @@ class Overview:
         if status.stamp - since >= 0.9:
             seen.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0
             seen.counted = (status.stamp, status.sent)
+        if status.phase == Phase.RUNNING.word and seen.phase != status.phase:
+            seen.began = status.stamp
         seen.status = status
         seen.behind = min(seen.behind, time.time() - status.stamp)

@@ -33,6 +33,7 @@ POLL_S: Final = 0.02
 FLUSH_S: Final = 1.0
 AFTER_S: Final = 12.0  # how long robots may take to land after the conductor is gone
 FRESH_S: Final = 0.05  # a truth that is older does not belong to a state
+NAMED: Final = 100  # keys of which is told that something could not be read
 DEPTH: Final = 20_000  # samples that may wait while the disk does
 RARE: Final = 1_000  # of those that come once a second, or now and then: a ring takes its memory as it first goes round
 
@@ -44,7 +45,8 @@ class Recorder:
         self._keys, self._recording = keys, recording
         self._connected = True
         self._session = session
-        self.malformed = 0
+        self._unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
+        self._told: dict[str, int] = {}
         self._alive: set[str] = set()
         self._poses = network.pose_subscriber(session, keys.pose("*"), DEPTH)
         self._statuses = network.pose_subscriber(session, keys.status("*"), RARE)
@@ -89,8 +91,27 @@ class Recorder:
             for sample in network.received(handler):
                 try:
                     what(sample)
-                except ValueError:  # malformed, or on a key that is nobody's
-                    self.malformed += 1
+                except ValueError as error:  # malformed, or on a key that is nobody's
+                    key = str(sample.key_expr)
+                    self._unread[key] = self._unread.get(key, (0, ""))[0] + 1, str(error)
+
+    @property
+    def malformed(self) -> int:
+        """Messages that could not be read."""
+        return sum(count for count, _ in self._unread.values())
+
+    def complain(self, *, last: bool = False) -> None:
+        """Says in the recording what could not be read: of each key at once, and at the `last` how much it was.
+
+        Raises:
+            RecordingError: If it cannot be written.
+        """
+        for key, (count, why) in list(self._unread.items())[:NAMED]:
+            before = self._told.get(key, 0)
+            if not before or (last and count != before):
+                self._told[key] = count
+                text = f"could not read {count} {'message' if count == 1 else 'messages'} on {key}: {why}"
+                self._recording.event(wire.Event(time.time(), "unread", "recorder", text))
 
     def _pose(self, sample: zenoh.Sample) -> None:
         payload = sample.payload.to_bytes()
@@ -192,6 +213,7 @@ def record(file: str, target: Path, *, case: str, source: Path, connect: Sequenc
             recorder.take()
             now = time.monotonic()
             if now > flush_at:
+                recorder.complain()
                 recording.flush()
                 flush_at = now + FLUSH_S
             if lost.is_set():
@@ -199,6 +221,7 @@ def record(file: str, target: Path, *, case: str, source: Path, connect: Sequenc
                 if recorder.alone or now > last or not network.connected(session):
                     break
         recorder.take()
+        recorder.complain(last=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -32,6 +32,7 @@ class Seen:
         told: Number of the last incident that was said.
         place: Where it last said that it was [m].
         former: The process whose statuses are of the past: the robot has a new one, or will have.
+        began: Stamp of its first tick in the experiment, UTC [s].
     """
 
     status: wire.Status | None = None
@@ -45,6 +46,7 @@ class Seen:
     told: int = 0
     place: wire.Vector | None = None
     former: int | None = None
+    began: float | None = None
 
     @property
     def gone(self) -> bool:
@@ -64,6 +66,7 @@ class Seen:
         self.former = self.status.pid if self.status is not None else self.former
         self.status, self.alive, self.vanished = None, False, inf
         self.rate, self.counted, self.behind, self.told = 0.0, (0.0, 0), inf, 0
+        self.began = None
 
 
 @dataclass

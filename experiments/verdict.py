@@ -30,6 +30,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """The verdict over all cases, the first one being the reference."""
     return [
         *interruptions(cases),
+        *_troubles(cases),
         *_nothing_lost(cases),
         *(Finding("plain", text) for text in sentences(cases)),
         *_deadlines(cases),
@@ -88,6 +89,17 @@ def _nothing_lost(cases: Sequence[CaseMetrics]) -> list[Finding]:
         return [Finding("good", f"Nothing was lost: {number(sent)} poses were sent, and no running number is missing.")]
     where = _list([f"{number(count)} in {name}" for name, count in lost.items() if count])
     return [Finding("bad", f"Samples were lost: {where}, of {number(sent)} poses sent in all.")]
+
+
+def _troubles(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Robots that began late, and messages that could not be read."""
+    found = []
+    for case in cases:
+        more = len(case.troubles) - NAMED
+        shown = [*case.troubles[:NAMED], *([f"{more} more like this"] if more > 0 else [])]
+        if shown:
+            found.append(Finding("bad", f"In {case.case}: {'; '.join(shown)}."))
+    return found
 
 
 def _deadlines(cases: Sequence[CaseMetrics]) -> list[Finding]:

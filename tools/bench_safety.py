@@ -313,8 +313,7 @@ class _Park:
         from experiments import orders  # noqa: PLC0415
 
         kinds: dict[str, wire.OrderKind] = {"takeoff": "takeoff", "start": "start"}
-        for name in self._names:
-            reply = orders.give(self._session, self._keys, name, wire.Order(kinds[what], at=at))
+        for name, reply in orders.give(self._session, self._keys, self._names, wire.Order(kinds[what], at=at)).items():
             if not reply.ok:
                 raise RuntimeError(f"{name} does not {what}: {reply.reason}")
 

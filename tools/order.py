@@ -5,15 +5,13 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from typing import Final, get_args
+from typing import get_args
 
 from agents import session as network
 from agents import wire
 from agents.endpoint import DEFAULT_ENDPOINT
 from agents.keys import Keys
 from experiments import orders
-
-LEAD_S: Final = 0.5  # a common start lies so far ahead, that every robot has it by then
 
 
 def command(what: str, robots: Sequence[str], *, connect: Sequence[str], realm: str, identity: str = "operator") -> int:
@@ -41,10 +39,11 @@ def command(what: str, robots: Sequence[str], *, connect: Sequence[str], realm: 
         if not there:
             print(f"zenpark: no robot is there in the realm '{realm}'; `zenpark keys` shows who is", file=sys.stderr)
             return 2
-        at = time.time() + LEAD_S if what == "start" else None
+        told = list(robots) or sorted(there)
+        at = time.time() + orders.lead(len(told)) if what == "start" else None
         refused = False
-        for robot in robots or sorted(there):
-            reply = orders.give(session, keys, robot, wire.Order(what, at=at))  # type: ignore[arg-type]
+        order = wire.Order(what, at=at)  # type: ignore[arg-type]
+        for robot, reply in orders.give(session, keys, told, order).items():
             refused |= not reply.ok
             print(
                 f"{robot}: {'yes' if reply.ok else 'no'}, {reply.phase}" + (f": {reply.reason}" if reply.reason else "")

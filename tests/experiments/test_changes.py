@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -82,7 +83,10 @@ class View:
     def say(self, kind: str, source: str, text: str) -> None:
         self.said.append((kind, source, text))
 
-    def order(self, name: str, order: wire.Order) -> wire.Reply:
+    def order(self, names: Sequence[str], order: wire.Order) -> dict[str, wire.Reply]:
+        return {name: self._order(name, order) for name in names}
+
+    def _order(self, name: str, order: wire.Order) -> wire.Reply:
         self.given.append((name, order.order))
         if name in self._stage.hung:
             return wire.Reply(name, ok=False, phase="unknown", reason="no answer")

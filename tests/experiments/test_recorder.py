@@ -24,9 +24,13 @@ class Taken:
     def __init__(self) -> None:
         self.contacts: list[wire.Contact] = []
         self.worlds: list[wire.WorldState] = []
+        self.events: list[wire.Event] = []
 
     def contact(self, contact: wire.Contact) -> None:
         self.contacts.append(contact)
+
+    def event(self, event: wire.Event) -> None:
+        self.events.append(event)
 
     def world(self, said: wire.WorldState) -> None:
         self.worlds.append(said)
@@ -63,3 +67,11 @@ def test_what_the_world_says_is_taken_down_if_it_can_be_true(
     assert set(map(str, taken.contacts)) == {str(touched(0.3))}
     assert set(map(str, taken.worlds)) == {str(world(0.2))}
     assert recorder.malformed >= 5
+    recorder.complain()
+    recorder.complain()
+    texts = [(event.kind, event.source, event.text) for event in taken.events]
+    assert [(kind, source) for kind, source, _ in texts] == [("unread", "recorder")] * 2
+    assert {text.split(" on ")[1].split(": ")[0] for *_, text in texts} == {KEYS.contact, KEYS.world}
+    before = recorder.malformed
+    recorder.complain(last=True)
+    assert (recorder.malformed, len(taken.events)) == (before, 2)  # nothing new

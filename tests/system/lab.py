@@ -113,7 +113,7 @@ class Watcher(Looking):
         return self.status[robot].phase if robot in self.status else ""
 
     def order(self, robot: str, order: wire.Order) -> wire.Reply:
-        return orders.give(self.session, self.keys, robot, order)
+        return orders.give(self.session, self.keys, [robot], order)[robot]
 
     def close(self) -> None:
         self.session.close()  # type: ignore[no-untyped-call]

@@ -164,7 +164,7 @@ def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory: Laboratory, wh
 @pytest.mark.parametrize("who", ["KH03", "observer", "recorder", "world", "centre", "ros2"])
 def test_orders_are_the_operators(laboratory: Laboratory, who: str) -> None:
     with laboratory.session(who) as session:
-        reply = orders.give(session, KEYS, "CF01", wire.Order("land"))
+        reply = orders.give(session, KEYS, ["CF01"], wire.Order("land"))["CF01"]
         assert (reply.ok, reply.reason) == (False, "no answer")
         for key in ("park/*/order", "park/**", "park/CF01/*", "**"):
             assert not list(session.get(key, payload=wire.encode(wire.Order("land")), encoding=wire.JSON, timeout=1.0))

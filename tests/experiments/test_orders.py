@@ -1,0 +1,67 @@
+"""Orders reach all robots at once, and who begins late is known."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from agents import session as network
+from agents import wire
+from agents.keys import Keys
+from experiments import orders
+from experiments.overview import Overview
+from experiments.seen import Progress, Seen
+from tests.conftest import RouterProcess
+from tests.experiments.recordings import START, status
+
+KEYS = Keys()
+
+
+@pytest.mark.system
+def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProcess) -> None:
+    """The first answers only when the last has the order: whoever is asked one after the other waits in vain."""
+    names = ["A", "B", "C"]
+    over = threading.Event()
+
+    def answer() -> None:
+        waiting = {}
+        while not over.wait(0.005):
+            for name, queryable in told.items():
+                for query in network.received(queryable.handler):
+                    waiting[name] = query
+            if len(waiting) == len(names):
+                for name, query in waiting.items():
+                    with query:
+                        reply = wire.Reply(name, name != "B", "airborne", "" if name != "B" else "no")
+                        query.reply(KEYS.order(name), wire.encode(reply), encoding=wire.JSON)
+                waiting = {}
+
+    with (
+        network.open_session([router.endpoint], name="robots") as robots,
+        network.open_session([router.endpoint], name="conductor") as conductor,
+    ):
+        told = {name: network.orders(robots, KEYS.order(name)) for name in names}
+        thread = threading.Thread(target=answer)
+        thread.start()
+        try:
+            replies = orders.give(conductor, KEYS, [*names, "D"], wire.Order("hold"), 20.0)
+        finally:
+            over.set()
+            thread.join()
+    assert [(name, reply.ok, reply.reason) for name, reply in replies.items()] == [
+        ("A", True, ""), ("B", False, "no"), ("C", True, ""), ("D", False, "no answer"),
+    ]  # fmt: skip
+
+
+def test_when_a_robot_began_is_its_first_status_of_the_experiment() -> None:
+    view = Overview.__new__(Overview)
+    view._progress = Progress("case", "running", None, 1.0, {"TB01": Seen()})
+    view.robots = view._progress.robots
+    view.say = lambda *_, **__: None  # type: ignore[method-assign]
+    for phase, at in (("airborne", -0.1), ("running", 0.28), ("running", 1.28), ("landing", 2.0)):
+        said = status(at=at)
+        view._heed(wire.decode(wire.encode(said).replace(b'"run"', f'"{phase}"'.encode()), wire.JSON, wire.Status))
+    assert view.robots["TB01"].began == START + 0.28
+    view.robots["TB01"].forget()
+    assert view.robots["TB01"].began is None
