@@ -9,8 +9,8 @@ A tick has two halves: `speak`, then `act`. Whoever carries messages may deliver
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from agents.assignment import Assignment
@@ -34,8 +34,7 @@ from agents.speaking import Said, Voice
 from agents.triggers import Told, Trigger
 
 
-@dataclass(frozen=True)
-class Actions:
+class Actions(msgspec.Struct, frozen=True):
     """What comes out of a tick.
 
     Attributes:
@@ -115,6 +114,7 @@ class Agent:
         self._everybody: Mask = np.ones(rows, dtype=bool)
         self._wild = self._nobody
         self._where: Whereabouts
+        self._age: Array
 
     # ------------------------------------------------------------------ what the outside tells
 
@@ -210,7 +210,8 @@ class Agent:
         """The first half of a tick: phases move on, and it is decided who speaks. What is said was measured."""
         self.deciding.settle(t)
         life = self.life
-        self._where = self._safety.where(state.position, state.yaw, t - state.time)
+        self._age = t - state.time
+        self._where = self._safety.where(state.position, state.yaw, self._age)
         duties = life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
         self._duties = self._landing.direct(
             t, duties, state, self._where, hearing=self.hearing, late=self.outside.failing, phase=life.phase
@@ -246,9 +247,9 @@ class Agent:
             self._follow(self.guidance, state.position)
         goal, avoided = self.goal, self._nobody
         aside = self._landing.aside
-        if some(aside):
+        if self._landing.anybody_aside:
             goal = np.where(aside[:, None], self._landing.spot, goal)
-        age, where = t - state.time, self._where
+        age, where = self._age, self._where
         avoidance = self.assignment.avoidance
         if avoidance is None or self._sight is None:
             setpoint = self._individual.setpoint(goal, self.toward, state.position, state.yaw)

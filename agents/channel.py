@@ -8,9 +8,10 @@ running number (see `agents.chance`), so that both lose the same samples. docs/n
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 
 from agents.chance import Words, uniform
@@ -78,8 +79,7 @@ class Conditions:
         return cls(**columns, outages=tuple(outages), duration=parts[0].duration)
 
 
-@dataclass(frozen=True)
-class Samples:
+class Samples(msgspec.Struct, frozen=True):
     """Poses on their way (M): link, arrival time, sample time [s], number, position and velocity (M, 3).
 
     `extra` (M, k) is what else is told with them, for those who need it: with all that go over a channel, or with none.
@@ -106,7 +106,7 @@ class Samples:
         )
 
 
-COLUMNS: Final = tuple(field.name for field in fields(Samples) if field.name != "extra")
+COLUMNS: Final = tuple(name for name in Samples.__struct_fields__ if name != "extra")
 
 
 class Channel:
@@ -273,7 +273,7 @@ class Channel:
             return self._flying[0]
         pool = Samples(*(np.concatenate([getattr(each, column) for each in self._flying]) for column in COLUMNS))
         extra = [each.extra for each in self._flying if each.extra is not None]
-        return replace(pool, extra=np.concatenate(extra)) if extra else pool
+        return msgspec.structs.replace(pool, extra=np.concatenate(extra)) if extra else pool
 
 
 def _thresholds(conditions: Conditions) -> tuple[Array, Array]:

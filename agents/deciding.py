@@ -6,8 +6,7 @@ it for all that it guides, from where they last said that they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import msgspec
 import numpy as np
 
 from agents import coordination
@@ -20,8 +19,7 @@ from agents.rows import Array, Index, Mask, some
 from agents.updating import Input, Updating
 
 
-@dataclass(frozen=True)
-class Decided:
+class Decided(msgspec.Struct, frozen=True):
     """What a decision says of all rows; of those that are not `due` it means nothing.
 
     Attributes:

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import asin, degrees, expm1, hypot, sin
-from typing import Final, NamedTuple
+from typing import Final
 
+import msgspec
 import numpy as np
 
 from agents.assignment import Assignment
@@ -55,7 +56,7 @@ class Outside:
                 self.late = 0.0
 
 
-class Standing(NamedTuple):
+class Standing(msgspec.Struct, frozen=True):
     """How rows (N,) stand in the experiment on a tick, for `Detector.look`.
 
     Attributes:

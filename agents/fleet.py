@@ -38,8 +38,6 @@ class Fleet:
 
     def read(self, t: float) -> BodyState:
         """See `Body.read`."""
-        if len(self._parts) == 1:
-            return self._parts[0][1].read(t)
         states = [(group, body.read(t)) for group, body in self._parts]
         merged: dict[str, Any] = {}
         for field in fields(BodyState):
@@ -101,8 +99,8 @@ class Fleet:
         return [(body, which) for body, which in found if len(which)]
 
 
-def assemble(request: BodyRequest) -> Fleet:
-    """The bodies that the addresses of a request ask for.
+def assemble(request: BodyRequest) -> Body:
+    """The bodies that the addresses of a request ask for; one that carries all rows stands by itself.
 
     Raises:
         plugins.UnknownPlugin: If no body of that name is installed.
@@ -113,4 +111,4 @@ def assemble(request: BodyRequest) -> Fleet:
     for name in dict.fromkeys(names):
         group = np.array([row for row, other in enumerate(names) if other == name], dtype=np.intp)
         parts.append((group, plugins.load(plugins.BODIES, name)(request.of(group))))
-    return Fleet(len(names), parts)
+    return Fleet(len(names), parts) if len(parts) > 1 else parts[0][1]

@@ -34,6 +34,7 @@ class Landing:
 
     Attributes:
         aside: (N,) rows that must land and are not there yet.
+        anybody_aside: Whether there are any.
         spot: (N, 3) where they go [m].
     """
 
@@ -49,7 +50,7 @@ class Landing:
         self._their_height = np.array([kind.height for kind in speaks])
         self._flies = np.array([kind.flies for kind in assignment.kinds])
         self._nobody: Mask = np.zeros(rows, dtype=bool)
-        self.aside = self._nobody
+        self.aside, self.anybody_aside = self._nobody, False
         self.spot = np.full((rows, 3), np.nan)
         self._until = np.full(rows, -np.inf)
         self._apart = np.full(len(links), np.inf)
@@ -77,7 +78,7 @@ class Landing:
             phase: (N,) of the rows; one that does not land any more goes nowhere.
         """
         told = duties is not None and len(duties.land) > 0
-        if not (told or some(self.aside)):
+        if not (told or self.anybody_aside):
             return duties
         self.spot[~self.aside] = np.nan
         due = self.aside & (phase == LANDING)
@@ -89,6 +90,7 @@ class Landing:
         able = due & self._flies & state.flying & ~where.blind & ~where.beyond & (t <= self._until)
         able &= (state.position[:, 2] > LOW) & (not late)
         self.aside = able & self._must_wait(state, place, gone)
+        self.anybody_aside = some(self.aside)
         for row in np.flatnonzero(self.aside).tolist():
             self._choose(row, state.position[row], place, gone)
         lands = np.flatnonzero(due & ~self.aside)
@@ -99,7 +101,7 @@ class Landing:
 
     def hurry(self) -> None:
         """Whoever is on its way aside has been told to land where it is."""
-        self.aside = self._nobody
+        self.aside, self.anybody_aside = self._nobody, False
 
     def below(self, row: int) -> str:
         """Who is below a row that goes aside, in words."""

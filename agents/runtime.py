@@ -44,6 +44,7 @@ from agents.watchdog import AGAIN_S, Watchdog
 FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its launcher was lost has its motors cut
 STOPPED_S: Final = 5.0  # a body that does not say that its motors stand is told so long, and then left
 HUSH_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
+ROUTER_S: Final = 0.045  # between two looks at the router
 DOUBT_S: Final = 1.0  # a robot whose process stood still holds for so long: what it knows is old
 
 
@@ -182,6 +183,7 @@ class Runtime:
     def _join(self, session: zenoh.Session) -> None:
         keys, names = self._setup.keys, self._names
         self._session = session
+        self._router_due, self._silent_since = -np.inf, np.inf
         self._router = network.RouterWatch(session, keys.alive(names[0]))
         self._poses = [network.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
@@ -275,7 +277,9 @@ class Runtime:
         """Since when nobody can be believed: the routers are gone, or this process has just stood still."""
         if t < self._doubt_until:  # long enough ago to hold, and not long enough to land
             return min(before, t - self._assignment.limits.link_silence_s - self._dt)
-        return self._router.silent_since(t)
+        if t >= self._router_due:  # a look at the router costs as much as a law
+            self._router_due, self._silent_since = t + ROUTER_S, self._router.silent_since(t)
+        return self._silent_since
 
     def _cut(self, _stop: wire.Stop) -> None:
         """Motors off as soon as an emergency stop is heard, in the thread that receives; the loop does the rest."""

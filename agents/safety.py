@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from agents.avoidance import Avoidance, Nearby, Self
@@ -84,8 +85,7 @@ class Whereabouts:
     outside: Array
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(msgspec.Struct, frozen=True):
     """What may be sent, and what else must happen.
 
     Attributes:

@@ -1,9 +1,9 @@
 """Sessions on the Zenoh network, and what a robot declares on them.
 
-Everything that is received waits in a ring channel and is polled from the control loop. A callback would cost a thread
-each, a slow one stops all reception of its session, and one that is left open keeps the interpreter from exiting.
-A ring channel does none of this: it keeps the newest items and never blocks. The emergency stop alone cannot wait for
-the next tick (`Alarm`).
+Everything that is received waits to be polled from the control loop: frequent samples in a ring channel, which keeps
+the newest ones and never blocks; rare ones in an `Inbox`. A callback of the usual kind would cost a thread each, a slow
+one stops all reception of its session, and one that is left open keeps the interpreter from exiting. The emergency stop
+alone cannot wait for the next tick (`Alarm`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 from math import inf
-from typing import Final, Protocol, Self, TypeVar
+from typing import Final, Generic, Protocol, Self, TypeVar
 
 import zenoh
 from zenoh.ext import (
@@ -34,6 +34,7 @@ from agents.endpoint import EndpointError
 from agents.promptness import prompt_threads
 from agents.settings import ASK_S, LEASE_S, config, reason, settings
 
+T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
 RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
@@ -48,6 +49,8 @@ ANSWER_S: Final = 0.3  # a question without an answer for so long begins a silen
 ASKED: Final = 8  # questions that are waited for at once
 LOOK_S: Final = 0.1  # between two looks for an answer no more than this is held against the router
 NO_ORDER: Final = 'an order is a query with a payload, such as {"order": "land"}'
+ORDERS: Final = 8  # that wait to be answered
+EVENTS_OF_LIFE: Final = 256  # comings and goings that wait to be polled
 EVENTS: Final = 64  # of a run that are said again to who was cut off: without a router much happens at once
 
 
@@ -330,6 +333,28 @@ class Alarm:
             self._waiting.append(stop)
 
 
+class Inbox(Generic[T]):
+    """Rare items, put in by the thread that receives, until they are polled.
+
+    An empty one costs a tenth of an empty ring channel to poll. Items that come often belong into a ring channel: each
+    item here costs the receiving thread a wait for the interpreter's lock.
+    """
+
+    def __init__(self, depth: int, wanted: Callable[[T], bool] = lambda _: True) -> None:
+        """Keeps the newest `depth` items that are `wanted`. `filled` is the callback to declare."""
+        self._items: deque[T] = deque(maxlen=depth)
+        self._wanted = wanted
+        self.filled = Callback(self._take, indirect=False)
+
+    def try_recv(self) -> T | None:
+        """See `Polled`."""
+        return self._items.popleft() if self._items else None
+
+    def _take(self, item: T) -> None:
+        if self._wanted(item):
+            self._items.append(item)
+
+
 class LastValue:
     """Answers a plain `get` (z_get, REST) on a key with its last value, which the cache of an advanced publisher does
     not: call `answer` from the control loop."""
@@ -338,7 +363,8 @@ class LastValue:
         self.key = key
         self.mime = mime
         self._payload: bytes | None = None
-        self._queryable = session.declare_queryable(key, RingChannel(8))
+        self._questions = Inbox[zenoh.Query](ORDERS)
+        self._queryable = session.declare_queryable(key, self._questions.filled)
 
     def hold(self, payload: bytes) -> None:
         """Remembers the value to answer with."""
@@ -347,7 +373,7 @@ class LastValue:
     def answer(self) -> int:
         """Replies to whoever asked since the last call, with nothing if there is no value yet; says to how many."""
         asked = 0
-        for query in received(self._queryable.handler):
+        for query in received(self._questions):
             with query:
                 if self._payload is not None:
                     query.reply(self.key, self._payload, encoding=self.mime)
@@ -380,7 +406,8 @@ class Orders:
     """
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
-        self._queryable = session.declare_queryable(key, RingChannel(8), complete=True)
+        self._queries = Inbox[zenoh.Query](ORDERS)
+        self._queryable = session.declare_queryable(key, self._queries.filled, complete=True)
 
     @property
     def handler(self) -> Self:
@@ -389,7 +416,7 @@ class Orders:
 
     def try_recv(self) -> zenoh.Query | None:
         """See `Polled`."""
-        for query in received(self._queryable.handler):
+        for query in received(self._queries):
             if query.payload is not None and query.payload.to_bytes():
                 return query
             with query:
@@ -433,19 +460,8 @@ class AliveWatch:
 
     def __init__(self, session: zenoh.Session, keyexpr: str) -> None:
         """Those already there come first."""
-        self._subscriber = session.liveliness().declare_subscriber(keyexpr, RingChannel(256), history=True)
-
-    @property
-    def handler(self) -> Self:
-        """See `Polled`."""
-        return self
-
-    def try_recv(self) -> zenoh.Sample | None:
-        """See `Polled`."""
-        for sample in received(self._subscriber.handler):
-            if "*" not in str(sample.key_expr):
-                return sample
-        return None
+        self.handler = Inbox[zenoh.Sample](EVENTS_OF_LIFE, lambda sample: "*" not in str(sample.key_expr))
+        self._subscriber = session.liveliness().declare_subscriber(keyexpr, self.handler.filled, history=True)
 
 
 def alive_watch(session: zenoh.Session, keyexpr: str) -> AliveWatch:

@@ -84,5 +84,5 @@ class Speaker:
 
     def comings(self) -> Iterator[bool]:
         """Whether it came (True) or went, each time that it did, oldest first."""
-        for sample in network.received(self._alive):
+        for sample in network.received(self._alive.handler):
             yield sample.kind == zenoh.SampleKind.PUT

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from agents.plugins import FAILURES, PluginError
@@ -13,8 +13,7 @@ from agents.rows import Array, Index, every
 from agents.triggers import Told, Trigger, View
 
 
-@dataclass(frozen=True)
-class Said:
+class Said(msgspec.Struct, frozen=True):
     """A moment of speaking: `rows` that speak, and of all rows the position and velocity (N, 3) to be said."""
 
     rows: Index

@@ -9,7 +9,7 @@ import numpy as np
 from agents import plugins
 from agents.body import BodyRequest, BodyState
 from agents.positioning import PATIENCE_S, External, velocity_after
-from agents.rows import Array, Index, Mask
+from agents.rows import Array, Index, Mask, every, span
 from twins.disturbance import Drift, HoverJitter, Latency, Measurement
 from twins.engine import Engine, EngineFactory, Stage, Touch
 from twins.noise import Noise
@@ -51,7 +51,8 @@ class TwinBody:
         self.engine: Engine = factory.build(stage)
         flies = np.array([k.flies for k in kinds])
         names, seeds, nature = request.names, request.seeds, request.disturbance
-        air = self._in_air = np.flatnonzero(flies)
+        air = np.flatnonzero(flies)
+        self._in_air, self._drives = span(air), ~flies
         aloft = [nature[i] for i in air]
         air_names, air_seeds = [names[i] for i in air], [seeds[i] for i in air]
         self._jitter = HoverJitter(aloft, Noise(air_names, air_seeds, "hover jitter", 2), self._dt)
@@ -64,7 +65,6 @@ class TwinBody:
         self._sensors = RangeSensors(request, self._world) if any(self._world.sensors) else None
         self._endurance = np.array([ENDURANCE_S[k.name] for k in kinds])
         self._used = np.zeros(rows)
-        self._on_floor = np.flatnonzero(~flies)
         self._outside = np.flatnonzero(request.external)
         self._external = External(rows)
         self._measured_at, self._measured, self._velocity = -inf, np.zeros((rows, 3)), np.zeros((rows, 3))
@@ -117,8 +117,9 @@ class TwinBody:
         if velocity is not None and isinstance(self.engine, PointMassEngine):
             self.engine.push(rows, velocity)
         self._state = self._measure()
+        self._velocity = self._velocity.copy()
         self._velocity[rows] = 0.0 if velocity is None else velocity  # the way to the place was no motion
-        self._state.velocity = self._velocity.copy()
+        self._state.velocity = self._velocity
 
     def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
         """Where mirrored rows are: (len(rows), 3) [m], (len(rows),) [rad], (len(rows), 3) [m/s]; NaN: not there."""
@@ -140,11 +141,10 @@ class TwinBody:
         if self._jitter.present:
             self._jitter.advance()
             share = np.minimum(engine.position[self._in_air, 2] / FULL_WOBBLE, 1.0)
-            self._wobble = np.zeros_like(self._wobble)
+            self._wobble = np.zeros((len(self._used), 2))  # engines may keep the last one
             self._wobble[self._in_air] = share[:, None] * self._jitter.displacement
         engine.advance(t - self.begun_at if isfinite(self.begun_at) else -inf, self._wobble)
-        self._used[self._on_floor] += self._dt
-        self._used[self._in_air] += self._dt * engine.flying[self._in_air]
+        self._used += self._dt * (engine.flying | self._drives)
         if before is not None:
             self._drift.advance(engine.position[:, :2] - before)
         if self._sensors is not None:
@@ -165,7 +165,7 @@ class TwinBody:
         state = BodyState(
             time=np.full(rows, self._t),
             position=measured,
-            velocity=self._velocity.copy(),
+            velocity=self._velocity,
             yaw=heading,
             true_position=truth,
             true_yaw=yaw,
@@ -175,7 +175,7 @@ class TwinBody:
             attitude=engine.attitude,
         )
         if len(self._outside):
-            state.position, state.yaw = measured.copy(), heading.copy()
+            state.position, state.velocity, state.yaw = measured.copy(), self._velocity.copy(), heading.copy()
             self._external.fill(state, self._outside)
         return state
 
@@ -188,10 +188,11 @@ class TwinBody:
         """
         since = self._t - self._measured_at
         if since >= PATIENCE_S:
-            self._velocity[:] = 0.0
+            self._velocity = np.zeros_like(self._velocity)
         elif since > 0.0:
             velocity = velocity_after(self._velocity, measured - self._measured, since)
-            self._velocity = np.where(np.isfinite(velocity), velocity, 0.0)  # a mirrored robot may be out of sight
+            known = np.isfinite(velocity)  # a mirrored robot may be out of sight
+            self._velocity = velocity if every(known) else np.where(known, velocity, 0.0)
         self._measured_at, self._measured = self._t, measured
 
 

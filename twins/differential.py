@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from agents.kinds import Kind
-from agents.rows import Array, Index, Mask, clamp
+from agents.rows import Array, Index, Mask, clamp, every
 
 COMMAND_TIMEOUT_S: Final = 0.5  # without a new command the wheels stop, as the robots' own firmware does it
 
@@ -45,6 +45,7 @@ class Differential:
         self._turn = np.array([dt / d.base for d in drives])  # yaw of a step, per difference of the rim speeds
         self._limit = np.array([d.speed for d in drives])
         self._change = np.array([d.acceleration * dt for d in drives])
+        self._least = -self._change
         self._wheels = np.zeros((2, len(drives)))  # rim speeds, left and right [m/s]
         self._wanted = np.zeros((2, len(drives)))
         self._patience = np.full(len(drives), np.inf)
@@ -55,11 +56,15 @@ class Differential:
     def command(self, twist: Array) -> None:
         """Sets v [m/s] and ω [rad/s], (n, 2); rows of NaN keep theirs."""
         v, half = twist[:, 0], self._half_base * twist[:, 1]
-        wanted = np.empty_like(self._wanted)
+        wanted = np.empty((2, len(half)))
         wanted[0], wanted[1] = v - half, v + half
         given = np.isfinite(wanted[0])
-        np.copyto(self._wanted, wanted, where=given)
-        self._patience[given] = COMMAND_TIMEOUT_S
+        if every(given):
+            self._wanted = wanted
+            self._patience[:] = COMMAND_TIMEOUT_S
+        else:
+            np.copyto(self._wanted, wanted, where=given)
+            self._patience[given] = COMMAND_TIMEOUT_S
 
     def halt(self, rows: Index) -> None:
         """Wheels to zero speed."""
@@ -80,9 +85,10 @@ class Differential:
         self._patience -= self._dt
         wanted = self._wanted * (self._patience >= 0.0)
         # both wheels are slowed by the same factor, so that a curve stays that curve
-        over = np.maximum(np.abs(wanted[0]), np.abs(wanted[1])) / self._limit
+        speed = np.abs(wanted)
+        over = np.maximum(speed[0], speed[1]) / self._limit
         wanted /= np.maximum(over, 1.0)
-        self._wheels += clamp(wanted - self._wheels, -self._change, self._change)
+        self._wheels += clamp(wanted - self._wheels, self._least, self._change)
         left, right = self._wheels
         v = 0.5 * (left + right)
         turn = (right - left) * self._turn

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from agents.kinds import Kind
-from agents.rows import Array, Index, Mask, some
+from agents.rows import Array, Index, Mask, every, some
 
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs and landings
 SHORTEST_S: Final = 0.5  # of them
@@ -26,6 +26,7 @@ class Pilot:
         yaw_rate: (n,) of rows that take a velocity [rad/s].
         by_velocity: (n,) rows that take a velocity.
         any_by_velocity: Whether there are any.
+        anybody_climbs: Whether a row moves vertically by itself.
         landing: (n,) on their way down.
     """
 
@@ -44,6 +45,8 @@ class Pilot:
         self._to = self._from.copy()
         self._elapsed = np.full(rows, np.inf)
         self._span = np.ones(rows)
+        self._by_position = ~self.by_velocity
+        self.anybody_climbs = False
 
     @property
     def climbing(self) -> Mask:
@@ -53,10 +56,15 @@ class Pilot:
     def command(self, setpoint: Array) -> None:
         """Position and yaw, or velocity and yaw rate (n, 4); rows of NaN, on the ground or landing keep theirs."""
         given = self.flying & ~(np.isnan(setpoint[:, 0]) | self.landing)
-        position = given & ~self.by_velocity
-        np.copyto(self.target, setpoint[:, :3], where=position[:, None])
-        np.copyto(self.heading, setpoint[:, 3], where=position)
-        self._elapsed[given] = np.inf
+        position = given & self._by_position
+        if every(position):
+            self.target[:], self.heading[:] = setpoint[:, :3], setpoint[:, 3]
+        else:
+            np.copyto(self.target, setpoint[:, :3], where=position[:, None])
+            np.copyto(self.heading, setpoint[:, 3], where=position)
+        if self.anybody_climbs:
+            self._elapsed[given] = np.inf
+            self.anybody_climbs = some(self.climbing)
         if self.any_by_velocity:
             velocity = given & self.by_velocity
             np.copyto(self.wanted, setpoint[:, :3], where=velocity[:, None])
@@ -85,6 +93,7 @@ class Pilot:
         self.wanted[rows], self.yaw_rate[rows] = 0.0, 0.0
         self.flying[rows], self.landing[rows] = flying, False
         self._elapsed[rows] = np.inf
+        self.anybody_climbs = some(self.climbing)
 
     def advance(self, climbing: Mask) -> None:
         """One step of dt of the rows `climbing`: their target moves by a polynomial, without jerk at both ends."""
@@ -103,6 +112,7 @@ class Pilot:
         self.target[rows] = position[rows]
         self._from[rows], self._to[rows] = position[rows, 2], height
         self._elapsed[rows] = 0.0
+        self.anybody_climbs = some(self.climbing)
         self._span[rows] = np.maximum(np.abs(height - position[rows, 2]) / CLIMB, SHORTEST_S)
 
 

@@ -137,7 +137,6 @@ class PointMassEngine(Models):
 
     def advance(self, t: float, wobble: Array) -> None:
         """See `Engine.advance`."""
-        self.position, self.velocity, self.yaw = self.position.copy(), self.velocity.copy(), self.yaw.copy()
         if len(self.on_floor):
             drive = self.differential
             drive.advance()

@@ -57,6 +57,7 @@ class Quadrotor(Piloted):
         self._kp = np.array([r.position for r in responses])
         self._gain = dt * np.array([r.velocity for r in responses])  # of a step: k_v dt
         self._speed = np.array([r.speed for r in responses]).reshape(rows, 3)
+        self._slowest = -self._speed
         self._tilt = np.minimum(dt * np.array([r.tilt for r in responses]).reshape(rows, 3), 1.0)
         self._leaning = leaning
         self._change = np.zeros((rows, 3))  # of velocity in a step, as it comes about [m/s]
@@ -72,15 +73,14 @@ class Quadrotor(Piloted):
     def advance(self) -> None:
         """One step of dt: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v), which leaning delays."""
         pilot = self._pilot
-        climbing = pilot.climbing
-        if some(climbing):
-            pilot.advance(climbing)
+        if pilot.anybody_climbs:
+            pilot.advance(pilot.climbing)
         wanted = self._kp * (pilot.target - self.position)
         turn = self._turn * (pilot.heading - self.yaw)
         if pilot.any_by_velocity:
-            wanted = np.where((pilot.by_velocity & ~climbing)[:, None], pilot.wanted, wanted)
+            wanted = np.where((pilot.by_velocity & ~pilot.climbing)[:, None], pilot.wanted, wanted)
             turn = np.where(pilot.by_velocity, pilot.yaw_rate, turn)
-        wanted = clamp(wanted, -self._speed, self._speed)
+        wanted = clamp(wanted, self._slowest, self._speed)
         change = self._gain * (wanted - self.velocity)
         if self._leaning:
             change = self._change = self._change + self._tilt * (change - self._change)

@@ -18,6 +18,7 @@ from agents.session import (
     ASK_EVERY_S,
     NO_ORDER,
     Alarm,
+    Inbox,
     RouterWatch,
     Unreachable,
     alive_token,
@@ -362,6 +363,20 @@ def test_interpreter_exits_although_a_session_was_left_open(router):
         check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "ready\n", "")
+
+
+@pytest.mark.system
+def test_an_inbox_keeps_the_newest_wanted_items(router, eventually):
+    inbox = Inbox[zenoh.Sample](2, lambda sample: sample.payload.to_bytes() != b"1")
+    assert list(received(inbox)) == []
+    with open_session([router.endpoint], name="CF01") as session:
+        session.declare_subscriber(POSE, inbox.filled)
+        for number in (b"0", b"1", b"2", b"3"):
+            session.put(POSE, number)
+        got = []
+        eventually(lambda: got.extend(payloads(inbox)) or got)
+        assert got == [b"2", b"3"]
+        assert list(received(inbox)) == []
 
 
 @pytest.mark.system
