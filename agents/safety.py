@@ -115,7 +115,8 @@ class Safety:
         self._takes_position = takes == "position"
         self._speed = np.minimum(np.array([kind.speed for kind in kinds]), limits.speed)
         # a body that closes position errors by itself goes as fast as its goal is far
-        self._step = np.minimum(limits.goal_step, self._speed / np.array([kind.response for kind in kinds]))
+        self._closes_s = 1.0 / np.array([kind.response for kind in kinds])
+        self._step = np.minimum(limits.goal_step, self._speed * self._closes_s)
         self._turn_rate = np.array([kind.turn_rate for kind in kinds])
         flies = np.array([kind.flies for kind in kinds])[:, None]
         inside = np.array([limits.margin, limits.margin, 0.0])
@@ -175,12 +176,13 @@ class Safety:
             safe[blind | wild] = 0.0
             stay = wild & self._takes_position
             safe[stay, :3] = here[stay]
-        self._limit(safe, here, yaw)
+        late = np.where(blind, 0.0, np.maximum(age, 0.0)) if troubled else np.maximum(age, 0.0)
+        self._limit(safe, here, yaw, late)
         avoided = nobody
         if avoidance is not None and own is not None and nearby is not None:
             limited = safe
             wished = _wished(avoidance, limited, own, nearby)
-            safe = self._restrained(limited, wished, here, yaw, blind | wild)
+            safe = self._restrained(limited, wished, here, yaw, late, blind | wild)
             if safe is not limited:
                 avoided = np.asarray((np.abs(safe - limited) > ROUNDING).any(axis=1))
         other = np.abs(safe - setpoint) > ROUNDING
@@ -191,19 +193,21 @@ class Safety:
             safe[blind & self._takes_position] = np.nan
         return Verdict(safe, changed, blind, wild, avoided)
 
-    def _limit(self, setpoint: Array, here: Array, yaw: Array) -> None:
-        """Brings setpoints (N, 4) within all limits, in place."""
+    def _limit(self, setpoint: Array, here: Array, yaw: Array, age: Array) -> None:
+        """Brings setpoints (N, 4) within all limits, in place; rows were `here` (N, 3) [m] `age` (N,) [s] ago."""
         if self._any_position:
             rows = self._position
             setpoint[rows, :3] = self._near(setpoint[rows, :3], here[rows], rows)
         if self._any_velocity:
             rows = self._velocity
-            setpoint[rows] = self._slow(setpoint[rows], here[rows], rows)
+            setpoint[rows] = self._slow(setpoint[rows], here[rows], age[rows], rows)
         if self._any_twist:
             rows = self._twist
-            setpoint[rows, :2] = self._drive(setpoint[rows, :2], here[rows, :2], yaw[rows], rows)
+            setpoint[rows, :2] = self._drive(setpoint[rows, :2], here[rows, :2], yaw[rows], age[rows], rows)
 
-    def _restrained(self, setpoint: Array, wished: Array, here: Array, yaw: Array, unknown: Mask) -> Array:
+    def _restrained(  # noqa: PLR0917 - what limits take
+        self, setpoint: Array, wished: Array, here: Array, yaw: Array, age: Array, unknown: Mask
+    ) -> Array:
         """Setpoints (N, 4) that avoidance wishes instead of those that are within the limits, within the limits again.
 
         A row that is not made of numbers is not taken, and `unknown` rows (N,), which do not know where they are or
@@ -214,7 +218,7 @@ class Safety:
         if not some(other):
             return setpoint
         again = np.where(other[:, None], wished, setpoint)
-        self._limit(again, here, yaw)
+        self._limit(again, here, yaw, age)
         return np.where(other[:, None], again, setpoint)  # limits twice over may differ in the last bit
 
     def _near(self, target: Array, here: Array, rows: Rows) -> Array:
@@ -227,24 +231,30 @@ class Safety:
             target[far] = here[far] + step[far] * (longest[far] / length[far])[:, None]
         return target
 
-    def _slow(self, velocity: Array, here: Array, rows: Rows) -> Array:
-        """Velocities within the limits, and not out of the arena."""
+    def _slow(self, velocity: Array, here: Array, age: Array, rows: Rows) -> Array:
+        """Velocities within the limits, and not out of the arena.
+
+        Toward a wall as fast as a goal on it would be closed in on, less what was flown since `here` was measured; from
+        beyond a wall, back.
+        """
         speed, turn = self._speed[rows, None], self._turn_rate[rows]
-        linear = clamp(velocity[:, :3], -speed, speed)
-        outward = ((here > self._high[rows]) & (linear > 0)) | ((here < self._low[rows]) & (linear < 0))
-        velocity[:, :3] = np.where(outward, 0.0, linear)
+        seconds = (self._closes_s[rows] + age)[:, None]
+        inside = clamp(velocity[:, :3], (self._low[rows] - here) / seconds, (self._high[rows] - here) / seconds)
+        velocity[:, :3] = clamp(inside, -speed, speed)
         velocity[:, 3] = clamp(velocity[:, 3], -turn, turn)
         return velocity
 
-    def _drive(self, twist: Array, here: Array, yaw: Array, rows: Rows) -> Array:
-        """Twists within the limits, and not out of the arena: turning on the spot is always allowed."""
+    def _drive(self, twist: Array, here: Array, yaw: Array, age: Array, rows: Rows) -> Array:
+        """Twists within the limits, and not out of the arena, as `_slow`: turning on the spot is always allowed."""
         speed, turn = self._speed[rows], self._turn_rate[rows]
         v = clamp(twist[:, 0], -speed, speed)
-        low, high = self._low[rows, :2], self._high[rows, :2]
-        if some((here > high) | (here < low)):
-            heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * v[:, None]
-            outward = ((here > high) & (heading > 0)) | ((here < low) & (heading < 0))
-            v = np.where(outward.any(axis=1), 0.0, v)
+        below, above = here - self._low[rows, :2], self._high[rows, :2] - here
+        seconds = self._closes_s[rows] + age
+        if some(np.minimum(below, above) < (speed * seconds)[:, None]):
+            moves = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * v[:, None]
+            most = np.maximum(np.where(moves > 0.0, above, below), 0.0) / seconds[:, None]
+            amount = np.abs(moves)
+            v = v * np.where(amount > most, most / np.maximum(amount, ROUNDING), 1.0).min(axis=1)
         twist[:, 0], twist[:, 1] = v, clamp(twist[:, 1], -turn, turn)
         return twist
 
