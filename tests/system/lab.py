@@ -23,6 +23,7 @@ from agents import session as network
 from agents import wire
 from agents.keys import Keys
 from experiments import orders
+from experiments.run import reopen
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -248,3 +249,17 @@ class Flight:
 def gone(processes: Sequence[psutil.Process]) -> bool:
     """Whether none of them runs any more; a zombie that nobody reaps counts as gone."""
     return not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in processes)
+
+
+def assert_held_in_time(flight: Flight, case: str, stopped: float) -> None:
+    """Robots of a finished run held once because the router froze at `stopped` [s, UTC], as each recorded it itself."""
+    run = reopen(flight.folder)
+    trace = run.traces[case]
+    said = [event.text for event in trace.events if event.source == "conductor"]
+    assert sum("no router answers" in text for text in said) == 1
+    for name in trace.experiment.robots:
+        status = typed(flight.folder / f"{case}.mcap", f"/{name}/status")[-1]
+        hold, over = [each for each in status.incidents if "no connection to a router" in each.text]
+        assert hold.text.startswith("hold: ")
+        assert stopped < hold.stamp < stopped + trace.experiment.safety.link_silence_s + 1.0
+        assert over.text.startswith("over: ")

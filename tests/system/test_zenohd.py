@@ -1,13 +1,20 @@
-"""A router that is not ours, with the configuration that `zenpark router --print-config` prints."""
+"""A router that is not ours, with the configuration that `zenpark router --print-config` prints, or with none.
+
+`tests/system/zenohd.py` builds a zenohd; where there is none, these tests are skipped and say why.
+"""
 
 from __future__ import annotations
 
 import json
-import shutil
+import signal
+import socket
 import subprocess
+import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -17,7 +24,8 @@ from agents.endpoint import free_endpoint
 from agents.settings import config, settings
 from experiments import access
 from experiments.run import load, reopen
-from tests.system.lab import Flight, until
+from tests.system import zenohd
+from tests.system.lab import Flight, assert_held_in_time, typed, until
 from tests.system.test_transports import SHORT, found
 from tools import router
 
@@ -34,28 +42,42 @@ def ours(file: Path) -> Iterator[None]:
 
 @contextmanager
 def theirs(file: Path) -> Iterator[None]:
-    """A zenohd on PATH."""
-    process = subprocess.Popen(["zenohd", "--config", str(file)], stdin=subprocess.DEVNULL)
-    try:
-        endpoint = json.loads(file.read_text())["listen"]["endpoints"]
-        until(lambda: answers(endpoint, process), "zenohd answers", 10.0)
+    """A zenohd, from the same file."""
+    with started(json.loads(file.read_text())["listen"]["endpoints"][0], "--config", str(file)):
         yield
+
+
+@contextmanager
+def started(endpoint: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A zenohd that listens."""
+    process = subprocess.Popen([zenohd.folder() / "zenohd", *arguments], stdin=subprocess.DEVNULL)
+    try:
+        until(lambda: answers(endpoint, process), "zenohd answers", 10.0)
+        yield process
     finally:
+        process.send_signal(signal.SIGCONT)
         process.terminate()
         process.wait(10)
 
 
-def answers(endpoints: list[str], process: subprocess.Popen[bytes]) -> bool:
+def answers(endpoint: str, process: subprocess.Popen[bytes]) -> bool:
     assert process.poll() is None
-    host, _, port = endpoints[0].partition("/")[2].rpartition(":")
-    probe = subprocess.run(["bash", "-c", f"exec 3<>/dev/tcp/{host}/{port}"], capture_output=True, check=False)
-    return probe.returncode == 0
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    with socket.socket() as probe:
+        return probe.connect_ex((host, int(port))) == 0
 
 
-WITH = [
-    ours,
-    pytest.param(theirs, marks=pytest.mark.skipif(shutil.which("zenohd") is None, reason="no zenohd on PATH")),
-]
+def missing() -> str:
+    """Why there is no zenohd; empty if there is one."""
+    try:
+        zenohd.folder()
+    except zenohd.NotBuilt as error:
+        return str(error)
+    return ""
+
+
+NEEDED = pytest.mark.skipif(bool(missing()), reason=missing())
+WITH = [ours, pytest.param(theirs, marks=NEEDED)]
 
 
 @pytest.mark.parametrize("start", WITH)
@@ -80,3 +102,45 @@ def test_an_experiment_at_a_router_of_somebody_else(tmp_path: Path, start: Route
             with zenoh.open(stranger) as session:
                 assert not [r for r in session.get("park/KH01/order", payload=b"{}", timeout=0.5) if r.ok]
     assert reopen(flight.folder).metrics["periodic"].lost == 0
+
+
+@NEEDED
+def test_a_plain_zenohd_is_read_by_rest_and_may_freeze(tmp_path: Path) -> None:
+    """No file: a lease of 10 s. What the README says of REST."""
+    endpoint, rest = free_endpoint(0), free_endpoint(0).partition("/")[2]
+
+    def read(path: str) -> Any:
+        with urllib.request.urlopen(f"http://{rest}/{path}", timeout=10.0) as answer:
+            return json.load(answer)
+
+    def post(path: str, body: object) -> Any:
+        headers = {"content-type": "application/json"}
+        asked = urllib.request.Request(f"http://{rest}/{path}", json.dumps(body).encode(), headers, method="POST")
+        with urllib.request.urlopen(asked, timeout=10.0) as answer:
+            return json.load(answer)
+
+    with started(endpoint, "-l", endpoint, "--no-multicast-scouting", "--rest-http-port", rest) as process:
+        changes = ("--set", f'network.connect=["{endpoint}"]', "--set", "duration_s=8", "--no-report")
+        flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", *changes)
+        flight.until_said("phase conductor: formation")
+        (last,) = read("park/CF01/pose")
+        assert (last["key"], last["encoding"]) == ("park/CF01/pose", "application/json")
+        assert len(last["value"]["position"]) == 3
+        names = ("CF01", "KH01", "KH02")
+        assert {each["key"] for each in read("park/*/pose")} == {f"park/{name}/pose" for name in names}
+        assert {each["key"] for each in read("park/**")} == {f"park/{name}/pose" for name in names}, "and no errors"
+        replies = post("park/*/order", {"order": "get", "name": "clamp"})
+        # the conductor has an order key too, and says that this is none of its orders
+        told = [each["value"] for each in replies if each["key"] != "ERROR"]
+        assert {each["robot"] for each in told if each["ok"]} == set(names)
+        process.send_signal(signal.SIGSTOP)
+        stopped = time.time()
+        flight.until_said(r"router conductor: no router answers for \d\.\d s")
+        until(lambda: time.time() > stopped + 3.0, "every robot has had the time to hold")
+        process.send_signal(signal.SIGCONT)
+        flight.until_said(r"router conductor: a router answers again, after \d\.\d s")
+        code, _ = flight.finish()
+        assert code == 0, flight.logs()
+    assert_held_in_time(flight, "periodic", stopped)
+    for name in names:
+        assert typed(flight.folder / "periodic.mcap", f"/{name}/status")[-1].malformed == 0

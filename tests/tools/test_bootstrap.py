@@ -1,8 +1,13 @@
 import re
+import subprocess
 import tomllib
 from pathlib import Path
 
+import psutil
 import pytest
+
+from tests.system import zenohd
+from tests.system.lab import gone, until
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -92,3 +97,35 @@ def test_what_tests_need_besides_is_installed_by_root_only(bootstrap, monkeypatc
     bootstrap.add_needed()
     assert [command[2] for command in run] == (["update", "install"] if installs else [])
     assert not installs or run[1][-2:] == ["openssh-server", "iproute2"]
+
+
+def test_a_build_of_zenohd_that_takes_too_long_ends_with_all_that_it_started(bootstrap, monkeypatch, tmp_path, capsys):
+    builder, child = tmp_path / "python", tmp_path / "child"
+    builder.write_text(f"#!/bin/sh\nsleep 600 & echo $! > {child}.half; mv {child}.half {child}; wait\n")
+    builder.chmod(0o755)
+    monkeypatch.setattr(bootstrap, "PYTHON", builder)
+    monkeypatch.setattr(bootstrap, "QUICK_S", 0.01)
+    monkeypatch.setattr(bootstrap, "BUILD_S", 0.01)
+    with subprocess.Popen(["true"]) as first, bootstrap.built_behind(first, []) as wait:
+        until(child.exists, "it has begun")
+        wait()
+    assert "no zenohd yet; the next build goes on there" in capsys.readouterr().err
+    left = int(child.read_text())
+    until(lambda: not psutil.pid_exists(left) or gone([psutil.Process(left)]), "its compiler is gone")
+
+
+def test_why_there_is_no_zenohd_is_said_by_the_tests_that_are_skipped(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for name in ("CACHE", "BUILT", "REASON"):
+        monkeypatch.setattr(zenohd, name, tmp_path / name)
+    for asked in (zenohd.folder, lambda: zenohd.build(1)):
+        with pytest.raises(zenohd.NotBuilt, match="no cargo to build one"):
+            asked()
+    cargo = tmp_path / "cargo"
+    cargo.write_text("#!/bin/sh\necho error: no crates.io >&2; exit 101\n")
+    cargo.chmod(0o755)
+    with pytest.raises(zenohd.NotBuilt, match=r"`python -m .* builds one"):
+        zenohd.folder()
+    for asked in (lambda: zenohd.build(1), zenohd.folder):
+        with pytest.raises(zenohd.NotBuilt, match=r"cargo metadata failed: error: no crates\.io"):
+            asked()

@@ -1,0 +1,168 @@
+"""Build of zenohd with its REST and storage plugins from crates.io, once per version, into a cache.
+
+`python -m tests.system.zenohd` builds it in about ten minutes, goes on where an earlier attempt was ended, and prints
+the folder; `./zenpark test` does so behind the tests. Neither PyPI nor Debian has a zenohd. Without cargo or crates.io
+the tests that need one are skipped and say why.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+import psutil
+
+from tests.system.lab import gone
+
+VERSION: Final = version("eclipse-zenoh")  # the same as the library of the robots
+CRATES: Final = ("zenohd", "zenoh-plugin-rest", "zenoh-plugin-storage-manager")
+CACHE: Final = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / f"zenohd-{VERSION}"
+BUILT: Final = CACHE / "bin"
+REASON: Final = CACHE / "reason.txt"  # why the last build failed
+NO_CARGO: Final = "no zenohd on PATH, and no cargo to build one"
+ONLINE: Final = {"CARGO_NET_RETRY": "1", "CARGO_HTTP_TIMEOUT": "20"}  # without crates.io: no minutes of waiting
+
+# `cargo metadata` fetches the sources of dependencies; that zenohd has no library is a warning
+_FETCH: Final = """
+[package]
+name = "sources"
+version = "0.0.0"
+edition = "2021"
+[lib]
+path = "sources.rs"
+[dependencies]
+{dependencies}
+"""
+# One workspace: a plugin is loaded only by a zenohd with the same compiler and the same features of its libraries.
+# A release with link-time optimisation would take three times as long.
+_WORKSPACE: Final = """
+[workspace]
+resolver = "2"
+members = {members}
+[profile.release]
+lto = "off"
+opt-level = 1
+codegen-units = 16
+debug = false
+"""
+
+
+class NotBuilt(Exception):
+    """No zenohd, and why."""
+
+
+def folder() -> Path:
+    """The folder with `zenohd` and its plugins: on PATH, or built before.
+
+    Raises:
+        NotBuilt: If there is none.
+    """
+    if (found := shutil.which("zenohd")) is not None:
+        return Path(found).resolve().parent
+    if (BUILT / "zenohd").exists():
+        return BUILT
+    if shutil.which("cargo") is None:
+        raise NotBuilt(NO_CARGO)
+    why = REASON.read_text().strip() if REASON.exists() else "`python -m tests.system.zenohd` builds one"
+    raise NotBuilt(f"no zenohd on PATH or in {BUILT}: {why}")
+
+
+def build(jobs: int) -> Path:
+    """Builds zenohd unless there is one; one process at a time, others wait for it.
+
+    Raises:
+        NotBuilt: If cargo is missing, crates.io is out of reach, or the build fails.
+    """
+    with suppress(NotBuilt):
+        return folder()
+    if shutil.which("cargo") is None:
+        raise NotBuilt(NO_CARGO)
+    CACHE.mkdir(parents=True, exist_ok=True)
+    with (CACHE / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with suppress(NotBuilt):
+            return folder()
+        try:
+            _build(CACHE / "build", jobs)
+        except (OSError, NotBuilt) as error:
+            REASON.write_text(str(error))
+            raise NotBuilt(str(error)) from None
+        REASON.unlink(missing_ok=True)
+    return folder()
+
+
+def _build(work: Path, jobs: int) -> None:
+    sources = work / "sources"
+    sources.mkdir(parents=True, exist_ok=True)
+    dependencies = "\n".join(f'{name} = "={VERSION}"' for name in CRATES)
+    (sources / "Cargo.toml").write_text(_FETCH.format(dependencies=dependencies))
+    (sources / "sources.rs").touch()
+    said = _cargo("metadata", "--format-version", "1", where=sources)
+    (registry,) = {
+        Path(package["manifest_path"]).parent.parent
+        for package in json.loads(said)["packages"]
+        if package["name"] == CRATES[1]
+    }
+    members = [f"{name}-{VERSION}" for name in CRATES]
+    for member in members:
+        shutil.copytree(registry / member, work / member, dirs_exist_ok=True)
+    (work / "Cargo.toml").write_text(_WORKSPACE.format(members=json.dumps(members)))
+    shutil.copy(work / members[0] / "Cargo.lock", work / "Cargo.lock")  # the dependencies of the release
+    _cargo("build", "--release", "--workspace", f"-j{jobs}", where=work)
+    half = CACHE / "half"
+    shutil.rmtree(half, ignore_errors=True)
+    half.mkdir()
+    release = work / "target" / "release"
+    for file in (release / "zenohd", *release.glob("libzenoh_plugin_*")):
+        if file.suffix in {"", ".so", ".dylib"}:
+            shutil.copy(file, half)
+    half.rename(BUILT)
+    shutil.rmtree(work)
+
+
+def _cargo(*arguments: str, where: Path) -> str:
+    """Standard output of cargo."""
+    done = subprocess.run(
+        ["cargo", *arguments],
+        cwd=where,
+        env={**ONLINE, **os.environ},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+    )
+    if done.returncode != 0:
+        raise NotBuilt(f"cargo {arguments[0]} failed: {' | '.join(done.stderr.strip().splitlines()[-4:])}")
+    return done.stdout
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Builds; with `--after PID`, when that process has ended."""
+    if arguments:
+        option, pid = arguments
+        assert option == "--after"
+        with suppress(psutil.NoSuchProcess):
+            first = [psutil.Process(int(pid))]
+            while not gone(first):
+                time.sleep(1.0)
+    try:
+        print(build(jobs=os.cpu_count() or 1))
+    except NotBuilt as not_built:
+        print(f"no zenohd: {not_built}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
