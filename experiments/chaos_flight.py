@@ -52,6 +52,7 @@ LEAD_S: Final = 1.0  # the start is announced not longer before
 CABLES: Final = "cables.json"
 SWITCHES: Final = "switches"
 LEASE_S: Final = 60.0  # of a patient router, as ROS 2 sets it
+DEAF_S: Final = 1.0  # after which whoever listens to a robot that is there again has heard it
 NOTICED_S: Final = 1.0  # a robot that hears no router holds `link_silence_s` and so much later
 SAYS: Final = {"router": "router", "failover": "router", "disk": "recorder"}  # who ends, and is said to
 REFUSED: Final = 2  # exit code of a process whose name is taken
@@ -102,6 +103,7 @@ class _Running:
     there: set[str] = field(default_factory=set)  # who was under way before
     told: dict[str, int] = field(default_factory=dict)  # the last incident of each robot before
     restarted: float | None = None
+    back: float | None = None
     violations: list[str] = field(default_factory=list)
 
     def deplore(self, text: str) -> None:
@@ -384,11 +386,16 @@ class Flight:
         if why := injector.answer.reason or injector.answer.refused.get(victim):
             running.deplore(f"{victim} is not let in again: {why}")
             return ""
-        if victim not in live:
+        if victim not in eyes.alive:
             return f"{victim} is not back"
+        running.back = running.back or time.monotonic()
         deaf = [name for name in live if victim in self._hears[name]]
         deaf = [name for name in deaf if eyes.listened.get((name, victim), 0.0) < running.restarted]
-        return f"{', '.join(deaf)}: has not heard {victim} again" if deaf else ""
+        if deaf and time.monotonic() - running.back > DEAF_S:
+            running.deplore(f"{', '.join(deaf)}: heard nothing of {victim} in the first {DEAF_S:g} s of its new life")
+        if deaf or victim not in live:
+            return f"{victim} does not take part yet, or is not heard by {', '.join(deaf) or 'anybody'}"
+        return ""
 
     def _after_double(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
         victim, second = running.victim, injector.second
