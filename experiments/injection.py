@@ -104,8 +104,10 @@ class Injector:
         if kind == "double":
             self.second = self._again(victim)
         if kind in CLOCKS:
-            whose, direction = CLOCKS[kind]
-            return self._step(whose.format("+".join(self._companions(victim))), direction * size)
+            name, direction = CLOCKS[kind]
+            switch = self._switch(name.format("+".join(self._companions(victim))))
+            switch.write(direction * size + (switch.read() if kind == "clock" else 0.0))
+            return f"{direction * size:+g} s"
         if kind == "disk":
             return self._fill()
         return f"{self.spoil(victim, session, keys)} payloads of nonsense" if kind == "corrupt" else ""
@@ -113,7 +115,7 @@ class Injector:
     def end(self, fault: Fault) -> None:
         """Lifts it."""
         if fault.kind == "mocap-clock":
-            self._step(CLOCKS[fault.kind][0], -fault.size)
+            self._switch(CLOCKS[fault.kind][0]).write(0.0)
         elif fault.lasts_s:
             self.release()
 
@@ -159,12 +161,6 @@ class Injector:
 
     def _switch(self, name: str) -> Switch:
         return self._switches.setdefault(name, Switch(self._folder / name))
-
-    def _step(self, name: str, seconds: float) -> str:
-        """From now on a clock reads that much more than it would."""
-        switch = self._switch(name)
-        switch.write(switch.read() + seconds)
-        return f"{seconds:+g} s"
 
     def _again(self, victim: str) -> Process:
         """A second process of a name: the same command again."""
