@@ -1,5 +1,7 @@
 """The clock of an experiment as one process reads it: that of its machine, set right by what it is known to lack.
 
+The wall clock is read once and goes on with the monotonic one: a step in mid-run (NTP, an operator) moves nothing.
+
 Clocks drift. Whoever started the process on another machine measures again during the run and says so on its lifeline,
 `clock -0.200131`; the process follows by going a little faster or slower, never back: stamps tell which of two
 samples is the newer one.
@@ -34,13 +36,19 @@ class Clock:
 
     correction_s: float = 0.0
     _wanted: float = field(init=False, repr=False)
+    _zero: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         self._wanted = self.correction_s
+        self._zero = time.time() - time.monotonic()
 
     def utc(self) -> float:
         """Now, UTC [s]."""
-        return time.time() + self.correction_s
+        return self.at(time.monotonic())
+
+    def at(self, monotonic: float) -> float:
+        """UTC [s] at a time of the monotonic clock [s]."""
+        return self._zero + monotonic + self.correction_s
 
     def heed(self, line: bytes) -> None:
         """Takes a line of `said` up, from any thread; what is none, or too far off to be drift, is refused."""

@@ -112,7 +112,8 @@ class Neighbours:
 
     def _believe(self, got: Samples, utc: float) -> None:
         """Poses have got through."""
-        self._agent.hear(got.link, got.position, got.velocity, got.stamp, got.arrival)
+        # see `plausibility.taken`; what is recorded keeps its own stamp
+        self._agent.hear(got.link, got.position, got.velocity, np.minimum(got.stamp, got.arrival), got.arrival)
         columns = (got.link, got.seq, got.stamp, got.arrival, got.position, got.velocity)
         for link, seq, stamp, arrival, position, velocity in zip(*(c.tolist() for c in columns), strict=True):
             row, who = self._ends[link]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from typing import Final
 
@@ -10,6 +9,7 @@ import zenoh
 from zenoh.handlers import Handler
 
 from agents import session as network
+from agents.clock import Clock
 from agents.protocols import ros2
 from agents.protocols.ros2 import Message, Role, Style, Types
 
@@ -29,6 +29,7 @@ class Participant:
         self.style: Final[Style] = style
         self.domain: Final = domain
         self.zid: Final = str(session.zid())
+        self.clock: Final = Clock()
         self._entities = 0
 
     def number(self) -> int:
@@ -106,7 +107,11 @@ class Publisher:
             self._publisher.put(payload)
             return
         self._sequence += 1
-        self._publisher.put(payload, attachment=ros2.attachment(self._sequence, time.time_ns(), self._gid))
+        now = round(self._node.participant.clock.utc() * 1e9)
+        self._publisher.put(
+            payload,
+            attachment=ros2.attachment(self._sequence, now, self._gid),
+        )
 
     def close(self) -> None:
         """Leaves the graph."""

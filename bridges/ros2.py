@@ -9,7 +9,6 @@ import argparse
 import re
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -75,7 +74,8 @@ class Graph:
         self._alive = network.alive_watch(session, keys.alive("*"))
         self._centres = network.alive_watch(session, keys.centre_alive)
         self._guided = False
-        self._seq = round(time.time() * 1e3)  # beyond whatever somebody else who decided had reached
+        self._clock = participant.clock
+        self._seq = round(self._clock.utc() * 1e3)  # beyond whatever somebody else who decided had reached
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -86,7 +86,7 @@ class Graph:
         """Passes on what has arrived."""
         statuses = [*self._lives(), *self._reports()]
         if statuses:
-            header = self._types.header(time.time(), "")
+            header = self._types.header(self._clock.utc(), "")
             self._diagnostics.put(self._types.make(ros2.DIAGNOSTIC_ARRAY, header=header, status=statuses))
         self._moves()
         for sample in network.received(self._centres.handler):
@@ -128,7 +128,7 @@ class Graph:
                 continue
             try:
                 state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
-                plausibility.check_state(state, robot=name, now=time.time(), reach=REACH)
+                plausibility.check_state(state, robot=name, now=self._clock.utc(), reach=REACH)
             except wire.Malformed:
                 self.malformed += 1
                 continue
@@ -162,7 +162,7 @@ class Graph:
         turned = q.x or q.y or q.z or q.w  # a quaternion of zeros: whoever asks does not care
         yaw = atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z)) if turned else None
         self._seq += 1
-        goal = wire.Goal(name, self._seq, time.time(), (place.x, place.y, place.z), yaw, robot.stamp)
+        goal = wire.Goal(name, self._seq, self._clock.utc(), (place.x, place.y, place.z), yaw, robot.stamp)
         robot.out.put(wire.encode(goal))
 
 

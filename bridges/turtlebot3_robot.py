@@ -6,7 +6,6 @@ when we do. So nothing here may end without a zero on cmd_vel, and what is sent 
 
 from __future__ import annotations
 
-import time
 from math import atan2, cos, hypot, nan, pi, sin
 from typing import Final
 
@@ -54,6 +53,7 @@ class Robot:
         where = turtlebot3.address(name, request.addresses[row], chosen)
         self.name, self.where, self.chosen = name, where, chosen
         self.endpoints = (chosen.endpoint,) if chosen.endpoint else request.endpoints
+        self._clock = request.clock
         self.pose = (nan, nan, nan)
         self.speed = (0.0, 0.0)
         self.battery = nan
@@ -188,7 +188,7 @@ class Robot:
         self._zeros += not moving
         message = self._types.twist((twist[0], 0.0, 0.0), (0.0, 0.0, twist[1]))
         if self._command_type == ros2.TWIST_STAMPED:
-            header = self._types.header(time.time(), "base_footprint")
+            header = self._types.header(self._clock.utc(), "base_footprint")
             message = self._types.make(ros2.TWIST_STAMPED, header=header, twist=message)
         self._command.put(message)
 

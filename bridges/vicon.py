@@ -19,6 +19,7 @@ import zenoh
 
 from agents import session as network
 from agents import wire
+from agents.clock import Clock
 from agents.farewell import Farewell
 from agents.keys import Keys
 from agents.lifeline import Lifeline
@@ -128,6 +129,7 @@ class Bridge:
     def __init__(self, host: str, port: int, sieve: Sieve, positions: Positions, say: Callable[[str], None]) -> None:
         self._host, self._port = host, port
         self._sieve, self._positions, self._say = sieve, positions, say
+        self._clock = Clock()
         self._state = ""
 
     def run(self, over: Callable[[], bool]) -> bool:
@@ -166,9 +168,8 @@ class Bridge:
                     raise TimeoutError(f"no frame for {SILENCE_S:g} s (is the system live, and not paused?)")
                 continue
             heard = now
-            utc = time.time() - now
             for robot, measured, segment, yaw in self._sieve.sift(frame, now):
-                self._positions.publish(robot, utc + measured, segment, yaw)
+                self._positions.publish(robot, self._clock.at(measured), segment, yaw)
 
     def _tell(self, state: str) -> None:
         if state != self._state:

@@ -25,6 +25,7 @@ from agents import plugins, wire
 from agents import session as network
 from agents.centre import Centre, Told
 from agents.channel import Channel, Samples
+from agents.clock import Clock
 from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.keys import Keys
 from agents.leaving import end, held
@@ -82,7 +83,8 @@ class CentreProcess:
         self._phase, self._start = np.full(len(names), IDLE), np.full(len(names), np.inf)
         self._begun = np.inf
         self._next = self._utc = 0.0
-        self._seq = round(time.time() * 1e3)  # beyond whatever a centre before this one had reached
+        self._clock = Clock()
+        self._seq = round(self._clock.utc() * 1e3)  # beyond whatever a centre before this one had reached
         self._sent = self._missed = self._malformed = 0
         self._late_s, self._reported, self._cpu_s = 0.0, 0.0, time.process_time()
 
@@ -91,7 +93,7 @@ class CentreProcess:
         gc.collect()
         gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
         zero = time.monotonic()
-        self._utc = time.time()
+        self._utc = self._clock.at(zero)
         token = network.alive_token(self._session, self._keys.centre_alive)
         while not over.wait(max(0.0, zero + self._next + self._patience - time.monotonic())):
             now = time.monotonic() - zero - self._patience
@@ -151,7 +153,8 @@ class CentreProcess:
         """Poses have got through."""
         assert got.extra is not None  # all bring their yaw along
         rows = self.centre.listens[got.link]
-        self.centre.hear(rows, got.position, got.velocity, got.extra[:, 0], got.stamp, got.arrival)
+        taken = np.minimum(got.stamp, got.arrival)  # see `plausibility.taken`
+        self.centre.hear(rows, got.position, got.velocity, got.extra[:, 0], taken, got.arrival)
         start = float(self._start[self._guided].min())
         for link, stamp in zip(got.link.tolist(), got.stamp.tolist(), strict=True):
             self._heard[link] += self._within(stamp, start)
@@ -225,7 +228,7 @@ def serve(
         CentreTaken: If a centre is on the network already.
         Unreachable: If no router answers.
     """
-    began = time.time()
+    began = Clock().utc()
     read = document.read(file)
     experiment = chosen_case(read, case)
     steered = guided(experiment)

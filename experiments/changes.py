@@ -271,7 +271,7 @@ class HotChanges:
 
     def _frozen(self, name: str) -> bool:
         status = self._robots[name].status
-        return status is None or time.time() - status.stamp > FROZEN_S
+        return status is None or self._view.clock.utc() - status.stamp > FROZEN_S
 
     def _let_in(self, names: Sequence[str], order: wire.RunOrder) -> Steps:
         """Restart, or add: who is there by hand is only told to join, everybody else is started."""

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from agents import wire
+from agents.clock import Clock
 from agents.keys import Keys
 from experiments.assign import guided
 from experiments.changes import CLIMB_S, HotChanges
@@ -98,12 +99,13 @@ class Conductor:
         self._hosts, self._show, self._asked = hosts, show, interrupted
         self._emergency = Emergency() if emergency is None else emergency
         self._keys = Keys(experiment.network.realm)
+        self._clock = Clock()  # of each case: its robots' processes read the wall clock now as well
         steered = guided(experiment)
         self._robots = {
             name: Seen(error=None if name in steered else 0.0, out="standby" if robot.standby else "")
             for name, robot in experiment.robots.items()
         }
-        self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots)
+        self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots, clock=self._clock)
         self._starting: set[str] = set()
         self._crew = Crew(
             experiment,
@@ -151,7 +153,7 @@ class Conductor:
                         self._view.say("clock", "conductor", each)
         except RunFailed as failure:
             self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: say it now
-            self._progress.events.append(wire.Event(time.time(), "failed", "conductor", self._progress.phase))
+            self._progress.events.append(wire.Event(self._clock.utc(), "failed", "conductor", self._progress.phase))
             self._show(self._progress)
             raise
         finally:
@@ -248,7 +250,7 @@ class Conductor:
                 remedy = "set it (NTP), or let zenpark start the robot: [hosts]"
                 self._view.say("clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}")
         there = [name for name, seen in self._robots.items() if seen.reached("airborne") and not seen.gone]
-        at = time.time() + lead(len(there))
+        at = self._clock.utc() + lead(len(there))
         self._view.say("start", "conductor", "common start", stamp=at)
         self._order(wire.Order("start", at=at), there)
         self._starting = {*there}
@@ -264,7 +266,7 @@ class Conductor:
         self._changes.begin(start)
         self._repeat_at = start
         self._progress.phase = "starting together"
-        while (now := time.time()) < end + LAND_S and not self._interrupted():
+        while (now := self._clock.utc()) < end + LAND_S and not self._interrupted():
             self._look()
             self._view.tell_drift(*self._drift.news())
             self._progress.elapsed = now - start
@@ -282,7 +284,7 @@ class Conductor:
 
     def _start_late(self, start: float) -> None:
         """Repeats the start to robots that still wait: a busy machine may have lost the order, or its answer."""
-        now, busy = time.time(), self._changes.under_way
+        now, busy = self._clock.utc(), self._changes.under_way
         late = [
             name
             for name, seen in self._robots.items()
@@ -332,14 +334,20 @@ class Conductor:
 
     def _join(self, stack: ExitStack) -> None:
         self._view = Overview(
-            stack, self._experiment, self._endpoints, self._progress, self._recording.parent, identity=self._identity
+            stack,
+            self._experiment,
+            self._endpoints,
+            self._progress,
+            self._recording.parent,
+            identity=self._identity,
+            clock=self._clock,
         )
         stack.callback(self._emergency.listen(self._view.session, self._keys).close)
         self._changes = HotChanges(self._experiment, self._crew, self._view, self._keys)
 
     def _look(self) -> None:
         """Takes in what has happened since the last look."""
-        view, now = self._view, time.time()
+        view, now = self._view, self._clock.utc()
         for name in view.look():
             self._miss(name)
         for death in self._crew.deaths():

@@ -22,6 +22,7 @@ import zenoh
 from agents import plugins, wire
 from agents import session as network
 from agents.body import BodyError
+from agents.clock import Clock
 from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.farewell import Farewell
 from agents.keys import Keys
@@ -67,7 +68,7 @@ class DeviceProcess:
 
     def run(self, over: threading.Event) -> None:
         """Until told to end, or until the launcher and then the robots are gone."""
-        zero, utc = time.monotonic(), time.time()
+        zero, clock = time.monotonic(), Clock()
         due = 0.0
         with selectors.DefaultSelector() as waiting:
             while not over.is_set():
@@ -78,7 +79,7 @@ class DeviceProcess:
                 now = time.monotonic() - zero
                 if now >= due:
                     self._device.advance(now)
-                    self._tell(utc + now)
+                    self._tell(clock.at(zero + now))
                     due = max(due + self._dt, now - 10.0 * self._dt)  # after a long stop it does not hurry
                     if self._farewell.over() if self._farewell is not None else self._lost.is_set():
                         return

@@ -19,6 +19,7 @@ from zenoh.handlers import Handler
 from agents import plausibility, ranging, wire
 from agents import session as network
 from agents.body import RangeScan, Rays
+from agents.clock import Clock
 from agents.keys import Keys
 from agents.rows import Array, some
 from experiments.assign import WORLD, measured
@@ -62,7 +63,8 @@ class Exchange:
         # robots with another body have another simulator, or none, to tell things to
         self._elsewhere = {keys.setpoint(name) for name, robot in experiment.robots.items() if robot.body != WORLD}
         self._measured = frozenset(measured(experiment))
-        self.utc = time.time()
+        self._clock = Clock()
+        self.utc = self._clock.utc()
         self.contacts = self.refused = self.malformed = 0
         self.trouble = ""
         self._router = network.RouterWatch(session, keys.world_alive)
@@ -82,6 +84,10 @@ class Exchange:
         self._quiet = self._heard = np.zeros(0)
         self._place, self._velocity, self._yaw = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         self.enter()
+
+    def begin(self, monotonic: float) -> None:
+        """The world's clock is 0 at this time of the monotonic one [s]."""
+        self.utc = self._clock.at(monotonic)
 
     def enter(self) -> None:
         """The rows of the population, as they are now."""
@@ -275,7 +281,7 @@ class Exchange:
         for sample in network.received(handler):
             try:
                 state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
-                plausibility.check_state(state, robot=name, now=time.time(), reach=self._reach)
+                plausibility.check_state(state, robot=name, now=self._clock.utc(), reach=self._reach)
             except wire.Malformed as error:
                 self._deplore(error)
                 continue
@@ -329,7 +335,7 @@ class Exchange:
     def say(self, kind: str, source: str, text: str) -> None:
         """An event, for recorder and viewers."""
         print(f"{kind} {source}: {text}", flush=True)
-        self._events.put(wire.encode(wire.Event(time.time(), kind, source, text)))
+        self._events.put(wire.encode(wire.Event(self._clock.utc(), kind, source, text)))
 
     def refuse(self, source: str, reason: str) -> None:
         """Counts and says what was refused."""

@@ -19,6 +19,7 @@ from typing import Final
 import msgspec
 
 from agents import clock, lab
+from agents.clock import Clock
 from agents.endpoint import Endpoint
 from agents.wire import HostClock
 from experiments import certificates, clocks, ssh, version
@@ -94,7 +95,7 @@ class Station:
 
     def set_out(self) -> None:
         """Takes the wall clock as it is now: a step of it in mid-run is no drift of the host's."""
-        self._zero = time.time() - time.monotonic()
+        self._ours = Clock()
         self.applied, self._robots = 0.0, []
 
     def words(self, *arguments: str) -> list[str]:
@@ -135,12 +136,12 @@ class Station:
             raise HostError(self._broken())  # its end was noticed before
         deadline = time.monotonic() + limit_s
         text = msgspec.json.encode(question) + b"\n"
-        left = self._zero + time.monotonic()
+        left = self._ours.utc()
         with suppress(BrokenPipeError):  # what was said on the other channel tells why
             os.write(self._out.fileno(), text)
         while self._waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
             data = os.read(self._in.fileno(), 65536)
-            back = self._zero + time.monotonic()
+            back = self._ours.utc()
             if not data:
                 raise HostError(self._broken())
             *lines, self._rest = (self._rest + data).split(b"\n")

@@ -13,6 +13,7 @@ import zenoh
 
 from agents import lab, topology, wire
 from agents import session as network
+from agents.clock import Clock
 from agents.endpoint import DEFAULT_ENDPOINT
 from agents.keys import Keys
 from agents.leaving import held
@@ -45,6 +46,7 @@ class Overview:
         folder: Path,
         *,
         identity: str,
+        clock: Clock,
     ) -> None:
         """Joins the network.
 
@@ -55,10 +57,12 @@ class Overview:
             progress: Takes in what is said, and has the robots.
             folder: Of the run, where the endpoints are written down.
             identity: Whose certificate it shows, in a lab.
+            clock: By which its events are stamped.
 
         Raises:
             Unreachable: If no router answers.
         """
+        self.clock = clock
         self.robots, self._progress = progress.robots, progress
         self._keys = keys = Keys(experiment.network.realm)
         opened = network.open_session(
@@ -122,7 +126,7 @@ class Overview:
 
     def say(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
         """An event of the run, now or at `stamp` [s, UTC]."""
-        event = wire.Event(time.time() if stamp is None else stamp, kind, source, text)
+        event = wire.Event(self.clock.utc() if stamp is None else stamp, kind, source, text)
         self._progress.events.append(event)
         self._events.put(wire.encode(event))
 
@@ -181,4 +185,4 @@ class Overview:
         if status.phase == Phase.RUNNING.word and seen.phase != status.phase:
             seen.began = status.stamp
         seen.status = status
-        seen.behind = min(seen.behind, time.time() - status.stamp)
+        seen.behind = min(seen.behind, self.clock.utc() - status.stamp)

@@ -101,7 +101,7 @@ def _table(progress: Progress) -> RenderableType:
     grid = Grid(title=f"{progress.case}: {progress.phase}{elapsed}{silence}", box=box.SIMPLE_HEAD, title_justify="left")
     for heading in ("robot", "phase", "error, m", "sent", "1/s", "lost", "late", "CPU", "battery", ""):
         grid.add_column(heading, justify="left" if heading in ("robot", "phase", "") else "right", no_wrap=True)
-    now = time.time()
+    now = progress.clock.utc()
     for name, seen in progress.robots.items():
         grid.add_row(name, *_cells(seen, now))
     news = [event for event in progress.events if event.kind not in (*QUIET, OUTPUT)][-EVENTS:]

@@ -19,6 +19,7 @@ import zenoh
 
 from agents import session as network
 from agents import wire
+from agents.clock import Clock
 from agents.endpoint import EndpointError
 from agents.keys import Keys
 from agents.leaving import end, held
@@ -45,6 +46,7 @@ class Recorder:
         self._keys, self._recording = keys, recording
         self._connected = True
         self._session = session
+        self._arrival = Clock()
         self._unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
         self._told: dict[str, int] = {}
         self._alive: set[str] = set()
@@ -111,13 +113,13 @@ class Recorder:
             if not before or (last and count != before):
                 self._told[key] = count
                 text = f"could not read {count} {'message' if count == 1 else 'messages'} on {key}: {why}"
-                self._recording.event(wire.Event(time.time(), "unread", "recorder", text))
+                self._recording.event(wire.Event(self._arrival.utc(), "unread", "recorder", text))
 
     def _pose(self, sample: zenoh.Sample) -> None:
         payload = sample.payload.to_bytes()
         pose = wire.decode(payload, str(sample.encoding), wire.Pose)
         self._own(sample, pose.robot)
-        self._recording.pose(pose, time.time(), len(payload))
+        self._recording.pose(pose, self._arrival.utc(), len(payload))
 
     def _state(self, sample: zenoh.Sample) -> None:
         state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
@@ -158,7 +160,7 @@ class Recorder:
         goal = wire.decode(payload, str(sample.encoding), wire.Goal)
         self._own(sample, goal.robot)
         self._finite(sample, goal.stamp, goal.pose)
-        self._recording.goal(goal, time.time(), len(payload))
+        self._recording.goal(goal, self._arrival.utc(), len(payload))
 
     def _said_by_centre(self, sample: zenoh.Sample) -> None:
         said = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.CentreState)

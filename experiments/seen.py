@@ -8,6 +8,7 @@ from math import inf
 from typing import Final, Literal
 
 from agents import wire
+from agents.clock import Clock
 from agents.lifecycle import Phase
 
 ORDER: Final = tuple(phase.word for phase in Phase)
@@ -80,6 +81,7 @@ class Progress:
     robots: dict[str, Seen]
     events: list[wire.Event] = field(default_factory=list)
     silent_since: float = inf
+    clock: Clock = field(default_factory=Clock)
 
 
 class News:

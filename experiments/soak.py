@@ -21,6 +21,7 @@ import zenoh
 
 from agents import session as network
 from agents import wire
+from agents.clock import Clock
 from agents.endpoint import free_endpoint
 from agents.keys import Keys
 from experiments import endurance, processes, soak_verdict
@@ -149,11 +150,11 @@ def soak(  # noqa: PLR0915 - one loop that follows one run
         table = stack.enter_context((folder / TABLE).open("w", newline="", encoding="utf-8"))
         written = csv.writer(table)
         written.writerow(COLUMNS)
-        due, over = 0.0, False
+        due, over, clock = 0.0, False, Clock()
         while watched.process.alive and not interrupted():
             time.sleep(POLL_S)
             ear.listen()
-            now = time.time()
+            now = clock.utc()
             for event in watched.news():
                 if event.kind == "start":
                     start = event.stamp

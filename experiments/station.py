@@ -25,6 +25,7 @@ import msgspec
 
 from agents import lab, plugins
 from agents import session as network
+from agents.clock import Clock
 from agents.endpoint import EndpointError
 from agents.lifeline import SILENCE_S
 from experiments import certificates, version
@@ -182,7 +183,7 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
         fd: Where the questions come in.
         patience_s: How long robots may take to land and to be gone [s].
     """
-    zero = time.time() - time.monotonic()  # a step of the wall clock does not move the robots, nor what is said of it
+    here = Clock()
     decoder = msgspec.json.Decoder(Question)
     waiting = select.poll()
     waiting.register(fd, select.POLLIN)
@@ -190,7 +191,7 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
     with contextlib.suppress(OSError):  # nobody listens any more
         while waiting.poll(SILENCE_S * 1e3):
             data = os.read(fd, 65536)
-            clock = zero + time.monotonic()
+            clock = here.utc()
             if not data:
                 break
             *lines, rest = (rest + data).split(b"\n")

@@ -21,6 +21,7 @@ import zenoh
 from agents import plugins, wire
 from agents import session as network
 from agents.body import BodyError
+from agents.clock import Clock
 from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
 from agents.farewell import Farewell
 from agents.keys import Keys
@@ -96,7 +97,7 @@ class WorldProcess:
         gc.collect()
         gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
         zero = time.monotonic()
-        exchange.utc = time.time()
+        exchange.begin(zero)
         token = network.alive_token(self._session, self._keys.world_alive)
         self._report(0.0)
         due = 0.0
@@ -227,7 +228,7 @@ def serve(
         WorldTaken: If a world is on the network already.
         Unreachable: If no router answers.
     """
-    began = time.time()
+    began = Clock().utc()
     read = document.read(file)
     experiment = chosen_case(read, case)
     robots = experiment.robots.values()

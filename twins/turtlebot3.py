@@ -8,7 +8,6 @@ as it likes. `watchdog_s` in the robot's settings adds what careful people run o
 from __future__ import annotations
 
 import socket
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -97,6 +96,7 @@ class TurtleBot3Twin:
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
         self._rows: list[_Row] = []
         addresses = []
+        self._clock = body.clock
         participants: dict[tuple[object, ...], Participant] = {}
         try:
             for row, name in enumerate(body.names):
@@ -217,7 +217,7 @@ class TurtleBot3Twin:
         self._told = self._model.yaw.copy()
         velocity = self._model.velocity
         speed = velocity[:, 0] * np.cos(self._model.yaw) + velocity[:, 1] * np.sin(self._model.yaw)
-        now = time.time()
+        now = self._clock.utc()
         for index, row in enumerate(self._rows):
             make = row.types.make
             x0, y0, yaw0 = row.start
@@ -242,7 +242,7 @@ class TurtleBot3Twin:
             self._say(row.odometry, row.types, message, t)
 
     def _scan(self, t: float) -> None:
-        now = time.time()
+        now = self._clock.utc()
         for index, row in enumerate(self._rows):
             yaw = float(self._model.yaw[index])
             distance = self.sight(self._model.position[index], yaw, self._bearing + yaw)
@@ -266,7 +266,7 @@ class TurtleBot3Twin:
         spent = self._used * self._faults.drain / ENDURANCE_S["turtlebot3"]
         charge = max(0.0, self._faults.battery - spent)
         voltage = turtlebot3.EMPTY_V + charge * (turtlebot3.FULL_V - turtlebot3.EMPTY_V)
-        now = time.time()
+        now = self._clock.utc()
         for row in self._rows:
             message = row.types.make(
                 ros2.BATTERY_STATE,

@@ -22,6 +22,7 @@ import zenoh
 
 from agents import plausibility, wire
 from agents import session as network
+from agents.clock import Clock
 from agents.endpoint import EndpointError
 from agents.farewell import Farewell
 from agents.keys import Keys
@@ -246,7 +247,7 @@ class Truths:
 
 def serve(vicon: ViconTwin, truths: Truths, rate_hz: float, over: Callable[[], bool]) -> None:
     """Serves until it is over, with a frame every 1 / `rate_hz` [s]."""
-    zero = time.monotonic()
+    zero, clock = time.monotonic(), Clock()
     frame = 0
     while not over():
         wait = zero + (frame + 1) / rate_hz - time.monotonic()
@@ -256,7 +257,7 @@ def serve(vicon: ViconTwin, truths: Truths, rate_hz: float, over: Callable[[], b
             vicon.serve(waiting, t)
         if int(t * rate_hz) > frame:
             frame = int(t * rate_hz)
-            truths.show(vicon, time.time())
+            truths.show(vicon, clock.utc())
         vicon.advance(t)
 
 

@@ -33,8 +33,10 @@ def main(endpoint: str, world: str, names: Sequence[str]) -> None:
             name: session.declare_publisher(f"park/{name}/position", encoding="application/json") for name in names
         }
 
+        zero = time.time() - time.monotonic()  # read once: a step of the wall clock must not move a robot
+
         def tell(message: Any) -> None:  # noqa: ANN401 - a gz.msgs.Pose_V
-            stamp = time.time()  # not the header's, which is the time of the simulation
+            stamp = zero + time.monotonic()  # not the header's, which is the time of the simulation
             for pose in message.pose:
                 if pose.name in positions:
                     p = pose.position

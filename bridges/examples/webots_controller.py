@@ -28,6 +28,7 @@ def main(name: str, endpoint: str) -> None:
         commands = session.declare_subscriber(f"park/{name}/setpoint", zenoh.handlers.RingChannel(100))
         position = session.declare_publisher(f"park/{name}/position", encoding="application/json")
         v, turn, heard, done = 0.0, 0.0, 0.0, 0
+        zero = time.time() - time.monotonic()  # read once: a step of the wall clock must not move a robot
         while robot.step(step_ms) != -1:
             while (sample := commands.handler.try_recv()) is not None:
                 command = json.loads(sample.payload.to_string())
@@ -40,7 +41,7 @@ def main(name: str, endpoint: str) -> None:
                 wheel.setVelocity((v + side * HALF_BASE * turn) / WHEEL_RADIUS)
             rotation = me.getOrientation()  # nine numbers, row by row
             yaw = math.atan2(rotation[3], rotation[0])
-            place = {"robot": name, "stamp": time.time(), "position": list(me.getPosition()), "yaw": yaw}
+            place = {"robot": name, "stamp": zero + time.monotonic(), "position": list(me.getPosition()), "yaw": yaw}
             position.put(json.dumps(place))
 
 

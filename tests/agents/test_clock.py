@@ -1,6 +1,7 @@
 """One clock for everybody: what a neighbour whose clock is 0.2 s ahead does to a listener, and what sets it right."""
 
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,9 +42,37 @@ def test_a_wrong_clock_moves_the_neighbours_of_those_who_predict():
 def test_corrected_where_stamps_are_made_it_moves_nobody(monkeypatch):
     now = time.time()
     monkeypatch.setattr(time, "time", lambda: now + AHEAD_S)
-    assert Clock().utc() == now + AHEAD_S
+    monkeypatch.setattr(time, "monotonic", lambda: 7.0)
+    assert Clock().utc() == pytest.approx(now + AHEAD_S, abs=1e-6)
     clock = Clock(-AHEAD_S)
     assert misbelieved(T + clock.utc() - now, ConstantVelocity()) < 1e-6
+
+
+def test_a_step_of_the_wall_clock_moves_no_clock_that_was_read_before(monkeypatch):
+    wall, steady = 1000.0, 5.0
+    monkeypatch.setattr(time, "time", lambda: wall)
+    monkeypatch.setattr(time, "monotonic", lambda: steady)
+    clock = Clock(0.5)
+    wall, steady = 1000.0 - 3600.0, 7.0
+    assert clock.utc() == clock.at(7.0) == 1002.5
+    assert clock.at(4.0) == 999.5
+
+
+DATES = {  # of reports and figures, which nobody moves by, and chaos, which steps the clocks of others
+    "chaos_flight.py", "chaos_report.py", "report.py", "run.py", "soak_verdict.py", "sweep_page.py", "faulty.py",
+}  # fmt: skip
+
+
+def test_no_process_of_a_run_reads_the_wall_clock_but_by_its_clock():
+    root = Path(__file__).resolve().parents[2]
+    readers = {
+        file.name: [line.strip() for line in file.read_text().splitlines() if "time.time" in line]
+        for folder in ("agents", "bridges", "twins", "experiments")
+        for file in sorted((root / folder).rglob("*.py"))
+        if file.name not in DATES
+    }
+    once = [line for lines in readers.values() for line in lines if "= time.time() - time.monotonic()" not in line]
+    assert once == []
 
 
 def test_a_clock_follows_what_it_is_told_smoothly_and_never_back():

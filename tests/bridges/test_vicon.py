@@ -40,6 +40,42 @@ def frame(*, latency: float = 0.0, z_up: bool = True, **poses: tuple[float, floa
     return Frame(1, latency, seen, z_up)  # type: ignore[arg-type]
 
 
+class Frames:
+    """Stands in for a reader of the DataStream: a frame every 10 ms of a clock that this test moves."""
+
+    def __init__(self, *_: object) -> None:
+        self.number = 0
+
+    def newest(self, _timeout: float) -> Frame:
+        self.number += 1
+        Frames.steady += 0.01
+        return frame(CF01=(0.001 * self.number, 0.0, 0.5))
+
+    def close(self) -> None: ...
+
+    steady = 0.0
+
+
+@pytest.mark.parametrize("step", [-1.0, 3.0])
+def test_a_step_of_the_wall_clock_moves_no_position(monkeypatch: pytest.MonkeyPatch, step: float) -> None:
+    Frames.steady, wall = 5.0, 1.8e9
+    monkeypatch.setattr(vicon, "Reader", Frames)
+    monkeypatch.setattr(time, "monotonic", lambda: Frames.steady)
+    monkeypatch.setattr(time, "time", lambda: wall + Frames.steady + (step if Frames.steady > 6.0 else 0.0))
+    stamps: list[float] = []
+
+    class Ear:
+        def publish(self, _robot: str, stamp: float, *_: object) -> None:
+            stamps.append(stamp)
+
+    sieve = Sieve({"CF01": "CF01"}, lambda _: None)
+    bridge = vicon.Bridge("nowhere", 1, sieve, Ear(), lambda _: None)  # type: ignore[arg-type]
+    assert bridge.run(lambda: Frames.steady > 7.0)
+    assert len(stamps) > 150
+    np.testing.assert_allclose(np.diff(stamps), 0.01, atol=1e-6)
+    assert stamps[-1] == pytest.approx(wall + Frames.steady, abs=1e-6)
+
+
 # ---------------------------------------------------------------------- what it believes
 
 
