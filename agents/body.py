@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import Annotated, Any, Final, Protocol
 
 import msgspec
 import numpy as np
@@ -36,7 +36,7 @@ class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     hover_jitter: Jitter | None = None
     position_sigma: float | None = None  # [m] white noise of the measured position, per axis (planar for ground robots)
     yaw_sigma: float | None = None  # [rad] white noise of the measured yaw
-    latency_s: float | None = None  # [s] from command to effect
+    latency_s: Annotated[float, msgspec.Meta(ge=0, le=10)] | None = None  # [s] from command to effect
     odometry_drift: float | None = None  # [m per square root of m] random walk of the measured position with the way
 
 

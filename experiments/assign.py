@@ -345,6 +345,20 @@ def disturbance(experiment: Experiment, name: str) -> Disturbance:
     return Disturbance(**merged)  # type: ignore[arg-type]
 
 
+def uses_chance(experiment: Experiment) -> bool:
+    """Whether anything of an experiment depends on its seed: starts, noise of twins, the modelled network."""
+    nature = [disturbance(experiment, name) for name in experiment.robots]
+    noisy = any(
+        each.position_sigma or each.yaw_sigma or each.odometry_drift or (each.hover_jitter and each.hover_jitter.sigma)
+        for each in nature
+    )
+    scattered = bool(experiment.start.scatter or experiment.start.scatter_yaw)
+    channel, links = experiment.channel, experiment.channel.links.values()
+    lossy = channel.loss or channel.jitter_s or any(each.loss or each.jitter_s for each in links)
+    sees = experiment.avoidance is not None and experiment.world.sensor_noise > 0.0
+    return bool(noisy or scattered or lossy or sees)
+
+
 def request(
     experiment: Experiment, names: Sequence[str], seeds: Sequence[int], endpoints: Sequence[str] = ()
 ) -> BodyRequest:

@@ -10,13 +10,14 @@ import json
 import shutil
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import msgspec
 import numpy as np
 
+from agents.wire import MAX_PAYLOAD
 from experiments import architecture, assign, document, motion, reserves, safety_checks, surroundings, theory
 from experiments.analysis import Analysis, analyse
 from experiments.claim import FORGIVEN, Claim, Severity, few, listed
@@ -28,13 +29,8 @@ from experiments.prediction import message_rate
 from experiments.problem import DocumentError, Problem
 from experiments.syntax import parsed
 
-SUBJECTS: Final = (
-    *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
-    *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
-    *(motion.starts, motion.formation, motion.walls, motion.encounters, motion.speeds, motion.rates, motion.ends),
-    architecture.architecture,
-    safety_checks.safety,
-)
+NOT_RANDOM: Final = "not-random"
+HEARD_BYTES: Final = 200  # of one heard pose in telemetry
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
 ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}
@@ -63,6 +59,41 @@ class Finding:
     def __str__(self) -> str:
         """As a line for people."""
         return f"{MARK[self.severity]} {self.message}" + (f"; {self.remedy}" if self.remedy else "")
+
+
+def chance(analysis: Analysis) -> Iterator[Claim]:
+    """Do seeds change anything."""
+    if not assign.uses_chance(analysis.experiment):
+        message = "nothing in this file is random: runs of other seeds are the same"
+        remedy = "add what nature adds, such as [disturbance.all] with position_sigma = 0.0005"
+        yield Claim("warning", NOT_RANDOM, message, remedy, ("disturbance",))
+
+
+def telemetry(analysis: Analysis) -> Iterator[Claim]:
+    """Does what a robot hears between two samples of telemetry fit into one message."""
+    experiment, links = analysis.experiment, assign.heard_links(analysis.experiment)
+    if not len(links):
+        return
+    heard = np.bincount(links.listener)
+    size = float(heard.max()) * experiment.rates.pose_hz / experiment.rates.state_hz * HEARD_BYTES
+    if size > MAX_PAYLOAD:
+        name = analysis.names[int(heard.argmax())]
+        message = (
+            f"{name} may hear {size / HEARD_BYTES:.0f} poses between two samples of telemetry, "
+            f"{size / 1024.0:.0f} kB: each sample is sent in {int(np.ceil(size / MAX_PAYLOAD))} messages or more"
+        )
+        yield Claim("warning", "telemetry-split", message, "raise rates.state_hz", ("rates", "state_hz"))
+
+
+SUBJECTS: Final = (
+    *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
+    *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
+    *(motion.starts, motion.formation, motion.walls, motion.encounters, motion.speeds, motion.rates, motion.ends),
+    architecture.architecture,
+    safety_checks.safety,
+    chance,
+    telemetry,
+)
 
 
 class Figures(msgspec.Struct, frozen=True, kw_only=True):

@@ -118,6 +118,12 @@ def _rates(experiment: Experiment) -> Iterator[Fault]:
                 f"the nearest that does: {name} = {_divisor(body, body / ratio):g}",
             )
 
+    samples = experiment.duration_s * experiment.rates.state_hz
+    if samples < 1.0 - 1e-9:
+        message = f"duration_s = {experiment.duration_s:g} holds less than two samples of telemetry"
+        hint = f"give it {1.0 / experiment.rates.state_hz:g} s or more, or raise rates.state_hz"
+        yield Fault(("duration_s",), message, hint)
+
 
 def _divisor(body: float, wanted: float) -> float:
     """The nearest rate that divides `body` and can be written in a few digits."""

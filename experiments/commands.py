@@ -6,6 +6,7 @@ import json
 import sys
 import webbrowser
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +18,18 @@ from experiments.problem import DocumentError, Problem
 from experiments.progress import shown
 from experiments.realtime import Staging, conduct
 from experiments.records import RecordingError
-from experiments.run import SOURCE, Interrupts, Run, chosen, load, new_folder, read_back, reopen, simulate_seeds
+from experiments.run import (
+    SOURCE,
+    Interrupts,
+    Run,
+    chosen,
+    load,
+    new_folder,
+    read_back,
+    remove_unused,
+    reopen,
+    simulate_seeds,
+)
 from experiments.seeds import across_seeds
 from experiments.standins import BODIES
 
@@ -43,10 +55,33 @@ def run(
     read = load(file, *changes)
     _refuse(staging, virtual=virtual, seeds=seeds)
     chosen(read, staging.cases)
-    if not sound(read, changes) and not anyway:
+    if not sound(read, changes, seeds=seeds) and not anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     folder = new_folder(read, out)
+    try:
+        again = _command(file, staging, virtual=virtual, changes=changes, seeds=seeds, anyway=anyway)
+        way = _Way(virtual, seeds, as_json=as_json, report=report, open_report=open_report, again=again)
+        return _fly(read, folder, staging, way)
+    finally:
+        remove_unused(folder)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """What to make of a run, and the command that makes it again."""
+
+    virtual: bool
+    seeds: int
+    as_json: bool
+    report: bool
+    open_report: bool
+    again: str
+
+
+def _fly(read: document.Document, folder: Path, staging: Staging, way: _Way) -> int:
+    """Runs, writes and tells; returns the exit code."""
+    virtual, seeds, as_json = way.virtual, way.seeds, way.as_json
     read.keep(folder / SOURCE)
     interrupted, emergency = Interrupts(), Emergency()
     if virtual:
@@ -72,8 +107,8 @@ def run(
         why = emergency.words or "interrupted"
         print(f"{why}, before the common start: there is nothing to report; logs: {folder / 'logs'}")
         return STOPPED if emergency else 130
-    again = _command(file, staging, virtual=virtual, changes=changes, seeds=seeds, anyway=anyway)
-    page = _keep(runs, folder, again) if report else None
+    _write_figures_of_merit(runs, folder)
+    page = _keep(runs, folder, way.again) if way.report else None
     summary: dict[str, Any] = runs[0].summary()
     if seeds > 1:
         summary["across"] = across_seeds([each.summary() for each in runs])
@@ -81,7 +116,7 @@ def run(
         print(json.dumps(summary))
     else:
         _tell(runs, summary, page)
-    if open_report and page is not None:
+    if way.open_report and page is not None:
         webbrowser.open(page.resolve().as_uri())
     if emergency:
         print(f"zenpark: {emergency.words}", file=sys.stderr)
@@ -102,11 +137,13 @@ def _refuse(staging: Staging, *, virtual: bool, seeds: int) -> None:
             raise DocumentError([Problem(option, 0, 0, "is for real time", "leave out --virtual")])
 
 
-def sound(read: document.Document, changes: Sequence[str]) -> bool:
-    """Says on standard error what the check warns of; False if it finds errors."""
-    from experiments.check import check  # noqa: PLC0415
+def sound(read: document.Document, changes: Sequence[str], *, seeds: int) -> bool:
+    """Says on standard error what the check warns of, for a run of so many seeds; False if it finds errors."""
+    from experiments.check import NOT_RANDOM, check  # noqa: PLC0415
 
     found = [finding for finding in check(read, changes) if finding.severity != "note"]
+    if seeds == 1:
+        found = [finding for finding in found if finding.code != NOT_RANDOM]
     for finding in found:
         print(finding, file=sys.stderr)
     return all(finding.severity != "error" for finding in found)
@@ -123,6 +160,7 @@ def report(folders: Sequence[str], *, out: str | None) -> int:
     target = Path(out or "comparison.html") if len(runs) > 1 else Path(out or folders[0])
     try:
         if len(runs) == 1:
+            _write_figures_of_merit(runs, target)
             print(_keep(runs, target, ""))
         else:
             named = [(Path(f).name, list(r.traces.values())) for f, r in zip(folders, runs, strict=True)]
@@ -174,15 +212,21 @@ def _command(file: str, staging: Staging, *, virtual: bool, changes: Sequence[st
     return " ".join([*parts, *(["--anyway"] if anyway else [])])
 
 
+def _write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
+    """Writes `metrics.csv` and `metrics.json` of a run into its folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    every = [case for each in runs for case in each.metrics.values()]
+    results.write_csv(folder / "metrics.csv", every)
+    results.write_json(folder / "metrics.json", every)
+
+
 def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
-    """Writes tables, figures and report of a run into its folder; returns the report."""
+    """Writes figures and report of a run into its folder; returns the report."""
     from experiments import drawing as figures  # noqa: PLC0415 - matplotlib takes 0.6 s
     from experiments import report as pages  # noqa: PLC0415
     from experiments.page import date_of  # noqa: PLC0415
 
     every = [case for each in runs for case in each.metrics.values()]
-    results.write_csv(folder / "metrics.csv", every)
-    results.write_json(folder / "metrics.json", every)
     traces = [trace for each in runs for trace in each.traces.values()]
     for name, figure in runs[0].figures().items():
         figures.save(figure, folder / "figures", name)
@@ -209,7 +253,7 @@ def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> No
         if across is not None:
             means = across["cases"][name]
             mean, ratio = ({k: v["mean"] for k, v in means[what].items()} for what in ("mean", "ratio"))
-            spread = {k: f" ± {_figure(means['mean'][k]['std'])}" for k in spread}
+            spread = {k: f" ± {_figure(means['mean'][k]['ci95'])}" for k in spread}
         lost = sum(r["lost"] for r in case["robots"].values())
         line = f"{name:>12}: {_figure(mean['f_hz'])}{spread['f_hz']} messages/s"
         if mean["iae"] is None:
@@ -227,6 +271,8 @@ def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> No
     for finding in verdict.contacts([case for each in runs for case in each.metrics.values()]):
         if finding.mark == "bad":
             print(finding.text)
+    if across is not None:
+        print(f"± is the half-width of the 95 % confidence interval of the mean over {len(runs)} seeds (Student's t)")
     for note in runs[0].notes:
         print(f"note: {note}")
     print(f"run: {runs[0].folder}")

@@ -16,6 +16,8 @@ from twins.scene import Obstacle
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
+Rate = Annotated[float, Meta(gt=0, le=2000)]
+Delay = Annotated[float, Meta(ge=0, le=60)]
 AtLeastOne = Annotated[float, Meta(ge=1)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Planar = tuple[float, float]
@@ -61,10 +63,10 @@ class Arena(Part, frozen=True):
 class Rates(Part, frozen=True):
     """How often things happen; pose_hz, coordination_hz and state_hz divide body_hz."""
 
-    body_hz: Annotated[Positive, Meta(description="position control and body")] = 100.0
-    pose_hz: Annotated[Positive, Meta(description="how often the trigger is asked")] = 50.0
-    coordination_hz: Annotated[Positive, Meta(description="how often a new goal is decided")] = 10.0
-    state_hz: Annotated[Positive, Meta(description="telemetry for recorder and viewers")] = 50.0
+    body_hz: Annotated[Rate, Meta(description="position control and body")] = 100.0
+    pose_hz: Annotated[Rate, Meta(description="how often the trigger is asked")] = 50.0
+    coordination_hz: Annotated[Rate, Meta(description="how often a new goal is decided")] = 10.0
+    state_hz: Annotated[Rate, Meta(description="telemetry for recorder and viewers")] = 50.0
 
 
 class Robot(Part, frozen=True):
@@ -217,12 +219,12 @@ class Leg(Part, frozen=True):
 class LinkChannel(Part, frozen=True):
     """What is otherwise on one link; what is left out is as on all others."""
 
-    delay_s: Annotated[NotNegative | None, Meta(description="from speaker to listener [s]")] = None
-    jitter_s: Annotated[NotNegative | None, Meta(description="mean of an exponential addition [s]")] = None
+    delay_s: Annotated[Delay | None, Meta(description="from speaker to listener [s]")] = None
+    jitter_s: Annotated[Delay | None, Meta(description="mean of an exponential addition [s]")] = None
     loss: Annotated[Share | None, Meta(description="share of samples that never arrive")] = None
     burst: Annotated[AtLeastOne | None, Meta(description="mean number of samples that are lost in a row")] = None
     bandwidth: Annotated[Positive | None, Meta(description="[bit/s] of payload")] = None
-    queue_s: Annotated[NotNegative | None, Meta(description="longest wait for a link that is busy [s]")] = None
+    queue_s: Annotated[Delay | None, Meta(description="longest wait for a link that is busy [s]")] = None
 
 
 class Outage(Part, frozen=True):
@@ -244,10 +246,10 @@ class Channel(Part, frozen=True):
     """What the network does to poses between robots: modelled in virtual time, added at the listener in real time."""
 
     delay_s: Annotated[
-        NotNegative,
+        Delay,
         Meta(description="from speaker to listener [s]; in real time what the network itself takes counts towards it"),
     ] = 0.001
-    jitter_s: Annotated[NotNegative, Meta(description="mean of an exponential addition [s]")] = 0.0
+    jitter_s: Annotated[Delay, Meta(description="mean of an exponential addition [s]")] = 0.0
     loss: Annotated[Share, Meta(description="share of samples that never arrive")] = 0.0
     burst: Annotated[
         AtLeastOne | None,
@@ -257,7 +259,7 @@ class Channel(Part, frozen=True):
         None
     )
     queue_s: Annotated[
-        NotNegative, Meta(description="a sample that would wait longer for its link to be free is dropped [s]")
+        Delay, Meta(description="a sample that would wait longer for its link to be free is dropped [s]")
     ] = 0.5
     outages: Annotated[list[Outage], Meta(description="times in which nothing passes")] = []
     links: Annotated[

@@ -13,10 +13,13 @@ An experiment may stand in the notebook itself: `loads` takes its text. `experim
 
 from __future__ import annotations
 
+import itertools
 import math
+import shutil
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
 
 RUNS: Final = Path("runs")
 SOURCE: Final = "experiment.toml"
+MOST_SAMPLES: Final = 2e7  # states of one robot; each takes about 300 bytes
 
 
 @dataclass(frozen=True)
@@ -138,6 +142,7 @@ def simulate_seeds(
 
     `tell` is called again and again with how far it is.
     """
+    _refuse_too_much(read.experiment, len(seeds))
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     for name, experiment in chosen(read, cases).items():
         experiment = reserves.taking_part(experiment)  # noqa: PLW2901
@@ -149,6 +154,17 @@ def simulate_seeds(
             if folder is not None and copy == 0:
                 logbook.record(folder / f"{name}.mcap", read.text)
     return [_measured(read.experiment.title, mine, folder, read.listing) for mine in traces]
+
+
+def _refuse_too_much(experiment: Experiment, seeds: int) -> None:
+    """Raises DocumentError for a run in virtual time that no memory holds."""
+    samples = experiment.duration_s * experiment.rates.state_hz * len(experiment.robots) * seeds
+    if samples > MOST_SAMPLES:
+        message = f"a run in virtual time of {samples:.2g} samples; {MOST_SAMPLES:.0e} fit into memory"
+        hint = (
+            "take fewer --seeds (`zenpark sweep` runs any number, cell by cell), a lower rates.state_hz or duration_s"
+        )
+        raise DocumentError([Problem("--seeds" if seeds > 1 else "duration_s", 0, 0, message, hint)])
 
 
 def _pass_on(tell: Told, case: str, duration_s: float, elapsed: float) -> None:
@@ -210,10 +226,11 @@ def new_folder(read: Document, out: str | None) -> Path:
     Raises:
         DocumentError: If it holds something already, or cannot be made.
     """
-    stamp = datetime.now().astimezone().strftime("%Y-%m-%dT%H-%M-%S")
-    folder = Path(out) if out is not None else RUNS / f"{read.path.stem}-{stamp}"
+    folder = RUNS if out is None else Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if out is None:
+            return _folder_of_now(folder, read.path.stem)
         taken = any(folder.iterdir())
     except OSError as error:
         hint = "choose a place that may be written to with --out"
@@ -221,6 +238,23 @@ def new_folder(read: Document, out: str | None) -> Path:
     if taken:
         raise DocumentError([Problem(str(folder), 0, 0, "holds something already", "name a new folder with --out")])
     return folder
+
+
+def _folder_of_now(runs: Path, name: str) -> Path:
+    """Makes a folder that nobody else has, however many runs begin in the same second."""
+    stamp = datetime.now().astimezone().strftime("%Y-%m-%dT%H-%M-%S")
+    for number in itertools.count(1):
+        folder = runs / (f"{name}-{stamp}" if number == 1 else f"{name}-{stamp}-{number}")
+        with suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+    raise AssertionError
+
+
+def remove_unused(folder: Path) -> None:
+    """Removes the folder of a run in which nothing was run: there is no recording, and no process has said anything."""
+    if not any(folder.glob("*.mcap")) and not any(folder.glob("logs/*")):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 class Interrupts:

@@ -23,7 +23,9 @@ def run(
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of all randomness, instead of the file's.")] = None,
     settings: Settings = None,
     as_json: AsJson = False,
-    seeds: Annotated[int, typer.Option(min=1, help="Runs so many seeds: mean and spread (virtual only).")] = 1,
+    seeds: Annotated[
+        int, typer.Option(min=1, max=100_000, help="Runs so many seeds: mean and 95 % interval (virtual only).")
+    ] = 1,
     bodies: Bodies = None,
     here: Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")] = False,
     anyway: Anyway = False,

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agents.body import Disturbance
 from experiments import document, entries
 from experiments.check import Figures, check, command, figures, schema_command
 from experiments.document import Document
@@ -115,6 +116,8 @@ def test_gains(gain, code):
         (PARK, "robots.CF02.hover=0.9", ("error", "too-high"), "KH02 - CF02 (0.86 m)", "0.860 m"),
         (PARK, "timeline.0.plan.speed=0.3", ("error", "leader-too-fast"), "0.3 m/s; it has 0.22", "0.2 m/s"),
         (PARK, "safety.speed=0.1", ("error", "leader-too-fast"), "it has 0.1 m/s", "0.09 m/s"),
+        (PARK, "disturbance={}", ("warning", "not-random"), "runs of other seeds are the same", "position_sigma"),
+        (PARK, "rates.state_hz=0.25", ("warning", "telemetry-split"), "is sent in 3 messages or more", "state_hz"),
         (PARK, "timeline.0.plan.speed=0.21", ("warning", "leader-near-limit"), "of the 0.22 m/s", "0.2 m/s"),
         (
             PARK,
@@ -167,8 +170,9 @@ def ground(links: dict[str, float], leader: str | None = None, **changes) -> dic
     """Codes and messages of errors and warnings of four Kheperas in a large arena."""
     formation = Formation(links=links, leader=leader)
     made = Experiment(
-        title="made", robots=GROUND, duration_s=60.0, arena=Arena(size=(6.0, 6.0, 2.0)), formation=formation
-    )
+        title="made", robots=GROUND, duration_s=60.0, arena=Arena(size=(6.0, 6.0, 2.0)), formation=formation,
+        disturbance={"all": Disturbance(position_sigma=0.0005)},
+    )  # fmt: skip
     found = check(of(msgspec.structs.replace(made, **changes)))
     return {each.code: each.message for each in found if each.severity != "note"}
 
