@@ -154,6 +154,10 @@ class Agent:
         """See `Hearing.find`."""
         self.hearing.find(at)
 
+    def forget(self, at: Index) -> None:
+        """See `Hearing.forget`."""
+        self.hearing.forget(at)
+
     def hear_goal(self, rows: Index, goal: Array, toward: Array, stamp: Array) -> Mask:
         """See `Guidance.hear`; rows that nobody guides take no goals."""
         return (
@@ -277,7 +281,7 @@ class Agent:
             return self._nobody  # nobody asks any more
         lacks = np.zeros(len(life.phase), dtype=bool)
         if assignment.patience_s is None or t <= assignment.patience_s:
-            lacks[assignment.links.listener[assignment.lacking(self.heard.stamp)]] = True
+            lacks[assignment.links.listener[assignment.lacking(self.hearing.greeted)]] = True
             if self.guidance is not None:
                 lacks |= self.guidance.unheard()
         failing = self._preflight.check(t, state, self._where, self.hearing, self.outside, (lacks, self.missing))

@@ -73,7 +73,7 @@ class Centre:
         order = order[stamp[order] > poses.stamp[rows[order]]]
         mine = rows[order]
         poses.position[mine], poses.velocity[mine], self.yaw[mine] = position[order], velocity[order], yaw[order]
-        poses.stamp[mine], poses.arrived[mine], poses.gone[mine] = stamp[order], arrived[order], np.inf
+        poses.stamp[mine], poses.arrived[mine] = stamp[order], arrived[order]
         links = self._links(mine)
         who = self.assignment.links.speaker[links]
         self.deciding.hearing.hear(
@@ -86,19 +86,26 @@ class Centre:
         self.deciding.begin(np.array([row]), np.array([[x, y, z]]), np.array([yaw]))
 
     def lose(self, rows: Index, t: float) -> None:
-        """These robots are gone since `t` [s]; heard again, they are back."""
+        """The tokens of these robots are gone since `t` [s]."""
         self.poses.gone[rows] = np.minimum(self.poses.gone[rows], t)
         self.deciding.hearing.lose(self._links(rows), t)
 
     def find(self, rows: Index) -> None:
-        """These robots are back, whether or not they have something new to say."""
+        """The tokens of these robots are there: they live, whether or not they have something to say."""
         self.poses.gone[rows] = np.inf
         self.deciding.hearing.find(self._links(rows))
+
+    def forget(self, rows: Index) -> None:
+        """These robots begin a new life: poses of the one before are of another robot."""
+        poses = self.poses
+        poses.position[rows], poses.velocity[rows] = np.nan, 0.0
+        poses.stamp[rows] = poses.arrived[rows] = -np.inf
+        self.deciding.hearing.forget(self._links(rows))
 
     def missing(self) -> Index:
         """Rows that it needs and never heard, or that are gone."""
         poses, rows = self.poses, self.listens
-        return rows[~np.isfinite(poses.stamp[rows]) | np.isfinite(poses.gone[rows])]
+        return rows[~np.isfinite(poses.stamp[rows]) | (poses.gone[rows] < np.inf)]
 
     def decide(self, t: float, phase: Index, start: Array) -> Told:
         """Goals at `t` [s].
@@ -115,7 +122,7 @@ class Centre:
         deciding.settle(t)
         # a status that says so may still be on its way, but the start was known before
         phase = np.where((phase == AIRBORNE) & (t >= start - ROUNDING_S), RUNNING, phase)
-        known = self.guided & np.isfinite(poses.stamp) & np.isinf(poses.gone)
+        known = self.guided & np.isfinite(poses.stamp) & (poses.gone == np.inf)
         running, waiting = known & (phase == RUNNING), known & (phase <= AIRBORNE) & self._complete(t)
         position = np.full((len(known), 3), np.nan)
         position[known] = poses.believed(self.assignment.predictor, t, np.flatnonzero(known))
@@ -139,7 +146,7 @@ class Centre:
     def _complete(self, t: float) -> Mask:
         """Rows (N,) whose neighbours were all heard once, or waited for long enough."""
         complete = np.ones(len(self.guided), dtype=bool)
-        patience, stamp = self.assignment.patience_s, self.deciding.hearing.heard.stamp
+        patience, stamp = self.assignment.patience_s, self.deciding.hearing.greeted
         if patience is None or t <= patience:
             complete[self.assignment.links.listener[self.assignment.lacking(stamp)]] = False
         return complete

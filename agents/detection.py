@@ -112,6 +112,8 @@ class Detector:
             self._near(t, state, hearing, seen)
         if hearing.unsettled:
             self._missed(t, hearing, rows, seen)
+        if hearing.behind is not None:
+            self._behind(hearing, hearing.behind, seen)
         if rows.lacking is not None and some(rows.lacking):
             seen.append(Sighting(Cause.CENTRE, rows.lacking, lambda _: "its centre is gone, or its goals are old"))
         self._surroundings(t, outside, seen)
@@ -200,7 +202,8 @@ class Detector:
     def _missed(self, t: float, hearing: Hearing, rows: Standing, seen: list[Sighting]) -> None:
         """Neighbours that are gone."""
         links, assignment = self._assignment.links, self._assignment
-        gone = self._lawful & (t - hearing.heard.gone > self._limits.link_silence_s)
+        since = hearing.heard.gone
+        gone = self._lawful & np.isfinite(since) & (t - since > self._limits.link_silence_s)
 
         def names(row: int) -> str:
             return ", ".join(assignment.speakers[s] for s in links.speaker[gone & (links.listener == row)].tolist())
@@ -211,6 +214,24 @@ class Detector:
             seen.append(Sighting(Cause.NEIGHBOUR, without & rows.cruising, names))
         if rows.alone is not None and some(rows.alone):
             seen.append(Sighting(Cause.ALONE, rows.alone & rows.cruising, lambda row: names(row) or "none was heard"))
+
+    def _behind(self, hearing: Hearing, behind: Mask, seen: list[Sighting]) -> None:
+        """Neighbours whose clocks are behind."""
+        links, heard = self._assignment.links, hearing.heard
+        late = behind & (heard.gone == np.inf)
+
+        def names(row: int) -> str:
+            mine = np.flatnonzero(late & (links.listener == row))
+            return ", ".join(
+                f"the poses of {self._assignment.speakers[links.speaker[link]]} are "
+                f"{heard.arrived[link] - heard.stamp[link]:.1f} s old when they arrive"
+                for link in mine.tolist()
+            )
+
+        if some(late):
+            rows = np.zeros(len(self._flies), dtype=bool)
+            rows[links.listener[late]] = True
+            seen.append(Sighting(Cause.BEHIND, rows, names))
 
     def _surroundings(self, t: float, outside: Outside, seen: list[Sighting]) -> None:
         """The process, and who is on the network."""

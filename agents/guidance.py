@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from agents.rows import Array, Index, Mask
+from agents.rows import Array, Index, Mask, some
 
 
 class Guidance:
@@ -40,12 +40,12 @@ class Guidance:
         self.goal[rows], self.toward[rows], self.stamp[rows] = goal[newer], toward[newer], stamp[newer]
         self.goal[rows, 2] = np.where(self._flies[rows], self.goal[rows, 2], 0.0)
         self.fresh[rows] = True
-        if len(rows):
+        if self.gone < np.inf and some(self.stamp[rows] > self.gone):  # decided after that: there is another
             self.gone = np.inf
         return newer
 
     def lose(self, t: float) -> None:
-        """The centre is gone since `t` [s]; heard again, it is back."""
+        """The centre is gone since `t` [s]; a goal that was decided later is of another one."""
         self.gone = min(self.gone, t)
 
     def find(self) -> None:

@@ -59,6 +59,7 @@ class Cause(IntEnum):
     BELOW = 19
     SINKING = 20
     CLOCK = 21
+    BEHIND = 22
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,7 @@ RULES: Final[Mapping[Cause, Rule]] = {
     ),
     Cause.TILT: Rule("it has tipped over", Outcome.CUT, after_s=0.1, landing=True),
     Cause.NEIGHBOUR: Rule("a neighbour is lost", Outcome.WARN),
+    Cause.BEHIND: Rule("a neighbour's clock is behind", Outcome.WARN),
     Cause.ALONE: Rule("all its neighbours are lost", Outcome.HOLD),
     Cause.CENTRE: Rule("nobody guides it", Outcome.HOLD),
     Cause.BATTERY: Rule("its battery is low", Outcome.LAND, after_s=1.0),  # its voltage sags under a short load

@@ -15,7 +15,8 @@ from agents.rows import Array, Index, Mask, every, some
 class Heard:
     """What was last heard on each link (E): positions and velocities (E, 3), sample and arrival times (E,) [s].
 
-    `gone` is the time since which the speaker is known to be dead, infinity while it lives.
+    `gone` is the time since which the speaker is known to be dead, infinity while it lives, and minus infinity before
+    its liveliness token was seen: a pose alone is no sign of life.
     """
 
     position: Array
@@ -28,7 +29,7 @@ class Heard:
     def nothing(cls, count: int) -> Heard:
         """Before anything was heard."""
         never = np.full(count, -np.inf)
-        return cls(np.full((count, 3), np.nan), np.zeros((count, 3)), never, never.copy(), np.full(count, np.inf))
+        return cls(np.full((count, 3), np.nan), np.zeros((count, 3)), never, never.copy(), never.copy())
 
     def believed(self, predictor: Predictor, t: float, which: Index) -> Array:
         """Where (K, 3) [m] the speakers of links `which` (K,), all heard once, are believed to be at `t` [s]."""
@@ -47,9 +48,10 @@ class Hearing:
 
     Attributes:
         heard: What was heard on each link (E).
-        live: Links that take part in the law: heard once, the speaker is not gone for long, not only for avoidance,
-            and there at all in a formation whose links come and go.
+        live: Links that take part in the law: heard once, the speaker lives or is not gone for long, not only for
+            avoidance, and there at all in a formation whose links come and go.
         links: Those, with what they ask for now.
+        behind: (E,) links whose speakers stamp their poses with a clock that is behind; None: there are none.
         unsettled: Some speaker was never heard or is gone, so that time alone can change what is live.
     """
 
@@ -63,6 +65,7 @@ class Hearing:
         """
         self.heard = Heard.nothing(len(links))
         self.unsettled = True
+        self.behind: Mask | None = None
         self._all, self._watched, self._silence_s = links, watched, silence_s
         self._there: Mask = np.ones(len(links), dtype=bool) if watched is None else ~watched
         self._taking_part = self._heard_of = np.zeros(len(links), dtype=bool)
@@ -82,27 +85,44 @@ class Hearing:
             stamp, arrived = stamp[newer], arrived[newer]
         heard.position[at], heard.velocity[at] = position, velocity
         heard.stamp[at], heard.arrived[at] = stamp, arrived
-        if self.unsettled:
-            heard.gone[at] = np.inf
 
     def lose(self, at: Index, t: float) -> None:
-        """The speakers of links `at` are gone since `t` [s]; heard again, they are back."""
+        """The tokens of the speakers of links `at` are gone since `t` [s]."""
         self.heard.gone[at] = np.minimum(self.heard.gone[at], t)
         self.unsettled = True
 
     def find(self, at: Index) -> None:
-        """The speakers of links `at` are back, whether or not they have something new to say."""
+        """The tokens of the speakers of links `at` are there: these live, whether or not they have something to say."""
         self.heard.gone[at] = np.inf
+        self.unsettled = True
+
+    def forget(self, at: Index) -> None:
+        """The speakers of links `at` begin a new life: poses of the one before are of another robot."""
+        heard = self.heard
+        heard.position[at], heard.velocity[at] = np.nan, 0.0
+        heard.stamp[at] = heard.arrived[at] = -np.inf
+        self.unsettled = True
+
+    def distrust(self, at: Index, behind: bool) -> None:
+        """The clocks of the speakers of links `at` are behind, or are so no longer."""
+        mask = np.zeros(len(self._all), dtype=bool) if self.behind is None else self.behind
+        mask[at] = behind
+        self.behind = mask if some(mask) else None
+
+    @property
+    def greeted(self) -> Array:
+        """(E,) time of the last sample on links whose speaker was there once [s]; minus infinity on the others."""
+        return np.where(self.heard.gone == -np.inf, -np.inf, self.heard.stamp)
 
     def missing(self, row: int) -> Index:
         """Speakers that a row has never heard, or that are gone."""
-        lacks = ~np.isfinite(self.heard.stamp) | np.isfinite(self.heard.gone)
+        lacks = ~np.isfinite(self.heard.stamp) | (self.heard.gone < np.inf)
         return np.asarray(self._all.speaker[(self._all.listener == row) & lacks])
 
     def choose(self, t: float) -> Index:
         """Decides at `t` [s] which links are live; gives the rows for which that has changed."""
         heard = self.heard
-        known, here = np.isfinite(heard.stamp), np.isinf(heard.gone)
+        known, here = np.isfinite(heard.stamp), heard.gone == np.inf
         self.unsettled = not (known & here).all()
         self._heard_of = known & (t - heard.gone <= self._silence_s)
         return self._select()

@@ -12,7 +12,7 @@ from agents import wire
 from agents.agent import Agent, links_by_speaker
 from agents.channel import Channel, Conditions, Samples
 from agents.keys import Keys
-from agents.speaker import Said, Speaker
+from agents.speaker import Coming, Said, Speaker
 
 NEWS: Final = 20_000  # newest poses that wait for telemetry, which takes them several times a second: 10 MB
 
@@ -69,23 +69,36 @@ class Neighbours:
 
     def listen(self, t: float, utc: float) -> None:
         """Takes in what has arrived at `t` [s] of the process's clock, which stood at 0 at `utc` [s]."""
-        arrived: list[tuple[int, Said]] = []
         for speaker in self.speakers:
-            for said in speaker.news(utc + t):
-                speaker.lost += said.missed
-                arrived += [(link, said) for link in speaker.links.tolist()]
-        if arrived:
-            self._send(arrived, t, utc)
-        for speaker in self.speakers:
-            for came in speaker.comings():
+            for coming in speaker.comings():
                 self.changed = True
-                if came:
+                if coming is Coming.CAME:
                     self._agent.find(speaker.links)
+                elif coming is Coming.ANEW:
+                    self._begin(speaker)
                 else:
                     self._channel.forget(speaker.links)
                     self._agent.lose(speaker.links, t)
+        arrived: list[tuple[int, Said]] = []
+        for speaker in self.speakers:
+            behind = speaker.behind
+            for said in speaker.news(utc + t):
+                speaker.lost += said.missed
+                if said.anew:
+                    self._begin(speaker)
+                    arrived = [(link, before) for link, before in arrived if link not in speaker.links]
+                arrived += [(link, said) for link in speaker.links.tolist()]
+            if speaker.behind != behind:
+                self._agent.hearing.distrust(speaker.links, speaker.behind)
+        if arrived:
+            self._send(arrived, t, utc)
         if (got := self._channel.due(t)) is not None:
             self._believe(got, utc)
+
+    def _begin(self, speaker: Speaker) -> None:
+        """A neighbour begins a new life."""
+        self._channel.forget(speaker.links)
+        self._agent.forget(speaker.links)
 
     def _send(self, arrived: list[tuple[int, Said]], t: float, utc: float) -> None:
         """Gives poses, each with the link on which it arrived, to the modelled network, all of a tick at once."""

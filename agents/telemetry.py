@@ -201,6 +201,7 @@ class Telemetry:
                 heard=self._neighbours.heard[row],
                 lost={speaker.name: speaker.lost for speaker in mine},
                 dropped=self._dropped_of(row),
+                stale={speaker.name: speaker.stale for speaker in mine if speaker.stale},
                 malformed=counts.malformed + self._neighbours.malformed,
                 refused=counts.refused,
                 ticks=counts.ticks,

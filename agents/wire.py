@@ -113,8 +113,9 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     `missing` names neighbours that were never heard or are gone; `lost` counts, per neighbour, samples that the
     sequence numbers prove were sent and never came, `dropped` those that came and that the modelled network dropped
-    (`agents.channel`; names without any are left out). `late_s` is the largest lateness of a tick since the last
-    status.
+    (`agents.channel`), and `stale` those that came and were left out, because a newer one was known or the process that
+    sent them is gone (names without any are left out of both). `late_s` is the largest lateness of a tick since the
+    last status.
     `started` is the UTC time at which the robot began to run the experiment (0 before). From there `ticks` count, and
     `decisions`, at which it computed its goal (or was told one). `interventions` are ticks on which safety changed what
     had been decided, `avoided` those of them, and of changed goals, that kept clear of something. `origin` is where it
@@ -149,6 +150,7 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     origin: Setpoint | None = None
     hazard: str = ""
     incidents: list[Incident] = []
+    stale: dict[str, int] = {}
 
 
 class Position(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

@@ -35,7 +35,7 @@ from agents.naming import NameTaken, claim
 from agents.plausibility import reach_of
 from agents.process import told_to_end
 from agents.rows import Index
-from agents.speaker import Said, Speaker
+from agents.speaker import Coming, Said, Speaker
 from agents.telemetry import resident_mb
 from experiments import conditions, document, mesh
 from experiments.assign import assign_centre, guided
@@ -115,21 +115,30 @@ class CentreProcess:
             for sample in network.received(statuses.handler):
                 self._heed(row, sample)
         for speaker in self._speakers:
-            for said in speaker.news(self._utc + t):
-                self._send(speaker, said, t)
-            for came in speaker.comings():
-                rows = self.centre.listens[speaker.links]
-                if came:
+            rows = self.centre.listens[speaker.links]
+            for coming in speaker.comings():
+                if coming is Coming.CAME:
                     self.centre.find(rows)
+                elif coming is Coming.ANEW:
+                    self._begin(speaker)
                 else:
                     self._channel.forget(speaker.links)
                     self.centre.lose(rows, t)
+            for said in speaker.news(self._utc + t):
+                if said.anew:
+                    self._begin(speaker)
+                self._send(speaker, said, t)
         if (got := self._channel.due(t)) is not None:
             self._believe(got)
         begun = float(self._start[self._guided].min())
         if begun != self._begun and isfinite(begun):  # decisions fall on the same instants as those of the robots
             self._begun = begun
             self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
+
+    def _begin(self, speaker: Speaker) -> None:
+        """A robot begins a new life."""
+        self._channel.forget(speaker.links)
+        self.centre.forget(self.centre.listens[speaker.links])
 
     def _send(self, speaker: Speaker, said: Said, t: float) -> None:
         """One pose has come: it is given to the modelled network."""

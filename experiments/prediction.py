@@ -68,6 +68,7 @@ def predict(assignment: Assignment, start: Array, yaw: Array, leads: Index, hz: 
             duration=2.0 * assignment.duration + 1.0,  # it must not end before the last decision
         )
     )
+    agent.find(np.arange(len(assignment.links)))
     share = closed(assignment.kinds, hz)[:, None]
     speed = np.minimum([kind.speed for kind in assignment.kinds], assignment.limits.speed)[:, None] / hz
     flies = np.array([kind.flies for kind in assignment.kinds])[:, None]

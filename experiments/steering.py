@@ -49,6 +49,7 @@ class Steering:
 
     def __init__(self, experiment: Experiment, seeds: Sequence[int]) -> None:
         self.centre = Centre(assign.assign_centre(experiment, len(seeds)))
+        self.centre.find(self.centre.listens)  # all robots are there from the beginning
         self._sent: list[tuple[Any, ...]] = []
         self._followed: list[tuple[Any, ...]] = []
         self._heard: list[tuple[Any, ...]] = []

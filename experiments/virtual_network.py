@@ -29,6 +29,7 @@ class VirtualNetwork:
         self._steering = None if assignment.guided is None else Steering(experiment, seeds)
         self._seq: Index = np.zeros(rows, dtype=np.intp)
         self._nothing = np.zeros((rows, 0))
+        agent.find(np.arange(len(assignment.links)))  # all robots are there from the beginning
         self._sent: list[tuple[Any, ...]] = []
         self._heard: list[tuple[Any, ...]] = []
 

@@ -28,6 +28,7 @@ class Group:
         self.assignment = assign.assign(experiment, self.names)
         self.agent = Agent(self.assignment)
         self.body = TwinBody(assign.request(experiment, self.names, [experiment.seed]))
+        self.agent.find(np.arange(len(self.assignment.links)))
         self.by_speaker = links_by_speaker(self.assignment.links, self.assignment.speakers)
         self.state: BodyState
         self.actions: Actions

@@ -28,6 +28,7 @@ class Desk:
 
     def __init__(self, experiment, copies=1, seed=3):
         self.centre = Centre(assign.assign_centre(experiment, copies))
+        self.centre.find(self.centre.listens)
         self.rows = len(self.centre.guided)
         rng = np.random.default_rng(seed)
         one = rng.uniform(-0.8, 0.8, (self.rows // copies, 3))
@@ -51,6 +52,7 @@ def test_it_decides_what_the_robots_would_to_the_last_bit(park, update):
     desk = Desk(replaced(park, architecture="centralised"))
     agent = Agent(assign.assign(park, tuple(park.robots)))
     links, rng = agent.assignment.links, np.random.default_rng(1)
+    agent.find(np.arange(len(links)))
     agent.life.phase[:] = AIRBORNE
     agent.life.start_at[:] = 0.0
     still, place = np.zeros((7, 3)), desk.position.copy()

@@ -34,6 +34,7 @@ class Bench:
 
     def __init__(self, experiment, names=("A", "B")):
         self.agent = Agent(assign.assign(experiment, names))
+        self.agent.find(np.arange(len(self.agent.assignment.links)))
         self.position = np.array([[-0.4, 0.0, 0.0], [0.4, 0.1, 0.8]])[: len(names)]
         self.t = 0.0
 

@@ -71,6 +71,7 @@ EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while th
     Cause.BELOW: [(0, "WARN")],
     Cause.SINKING: [(10, "LAND")],
     Cause.CLOCK: [(50, "WARN")],
+    Cause.BEHIND: [(0, "WARN")],
 }
 
 

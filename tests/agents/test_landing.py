@@ -42,6 +42,7 @@ class Bench:
         self.assignment = assignment = assign.assign(experiment, tuple(robots))
         self.landing = Landing(assignment)
         self.hearing = Hearing(assignment.links, None, 1.0)
+        self.hearing.find(np.arange(len(assignment.links)))
         self.safety = Safety(assignment.kinds, assignment.limits)
         self.position = np.array(position, dtype=float)
         self.velocity = np.zeros_like(self.position)

@@ -1,0 +1,204 @@
+"""A neighbour is alive by its token alone, and a new process of it is a new life."""
+
+from __future__ import annotations
+
+import pytest
+import zenoh
+
+from agents import wire
+from agents.agent import Agent
+from agents.keys import Keys
+from agents.neighbours import Neighbours
+from agents.speaker import LATE_S
+from experiments import assign
+from tests.agents.few import pair
+from tests.fuzz.loopnet import Net, Payload
+
+UTC, KEYS = 1.7e9, Keys()
+
+
+class Source:
+    def __init__(self, session: str) -> None:
+        self.source_id, self.zid = self, session
+
+
+class Sample:
+    """What Zenoh hands out: of a token, or of a pose from a session."""
+
+    timestamp = attachment = None
+    encoding = wire.JSON
+
+    def __init__(self, key: str, payload: bytes = b"", *, gone: bool = False, session: str | None = None) -> None:
+        self.key_expr, self.payload = key, Payload(payload)
+        self.kind = zenoh.SampleKind.DELETE if gone else zenoh.SampleKind.PUT
+        self.source_info = None if session is None else Source(session)
+
+
+class Robot:
+    """A, alone in its process, and B, of which the test says everything."""
+
+    def __init__(self, net: Net) -> None:
+        self.net, self.agent = net, Agent(assign.assign(pair(), ("A",)))
+        self.neighbours = Neighbours(net.session, KEYS, self.agent, reach=(5.0, 5.0, 5.0))
+        (self.speaker,) = self.neighbours.speakers
+        self.t = 0.0
+
+    def tell(self, key: str, **what: object) -> None:
+        for channel in self.net.channels:
+            if channel.expression.intersects(zenoh.KeyExpr(key)):
+                channel.add(Sample(key, **what))
+
+    def pose(self, seq: int, x: float, *, session: str | None, age: float = 0.0) -> None:
+        said = wire.pose("B", seq, UTC + self.t - age, [x, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0)
+        self.tell(KEYS.pose("B"), payload=wire.encode(said), session=session)
+
+    def token(self, session: str | None, *, gone: bool = False) -> None:
+        """The tokens of B, as they come and go together."""
+        if session is not None:
+            self.tell(Keys.life(KEYS.alive("B"), session), gone=gone)
+        self.tell(KEYS.alive("B"), gone=gone)
+
+    def after(self, seconds: float = 0.02) -> None:
+        self.neighbours.listen(self.t, UTC)
+        self.agent.deciding.settle(self.t)
+        self.t += seconds
+
+    @property
+    def live(self) -> bool:
+        """Whether B takes part in the law."""
+        return len(self.agent.hearing.live) == 1
+
+    @property
+    def x(self) -> float:
+        return float(self.agent.heard.position[0, 0])
+
+
+@pytest.fixture
+def robot():
+    with Net().worn() as net:
+        yield Robot(net)
+
+
+def test_a_pose_without_a_token_is_not_believed(robot):
+    robot.pose(1, 0.4, session="one")  # the last value of a robot that has landed, and has taken its token back
+    robot.after(5.0)
+    robot.after()
+    assert not robot.live
+    assert robot.agent.missing(0) == ["B"]
+    assert robot.agent.assignment.lacking(robot.agent.hearing.greeted).all()
+    robot.token("one")
+    robot.after()
+    assert robot.live
+    assert robot.agent.missing(0) == []
+    assert robot.x == 0.4
+
+
+def test_a_late_sample_revives_nobody(robot):
+    robot.token("one")
+    robot.pose(1, 0.4, session="one")
+    robot.after()
+    robot.token("one", gone=True)
+    robot.after(4.0)
+    robot.pose(2, 0.5, session="one", age=2.5)
+    robot.after()
+    assert not robot.live
+    assert robot.agent.missing(0) == ["B"]
+    robot.after(500.0)
+    robot.after()
+    assert not robot.live
+
+
+@pytest.mark.parametrize("behind_s", [1.0, 60.0, -3.0])
+def test_a_neighbour_that_is_restarted_is_heard_at_once_whatever_its_clock_says(robot, behind_s):
+    robot.token("one")
+    for seq in range(1, 100):
+        robot.pose(seq, 0.4, session="one", age=min(0.0, behind_s))
+        robot.after()
+    robot.token("one", gone=True)
+    robot.after(2.0)
+    robot.token("two")
+    robot.after()
+    assert not robot.live  # where the former process was is not where this one is
+    assert robot.agent.missing(0) == ["B"]
+    robot.pose(1, -0.4, session="two", age=max(0.0, behind_s))
+    robot.after()
+    assert robot.live
+    assert robot.x == -0.4
+    assert robot.speaker.lost == 0
+    robot.pose(100, 0.4, session="one")  # held back by the network since the first life
+    robot.after()
+    assert robot.x == -0.4
+    assert robot.speaker.stale == 1
+
+
+def test_a_neighbour_that_was_cut_off_is_believed_where_it_was(robot):
+    robot.token("one")
+    robot.pose(7, 0.4, session="one")
+    robot.after()
+    robot.token("one", gone=True)
+    robot.after(2.0)
+    assert robot.live  # known so far to be gone for no time at all
+    robot.after()
+    assert not robot.live
+    robot.token("one")
+    robot.after()
+    assert robot.live
+    assert robot.x == 0.4
+
+
+def test_a_robot_of_another_make_begins_anew_with_its_token_or_with_a_clock_that_is_set_back(robot):
+    robot.token(None)
+    robot.pose(7, 0.4, session=None)
+    robot.after()
+    robot.token(None, gone=True)
+    robot.after(1.0)
+    robot.token(None)
+    robot.pose(1, 0.3, session=None, age=30.0)
+    robot.after()
+    assert (robot.live, robot.x) == (True, 0.3)
+    robot.pose(2, 0.2, session=None, age=90.0)  # its clock steps while it runs: the number says that it is newer
+    robot.after()
+    assert robot.x == 0.2
+    robot.pose(1, 0.9, session=None, age=95.0)
+    robot.after()
+    assert (robot.x, robot.speaker.stale) == (0.2, 1)
+
+
+def test_no_other_session_speaks_for_a_robot_whose_token_is_there(robot):
+    robot.token("one")
+    robot.pose(1, 0.4, session="one")
+    robot.after()
+    robot.pose(9, 3.0, session="other")
+    robot.after()
+    assert (robot.x, robot.speaker.stale) == (0.4, 1)
+
+
+def hazards(robot: Robot) -> list[str]:
+    agent = robot.agent
+    seen: list = []
+    if agent.hearing.behind is not None:
+        agent._detector._behind(agent.hearing, agent.hearing.behind, seen)
+    return [f"{each.cause.name}: {each.say(0)}" for each in seen if each.rows[0]]
+
+
+def test_poses_that_are_always_older_than_a_network_delays_them_are_a_hazard(robot):
+    robot.token("one")
+    robot.pose(1, 0.4, session="one", age=60.0)  # the last value of a robot that is silent: no proof
+    robot.after()
+    assert hazards(robot) == []
+    for seq in range(2, 5):
+        robot.pose(seq, 0.4, session="one", age=LATE_S + 1.0)
+        robot.after()
+    assert hazards(robot) == ["BEHIND: the poses of B are 4.0 s old when they arrive"]
+    robot.pose(9, 0.4, session="one")
+    robot.after()
+    assert hazards(robot) == []
+
+
+def test_what_waited_while_the_listener_stood_still_is_no_proof_of_a_slow_clock(robot):
+    robot.token("one")
+    robot.t = 100.0
+    for seq in range(1, 8):
+        robot.pose(seq, 0.4, session="one", age=10.0 - seq)
+    robot.after()
+    assert hazards(robot) == []
