@@ -281,6 +281,8 @@ class CaseMetrics(msgspec.Struct, frozen=True):
         avoided_share: Ticks on which avoidance did over ticks, of all robots.
         world_factor: Lowest simulated over real time that the world reported while it was not paused; None without a
             world in real time.
+        away_s: For how long nobody's position was known and all came back: the network was away. `known`, `coverage`,
+            acquisition and settling are over the rest [s].
         troubles: What conductor and recorder found wrong: robots that began late, messages that could not be read.
         network_messages: Of the whole network: poses of all robots, leaders too, and goals of the centre.
         network_bytes: Their payload [bytes].
@@ -324,6 +326,7 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     intervened_share: float | None
     avoided_share: float | None
     world_factor: float | None
+    away_s: float = 0.0
     troubles: tuple[str, ...] = ()
     network_messages: int = 0
     network_bytes: int = 0

@@ -32,6 +32,7 @@ from experiments.signals import (
     leaders,
     mean_known,
     net_rotation,
+    network_away,
     outside_arena,
     phase_starts,
     transmissions,
@@ -132,6 +133,7 @@ def measure(trace: Trace) -> CaseMetrics:
         intervened_share=_share(trace.interventions.sum(), ticks),
         avoided_share=_share(trace.avoided.sum(), ticks),
         world_factor=_slowest(trace),
+        away_s=network_away(errors.alive, trace.time)[0],
         troubles=tuple(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
         network_messages=sum(robot.messages + robot.goals for robot in robots),
         network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
@@ -172,8 +174,10 @@ def _robots(
     duration = float(time[-1] - time[0])
     total = errors.per_robot()
     iae, itae, rmse = integrals(total, time)
-    coverage = (np.isfinite(errors.error).mean(axis=0) @ mine) / np.maximum(mine.sum(axis=0), 1.0)
-    settled = after_last(~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0)), time)
+    there = ~errors.away
+    coverage = (np.isfinite(errors.error[there]).mean(axis=0) @ mine) / np.maximum(mine.sum(axis=0), 1.0)
+    unsettled = ~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0))
+    settled = after_last(unsettled & (there[:, None] | np.isfinite(total)), time)
     sent, recorded = transmissions(trace)
     size = np.bincount(trace.sent.robot, weights=trace.sent.bytes, minlength=rows)
     linked = np.zeros((rows, rows), dtype=bool)  # what only avoidance listens to does not belong to the formation
@@ -218,7 +222,7 @@ def _robots(
             listeners=int(listeners[i]),
             heard=int(heard[i]),
             coverage=float(coverage[i]),
-            known=float(errors.alive[:, i].mean()),
+            known=float(errors.alive[there, i].mean()),
             collisions=len(own[i]),
             impulse=max((each.impulse for each in own[i] if each.impulse is not None), default=None),
             overlap=max((each.overlap for each in own[i]), default=None),

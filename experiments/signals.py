@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from experiments.experiment import Experiment
 from experiments.formation import Pattern, errors
 from experiments.losses import unrecorded
 from experiments.trace import Trace
+
+RETURN_S: Final = 3.0  # robots come back one after the other when the network does
 
 
 def links_of(trace: Trace) -> Links:
@@ -61,6 +64,7 @@ class LinkErrors:
         error: (T, E) as the law measures it, |‖p_i − p_j‖ − d_ij| for distances [m]; NaN where an end is unknown or
             the link is not there.
         alive: (T, N) whether the robot's own position is known.
+        away: (T,) the network was away, see `network_away`: what is unknown then tells nothing of a robot.
     """
 
     time: Array
@@ -68,6 +72,7 @@ class LinkErrors:
     own: Array
     error: Array
     alive: Mask
+    away: Mask
 
     @classmethod
     def of(cls, trace: Trace) -> LinkErrors:
@@ -76,11 +81,13 @@ class LinkErrors:
         law = plugins.build(plugins.LAWS, trace.experiment.formation.law)
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
         error = errors(law, pattern, trace.time, trace.true_position)
-        return cls(trace.time, pattern.links, own_links(pattern.links, len(trace.robots)), error, alive)
+        own, (_, away) = own_links(pattern.links, len(trace.robots)), network_away(alive, trace.time)
+        return cls(trace.time, pattern.links, own, error, alive, away)
 
     def part(self, begin: int, end: int) -> LinkErrors:
         """The same from one row in time to another."""
-        return LinkErrors(self.time[begin:end], self.net, self.own, self.error[begin:end], self.alive[begin:end])
+        rows = slice(begin, end)
+        return LinkErrors(self.time[rows], self.net, self.own, self.error[rows], self.alive[rows], self.away[rows])
 
     def per_robot(self) -> Array:
         """e_i(t) = Σ_j e_ij (T, N) [m] over its own links, see `error`; NaN where none of them is known."""
@@ -100,7 +107,7 @@ class LinkErrors:
         count = np.concatenate([edge, np.cumsum(known, axis=0)])
         before = np.maximum(np.arange(1, len(total)) - window, 0)  # the window fills up at the start
         outside = (total[1:] - total[before]) > tolerance * (count[1:] - count[before]) + 1e-12
-        unknown = (known.astype(float) @ self.own == 0.0) | ~self.alive
+        unknown = ((known.astype(float) @ self.own == 0.0) | ~self.alive) & ~self.away[:, None]
         return after_last((outside.astype(float) @ self.own > 0.0) | unknown, self.time)
 
     def worst(self, names: Sequence[str]) -> list[tuple[float | None, str]]:
@@ -116,6 +123,28 @@ class LinkErrors:
             other = self.net.speaker[k] if self.net.listener[k] == i else self.net.listener[k]
             found.append((float(mean[k]), names[other]))
         return found
+
+
+def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:
+    """Holes that all robots share and that end: not the robots, the network was gone.
+
+    Args:
+        alive: (T, N) whether a robot's position is known.
+        time: (T,) [s].
+
+    Returns:
+        For how long nobody's position was known [s], and the rows (T,) within `RETURN_S` of that at which some are not.
+    """
+    nobody: Mask = np.asarray(~alive.any(axis=1))
+    ends = np.flatnonzero(alive.any(axis=1))
+    nobody[(ends[-1] if len(ends) else 0) :] = False  # robots that never come back have gone
+    if alive.shape[1] < 2 or not nobody.any():
+        return 0.0, np.zeros(len(time), dtype=bool)
+    moments = time[nobody]
+    after = np.searchsorted(moments, time)
+    padded = np.concatenate([[-np.inf], moments, [np.inf]])
+    near = np.minimum(time - padded[after], padded[after + 1] - time) <= RETURN_S
+    return float(nobody.sum() * (time[1] - time[0])), np.asarray((near & ~alive.all(axis=1)) | nobody)
 
 
 def formation_errors(trace: Trace) -> Array:

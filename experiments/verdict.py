@@ -54,7 +54,7 @@ def _formation(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 
 def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """Which runs ended before their time; the first thing that a reader must know."""
+    """Which runs ended before their time, or were without a network; the first thing that a reader must know."""
     found, several = [], len(by_case(cases)) > 1
     for run in cases:
         if run.interrupted:
@@ -63,6 +63,10 @@ def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
                 f"{where} after {run.duration_s:.1f} s of {run.planned_s:g} s: all {'its ' if several else ''}figures"
             )
             found.append(Finding("fair", f"{text} are up to there."))
+        if run.away_s:
+            where = f"In {run.case} the" if several else "The"
+            text = f"{where} network was away for {run.away_s:.1f} s: errors are over the rest of the time."
+            found.append(Finding("fair", text))
     return found
 
 

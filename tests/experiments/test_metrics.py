@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import metrics, results, seeds
+from experiments import metrics, results, seeds, verdict
 from experiments.measured import INDICES, CaseMetrics, RobotMetrics
 from experiments.signals import formation_errors, net_rotation
 from experiments.trace import Trace
@@ -343,3 +343,33 @@ def test_errors_do_not_depend_on_where_the_formation_stands(turn: float, x: floa
     moved = metrics.measure(dataclasses.replace(known, true_position=place))
     for index in ("iae", "itae", "rmse"):
         assert moved.mean[index] == pytest.approx(metrics.measure(known).mean[index], rel=1e-9)
+
+
+def test_time_without_a_network_is_nobodys_death():
+    """A router that was away for 2 s of 10: all robots are unknown then, and come back one after the other."""
+    known = pair(1.0 + np.exp(-T))
+    place = known.true_position.copy()
+    place[(T > 4.0) & (T < 6.0)] = np.nan
+    place[(T > 4.0) & (T < 6.4), 1] = np.nan
+    measured = metrics.measure(dataclasses.replace(known, true_position=place))
+    whole = metrics.measure(known)
+    assert measured.away_s == pytest.approx(2.0, abs=2 * STEP)
+    assert measured.died == ()
+    assert measured.acquired_s == whole.acquired_s
+    assert [robot.known for robot in measured.robots] == [1.0, 1.0]
+    assert measured.robots[1].coverage == 1.0
+    assert measured.robots[1].settle_s == whole.robots[1].settle_s
+    assert measured.mean["iae"] is not None
+    assert any("away for 2.0 s" in finding.text for finding in verdict.interruptions([measured]))
+
+
+@pytest.mark.parametrize("gone", [[0, 1], [1]])
+def test_who_does_not_come_back_has_died(gone: list[int]):
+    known = pair(1.0 + np.exp(-T))
+    place = known.true_position.copy()
+    for row in gone:
+        place[T > 4.0, row] = np.nan
+    measured = metrics.measure(dataclasses.replace(known, true_position=place))
+    assert measured.away_s == 0.0
+    assert measured.robots[1].known < 0.5
+    assert measured.robots[1].robot in measured.died
