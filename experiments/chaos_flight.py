@@ -40,7 +40,7 @@ from experiments.watched import Watched
 
 POLL_S: Final = 0.02
 BEGIN_S: Final = 100.0  # to the common start
-FORM_S: Final = 30.0  # a formation that has not come together by then does not
+FORM_S: Final = 45.0  # a formation that has not come together by then does not: who avoids others takes its time
 HEAL_S: Final = 30.0  # at the latest so long after a fault is lifted the formation stands again
 SETTLED_S: Final = 0.5  # and stays so
 FRESH_S: Final = 1.6  # a robot that says nothing for longer is not back: statuses come once a second
@@ -101,9 +101,11 @@ class _Running:
     held_at: Array | None = None
     utc: float = field(default_factory=time.time)
     there: set[str] = field(default_factory=set)  # who was under way before
+    events: int = 0  # that had happened before
     told: dict[str, int] = field(default_factory=dict)  # the last incident of each robot before
     restarted: float | None = None
     back: float | None = None
+    died: bool = False
     violations: list[str] = field(default_factory=list)
 
     def deplore(self, text: str) -> None:
@@ -250,7 +252,8 @@ class Flight:
             if self._formed_since is not None and now - self._formed_since >= SETTLED_S:
                 self._well = now
             elif t > FORM_S:
-                self._wrong.append(f"not in formation {FORM_S:g} s after the start: no fault was done")
+                why = self._apart(eyes, live, now - FRESH_S, t)
+                self._wrong.append(f"not in formation {FORM_S:g} s after the start ({why}): no fault was done")
                 return False
             return True
         return now < self._well + self._left[0].after_s or self._begin(injector, eyes, t, now)
@@ -273,7 +276,7 @@ class Flight:
         self._conductor_dead = fault.kind == "conductor"
         eyes.orders.clear()
         told = {name: status.incidents[-1].seq for name, status in eyes.status.items() if status.incidents}
-        self._now = _Running(fault, victim, now, note, before, there=running, told=told)
+        self._now = _Running(fault, victim, now, note, before, there=running, events=len(self._events), told=told)
         self._at = t
         if fault.kind == "conductor":
             self._watch_landing(eyes, self._now)
@@ -301,7 +304,7 @@ class Flight:
     def _close(self, running: _Running, well: float | None, eyes: Eyes) -> None:
         now = time.monotonic()
         well = now if well is None else well
-        if running.fault.kind == "read-error":
+        if running.fault.kind == "read-error" or running.died:
             self._dead[running.victim] = now
         left = set() if self._conductor_dead else running.there - self._dead.keys()
         down = [name for name in sorted(left) if self._down(name, eyes)]
@@ -367,6 +370,21 @@ class Flight:
         blind = [name for name in live if victim in self._hears[name] and victim not in eyes.status[name].missing]
         return f"{', '.join(blind)}: not noticed that {victim} is gone" if blind else ""
 
+    def _after_bits(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        """Some wrong bits make Zenoh's client abort its process, which TCP's own checksum would have kept from it."""
+        victim = running.victim
+        if not running.died and "SIGABRT" in self._lost_since(running):
+            running.died, running.note = True, "its process was aborted by Zenoh"
+        if running.died:
+            up = eyes.invariants.up(victim)
+            return f"{victim} has not come down yet" if up else self._after_kill(running, injector, eyes, live)
+        return self._after_any(running, injector, eyes, live)
+
+    def _lost_since(self, running: _Running) -> str:
+        """What the conductor has said since the fault began of the end of the victim's process; empty if nothing."""
+        ends = [e.text for e in self._events[running.events :] if e.kind == "lost" and e.source == running.victim]
+        return "".join(ends[:1])
+
     def _after_read_error(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
         victim = running.victim
         if not any(order.robot == victim and order.action in ("land", "stop") for order in eyes.orders):
@@ -378,7 +396,7 @@ class Flight:
     def _after_clock_behind(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
         victim = running.victim
         if running.restarted is None:
-            if victim in eyes.alive or not any(e.kind == "lost" and e.source == victim for e in self._events):
+            if victim in eyes.alive or not self._lost_since(running):
                 return f"nobody has said that {victim} is lost"
             self._off.add(victim)
             running.restarted = time.monotonic()
@@ -425,6 +443,8 @@ class Flight:
             for incident in self._held(name, "position", running, eyes):
                 running.deplore(f"{name}: {incident.text}")
         return ""
+
+    _after_clock = _after_mocap_clock
 
     @staticmethod
     def _down(name: str, eyes: Eyes) -> bool:

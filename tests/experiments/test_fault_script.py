@@ -62,5 +62,5 @@ def test_every_kind_is_known_to_those_that_do_it_and_that_look_after_it():
     assert set(KINDS) - tables == {"double", "read-error", "disk", "corrupt"}, "done by functions of their own"
     looked_after = {name.removeprefix("_after_").replace("_", "-") for name in vars(chaos_flight.Flight)}
     assert {kind for kind in KINDS if kind in looked_after} == {
-        "kill", "read-error", "clock-behind", "double", "frozen-router", "mocap-clock"
+        "kill", "bits", "clock", "read-error", "clock-behind", "double", "frozen-router", "mocap-clock"
     }  # fmt: skip
