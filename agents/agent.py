@@ -313,6 +313,7 @@ class Agent:
             landing,
             self.deciding.alone() if hearing.unsettled else None,
             None if guidance is None else running & guidance.lacking(t),
+            None if guidance is None else guidance.stamp,
             self.goal[:, 2],
             self._wild,
             self._landing,

@@ -24,6 +24,9 @@ SUNK: Final = 0.15  # [m] so far below its goal,
 SINKS: Final = 0.15  # [m/s] and this fast downward, a row is not flying where it wants to
 AHEAD_S: Final = 0.1  # no network here is later than this: what is stamped further ahead is from a clock that is ahead
 BEHIND: Final = 0.5  # share of the time after which a robot is blind; what is stamped so far behind is worth a warning
+# who was not heard so long after a standstill has had nothing new to say: what was missed comes with the next heartbeat
+# of its publisher, 0.5 s after what it said last, or with the history that is asked for after a reconnection
+SILENT_S: Final = 1.0
 LATE_WINDOW_S: Final = 1.0  # over so long it is counted how many ticks were missed,
 LATE_SHARE: Final = 0.9  # and with a larger share of them a control loop is none
 
@@ -36,11 +39,28 @@ class Outside:
         offline_since: When the connection to the router was lost [s]; infinity while there is one.
         unattended_since: When the conductor was lost [s]; infinity while it is there, or never was.
         late: Share of the last ticks that were missed, 0 to 1.
+        woke: When the process went on after it had stood still [s].
+        slept: For how long it had stood still [s].
+        linked: Since when after that it has had a router [s].
     """
 
     offline_since: float = np.inf
     unattended_since: float = np.inf
     late: float = 0.0
+    woke: float = -np.inf
+    slept: float = 0.0
+    linked: float = -np.inf
+
+    def wake(self, t: float, slept: float) -> None:
+        """The process goes on at `t` [s]; it had stood still for so long [s]."""
+        self.woke, self.slept, self.linked = t, slept, t
+
+    def just_woke(self, t: float) -> bool:
+        """Whether what was missed in a standstill may still be on its way at `t` [s]; ask on every tick."""
+        recent = t < self.linked + SILENT_S
+        if recent and self.offline_since < np.inf:
+            self.linked = t
+        return recent
 
     @property
     def failing(self) -> bool:
@@ -65,6 +85,7 @@ class Standing(msgspec.Struct, frozen=True):
         landing: On their way down.
         alone: Nobody is left that the law could listen to; None: nobody is alone.
         lacking: Run and are guided by nobody; None: nobody is guided.
+        told: When the goals of guided rows were decided [s], minus infinity for the others; None: nobody is guided.
         height: Of their goals [m].
         wild: The last setpoint was not made of finite numbers.
         places: Where those that land come down.
@@ -75,6 +96,7 @@ class Standing(msgspec.Struct, frozen=True):
     landing: Mask
     alone: Mask | None
     lacking: Mask | None
+    told: Array | None
     height: Array
     wild: Mask
     places: Landing
@@ -116,8 +138,23 @@ class Detector:
             self._behind(hearing, hearing.behind, seen)
         if rows.lacking is not None and some(rows.lacking):
             seen.append(Sighting(Cause.CENTRE, rows.lacking, lambda _: "its centre is gone, or its goals are old"))
+        if outside.just_woke(t):
+            self._forgotten(hearing, rows, outside, seen)
         self._surroundings(t, outside, seen)
         return seen
+
+    def _forgotten(self, hearing: Hearing, rows: Standing, outside: Outside, seen: list[Sighting]) -> None:
+        """Rows that have not heard all who are there, or their centre, since the process stood still."""
+        heard, links = hearing.heard, self._assignment.links
+        silent = (heard.stamp < outside.woke) & np.isfinite(heard.stamp) & np.isinf(heard.gone)
+        waits = np.zeros(len(self._flies), dtype=bool)
+        waits[links.listener[silent]] = True
+        if rows.told is not None:
+            waits |= (rows.told < outside.woke) & np.isfinite(rows.told)
+        if some(waits):
+            seen.append(
+                Sighting(Cause.STANDSTILL, waits, lambda _: f"for {outside.slept:.1f} s; it waits for its neighbours")
+            )
 
     def _lost(self, t: float, state: BodyState, where: Whereabouts, seen: list[Sighting]) -> None:
         """Position, and the arena."""

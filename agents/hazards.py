@@ -60,6 +60,7 @@ class Cause(IntEnum):
     SINKING = 20
     CLOCK = 21
     BEHIND = 22
+    STANDSTILL = 23
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,7 @@ RULES: Final[Mapping[Cause, Rule]] = {
     # its device lands it, or its battery carries it no more: who hears it must not follow
     Cause.SINKING: Rule("it comes down by itself", Outcome.LAND, after_s=0.1),
     Cause.BELOW: Rule("a robot is below it", Outcome.WARN, landing=True),
+    Cause.STANDSTILL: Rule("its process stood still", Outcome.HOLD),
     Cause.CLOCK: Rule("the clock that stamps its positions is off", Outcome.WARN, after_s=0.5),  # not one late sample
 }
 

@@ -45,7 +45,6 @@ FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its laun
 STOPPED_S: Final = 5.0  # a body that does not say that its motors stand is told so long, and then left
 HUSH_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
 ROUTER_S: Final = 0.045  # between two looks at the router
-DOUBT_S: Final = 1.0  # a robot whose process stood still holds for so long: what it knows is old
 
 
 class Runtime:
@@ -63,10 +62,9 @@ class Runtime:
         self._stopping: str | None = None
         self._leaving: set[int] = set()  # rows that were told to go while the run goes on
         self._retired: set[int] = set()  # rows that come down, or are down, while the run goes on
-        self._doubt_until = -np.inf
         self._cut_off = False  # motors were cut by a stop that the loop has not seen yet
         self._airborne = False  # a row was in the air when its body said so last, or took off since
-        self._slept, self._joined = 0.0, False
+        self._joined = False
         self._utc = self._now = self._next = 0.0
         self._reach = plausibility.reach_of(assignment.limits.low, assignment.limits.high)
         self._everyone = np.arange(len(self._names))
@@ -242,17 +240,16 @@ class Runtime:
         self.agent.land_here()
         self._be_there()
 
-    def _doubt(self, slept: float) -> None:
+    def _wake(self, slept: float) -> None:
         """The process stood still for so long [s]: until it has heard the others again, it holds."""
-        self._slept = slept
-        self._doubt_until = self._next + DOUBT_S
+        self.agent.outside.wake(self._next, slept)
         print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
     def _listen(self, t: float) -> None:
         """Takes in what has arrived since the last tick."""
         agent = self.agent
         outside = agent.outside
-        outside.offline_since = self._cut_off_since(t, outside.offline_since)
+        outside.offline_since = self._cut_off_since(t)
         for sample in network.received(self._conductor.handler):
             gone = sample.kind == zenoh.SampleKind.DELETE
             outside.unattended_since = min(outside.unattended_since, t) if gone else np.inf
@@ -273,10 +270,8 @@ class Runtime:
         for last in self._last:
             last.answer()
 
-    def _cut_off_since(self, t: float, before: float) -> float:
-        """Since when nobody can be believed: the routers are gone, or this process has just stood still."""
-        if t < self._doubt_until:  # long enough ago to hold, and not long enough to land
-            return min(before, t - self._assignment.limits.link_silence_s - self._dt)
+    def _cut_off_since(self, t: float) -> float:
+        """Since when the routers are gone [s]; infinity while one is there."""
         if t >= self._router_due:  # a look at the router costs as much as a law
             self._router_due, self._silent_since = t + ROUTER_S, self._router.silent_since(t)
         return self._silent_since
@@ -304,8 +299,9 @@ class Runtime:
                 self._counts.malformed += 1
                 query.reply_err(str(error).encode(), encoding="text/plain")
                 return
-            if order.order == "takeoff" and self._slept > ASK_S and t < self._doubt_until:
-                refusal, value = f"the process stood still for {self._slept:.1f} s; ask again", None  # he left long ago
+            slept = self.agent.outside.slept
+            if order.order == "takeoff" and slept > ASK_S and self.agent.outside.just_woke(t):  # he left long ago
+                refusal, value = f"the process stood still for {slept:.1f} s; ask again", None
             else:
                 refusal, value = carry_out(self.agent, row, order, t, self._utc)
             self._counts.refused += bool(refusal)
@@ -350,7 +346,7 @@ class Runtime:
             self._next += behind * self._dt
             self.agent.skip(behind)
             if behind * self._dt > self._setup.loop_silence_s:
-                self._doubt(behind * self._dt)
+                self._wake(behind * self._dt)
             t = self._now = self._next
             self._counts.late_s = max(self._counts.late_s, time.monotonic() - zero - t)
             self._next = t + self._dt
