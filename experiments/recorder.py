@@ -9,8 +9,9 @@ import argparse
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Sequence
-from math import isfinite
+from math import isfinite, remainder, tau
 from pathlib import Path
 from typing import Final
 
@@ -33,7 +34,9 @@ from experiments.records import RecordingError
 POLL_S: Final = 0.02
 FLUSH_S: Final = 1.0
 AFTER_S: Final = 12.0  # how long robots may take to land after the conductor is gone
-FRESH_S: Final = 0.05  # a truth that is older does not belong to a state
+FRESH_S: Final = 0.05  # a truth that is farther away in time does not belong to a state
+PATIENCE_S: Final = 0.2  # a state waits so long for the truth that follows it
+TRUTHS: Final = 256  # that are kept of each robot
 NAMED: Final = 100  # keys of which is told that something could not be read
 DEPTH: Final = 20_000  # samples that may wait while the disk does
 RARE: Final = 1_000  # of those that come once a second, or now and then: a ring takes its memory as it first goes round
@@ -60,7 +63,8 @@ class Recorder:
         self._centre = network.subscriber(session, keys.centre, RARE)
         self._clocks = network.pose_subscriber(session, keys.clock, RARE)
         self._truths = network.subscriber(session, keys.truth("*"), DEPTH)
-        self._truth: dict[str, wire.Position] = {}
+        self._truth: dict[str, deque[wire.Position]] = {}
+        self._waiting: dict[str, deque[tuple[float, wire.State]]] = {}  # for truth, since when
         self._watch = network.alive_watch(session, keys.alive("*"))
         self._token = network.alive_token(session, keys.recorder)
 
@@ -69,8 +73,8 @@ class Recorder:
         """Whether no robot is left."""
         return not self._alive
 
-    def take(self) -> None:
-        """Writes what has arrived.
+    def take(self, *, last: bool = False) -> None:
+        """Writes what has arrived; states of protocol twins wait for the truth behind them, but for the `last` time.
 
         Raises:
             RecordingError: If it cannot be written.
@@ -96,6 +100,12 @@ class Recorder:
                 except ValueError as error:  # malformed, or on a key that is nobody's
                     key = str(sample.key_expr)
                     self._unread[key] = self._unread.get(key, (0, ""))[0] + 1, str(error)
+
+        now = time.monotonic()
+        for robot, waiting in self._waiting.items():
+            truths = self._truth[robot]
+            while waiting and (last or waiting[0][1].stamp <= truths[-1].stamp or now - waiting[0][0] > PATIENCE_S):
+                self._recording.state(with_truth(waiting.popleft()[1], truths))
 
     @property
     def malformed(self) -> int:
@@ -124,16 +134,20 @@ class Recorder:
     def _state(self, sample: zenoh.Sample) -> None:
         state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
         self._own(sample, state.robot)
-        truth = self._truth.get(state.robot)
-        if state.true_position is None and truth is not None and abs(truth.stamp - state.stamp) < FRESH_S:
-            state = msgspec.structs.replace(state, true_position=truth.position, true_yaw=truth.yaw)
-        self._recording.state(state)
+        if state.true_position is None and state.robot in self._truth:
+            self._waiting.setdefault(state.robot, deque()).append((time.monotonic(), state))
+        else:
+            self._recording.state(state)
 
     def _take_truth(self, sample: zenoh.Sample) -> None:
         """A protocol twin says where its robot really is: its bridge cannot know."""
         truth = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
         self._own(sample, truth.robot)
-        self._truth[truth.robot] = truth
+        self._finite(sample, truth.stamp, *truth.position, truth.yaw or 0.0)
+        truths = self._truth.setdefault(truth.robot, deque(maxlen=TRUTHS))
+        if truths and truth.stamp <= truths[-1].stamp:
+            truths.clear()  # its device was started again
+        truths.append(truth)
 
     def _status(self, sample: zenoh.Sample) -> None:
         status = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Status)
@@ -182,6 +196,25 @@ class Recorder:
             raise wire.Malformed(f"a message of '{robot}' on {sample.key_expr}")
 
 
+def with_truth(state: wire.State, truths: Sequence[wire.Position]) -> wire.State:
+    """A state with where its robot really was then: on the line between the truths (in order of time) before and after.
+
+    Where only one is known, that one if it is fresh; unchanged if there is none.
+    """
+    after = next((truth for truth in truths if truth.stamp >= state.stamp), None)
+    before = next((truth for truth in reversed(truths) if truth.stamp <= state.stamp), None)
+    near = [each for each in (before, after) if each is not None and abs(each.stamp - state.stamp) < FRESH_S]
+    if not near:
+        return state
+    one, other = near[0], near[-1]
+    share = (state.stamp - one.stamp) / (other.stamp - one.stamp) if other.stamp > one.stamp else 0.0
+    x, y, z = (a + share * (b - a) for a, b in zip(one.position, other.position, strict=True))
+    yaw = one.yaw
+    if one.yaw is not None and other.yaw is not None:
+        yaw = wire.heading(one.yaw + share * remainder(other.yaw - one.yaw, tau))
+    return msgspec.structs.replace(state, true_position=(x, y, z), true_yaw=yaw)
+
+
 def record(file: str, target: Path, *, case: str, source: Path, connect: Sequence[str]) -> None:
     """Records one case until its lifeline is lost and the robots are gone, or until SIGTERM.
 
@@ -222,7 +255,7 @@ def record(file: str, target: Path, *, case: str, source: Path, connect: Sequenc
                 last = min(last, now + AFTER_S)
                 if recorder.alone or now > last or not network.connected(session):
                     break
-        recorder.take()
+        recorder.take(last=True)
         recorder.complain(last=True)
 
 

@@ -6,8 +6,9 @@ import hashlib
 import math
 import statistics
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from inspect import getfile
 from pathlib import Path
 from typing import Any, Final
@@ -103,14 +104,18 @@ def digest(experiment: Experiment) -> str:
 
 
 def code_of(experiment: Experiment) -> str:
-    """The same wherever runs of this experiment come to the same: our code, that of its plug-ins, and numpy's version.
+    """The same wherever runs of this experiment come to the same: our code, that of its plug-ins, and the versions of
+    numpy and of the library of the engine, which has its name.
 
     Of a plug-in the module counts in which it stands; another module that it imports does not.
     """
     chosen = _choices(msgspec.to_builtins(experiment), ())
     files = {Path(getfile(plugins.struct(group, plugins.split(choice)[0]))) for group, choice in chosen}
+    engine = plugins.split(experiment.world.engine)[0]
+    with suppress(PackageNotFoundError):
+        engine += version(engine)
     others = sorted(_file_digest(file) for file in files if file.parent.parent != _root())
-    return hashlib.sha256(":".join((_own_digest(), np.__version__, *others)).encode()).hexdigest()[:20]
+    return hashlib.sha256(":".join((_own_digest(), np.__version__, engine, *others)).encode()).hexdigest()[:20]
 
 
 def _choices(value: Any, path: Keys) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
@@ -221,7 +226,7 @@ def _root() -> Path:
 
 @cache
 def _own_digest() -> str:
-    files = sorted(file for package in PACKAGES for file in (_root() / package).glob("*.py"))
+    files = sorted(file for package in PACKAGES for file in (_root() / package).rglob("*.py"))
     return hashlib.sha256(":".join([version("zenpark"), *map(_file_digest, files)]).encode()).hexdigest()
 
 

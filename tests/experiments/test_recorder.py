@@ -11,9 +11,9 @@ import pytest
 from agents import session as network
 from agents import wire
 from agents.keys import Keys
-from experiments.recorder import Recorder
+from experiments.recorder import Recorder, with_truth
 from tests.conftest import RouterProcess
-from tests.experiments.recordings import touched, world
+from tests.experiments.recordings import START, state, touched, world
 
 KEYS = Keys()
 
@@ -75,3 +75,19 @@ def test_what_the_world_says_is_taken_down_if_it_can_be_true(
     before = recorder.malformed
     recorder.complain(last=True)
     assert (recorder.malformed, len(taken.events)) == (before, 2)  # nothing new
+
+
+def test_the_truth_of_a_state_is_on_the_line_between_those_beside_it() -> None:
+    """At 0.5 m/s the newest of 50 truths a second is up to 1 cm away."""
+    truths = [
+        wire.Position("TB01", START + 0.02 * k, (0.01 * k, 0.0, 0.0), wire.heading(math.pi - 0.05 + 0.02 * k))
+        for k in range(10)
+    ]
+    for at in (0.0, 0.013, 0.0975, 0.18):
+        found = with_truth(state(at=at), truths)
+        assert found.true_position == pytest.approx((0.5 * at, 0.0, 0.0), abs=1e-6)
+        assert math.remainder(found.true_yaw - (math.pi - 0.05 + at), math.tau) == pytest.approx(0.0, abs=1e-6)
+    assert with_truth(state(at=0.2), truths).true_position == truths[-1].position
+    for at in (-0.06, 0.24):
+        assert with_truth(state(at=at), truths).true_position is None
+    assert with_truth(state(at=0.0), []).true_position is None

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from experiments import metrics, sweep_runs
-from experiments.experiment import Channel, Start
+from experiments.experiment import Channel, Start, World
 from experiments.logbook import Logbook
 from experiments.run import load
 from experiments.sweep_runs import Outcome, code_of, digest, figures_of, fly
@@ -100,3 +100,13 @@ def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
     file.write_text("two")
     assert len({before, foreign, code_of(park)}) == 3
     sweep_runs._file_digest.cache_clear()
+
+
+def test_the_version_of_the_engines_library_counts(park, monkeypatch):
+    """Runs of another pymunk or mujoco are other runs; of one that is not used they are the same."""
+    real = sweep_runs.version
+    pymunk = msgspec.structs.replace(park, world=World(engine="pymunk"))
+    before = code_of(park), code_of(pymunk)
+    monkeypatch.setattr(sweep_runs, "version", lambda name: "0.0" if name == "pymunk" else real(name))
+    assert code_of(park) == before[0]
+    assert code_of(pymunk) != before[1]
