@@ -25,6 +25,7 @@ class Neighbours:
         news: (n) the newest poses that got through to each row, which telemetry empties.
         heard: (n) how many that were, ever.
         dropped: (E,) samples that the modelled network dropped.
+        arrived: Poses of other processes that the network brought, ever, each once, before the modelled channel.
         changed: Somebody came or went since whoever looks last said so.
     """
 
@@ -59,6 +60,7 @@ class Neighbours:
         ]
         self.news = [deque[wire.Heard](maxlen=NEWS) for _ in assignment.names]
         self.heard = [0] * len(assignment.names)
+        self.arrived = 0
         self.dropped = self._channel.dropped
         self.changed = False
 
@@ -84,6 +86,7 @@ class Neighbours:
             behind = speaker.behind
             for said in speaker.news(utc + t):
                 speaker.lost += said.missed
+                self.arrived += speaker.name not in self._agent.assignment.names
                 if said.anew:
                     self._begin(speaker)
                     arrived = [(link, before) for link, before in arrived if link not in speaker.links]

@@ -273,7 +273,8 @@ class Runtime:
     def _cut_off_since(self, t: float) -> float:
         """Since when the routers are gone [s]; infinity while one is there."""
         if t >= self._router_due:  # a look at the router costs as much as a law
-            self._router_due, self._silent_since = t + ROUTER_S, self._router.silent_since(t)
+            self._router_due = t + ROUTER_S
+            self._silent_since = self._router.silent_since(t, self._neighbours.arrived)
         return self._silent_since
 
     def _cut(self, _stop: wire.Stop) -> None:

@@ -184,13 +184,15 @@ class RouterWatch:
         self._now, self._asked, self._unanswered = 0.0, -inf, inf  # the latter: when the oldest question was asked
         self._looked = inf
         self._silent_since = inf
+        self._arrived = 0
         self._answers = 0  # since the silence began
 
-    def silent_since(self, t: float) -> float:
+    def silent_since(self, t: float, arrived: int = 0) -> float:
         """When the silence of the router began, or when the last link was lost; infinity while it answers.
 
         Args:
             t: Now, on any clock that does not go back [s]. Call it in each round of a loop, at 10 Hz or more.
+            arrived: Samples that came by the router, ever. While more come it need not be asked.
         """
         self._now += max(0.0, min(t - self._looked, LOOK_S))
         self._looked = t
@@ -207,6 +209,11 @@ class RouterWatch:
                 self._silent_since = inf
             else:
                 self._asked = -inf
+        if arrived != self._arrived:
+            self._arrived = arrived
+            if self._silent_since == inf:
+                self._waiting.clear()
+                self._asked, self._unanswered = self._now, inf
         if self._now - self._unanswered > ANSWER_S and self._silent_since == inf:
             self._silent_since, self._answers = t - (self._now - self._unanswered), 0
         if self._now - self._asked >= ASK_EVERY_S:

@@ -263,6 +263,20 @@ def test_a_process_that_gets_no_processor_does_not_blame_the_router():
     assert looks(watch, 5.58, 5.7) == pytest.approx(5.3, abs=0.03)
 
 
+def test_a_router_by_which_samples_come_is_not_asked():
+    session = Asked()
+    watch = RouterWatch(session, "park/CF01/alive")
+    ticks = [tick / 20 for tick in range(40)]
+    assert [watch.silent_since(t, arrived) for arrived, t in enumerate(ticks, 1)] == [inf] * len(ticks)
+    assert not session.questions
+    last = ticks[-1]
+    looked = [(t, watch.silent_since(t, len(ticks))) for t in (last + tick / 50 for tick in range(1, 40))]
+    asked = last + ASK_EVERY_S
+    assert next(t for t, since in looked if since < inf) == pytest.approx(asked + ANSWER_S, abs=0.05)
+    assert looked[-1][1] == pytest.approx(asked, abs=0.05)
+    assert watch.silent_since(looked[-1][0] + 0.02, len(ticks) + 1) < inf, "what was on its way is no answer"
+
+
 def test_members_of_a_mesh_are_not_asked():
     session = Asked()
     session.routers, session.peers = [], ["KH01"]
