@@ -32,6 +32,7 @@ from agents.safety import Safety, Whereabouts
 from agents.sight import Sight
 from agents.speaking import Said, Voice
 from agents.triggers import Told, Trigger
+from agents.wire import Setpoint
 
 
 class Actions(msgspec.Struct, frozen=True):
@@ -77,6 +78,7 @@ class Agent:
         guidance: What the others were told; None if there are none, and `all_guided` if there are only such.
         life: Phases.
         hazards: What is wrong with the rows, and what is done about it.
+        origins: Where rows that came back were told that they began.
         outside: What only the process around the decision knows: told by it.
     """
 
@@ -110,6 +112,7 @@ class Agent:
         self._safety = Safety(assignment.kinds, assignment.limits)
         self._sight = _sight(assignment)
         self._landing = Landing(assignment)
+        self.origins: dict[int, Setpoint] = {}
         self._nobody: Mask = np.zeros(rows, dtype=bool)
         self._everybody: Mask = np.ones(rows, dtype=bool)
         self._wild = self._nobody
@@ -175,12 +178,28 @@ class Agent:
         """Order to go on after a hold."""
         self._ordered[row] = False
 
-    def start(self, row: int, at: float) -> str:
-        """Order to begin at `at` [s], or to go on after a hold."""
+    def start(self, row: int, at: float, t: float = -np.inf, origin: Setpoint | None = None) -> str:
+        """Order to begin at `at` [s], or to go on after a hold.
+
+        Args:
+            row: Of the robot.
+            at: Common start [s].
+            t: Now [s].
+            origin: x, y, z [m] and yaw [rad] where the plan of a robot began that comes back; None: it begins anew.
+        """
+        waits = self.life.phase[row] == AIRBORNE
         refusal = self.life.start(row, at)
         if not refusal:
             self.resume(row)
+            if origin is not None and waits:
+                x, y, z, yaw = origin
+                self.origins[row] = origin
+                self.deciding.begin(np.array([row]), np.array([[x, y, z]]), np.array([yaw]), max(0.0, t - at))
         return refusal
+
+    def origin(self, row: int) -> Setpoint | None:
+        """x, y, z [m] and yaw [rad] where the plan of a row began, or where it was told that it began."""
+        return self.deciding.origin(row) or self.origins.get(row)
 
     def missing(self, row: int) -> list[str]:
         """Neighbours that a row has never heard, or that are gone; likewise its centre."""

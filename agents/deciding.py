@@ -92,15 +92,22 @@ class Deciding:
         hears[hearing.links.listener] = True
         return self._listens & ~hears
 
-    def begin(self, rows: Index, place: Array, yaw: Array) -> None:
-        """Plans of `rows` (K,) that have not begun do so where these were at the start: (K, 3) [m] and (K,) [rad]."""
+    def begin(self, rows: Index, place: Array, yaw: Array, elapsed_s: float = 0.0) -> None:
+        """Plans of `rows` (K,) that have not begun do so where these were when they did: (K, 3) [m] and (K,) [rad].
+
+        Legs that are due `elapsed_s` after the common start follow from there [s].
+        """
         count = len(self._listens)
         elapsed, position, heading = np.full(count, -np.inf), np.full((count, 3), np.nan), np.zeros(count)
-        elapsed[rows], position[rows], heading[rows] = 0.0, place, yaw
+        elapsed[rows], position[rows], heading[rows] = elapsed_s, place, yaw
         position[:, 2] = self.ground
         for itinerary in self._itineraries:
             mine = itinerary.rows
             itinerary.target(elapsed[mine], position[mine], heading[mine])
+
+    def origin(self, row: int) -> tuple[float, float, float, float] | None:
+        """x, y, z [m] and yaw [rad] where the plan of a row began; None if it has none, or it has not begun."""
+        return next(filter(None, (itinerary.origin(row) for itinerary in self._itineraries)), None)
 
     def forget(self, rows: Index) -> None:
         """Rows whose goals are old compute the law at the next decision, whatever a trigger says."""

@@ -36,7 +36,7 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
         case "takeoff":
             return agent.life.takeoff(row), None
         case "start":
-            return _start(agent, row, order.at, t, utc), None
+            return _start(agent, row, order, t, utc), None
         case "hold":
             return _hold(agent, row), None
         case "resume":
@@ -66,12 +66,15 @@ def _resume(agent: Agent, row: int) -> str:
     return ""
 
 
-def _start(agent: Agent, row: int, at: float | None, t: float, utc: float) -> str:
+def _start(agent: Agent, row: int, order: Order, t: float, utc: float) -> str:
+    at, origin = order.at, order.origin
     if at is None or not isfinite(at):
         return "a start needs `at`, a UTC time in seconds"
     if not t - agent.assignment.duration < at - utc < t + SOON_S:
         return f"start at {at} is not within this experiment; are the clocks set?"
-    refusal = agent.start(row, at - utc)
+    if origin is not None and not all(map(isfinite, origin)):
+        return "the `origin` of a start is x, y, z, yaw, all of them known"
+    refusal = agent.start(row, at - utc, t, origin)
     return refusal or _resume(agent, row)
 
 

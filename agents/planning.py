@@ -210,6 +210,7 @@ class Itinerary:
         self._leg = np.full(len(rows), -1)
         self._anchor = np.zeros((len(rows), 3))
         self._heading = np.zeros(len(rows))
+        self._origin = np.full((len(rows), 4), np.nan)
 
     def target(self, t: Array, position: Array, yaw: Array) -> tuple[Array, Array]:
         """Target position (R, 3) [m] and yaw (R,) [rad] at the rows' experiment times; NaN before the first leg.
@@ -230,6 +231,14 @@ class Itinerary:
                 target[mine], toward[mine] = leg.planner.target(elapsed, self._anchor[mine], self._heading[mine])
         return target, toward
 
+    def origin(self, row: int) -> tuple[float, float, float, float] | None:
+        """x, y, z [m] and yaw [rad] of a row when its first leg began; None before that, and of other rows."""
+        mine = np.flatnonzero((self.rows == row) & (self._leg >= 0))
+        if not len(mine):
+            return None
+        x, y, z, yaw = self._origin[mine[0]].tolist()
+        return x, y, z, yaw
+
     def _begin(self, number: int, rows: Mask, position: Array, yaw: Array) -> None:
         """Anchors a leg at the end of the one before, so that tracking errors don't add up, or at the robot."""
         anchor, heading = position[rows], yaw[rows].copy()
@@ -238,4 +247,6 @@ class Itinerary:
             elapsed = np.full(len(anchor), self.legs[number].at - before.at)
             anchor, toward = before.planner.target(elapsed, self._anchor[rows], self._heading[rows])
             heading = np.where(np.isnan(toward), heading, toward)
+        else:
+            self._origin[rows, :3], self._origin[rows, 3] = anchor, heading
         self._leg[rows], self._anchor[rows], self._heading[rows] = number, anchor, heading

@@ -300,6 +300,7 @@ class Runtime:
                 self._counts.malformed += 1
                 query.reply_err(str(error).encode(), encoding="text/plain")
                 return
+            waits = self.agent.life.phase[row] == Phase.AIRBORNE
             slept = self.agent.outside.slept
             if order.order == "takeoff" and slept > ASK_S and self.agent.outside.just_woke(t):  # he left long ago
                 refusal, value = f"the process stood still for {slept:.1f} s; ask again", None
@@ -308,7 +309,9 @@ class Runtime:
             self._counts.refused += bool(refusal)
             if order.order == "leave":
                 self._leaving.add(row)
-            if order.order == "start" and order.at is not None and not refusal:
+            if (
+                order.order == "start" and order.at is not None and not refusal and waits
+            ):  # one that runs keeps its grid
                 self._align(order.at - self._utc)
                 self._telemetry.due = t  # whoever decides for it must know in time when it begins
             phase = Phase(self.agent.life.phase[row]).word

@@ -215,7 +215,7 @@ class Telemetry:
                 pid=os.getpid(),
                 cpu_s=time.process_time(),
                 rss_mb=resident_mb(),
-                origin=self._origin[row],
+                origin=agent.origin(row) or self._origin[row],
                 hazard=agent.hazards.worst(row),
                 incidents=list(self._incidents[row]),
             )

@@ -118,10 +118,10 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     last status.
     `started` is the UTC time at which the robot began to run the experiment (0 before). From there `ticks` count, and
     `decisions`, at which it computed its goal (or was told one). `interventions` are ticks on which safety changed what
-    had been decided, `avoided` those of them, and of changed goals, that kept clear of something. `origin` is where it
-    began: x, y, z [m] and yaw [rad]. `hazard` is the worst of what is wrong with it now and what is done about that,
-    such as "hold: minimum separation: 0.18 m from CF03 (limit 0.25 m)"; `incidents` are the last few beginnings and
-    ends of such, again in every status, so that none is lost with one.
+    had been decided, `avoided` those of them, and of changed goals, that kept clear of something. `origin` is where it,
+    or its plan, began: x, y, z [m] and yaw [rad]. `hazard` is the worst of what is wrong with it now and what is done
+    about that, such as "hold: minimum separation: 0.18 m from CF03 (limit 0.25 m)"; `incidents` are the last few
+    beginnings and ends of such, again in every status, so that none is lost with one.
     """
 
     robot: str
@@ -294,6 +294,9 @@ class WorldReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What an operator asks of a robot: `at` is a UTC start time [s]; `name` and `value` belong to get and set.
 
+    `origin` belongs to the start of a robot that comes back: x, y, z [m] and yaw [rad] of the `Status.origin` that its
+    name had. Its plan goes on from there.
+
     A robot that is told to leave lands and takes its token back; its process ends with the last of its robots.
     """
 
@@ -301,6 +304,7 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     at: float | None = None
     name: str | None = None
     value: float | None = None
+    origin: Setpoint | None = None
 
 
 class Reply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

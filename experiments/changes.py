@@ -324,7 +324,9 @@ class HotChanges:
             yield from self._room({name: self._here(name) for name in names}, ROOM_S)
             yield from self._insist(names, wire.Order("takeoff"))
             yield from self._reach(names, "airborne", CLIMB_S)
-            yield from self._insist(names, wire.Order("start", at=self._start))
+            for name in names:
+                start = wire.Order("start", at=self._start, origin=robots[name].origin)
+                yield from self._insist([name], start)
             yield from self._reach(names, "running", FROZEN_S)
         except Refused:
             self._leaving |= {*names}

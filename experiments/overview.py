@@ -185,4 +185,5 @@ class Overview:
         if status.phase == Phase.RUNNING.word and seen.phase != status.phase:
             seen.began = status.stamp
         seen.status = status
+        seen.origin = status.origin or seen.origin
         seen.behind = min(seen.behind, self.clock.utc() - status.stamp)

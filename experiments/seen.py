@@ -32,6 +32,7 @@ class Seen:
         behind: The least time from a stamp of it to its arrival [s]: small, if its clock is right.
         told: Number of the last incident that was said.
         place: Where it last said that it was [m].
+        origin: Where it, or its plan, began, as its last process said: x, y, z [m] and yaw [rad].
         former: The process whose statuses are of the past: the robot has a new one, or will have.
         began: Stamp of its first tick in the experiment, UTC [s].
     """
@@ -46,6 +47,7 @@ class Seen:
     behind: float = inf
     told: int = 0
     place: wire.Vector | None = None
+    origin: wire.Setpoint | None = None
     former: int | None = None
     began: float | None = None
 
@@ -63,7 +65,7 @@ class Seen:
         return self.status is not None and ORDER.index(self.status.phase) >= ORDER.index(phase)
 
     def forget(self) -> None:
-        """The process that it had is over: what it said last holds no more, but for where it was."""
+        """The process that it had is over: what it said last holds no more, but for where it was and began."""
         self.former = self.status.pid if self.status is not None else self.former
         self.status, self.alive, self.vanished = None, False, inf
         self.rate, self.counted, self.behind, self.told = 0.0, (0.0, 0), inf, 0
