@@ -16,7 +16,7 @@ from agents.body import BodyState
 from agents.hazards import Cause, Sighting
 from agents.hearing import Hearing
 from agents.landing import Landing
-from agents.rows import Array, Mask, norm, some
+from agents.rows import Array, Mask, every, norm, some
 from agents.safety import ESCAPED, Whereabouts
 from agents.separation import Separation
 
@@ -114,6 +114,8 @@ class Detector:
         # the speed of flying kinds is per axis
         self._fastest = assignment.limits.overspeed * np.where(self._flies, np.sqrt(3.0), 1.0) * speed
         self._fastest_squared = self._fastest**2
+        self._slow_squared = np.minimum(self._fastest_squared, SINKS**2)  # who is slower neither sinks nor races
+        self._all_fly = self._flies.tobytes()
         links, watched = assignment.links, assignment.watched
         self._lawful = np.ones(len(links), dtype=bool) if watched is None else ~watched
         self._separation = Separation(assignment)
@@ -176,8 +178,9 @@ class Detector:
     def _measured(self, state: BodyState, rows: Standing, seen: list[Sighting]) -> None:
         """What the body itself says."""
         limits = self._limits
-        fast = np.vecdot(state.velocity, state.velocity) > self._fastest_squared
-        if some(fast):
+        squared = np.vecdot(state.velocity, state.velocity)
+        moving = not every(squared < self._slow_squared)
+        if moving and some(fast := squared > self._fastest_squared):
             speed = norm(state.velocity)
             seen.append(
                 Sighting(
@@ -189,11 +192,9 @@ class Detector:
             seen.append(
                 Sighting(Cause.BATTERY, low, lambda row: f"{state.battery[row]:.0%} (limit {limits.battery_low:.0%})")
             )
-        fallen = self._flies > state.flying
-        if some(fallen) and some(fallen := fallen & rows.cruising):
+        if state.flying.tobytes() != self._all_fly and some(fallen := (self._flies > state.flying) & rows.cruising):
             seen.append(Sighting(Cause.FALLEN, fallen, lambda _: "its motors are off"))
-        sinks = state.velocity[:, 2] < -SINKS
-        if some(sinks) and some(sinks := sinks & rows.cruising & self._flies):
+        if moving and some(sinks := (state.velocity[:, 2] < -SINKS) & rows.cruising & self._flies):
             short = rows.height - state.position[:, 2]
             if some(sinks := sinks & (short > SUNK)):
                 text = "{:.2f} m below its goal, and sinks at {:.2f} m/s"

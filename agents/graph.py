@@ -54,6 +54,8 @@ class Links:
 
     def onto_listeners(self, per_link: Array, rows: int) -> Array:
         """Sum of a quantity (E, ...) over each listener's links -> (rows, ...)."""
+        if len(self._heads) == rows > 0:
+            return np.asarray(np.add.reduceat(per_link, self._starts, axis=0))
         total = np.zeros((rows, *per_link.shape[1:]))
         if len(self):
             total[self._heads] = np.add.reduceat(per_link, self._starts, axis=0)

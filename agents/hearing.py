@@ -33,9 +33,9 @@ class Heard:
 
     def believed(self, predictor: Predictor, t: float, which: Index) -> Array:
         """Where (K, 3) [m] the speakers of links `which` (K,), all heard once, are believed to be at `t` [s]."""
-        position = self.position[which]
         if predictor is HOLD:
-            return position
+            return self.position if len(which) == len(self.position) else self.position[which]
+        position = self.position[which]
         return predictor.position(position, self.velocity[which], t - self.stamp[which])
 
     def believed_velocity(self, predictor: Predictor, t: float, which: Index) -> Array:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from agents.kinds import Kind
-from agents.rows import Array, clamp, norm, some, span
+from agents.rows import Array, clamp, every, norm, some, span
 
 REACHED = 0.005  # [m] nearer than this a ground robot stands; half of what a 1 cm trigger lets its neighbours know
 TURNED = math.radians(2.0)  # [rad] nearer than this to the yaw wanted it stands
@@ -49,7 +49,8 @@ class Individual:
         if self._any_position:
             rows = self._position
             setpoint[rows, :3] = goal[rows]
-            setpoint[rows, 3] = np.where(np.isnan(toward[rows]), 0.0, toward[rows])
+            unasked = np.isnan(toward[rows])
+            setpoint[rows, 3] = 0.0 if every(unasked) else np.where(unasked, 0.0, toward[rows])
         if self._any_velocity:
             rows = self._velocity
             velocity = self._response[rows, None] * (goal[rows] - position[rows])
@@ -93,7 +94,7 @@ def drive(
     x, y = way[:, 0], way[:, 1]
     along, across = cos * x + sin * y, cos * y - sin * x
     ahead = np.copysign(1.0, along)
-    alpha = np.arctan2(ahead * across, np.abs(along))
+    alpha = np.arctan2(ahead * across, ahead * along)
     twist = np.empty((len(way), 2))
     twist[:, 0] = ahead * np.minimum(response * distance * (1.0 - np.abs(alpha) / math.pi), speed)
     twist[:, 1] = turn_response * np.sin(alpha)

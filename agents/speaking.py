@@ -60,7 +60,7 @@ class Voice:
         )  # fmt: skip
         rows = asked(trigger, view, self._state)
         if len(rows):
-            seen = np.isfinite(position[rows])
+            seen = np.isfinite(position if len(rows) == len(position) else position[rows])
             if not every(seen):
                 rows = rows[seen.all(axis=1)]
             self.told.tell(rows, view)

@@ -29,6 +29,7 @@ from agents.rows import Array, Index
 
 STATUS_S: Final = 1.0
 INCIDENTS: Final = 16  # so many are told again
+WORDS: Final = tuple(phase.word for phase in Phase)
 UNDER_WAY: Final = ("airborne", "running")
 
 
@@ -125,21 +126,22 @@ class Telemetry:
         self._told += 1
         agent = self._agent
         position, velocity, truth = state.position.tolist(), state.velocity.tolist(), state.true_position.tolist()
-        goal, setpoint = agent.goal.tolist(), actions.setpoint.tolist()
+        goal, setpoint, error = agent.goal.tolist(), actions.setpoint.tolist(), agent.error.tolist()
+        yaw, true_yaw, phase = state.yaw.tolist(), state.true_yaw.tolist(), agent.life.phase.tolist()
         for row, name in enumerate(self._names):
             message = wire.State(
                 name,
                 self._told,
                 self.utc + t,
-                Phase(agent.life.phase[row]).word,
+                WORDS[phase[row]],
                 wire.vector(position[row]),
                 wire.vector(velocity[row]),
-                wire.heading(state.yaw[row]),
+                wire.heading(yaw[row]),
                 wire.vector(goal[row]),
                 tuple(setpoint[row]) if all(map(isfinite, setpoint[row])) else None,
-                wire.number(float(agent.error[row])),
+                wire.number(error[row]),
                 wire.vector(truth[row]),
-                wire.heading(state.true_yaw[row]),
+                wire.heading(true_yaw[row]),
                 list(self._neighbours.news[row]),
                 _known_row(state.attitude, row),
                 _known_row(state.shadow_position, row),

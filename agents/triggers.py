@@ -54,6 +54,10 @@ class Told:
 
     def tell(self, rows: Index, view: View) -> None:
         """An event of `rows`: remembers what they see."""
+        if len(rows) == len(self.time):  # all of them, as always in a process of one: a copy, without an index
+            self.position[:], self.velocity[:], self.time[:] = view.position, view.velocity, view.t
+            self.offset[:], self.energy[:] = view.offset, view.energy
+            return
         self.position[rows], self.velocity[rows], self.time[rows] = view.position[rows], view.velocity[rows], view.t
         self.offset[rows], self.energy[rows] = view.offset[rows], view.energy[rows]
 
@@ -182,7 +186,7 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             fired = fired | (quiet >= self.maximum_silence_s - ROUNDING_S)
         if self.minimum_interval_s > 0.0:
             fired = fired & (quiet >= self.minimum_interval_s - ROUNDING_S)
-        return np.flatnonzero(fired | (quiet == np.inf))
+        return np.asarray((fired | (quiet == np.inf)).nonzero()[0])
 
     def _evaluated(self, view: View, state: Array) -> Mask:
         if self.evaluate_every_s is None:
