@@ -13,8 +13,12 @@ from pathlib import Path
 
 import psutil
 import pytest
+from hypothesis import settings as hypothesis_settings
 
 from agents.endpoint import free_endpoint
+
+hypothesis_settings.register_profile("zenpark", deadline=None)  # no test depends on how fast this machine is
+hypothesis_settings.load_profile("zenpark")
 
 ROOT = Path(__file__).resolve().parent.parent
 

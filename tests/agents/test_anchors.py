@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from agents.anchors import Anchors
 from tests.agents.test_coordination import slope_of
 
-FEW = settings(max_examples=25, deadline=None)
+FEW = settings(max_examples=25)
 
 
 def some(seed, count=6, rows=4):

@@ -13,7 +13,7 @@ from agents.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
 from agents.rows import norm
 from tests.agents.things import NOTHING, near, own
 
-FEW = settings(max_examples=50, deadline=None)
+FEW = settings(max_examples=50)
 ALL = tuple(KINDS.values())
 nearby = st.floats(-1.5, 1.5)
 BARRIER = Barrier()

@@ -95,7 +95,7 @@ def walked(loss, burst, u, before):
     return found
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 0.9), st.floats(1.0, 30.0))
 def test_bursts_are_a_chain_though_nothing_is_remembered(seed, loss, more):
     burst = more / (1 - loss)
@@ -105,7 +105,7 @@ def test_bursts_are_a_chain_though_nothing_is_remembered(seed, loss, more):
     np.testing.assert_array_equal(lost(made, count=300), expected)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.permutations(range(1, 61)), st.sampled_from([np.nan, 8.0]))
 def test_a_fate_depends_on_no_other_sample_and_no_other_link(seed, order, burst):
     made = conditions(3, seed=seed, loss=0.3, burst=burst, jitter=0.01)
@@ -285,7 +285,7 @@ def test_after_the_end_nothing_is_lost():
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.lists(st.floats(0.0, 0.04), min_size=200, max_size=200))
 def test_the_listener_of_a_real_network_loses_what_the_virtual_one_does(seed, took):
     """The same sequence at both: by ticks, and one by one as it comes in over a real network."""

@@ -10,7 +10,7 @@ from agents.coordination import Bearing, Displacement, Distance, Mixed, goal, tr
 from agents.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, links
 
 SEEDS = st.integers(0, 2**32 - 1)
-FEW = settings(max_examples=25, deadline=None)
+FEW = settings(max_examples=25)
 
 
 def formation(seed, rows=5, count=8):

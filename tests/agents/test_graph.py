@@ -42,7 +42,7 @@ HEARS = {
     5: (2, 3, 4, 6),
     6: (4, 5),
 }
-FEW = settings(max_examples=40, deadline=None)
+FEW = settings(max_examples=40)
 REFERENCE = [(listener, speaker) for listener, heard in HEARS.items() for speaker in heard]
 
 
@@ -195,7 +195,7 @@ def triangulation(rng, rows, dimension):
     return np.array(pairs, dtype=np.intp)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(4, 12), st.sampled_from([2, 3]))
 def test_a_triangulation_is_rigid_and_without_any_edge_it_is_not(seed, rows, dimension):
     rng = np.random.default_rng(seed)
@@ -229,7 +229,7 @@ def rigid_motions(position, free):
     return np.linalg.matrix_rank(motions @ allowed, tol=1e-8) if allowed.size else 0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 7), st.booleans())
 def test_the_rank_needed_is_what_rigid_motions_leave(seed, rows, flat):
     rng = np.random.default_rng(seed)

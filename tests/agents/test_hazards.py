@@ -166,7 +166,7 @@ def test_who_is_on_the_ground_has_no_hazards_and_who_lands_only_those_of_landing
     assert cut == {Outcome.CUT}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.tuples(st.sets(st.sampled_from(Cause)), st.integers(1, 60), st.sampled_from(["both", "0", "1"]))),
     st.sampled_from(["drop", "hold", "land"]),
@@ -422,7 +422,7 @@ def occur(agent, event, t):
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.lists(st.tuples(SPOILT, EVENTS, st.integers(1, 80)), max_size=8),
     st.sampled_from(["drop", "hold", "land"]),

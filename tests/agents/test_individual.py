@@ -12,7 +12,7 @@ from agents.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
 from agents.rows import every, some, span
 from twins.differential import Differential
 
-FEW = settings(max_examples=25, deadline=None)
+FEW = settings(max_examples=25)
 SEEDS = st.integers(0, 2**32 - 1)
 GROUND = (KHEPERA4, TURTLEBOT3)
 NOWHERE = np.full((1, 3), np.nan)

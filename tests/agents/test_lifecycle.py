@@ -69,7 +69,7 @@ class Robots:
 
 
 @pytest.mark.slow
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=75)
 @given(
     st.lists(st.booleans(), min_size=1, max_size=3),
     st.lists(st.tuples(st.sampled_from(ORDERS), st.integers(0, 2), st.integers(0, 12)), max_size=25),

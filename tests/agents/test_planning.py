@@ -23,7 +23,7 @@ PLANS = [
     {"kind": "circle", "radius": -0.4, "period_s": 9.0, "turns": 1.25},
     {"kind": "lemniscate", "size": 0.5, "period_s": 15.0},
 ]
-FEW = settings(max_examples=15, deadline=None)
+FEW = settings(max_examples=15)
 SEEDS = st.integers(0, 2**32 - 1)
 
 

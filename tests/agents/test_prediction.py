@@ -12,7 +12,7 @@ from agents.hearing import Heard
 from agents.prediction import HOLD, ConstantVelocity, Hold, Predictor
 
 NAMES = plugins.names(plugins.PREDICTORS)
-FEW = settings(max_examples=25, deadline=None)
+FEW = settings(max_examples=25)
 SEEDS = st.integers(0, 2**32 - 1)
 
 

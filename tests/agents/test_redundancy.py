@@ -24,7 +24,7 @@ def one_by_one(position, pairs, free):
     return links, robots
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 9), st.sampled_from([0.5, 0.7, 0.9]), st.booleans())
 def test_it_is_what_leaving_each_out_would_tell(seed, rows, share, in_space):
     rng = np.random.default_rng(seed)

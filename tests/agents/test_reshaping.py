@@ -9,7 +9,7 @@ from agents.graph import Links
 from agents.reshaping import Change, Presence, Reshaping, progress, wanted
 from tests.agents.test_coordination import told_more
 
-FEW = settings(max_examples=25, deadline=None)
+FEW = settings(max_examples=25)
 
 
 def change(count, at=10.0, over=4.0, **parts):

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from agents.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO
 from agents.safety import ESCAPED, Limits, Safety
 
-FEW = settings(max_examples=60, deadline=None)
+FEW = settings(max_examples=60)
 ALL = tuple(KINDS.values())
 TAKES = np.array([kind.takes for kind in ALL])
 FLIES = np.array([kind.flies for kind in ALL])

@@ -22,7 +22,7 @@ def say(voice, t, position, velocity=None):
     return voice.speak(t, position, still, error=zeros, energy=zeros, start=zeros, offset=np.zeros((rows, 3)))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.floats(0.05, 2.0), st.floats(-0.5, 0.5))
 def test_the_low_pass_does_not_lag_behind_a_constant_velocity(constant, speed):
     smooth, velocity = LowPass(1), np.array([[speed, 0.0, 0.0]])

@@ -26,7 +26,7 @@ from agents.updating import Input
 from tests.agents.signals import DT, Play, wander
 
 SEEDS = st.integers(0, 2**32 - 1)
-SOME = settings(max_examples=15, deadline=None)
+SOME = settings(max_examples=15)
 LENGTH, SHARE = st.floats(0.002, 0.1), st.floats(0.01, 0.9)
 
 

@@ -21,7 +21,7 @@ FAMILIES = {
     "self-triggered", "lyapunov", "relative-control",
 }  # fmt: skip
 SEEDS = st.integers(0, 2**32 - 1)
-FEW = settings(max_examples=10, deadline=None)
+FEW = settings(max_examples=10)
 
 
 def made(name, **parameters):

@@ -25,7 +25,7 @@ from agents.wire import (
     Stop,
 )
 
-FEW = settings(max_examples=60, deadline=None)
+FEW = settings(max_examples=60)
 KINDS = (Pose, State, Status, Order, Reply, Stop, Event, Goal, CentreState)
 ENCODINGS = ("json", "msgpack")
 

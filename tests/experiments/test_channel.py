@@ -125,7 +125,7 @@ def test_everything_or_nothing():
     assert not nothing.channel.lost.any()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_repetitions_have_the_luck_that_they_would_have_alone(seed):
     rng = np.random.default_rng(seed)

@@ -106,7 +106,7 @@ def test_what_moves_is_where_it_is_then():
     assert found.arena[0] == Approach(("A", "cart"), pytest.approx(-0.2 - R), pytest.approx(2.0))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(x=st.floats(-2.0, 2.0), y=st.floats(-1.5, 1.5), size=st.tuples(st.floats(3.0, 6.0), st.floats(3.0, 6.0)))
 def test_distance_to_the_walls(x, y, size):
     arena = Arena(size=(*size, 2.0), walls=True)

@@ -72,33 +72,33 @@ def mutated(draw, lines):
 
 
 @pytest.mark.slow
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(mutated(LINES))
 def test_mutations_of_a_good_file(text):
     reads_or_refuses(text.encode())
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(mutated(RESOLVED.split("\n")))
 def test_mutations_of_a_good_json_file(text):
     reads_or_refuses(text.encode(), ".json")
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.text(max_size=200))
 def test_any_text(text):
     reads_or_refuses(text.encode("utf-8", "surrogatepass"))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=200), st.sampled_from([".toml", ".json"]))
 def test_any_bytes(content, suffix):
     reads_or_refuses(content, suffix)
 
 
 @pytest.mark.slow
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.lists(
         st.tuples(st.lists(FLAGS, min_size=1, max_size=5).map(".".join), st.one_of(TOKENS, st.text(max_size=10))).map(

@@ -85,7 +85,7 @@ def test_connectivity_of_known_graphs():
     assert algebraic_connectivity(links([], [], []), 1) == 0.0
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), rows=st.integers(3, 10))
 def test_distances_of_a_drawing_are_met_again(seed, rows):
     rng = np.random.default_rng(seed)

@@ -43,7 +43,7 @@ def test_grids_have_all_neighbours(rows, columns):
     assert made.position.mean(axis=0) == pytest.approx(np.zeros(3))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(4, 120))
 def test_hemispheres_are_rigid_and_keep_their_distances(count):
     made = layouts.hemisphere(count, 0.6, 0.25)
@@ -65,7 +65,7 @@ def test_the_links_of_a_hemisphere_are_those_of_the_convex_hull_of_its_points():
     assert {edge for edge in edges if inner[list(edge)].all()} <= own
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(2, 60), st.integers(0, 2**32 - 1))
 def test_henneberg_constructions_are_minimally_rigid(count, seed):
     made = layouts.henneberg(count, 0.6, np.random.default_rng(seed))
@@ -83,7 +83,7 @@ def test_both_of_hennebergs_steps_are_taken():
     assert (degree[4:] == 2).any()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(3, 30), st.lists(st.integers(1, 29), min_size=1, max_size=3))
 def test_circulants_are_those_of_graph_theory(count, jumps):
     theirs = networkx.circulant_graph(count, [jump for jump in jumps if jump < count])

@@ -87,7 +87,7 @@ def test_residual_is_the_last_second_of_each_phase_on_the_worst_link():
     assert robot.by_the_end == (pytest.approx(0.3), "A")
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(rate=st.floats(-0.5, 0.5), drift=st.floats(-0.3, 0.3), seed=st.integers(0, 1000))
 def test_net_rotation_finds_the_rate_whatever_else_moves(rate: float, drift: float, seed: int):
     shape = np.random.default_rng(seed).normal(size=(5, 3))
@@ -334,7 +334,7 @@ def test_json_holds_everything(tmp_path):
     assert msgspec.json.decode((tmp_path / "metrics.json").read_bytes(), type=list[CaseMetrics]) == [measured]
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(turn=st.floats(-3.0, 3.0), x=st.floats(-5.0, 5.0), y=st.floats(-5.0, 5.0))
 def test_errors_do_not_depend_on_where_the_formation_stands(turn: float, x: float, y: float):
     known = park(duration=3.0)

@@ -71,7 +71,7 @@ def test_a_rounded_shape_without_a_leader_has_no_modes_of_hours():
     assert found.radius < 1.0
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 8), st.booleans())
 def test_one_link_of_every_robot_at_once_tells_as_much_as_one_robot_at_a_time(seed, rows, anchored):
     rng = np.random.default_rng(seed)

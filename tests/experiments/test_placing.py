@@ -25,7 +25,7 @@ def asked(position, *, points=(), relative=False):
     )
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(4, 9), st.booleans())
 def test_a_shape_is_found_again_from_nearby(seed, rows, relative):
     rng = np.random.default_rng(seed)

@@ -245,7 +245,7 @@ def busy() -> Population:
     return Population(experiment())
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.text(max_size=4) | st.just("KH09"), place, number)
 def test_whatever_is_ordered_ends_well(busy: Population, name: str, where: tuple[float, float], yaw: float) -> None:
     """Robots that were let in do not overlap; everything else is `Refused`."""

@@ -134,7 +134,7 @@ def test_two_driven_at_each_other_touch_once_and_do_not_overlap(kind, aside):
         assert apart == pytest.approx(2 * kind.radius, abs=2e-4)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     heading=st.floats(-math.pi, math.pi),
     aside=st.floats(-0.05, 0.05),

@@ -230,7 +230,7 @@ def test_a_ray_that_begins_inside_a_thing_does_not_see_it():
     yaw=st.floats(-10.0, 10.0),
     corner=st.sampled_from([(2.0, 2.0), (2.0, -2.0), (-2.0, 2.0), (-2.0, -2.0)]),
 )
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_corners_are_tight(x, y, yaw, corner):
     """A ray aimed exactly at the corner of two walls meets one of them."""
     aim = math.atan2(corner[1] - y, corner[0] - x) - yaw
@@ -239,7 +239,7 @@ def test_corners_are_tight(x, y, yaw, corner):
 
 
 @given(st.integers(0, 2**32), st.floats(-6.0, 6.0))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_turning_and_shifting_everything_changes_nothing(seed, turn):
     rng = np.random.default_rng(seed)
     position, pose = np.zeros((5, 3)), rng.uniform(-1.5, 1.5, (1, len(THINGS), 3))
