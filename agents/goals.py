@@ -44,7 +44,8 @@ class HeardGoals:
         self._names: Sequence[str] = agent.assignment.names
         rows = np.flatnonzero(guidance.guided).tolist()
         self._goals = [(row, network.subscriber(session, keys.goal(self._names[row]), 8)) for row in rows]
-        self._watch = network.alive_watch(session, keys.centre_alive)
+        self._watch = network.alive_watch(session, keys.lives(keys.centre_alive))
+        self._centre, self._life = keys.centre_alive, ""
         self._seq = dict.fromkeys(rows, 0)
         self._rows = np.array(rows, dtype=np.intp)
         self._channel = Channel(conditions or Conditions.ideal(len(rows)))
@@ -53,6 +54,14 @@ class HeardGoals:
 
     def take(self, t: float, utc: float) -> None:
         """Takes in what has come by `t` [s] of a clock that was 0 at `utc`."""
+        for sample in network.received(self._watch.handler):
+            token = str(sample.key_expr)
+            if token != self._centre:
+                self._begin(Keys.life_of(token), there=sample.kind == zenoh.SampleKind.PUT)
+            elif sample.kind == zenoh.SampleKind.PUT:
+                self._guidance.find()
+            elif network.connected(self._session):  # without a router every token is gone, and that is another matter
+                self._guidance.lose(t)
         for link, (row, goals) in enumerate(self._goals):
             for sample in network.received(goals.handler):
                 self._hear(link, row, sample, t, utc)
@@ -63,11 +72,15 @@ class HeardGoals:
                 news = self._agent.hear_goal(which, position[None], np.array([toward]), np.array([stamp]))
                 if news.any():
                     self.news[which[0]].append(wire.Followed(seq, utc + sent, utc + pose, utc + t))
-        for sample in network.received(self._watch.handler):
-            if sample.kind == zenoh.SampleKind.PUT:
-                self._guidance.find()
-            elif network.connected(self._session):  # without a router every token is gone, and that is another matter
-                self._guidance.lose(t)
+
+    def _begin(self, life: str | None, *, there: bool) -> None:
+        """A centre of another session counts its goals anew; its clock may be behind that of the last one."""
+        if life is None or not there or life == self._life:
+            return
+        if self._life:
+            self._seq = dict.fromkeys(self._seq, 0)
+            self._guidance.stamp[self._rows] = -np.inf
+        self._life = life
 
     def _hear(self, link: int, row: int, sample: zenoh.Sample, t: float, utc: float) -> None:
         oldest_s = self._agent.assignment.limits.link_silence_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import math
 import os
 import select
@@ -114,6 +115,11 @@ class Address:
             wire.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return Wire(wire.fileno(), wire.close)
         line = os.open(self.serial, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        try:
+            fcntl.flock(line, fcntl.LOCK_EX | fcntl.LOCK_NB)  # before anything is changed: another process may drive
+        except OSError as error:
+            os.close(line)
+            raise BlockingIOError(error.errno, "another process has this line") from None
         try:
             control = termios.CS8 | termios.CREAD | termios.CLOCAL
             special = termios.tcgetattr(line)[6]
@@ -358,6 +364,8 @@ class Link:
         return self._ending.is_set() and (self._stands or time.monotonic() > self._until)
 
     def _remedy(self, error: OSError) -> str:
+        if isinstance(error, BlockingIOError):
+            return "end it first"
         if self._address.serial:
             return "is it plugged in, and may you use it (group dialout)?"
         if isinstance(error, ConnectionRefusedError):

@@ -75,6 +75,8 @@ class Exchange:
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._mirrors: dict[str, tuple[int, zenoh.Subscriber[Handler[zenoh.Sample]]]] = {}
         self._done: dict[str, int] = {}  # number of the last command that was carried out
+        self._lives: dict[str, str] = {}  # session that owns the name of a robot: a new one counts its commands anew
+        self._owners = network.alive_watch(session, keys.lives(keys.alive("*")))
         self._strangers: set[str] = set()
         self._met: set[frozenset[str]] = set()
         self._started: dict[str, float] = {}
@@ -175,6 +177,8 @@ class Exchange:
 
     def listen(self, t: float) -> None:
         """Takes in what has arrived."""
+        for sample in network.received(self._owners.handler):
+            self._own(sample)
         for sample in network.received(self._setpoints.handler):
             key = str(sample.key_expr)
             row = self._row.get(key)
@@ -235,6 +239,16 @@ class Exchange:
         else:
             (population.land if action == "land" else population.stop)(np.array([row]))
             self._quiet[row] = inf
+
+    def _own(self, sample: zenoh.Sample) -> None:
+        """A process owns the name of a robot: its clock, from which its numbers come, may be behind the last one's."""
+        key = str(sample.key_expr)
+        name, life = self._keys.whose(key), Keys.life_of(key)
+        if name is None or life is None or sample.kind == zenoh.SampleKind.DELETE:
+            return
+        if self._lives.get(name, life) != life:
+            self._done.pop(name, None)
+        self._lives[name] = life
 
     def _wonder(self, key: str) -> None:
         """A command to a robot that is not here."""

@@ -398,6 +398,26 @@ def test_a_stop_that_is_not_answered_is_said():
 
 
 @pytest.mark.system
+def test_a_serial_line_that_another_process_has_is_left_alone():
+    ours, theirs = os.openpty()
+    address = Address.of("KH01", f"kteam://{os.ttyname(theirs)}")
+    first = address.connect()
+    link = Link("KH02", address, protocol.Settings(), (0.0, 0.0, 0.0))
+    link.start()
+    try:
+        deadline = time.monotonic() + 10.0
+        while "another process has this line; end it first" not in link.trouble:
+            assert time.monotonic() < deadline, link.trouble
+            time.sleep(0.01)
+        assert not select.select([ours], [], [], 0.0)[0]  # nothing was said on it
+    finally:
+        link.end()
+        first.close()
+    address.connect().close()  # free again
+    os.close(ours)
+    os.close(theirs)
+
+
 def test_kteam_over_a_serial_line():
     """A pseudo terminal with the twin's side of the protocol at its other end."""
     ours, theirs = os.openpty()

@@ -1,0 +1,80 @@
+"""A process that is started again with a clock that is behind is obeyed: its numbers count anew."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from agents import wire
+from agents.agent import Agent
+from agents.goals import HeardGoals
+from agents.keys import Keys
+from experiments import assign
+from experiments.exchange import Exchange
+from experiments.experiment import Formation, Robot
+from experiments.population import Population
+from tests.agents.few import pair
+from tests.fuzz.loopnet import Net
+from tests.fuzz.messages import sent
+
+KEYS, UTC = Keys(), 1.7e9
+NOW, BEHIND = 1_700_000_000_000, 1_600_000_000_000  # milliseconds, at which numbers begin
+
+
+def own(net: Net, alive: str, session: str, *, gone: bool = False) -> None:
+    net.deliver(f"{Keys.life(alive, session)}\0\0".encode(), gone=gone)
+
+
+def test_a_world_obeys_the_stop_of_a_process_whose_clock_is_behind_that_of_the_one_before():
+    drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
+    experiment = pair(robots={"F": drone}, formation=Formation())
+    with Net().worn() as net:
+        world = Exchange(experiment, Population(experiment), net.session)
+
+        def order(seq: int, action: str, **more: object) -> bool:
+            """Whether it is carried out."""
+            before = world._done.get("F", 0)
+            net.deliver(sent(KEYS.setpoint("F"), wire.Command("F", seq, UTC, action, **more))[0])
+            world.listen(0.0)
+            return world._done.get("F", 0) != before
+
+        own(net, KEYS.alive("F"), "one")
+        assert order(NOW, "takeoff", height=0.5)
+        assert not order(BEHIND, "stop")  # of the same process: said again, or overtaken
+        own(net, KEYS.alive("F"), "one")  # it was cut off, and is the same
+        assert not order(BEHIND, "stop")
+        own(net, KEYS.alive("F"), "one", gone=True)
+        own(net, KEYS.alive("F"), "two")
+        assert order(BEHIND, "stop")
+
+
+def test_a_centre_whose_clock_is_behind_that_of_the_one_before_is_followed():
+    experiment = pair(architecture="centralised")
+    agent = Agent(assign.assign(experiment, ("A",)))
+    with Net().worn() as net:
+        goals = HeardGoals(net.session, KEYS, agent, agent.guidance, reach=(5.0, 5.0, 5.0))
+
+        def tell(seq: int, t: float, x: float) -> float:
+            """The goal that is pursued."""
+            goal = wire.Goal("A", seq, UTC + t, (x, 0.0, 0.0), None, UTC + t)
+            net.deliver(sent(KEYS.goal("A"), goal)[0])
+            goals.take(t, UTC)
+            return float(agent.guidance.goal[0, 0])
+
+        own(net, KEYS.centre_alive, "one")
+        assert tell(NOW, 1.0, 0.1) == 0.1
+        assert tell(BEHIND, 1.1, 0.2) == 0.1
+        assert goals.malformed == 1
+        own(net, KEYS.centre_alive, "two")
+        assert tell(BEHIND, 0.9, 0.3) == 0.3  # its clock lags by a little
+        assert goals.malformed == 1
+
+
+def test_a_late_goal_does_not_bring_a_dead_centre_back():
+    agent = Agent(assign.assign(pair(architecture="centralised"), ("A",)))
+    guidance, row, goal = agent.guidance, np.array([0]), np.zeros((1, 3))
+    guidance.hear(row, goal, np.zeros(1), np.array([1.0]))
+    guidance.lose(2.0)
+    guidance.hear(row, goal, np.zeros(1), np.array([1.9]))
+    assert guidance.lacking(2.1)[0]
+    guidance.hear(row, goal, np.zeros(1), np.array([2.2]))  # of another one, such as a tool of ROS
+    assert not guidance.lacking(2.3)[0]
