@@ -16,6 +16,7 @@ from agents import plugins
 from experiments import document, virtual
 from experiments.experiment import Experiment, Formation, Link, Robot, Start
 from experiments.formation import Pattern, errors
+from experiments.seeds import spread
 from experiments.signals import net_rotation
 
 SEEDS = tuple(range(200, 224))
@@ -37,7 +38,8 @@ class Row:
 
     def __str__(self) -> str:
         rate = np.array(self.rate)
-        mean = f"{rate.mean():.2f} ± {rate.std(ddof=1) / math.sqrt(len(rate)):.2f}"
+        half = spread(rate.tolist()).ci95 or 0.0
+        mean = f"{rate.mean():.2f} ± {half:.2f}"
         root = f"{math.sqrt(float((rate**2).mean())):.2f}"
         return f"| {self.name} | {mean} | {root} | {self.error:.1f} | {self.messages:.0f} |"
 
