@@ -1,6 +1,7 @@
 """The clock of an experiment as one process reads it: that of its machine, set right by what it is known to lack.
 
 The wall clock is read once and goes on with the monotonic one: a step in mid-run (NTP, an operator) moves nothing.
+All processes of a run on the launcher's machine share one reading, however late they are started.
 
 Clocks drift. Whoever started the process on another machine measures again during the run and says so on its lifeline,
 `clock -0.200131`; the process follows by going a little faster or slower, never back: stamps tell which of two
@@ -9,6 +10,7 @@ samples is the newer one.
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from dataclasses import dataclass, field
@@ -17,6 +19,7 @@ from typing import Final
 
 SLEW: Final = 0.005  # seconds per second; a hundred times what quartz drifts, and no body notices
 STEP_S: Final = 0.5  # more is no drift: somebody was suspended, or is mistaken
+READING: Final = "ZENPARK_CLOCK"  # environment: UTC at which the machine's monotonic clock was 0 [s]
 _WORD: Final = b"clock "
 
 
@@ -40,7 +43,8 @@ class Clock:
 
     def __post_init__(self) -> None:
         self._wanted = self.correction_s
-        self._zero = time.time() - time.monotonic()
+        shared = os.environ.get(READING)
+        self._zero = time.time() - time.monotonic() if shared is None else float(shared)
 
     def utc(self) -> float:
         """Now, UTC [s]."""
@@ -49,6 +53,10 @@ class Clock:
     def at(self, monotonic: float) -> float:
         """UTC [s] at a time of the monotonic clock [s]."""
         return self._zero + monotonic + self.correction_s
+
+    def shared(self) -> dict[str, str]:
+        """The environment of processes on this machine that are to read this clock."""
+        return {READING: repr(self.at(0.0))}
 
     def heed(self, line: bytes) -> None:
         """Takes a line of `said` up, from any thread; what is none, or too far off to be drift, is refused."""

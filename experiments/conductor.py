@@ -99,7 +99,7 @@ class Conductor:
         self._hosts, self._show, self._asked = hosts, show, interrupted
         self._emergency = Emergency() if emergency is None else emergency
         self._keys = Keys(experiment.network.realm)
-        self._clock = Clock()  # of each case: its robots' processes read the wall clock now as well
+        self._clock = launcher.clock = Clock()  # of each case, for all its processes here, however late they start
         steered = guided(experiment)
         self._robots = {
             name: Seen(error=None if name in steered else 0.0, out="standby" if robot.standby else "")

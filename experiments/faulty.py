@@ -11,6 +11,7 @@ writes and the processes of the run map into memory. Stamps of the network libra
 from __future__ import annotations
 
 import mmap
+import os
 import runpy
 import struct
 import sys
@@ -20,6 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from agents.clock import READING
 from experiments import processes
 
 MODULE: Final = "experiments.faulty"
@@ -52,6 +54,9 @@ def spoil(folder: Path, words: Sequence[str]) -> None:
     role = processes.role(words)
     utc, everyone, own = time.time, Switch(folder / "clock"), Switch(folder / f"clock-{role}")
     time.time = lambda: utc() + everyone.read() + own.read()
+    if own.read():  # a computer of its own
+        time.time = lambda: utc() + own.read()
+        os.environ.pop(READING, None)
     if role == "router":
         _announce(Switch(folder / "lease").read())
     elif processes.ROBOT in words:

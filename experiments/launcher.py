@@ -15,12 +15,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
+from agents.clock import Clock
 from agents.lifeline import BEAT_S
 
 ROUTER: Final = "router"  # the first; others are router2, router3, ...
@@ -76,11 +77,16 @@ def is_router(process: str) -> bool:
 
 
 class Launcher:
-    """Processes of one run; a context manager that leaves none behind."""
+    """Processes of one run; a context manager that leaves none behind.
+
+    Attributes:
+        clock: That modules read which are started here; None: each reads the wall clock anew.
+    """
 
     def __init__(self, logs: Path) -> None:
         """Output of each process goes to a file in the folder `logs`."""
         self._logs = logs
+        self.clock: Clock | None = None
         self._processes: dict[str, Process] = {}
         self._lock = threading.Lock()
         self._over = threading.Event()
@@ -101,9 +107,18 @@ class Launcher:
 
     def start(self, name: str, module: str, *arguments: str) -> Process:
         """Starts a module of this project in a process and session of its own; one thread per numeric library."""
-        return self.spawn(name, [sys.executable, "-m", module, *arguments])
+        shared = {} if self.clock is None else self.clock.shared()
+        return self.spawn(name, [sys.executable, "-m", module, *arguments], environment=shared)
 
-    def spawn(self, name: str, command: Sequence[str], *, told: bytes = b"", answers: bool = False) -> Process:
+    def spawn(
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        told: bytes = b"",
+        answers: bool = False,
+        environment: Mapping[str, str] | None = None,
+    ) -> Process:
         """Starts any command that holds its standard input as a lifeline.
 
         Args:
@@ -111,8 +126,9 @@ class Launcher:
             command: And its arguments.
             told: What it reads there before the first heartbeat.
             answers: Its standard output is the caller's to read, and only its errors are logged.
+            environment: Added to the launcher's own.
         """
-        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        own = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
         log = self._logs / f"{name}.log"
         with log.open("ab") as output:
             handle = subprocess.Popen(
@@ -121,7 +137,7 @@ class Launcher:
                 stdout=subprocess.PIPE if answers else output,
                 stderr=output,
                 start_new_session=True,  # Ctrl-C is the launcher's: it lands the robots first
-                env=environment,
+                env={**own, **(environment or {})},
             )
         assert handle.stdin is not None
         os.set_blocking(handle.stdin.fileno(), False)  # a stopped process must not stop the heartbeat of the others

@@ -12,6 +12,7 @@ from agents.clock import SLEW, STEP_S, Clock, said
 from agents.graph import links
 from agents.hearing import Hearing
 from agents.prediction import HOLD, ConstantVelocity, Predictor
+from experiments.launcher import Launcher
 
 AHEAD_S = 0.2
 SPEED = 0.3  # [m/s] of a neighbour along x
@@ -73,6 +74,22 @@ def test_no_process_of_a_run_reads_the_wall_clock_but_by_its_clock():
     }
     once = [line for lines in readers.values() for line in lines if "= time.time() - time.monotonic()" not in line]
     assert once == []
+
+
+def test_a_process_that_is_started_after_a_step_of_the_wall_clock_reads_the_clock_of_the_others(tmp_path, monkeypatch):
+    launcher = Launcher(tmp_path)
+    launcher.clock = first = Clock()
+    environments = []
+    monkeypatch.setattr(launcher, "spawn", lambda name, command, environment: environments.append(environment))
+    launcher.start("CF01", "experiments.robot")
+    wall = time.time
+    monkeypatch.setattr(time, "time", lambda: wall() + 60.0)
+    assert Clock().utc() > first.utc() + 59.0, "on a machine of its own"
+    for name, value in environments[0].items():
+        monkeypatch.setenv(name, value)
+    now = time.monotonic()
+    assert Clock().at(now) == pytest.approx(first.at(now), abs=1e-6)
+    assert Clock(-0.2).at(now) == pytest.approx(first.at(now) - 0.2, abs=1e-6)
 
 
 def test_a_clock_follows_what_it_is_told_smoothly_and_never_back():
