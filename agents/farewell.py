@@ -12,7 +12,9 @@ import zenoh
 from agents import session as network
 from agents.keys import Keys
 
-AFTER_S: Final = 20.0  # how long robots may take to land after the launcher is gone
+FAREWELL_S: Final = 15.0  # so long robots whose launcher is gone are flown down, and once more so long landed by force
+STOPPED_S: Final = 5.0  # a body that does not say that its motors stand is told so long, and then left
+AFTER_S: Final = 2.0 * FAREWELL_S + STOPPED_S + 5.0  # how long all of that may take, and the end of a process
 SETTLE_S: Final = 0.5  # the news of a robot that has just come may still be on its way
 
 

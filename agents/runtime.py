@@ -24,6 +24,7 @@ from agents import session as network
 from agents.agent import Actions, Agent
 from agents.assignment import Assignment
 from agents.body import Body, call_all
+from agents.farewell import FAREWELL_S, STOPPED_S
 from agents.goals import HeardGoals
 from agents.leaving import leave
 from agents.lifecycle import Phase
@@ -41,8 +42,6 @@ from agents.speaking import Said
 from agents.telemetry import Counts, Telemetry
 from agents.watchdog import AGAIN_S, Watchdog
 
-FAREWELL_S: Final = 15.0  # a robot that has not landed this long after its launcher was lost has its motors cut
-STOPPED_S: Final = 5.0  # a body that does not say that its motors stand is told so long, and then left
 HUSH_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
 ROUTER_S: Final = 0.045  # between two looks at the router
 

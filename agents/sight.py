@@ -12,6 +12,7 @@ from agents.avoidance import Nearby, Self
 from agents.body import BodyState, Rays
 from agents.graph import Links
 from agents.kinds import Kind
+from agents.plausibility import MAX_SPEED
 from agents.rows import Array, Index, Mask, clamp, every, some
 from agents.safety import Limits
 
@@ -74,8 +75,8 @@ class Sight:
         on with its velocity; a ray that ended on one that was heard is not counted a second time.
         """
         velocity = state.velocity
-        if not every(np.isfinite(velocity)):
-            velocity = np.where(np.isfinite(velocity), velocity, 0.0)
+        if not every(known := np.abs(velocity) <= MAX_SPEED):  # of an estimator that diverged, or not a number
+            velocity = np.where(known, velocity, 0.0)
         own = Self(
             state.position, velocity, state.yaw, self._radius, self._height, self._speed, self._turn_rate,
             self._response, self._lag, self._takes, self._by_position, self._by_twist, self._flies,

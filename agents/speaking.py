@@ -7,6 +7,7 @@ import math
 import msgspec
 import numpy as np
 
+from agents.plausibility import MAX_SPEED
 from agents.plugins import FAILURES, PluginError
 from agents.prediction import HOLD, Predictor
 from agents.rows import Array, Index, every
@@ -46,8 +47,8 @@ class Voice:
         """
         trigger = self.trigger
         unknown: Index | None = None
-        if not every(np.isfinite(velocity)):
-            unknown = np.flatnonzero(~np.isfinite(velocity).all(axis=1))
+        if not every(known := np.abs(velocity) <= MAX_SPEED):  # as nobody would believe it, it is not known
+            unknown = np.flatnonzero(~known.all(axis=1))
             velocity = velocity.copy()
             velocity[unknown] = 0.0
         if trigger.smoothing_s > 0.0:

@@ -22,6 +22,7 @@ from agents import session as network
 from agents import wire
 from agents.clock import Clock
 from agents.endpoint import EndpointError
+from agents.farewell import AFTER_S
 from agents.keys import Keys
 from agents.leaving import end, held
 from agents.lifeline import Lifeline
@@ -33,7 +34,6 @@ from experiments.records import RecordingError
 
 POLL_S: Final = 0.02
 FLUSH_S: Final = 1.0
-AFTER_S: Final = 12.0  # how long robots may take to land after the conductor is gone
 FRESH_S: Final = 0.05  # a truth that is farther away in time does not belong to a state
 PATIENCE_S: Final = 0.2  # a state waits so long for the truth that follows it
 TRUTHS: Final = 256  # that are kept of each robot

@@ -55,6 +55,12 @@ def placed(sight, t, now, told=None):
 # ---------------------------------------------------------------- oneself
 
 
+@pytest.mark.parametrize("absurd", [np.nan, np.inf, -np.inf, 51.0, -1e8, 1e38])
+def test_a_velocity_that_no_robot_has_is_not_known(absurd):
+    own, _ = alone().see(0.0, state([[0, 0, 0]], velocity=[[0.1, absurd, 0.2]]), Heard.nothing(0))
+    np.testing.assert_array_equal(own.velocity, [[0.1, 0.0, 0.2]])
+
+
 def test_a_row_knows_its_kind_its_pose_and_the_lower_of_two_limits():
     sight = Sight((KHEPERA4, TELLO, CRAZYFLIE), (KHEPERA4,), links([], [], []), LIMITS, 0.1)
     now = state([[0, 0, 0], [1, 0, 1], [2, 0, 1]], yaw=[1, 2, 3], velocity=[[0.1, 0, 0], [np.nan] * 3, [0, 0.2, 0]])

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
+from agents import farewell, runtime, wire
 from agents import session as network
-from agents import wire
 from agents.keys import Keys
-from experiments.recorder import Recorder, with_truth
+from experiments.recorder import AFTER_S, Recorder, with_truth
 from tests.conftest import RouterProcess
 from tests.experiments.recordings import START, state, touched, world
 
@@ -34,6 +34,11 @@ class Taken:
 
     def world(self, said: wire.WorldState) -> None:
         self.worlds.append(said)
+
+
+def test_whoever_serves_robots_or_records_them_waits_for_the_longest_way_down() -> None:
+    assert farewell.AFTER_S == AFTER_S
+    assert AFTER_S > 2.0 * runtime.FAREWELL_S + runtime.STOPPED_S
 
 
 @pytest.mark.system
