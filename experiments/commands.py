@@ -98,7 +98,9 @@ def _fly(read: document.Document, folder: Path, staging: Staging, way: _Way) -> 
         with interrupted:
             show = shown(quiet=as_json)
             try:
-                flown = conduct(read, folder, staging, show=show, interrupted=interrupted, emergency=emergency)
+                flown = conduct(
+                    read, folder, staging, show=show, interrupted=interrupted, emergency=emergency, tell=_warn
+                )
                 runs = [read_back(folder, *flown)]
             except KeyboardInterrupt:
                 print(f"\nended at once; `zenpark report {folder}` shows what was recorded", file=sys.stderr)
@@ -122,6 +124,11 @@ def _fly(read: document.Document, folder: Path, staging: Staging, way: _Way) -> 
         print(f"zenpark: {emergency.words}", file=sys.stderr)
         return STOPPED
     return 130 if interrupted.asked else 0
+
+
+def _warn(lines: Sequence[str]) -> None:
+    for line in lines:
+        print(f"zenpark: {line}", file=sys.stderr)
 
 
 def _refuse(staging: Staging, *, virtual: bool, seeds: int) -> None:

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+import json
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 
+from agents import plugins, registry
 from agents.access import rules
 from agents.endpoint import free_endpoints
 from agents.keys import Keys
 from agents.lab import LabError, register, require, secured
 from agents.lab import of as lab_of
+from agents.lab import options as lab_options
 from agents.settings import check_loopback
 from agents.topology import from_here
-from experiments import access, document, mesh, reach
+from experiments import access, assign, document, mesh, reach
 from experiments.conductor import Conductor, Result
 from experiments.document import Document
 from experiments.emergency import Emergency
@@ -59,6 +62,7 @@ def conduct(
     interrupted: Callable[[], bool],
     emergency: Emergency,
     launching: Callable[[Path], Launcher] = Launcher,
+    tell: Callable[[Sequence[str]], None] = lambda _: None,
 ) -> tuple[dict[str, Path], list[str]]:
     """Runs an experiment in real time: a router, a process per robot, a recorder.
 
@@ -70,6 +74,7 @@ def conduct(
         interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
         emergency: Hears emergency stops; after one no further case begins.
         launching: Makes the launcher of the processes, given the folder of their logs.
+        tell: Takes what the user should know before it begins.
 
     Returns:
         The recordings of the cases that have begun, and what the reader should know.
@@ -80,7 +85,8 @@ def conduct(
         RunFailed: If robots are not ready in time, unless the file says to go on without them.
         Unreachable: If the routers of the file do not answer.
         HostError: If a host cannot be reached, or has another zenpark.
-        DocumentError: If robots that run on hosts are to be put behind protocol twins.
+        DocumentError: If robots that run on hosts are to be put behind protocol twins, or are hardware that another
+            run of this machine has.
     """
     if staging.bodies == "protocol" and read.experiment.hosts and not staging.here:
         hint = "add --here, which lets all robots run on this machine"
@@ -105,7 +111,12 @@ def conduct(
         endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)
     rights = enforced(embodied.values(), endpoints, folder, staging.identity)
     (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
-    with launching(folder / "logs") as launcher:
+    me = registry.mine(
+        "run", read.experiment.title or read.path.stem, endpoints,
+        folder=folder, realm=network.realm, identity=staging.identity, robots=hardware(embodied.values()),
+    )  # fmt: skip
+    with registry.registered(me) as unlisted, launching(folder / "logs") as launcher:
+        tell([*([unlisted] if unlisted else []), *beside(me, registry.runs(), str(read.path))])
         for router in divided(listening, network.routers) if own_router else ():
             router.start(launcher, rights)
         hosts = Hosts(launcher, endpoints if meshed else listening)
@@ -140,6 +151,58 @@ def conduct(
         stopped + [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
     )
     return {case: result.recording for case, result in results.items() if result.start is not None}, notes
+
+
+def hardware(cases: Iterable[Experiment]) -> dict[str, str]:
+    """Robots of some cases by name, with the address of those that are hardware, and the host on which they run."""
+    found: dict[str, str] = {}
+    stood_in = {"twin", assign.WORLD, "external", *plugins.names(plugins.DEVICES)}
+    for case in cases:
+        hosts = {robot: host for host, each in case.hosts.items() for robot in each.robots}
+        for name, robot in case.robots.items():
+            if plugins.body_name(robot.body) in stood_in:
+                found.setdefault(name, "")
+            else:
+                device = f" {json.dumps(robot.device, sort_keys=True)}" if robot.device else ""
+                found[name] = robot.body + device + (f" on {hosts[name]}" if name in hosts else "")
+    return found
+
+
+def beside(me: registry.Run, others: Iterable[registry.Run], file: str) -> list[str]:
+    """What there is to say of runs that are up beside one and have robots of the same names.
+
+    Raises:
+        DocumentError: If a robot of the run is hardware that another one has.
+    """
+    said = []
+    for other in others:
+        if (other.pid, other.born) == (me.pid, me.born) or not other.alive:
+            continue
+        taken = sorted(name for name, body in me.robots.items() if body and _has(other, name, body))
+        if taken:
+            stop = (
+                lab_options(other.endpoints[0])
+                if len(other.endpoints) == 1
+                else f"--connect @{other.folder}/{mesh.ENDPOINTS}"
+            )
+            raise DocumentError(
+                [
+                    Problem(
+                        file, 0, 0, f"{', '.join(taken)} ({me.robots[taken[0]]}) is in another run, {other.words}",
+                        f"end that one first: Ctrl-C in its terminal (pid {other.pid}), or `zenpark estop {stop}`",
+                    )
+                ]
+            )  # fmt: skip
+        if same := sorted(me.robots.keys() & other.robots.keys()):
+            said.append(f"another run is up with robots of these names ({', '.join(same)}): {other.words}")
+    return said
+
+
+def _has(other: registry.Run, name: str, body: str) -> bool:
+    """Whether another run drives the same device: an address that names none belongs to the robot of that name."""
+    if plugins.body_name(body) == body:
+        return other.robots.get(name) == body
+    return body in other.robots.values()
 
 
 def enforced(

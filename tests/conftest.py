@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +21,8 @@ from agents.endpoint import free_endpoint
 
 hypothesis_settings.register_profile("zenpark", deadline=None)  # no test depends on how fast this machine is
 hypothesis_settings.load_profile("zenpark")
+# no test may find the runs of whoever uses this machine, least of all to stop them
+os.environ["ZENPARK_RUNS"] = tempfile.mkdtemp(prefix="zenpark-tests-")
 
 ROOT = Path(__file__).resolve().parent.parent
 

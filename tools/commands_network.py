@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.options import As, Connect, KeyExpression, Lab, Realm, Seconds, routers
+from tools.options import As, AsJson, Connect, KeyExpression, Lab, Realm, Seconds, routers
 
 app: Final = typer.Typer()
 
@@ -97,13 +97,26 @@ def hz(
 
 @app.command()
 def estop(
-    connect: Connect = None,
-    realm: Realm = "park",
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help="Only at this router; may be repeated. [all runs of this machine]"),
+    ] = None,
+    realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
     reason: Annotated[str, typer.Option(metavar="TEXT", help="Said with it.")] = "zenpark estop",
     lab: Lab = None,
-    identity: As = "operator",
+    identity: Annotated[
+        str | None, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab. [the run's operator]")
+    ] = None,
 ) -> None:
-    """Cut the motors of every robot, wherever it is."""
+    """Cut the motors of every robot of every run of this machine, or at a router."""
     from tools.estop import command  # noqa: PLC0415
 
     raise typer.Exit(command(connect=routers(connect, lab), realm=realm, reason=reason, who=identity))
+
+
+@app.command()
+def runs(as_json: AsJson = False) -> None:
+    """Show which runs are up on this machine: routers, robots, since when, folders."""
+    from tools.estop import runs as show  # noqa: PLC0415
+
+    raise typer.Exit(show(as_json=as_json))

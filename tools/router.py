@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,10 @@ from typing import Any
 from agents.access import Rights
 from agents.endpoint import DEFAULT_ENDPOINT
 from agents.lab import LabError, secured
+from agents.registry import mine, registered
 from agents.router import serve
 from agents.settings import settings
+from agents.topology import from_here
 
 
 def command(
@@ -50,7 +53,10 @@ def command(
     if print_config:
         print(json.dumps(of_zenohd(endpoints, linked, rights), indent=1))
         return 0
-    return serve(endpoints, link=linked, lifeline=lifeline, rights=rights)
+    with registered(mine("router", "a router by hand", list(map(from_here, endpoints)))) as why:
+        if why:
+            print(f"zenpark: {why}", file=sys.stderr)
+        return serve(endpoints, link=linked, lifeline=lifeline, rights=rights)
 
 
 def of_zenohd(endpoints: Sequence[str], link: Sequence[str] = (), rights: Rights | None = None) -> dict[str, Any]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import tools.estop
+from agents import registry
 from experiments import playback
 from tests.system.lab import ENVIRONMENT, ROOT, Flight
 
@@ -34,15 +37,33 @@ def estop(endpoint: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.timeout(120)
-def test_the_run_ends_says_why_and_no_other_case_begins(tmp_path: Path) -> None:
+def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     file, folder = tmp_path / "two.toml", tmp_path / "run"
-    file.write_text(TWO_CASES.format(duration=30.0))
+    file.write_text(TWO_CASES.format(duration=90.0))
     flight = Flight(folder, str(file), "--no-report")
     flight.until_said(r"phase conductor: formation", 40.0)
-    done = estop(flight.endpoint())
-    assert (done.returncode, done.stdout) == (0, "stopped: CF01, KH01\n")
+    other = Flight(tmp_path / "other", str(file), "--no-report")
+    other.until_said(r"phase conductor: formation", 40.0)
+    assert (
+        f"another run is up with robots of these names (CF01, KH01): two that stay together, {folder}" in other.said()
+    )
+    up = [[flight.endpoint()], [other.endpoint()]]
+    assert [run.endpoints for run in registry.runs()] == up
+    monkeypatch.setattr(tools.estop, "DEFAULT_ENDPOINT", flight.endpoint())  # whoever else uses this machine
+    assert tools.estop.runs(as_json=True) == 0
+    assert [run["robots"] for run in json.loads(capsys.readouterr().out)] == [{"CF01": "", "KH01": ""}] * 2
+    assert tools.estop.command(connect=[], realm=None, reason="person in arena", who=None) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"stopped: CF01, KH01 (two that stay together, {each.folder}, at {endpoint})"
+        for each, (endpoint,) in zip((flight, other), up, strict=True)
+    ]
+    other.until_said(r"stop conductor: emergency stop by operator: person in arena; the run ends here")
+    assert other.finish(30.0)[0] == 1
     flight.until_said(r"stop conductor: emergency stop by operator: person in arena; the run ends here")
     code, _ = flight.finish(30.0)
+    assert registry.runs() == []
     said = flight.said()
     assert code == 1
     assert "zenpark: emergency stop by operator: person in arena" in said
@@ -60,7 +81,7 @@ def test_before_the_common_start_too(tmp_path: Path) -> None:
     file.write_text(TWO_CASES.format(duration=30.0))
     flight = Flight(folder, str(file), "--no-report")
     flight.until_said(r"ready conductor: 2 robots", 40.0)
-    estop(flight.endpoint())
+    assert estop(flight.endpoint()).stdout == "stopped: CF01, KH01\n"
     code, out = flight.finish(30.0)
     assert code == 1
     assert "common start" not in flight.said()

@@ -52,6 +52,7 @@ def test_commands():
                 "twin",
                 "order",
                 "estop",
+                "runs",
                 "robot",
                 "bridge",
                 "centre",
@@ -99,6 +100,9 @@ def test_help_is_light():
 def test_an_emergency_stop_waits_for_no_numpy():
     _, modules = loaded("estop", "--connect", "tcp/127.0.0.1:9")
     assert "tools.estop" in modules
+    assert not {"numpy", "matplotlib", "mcap"} & modules
+    said, modules = loaded("runs")
+    assert said == "no run is up on this machine\n"
     assert not {"numpy", "matplotlib", "mcap"} & modules
 
 

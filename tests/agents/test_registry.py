@@ -1,0 +1,115 @@
+"""The list of runs: what is up is found, what died is cleaned away, and what is none of ours harms nobody."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from agents import registry
+from agents.endpoint import free_endpoint
+from agents.registry import Run, born, mine, registered, runs
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("ZENPARK_RUNS", str(tmp_path / "runs"))
+    return tmp_path / "runs"
+
+
+def nowhere() -> list[str]:
+    """A router that is not up."""
+    return [free_endpoint(preferred_port=0)]
+
+
+def dead() -> Run:
+    """A run whose process has ended."""
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    started = born(process.pid)
+    assert started is not None
+    process.communicate(b"\n")
+    return msgspec.structs.replace(mine("run", "dead", nowhere()), pid=process.pid, born=started)
+
+
+def test_a_run_is_listed_as_long_as_it_is_up(folder: Path) -> None:
+    run = mine("run", "two", nowhere(), folder=Path("here"), realm="hall", robots={"CF01": "radio://0", "KH01": ""})
+    assert runs() == []
+    with registered(run) as why:
+        assert why == ""
+        assert runs() == [run]
+        assert run.alive
+        with registered(mine("router", "a router by hand", nowhere())):
+            assert [each.what for each in runs()] == ["run", "router"]
+        assert run.words == f"two, {Path('here').absolute()}, at {run.endpoints[0]}"
+    assert runs() == []
+    assert list(folder.iterdir()) == []
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+def test_who_died_is_listed_only_while_its_router_answers(folder: Path) -> None:
+    run = dead()
+    with registered(run):
+        assert runs() == []
+        assert list(folder.iterdir()) == [], "cleaned"
+    with socket.create_server(("127.0.0.1", 0)) as router:
+        left = msgspec.structs.replace(run, endpoints=[f"tcp/127.0.0.1:{router.getsockname()[1]}"])
+        with registered(left):
+            assert runs() == [left], "its robots may still come down"
+            assert not left.alive
+
+
+def test_another_process_of_the_same_number_is_not_the_run() -> None:
+    assert not msgspec.structs.replace(mine("run", "two", nowhere()), born="1").alive
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"\xff\x00",
+        b"[" * 100_000,
+        b"{}",
+        b'{"what":"run","pid":-1,"born":"","since":0,"title":"","folder":"","endpoints":["tcp/127.0.0.1:1"]}',
+        b'{"what":"run","pid":1,"born":"","since":0,"title":"","folder":"","endpoints":["nonsense"]}',
+        b'{"what":"run","pid":1,"born":"","since":0,"title":"","folder":"","endpoints":[]}',
+        b" " * (registry.LARGEST + 1),
+    ],
+    ids=range(8),
+)
+def test_garbage_is_left_alone_and_hides_nobody(folder: Path, text: bytes) -> None:
+    run = mine("run", "two", nowhere())
+    with registered(run):
+        (folder / "0.json").write_bytes(text)
+        (folder / "1.json").mkdir()
+        (folder / "2.json").symlink_to("/dev/zero")
+        assert runs() == [run]
+        assert (folder / "0.json").exists()
+
+
+def test_a_folder_that_others_can_write_to_is_not_believed(folder: Path) -> None:
+    folder.mkdir(0o700)
+    (folder / "0.json").write_bytes(msgspec.json.encode(mine("run", "two", nowhere())))
+    assert len(runs()) == 1
+    folder.chmod(0o770)
+    assert runs() == []
+    with registered(mine("run", "two", nowhere())) as why:
+        assert "no folder of yours alone" in why
+    folder.rename(folder.with_name("elsewhere"))
+    folder.symlink_to(folder.with_name("elsewhere"))
+    assert runs() == []
+
+
+def test_without_a_runtime_folder_it_is_one_of_the_users_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ZENPARK_RUNS")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
+    with registered(mine("run", "two", nowhere())) as why:
+        assert why == ""
+        assert [path.name for path in tmp_path.iterdir()] == [f"zenpark-{os.getuid()}"]
+    (tmp_path / "session").mkdir(0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "session"))
+    with registered(mine("run", "two", nowhere())):
+        assert len(list((tmp_path / "session" / "zenpark").iterdir())) == 1

@@ -1,0 +1,75 @@
+"""Two runs on one machine: hardware belongs to one of them, twins of the same names fly beside each other."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from agents import registry
+from experiments.experiment import Formation, Host, Robot
+from experiments.problem import DocumentError
+from experiments.realtime import beside, hardware
+from tests.agents.few import pair
+
+RADIO = "radio://0/80/2M/E7E7E7E701"
+REAL = pair(
+    robots={
+        "CF01": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.5, body=RADIO),
+        "TE01": Robot(kind="tello", start=[0.5, 0.0], hover=0.5, body="tello"),
+        "KH01": Robot(kind="khepera4", start=[-0.5, 0.0], body="khepera4://10.0.0.7", device={"port": 344}),
+        "KH02": Robot(kind="khepera4", start=[-0.5, 0.5]),
+        "KH03": Robot(kind="khepera4", start=[-0.5, 0.9], body="khepera4-twin"),
+    },
+    formation=Formation(),
+)
+
+
+def run(robots: dict[str, str], title: str = "here", born: str | None = None) -> registry.Run:
+    made = registry.mine("run", title, ["tcp/127.0.0.1:7448"], folder=Path("/runs/other"), robots=robots)
+    return made if born is None else msgspec.structs.replace(made, born=born)
+
+
+def test_hardware_is_known_by_its_address_its_settings_and_its_host() -> None:
+    away = msgspec.structs.replace(REAL, hosts={"lab2": Host(address="ana@lab2", robots=["TE01"])})
+    assert hardware([REAL, away]) == {
+        "CF01": RADIO,
+        "TE01": "tello on lab2",
+        "KH01": 'khepera4://10.0.0.7 {"port": 344}',
+        "KH02": "",
+        "KH03": "",
+    }
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "refused"),
+    [
+        ({"CF01": RADIO}, {"CF01": RADIO}, True),
+        ({"CF09": RADIO}, {"CF01": RADIO}, True),
+        ({"TE01": "tello"}, {"TE01": "tello"}, True),
+        ({"TE02": "rmw"}, {"TE01": "rmw"}, False),
+        ({"CF01": RADIO}, {"CF01": RADIO[:-1] + "2"}, False),
+        ({"CF01": RADIO}, {"CF01": ""}, False),
+    ],
+)
+def test_hardware_that_another_run_has_is_refused(
+    monkeypatch: pytest.MonkeyPatch, mine: dict[str, str], theirs: dict[str, str], refused: bool
+) -> None:
+    me, other = run(mine), run(theirs, "there", born="another")
+    monkeypatch.setattr(registry, "born", lambda _pid: "another")
+    if not refused:
+        same = sorted(mine.keys() & theirs.keys())
+        assert beside(me, [me, other], "x.toml") == [
+            f"another run is up with robots of these names ({name}): there, /runs/other, at tcp/127.0.0.1:7448"
+            for name in same
+        ]
+        return
+    with pytest.raises(DocumentError) as caught:
+        beside(me, [me, other], "x.toml")
+    (problem,) = caught.value.problems
+    (name, body), *_ = mine.items()
+    assert problem.message == f"{name} ({body}) is in another run, there, /runs/other, at tcp/127.0.0.1:7448"
+    assert problem.hint.endswith("or `zenpark estop --connect tcp/127.0.0.1:7448`")
+
+
+def test_a_run_that_has_died_has_nothing() -> None:
+    assert beside(run({"CF01": RADIO}), [run({"CF01": RADIO}, born="long ago")], "x.toml") == []
