@@ -107,7 +107,7 @@ class Attentive:
     def __init__(self, *_: object) -> None: ...
 
     @staticmethod
-    def silent_since(_t: float) -> float:
+    def silent_since(_t: float, _arrived: int = 0) -> float:
         return math.inf
 
 
