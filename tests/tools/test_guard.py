@@ -77,3 +77,13 @@ def test_what_a_run_starts_on_its_hosts_needs_no_typer(words, code):
     loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "experiments.station" in loaded or "experiments.robot" in loaded
     assert not loaded & {"typer", "pydantic", "tools.cli"}
+
+
+def test_a_robot_loads_no_openssl():
+    program = (
+        "import atexit, runpy, sys; sys.argv = ['robot', '--help'];"
+        "atexit.register(lambda: print('openssl:', sys.modules['_hashlib'], 'hashlib' in sys.modules));"
+        "runpy.run_module('experiments.robot', run_name='__main__')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("openssl: None True\n")
