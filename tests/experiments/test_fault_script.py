@@ -4,7 +4,9 @@ import pytest
 
 from experiments import chaos_flight, injection
 from experiments.chaos import again
+from experiments.chaos_command import ALWAYS, AVOIDANCE, defaults
 from experiments.fault_script import KINDS, NATURES, script
+from experiments.run import load
 
 ROBOTS = ("TB01", "KH01", "CF01", "CF02")
 
@@ -64,3 +66,10 @@ def test_every_kind_is_known_to_those_that_do_it_and_that_look_after_it():
     assert {kind for kind in KINDS if kind in looked_after} == {
         "kill", "bits", "clock", "read-error", "clock-behind", "double", "frozen-router", "mocap-clock"
     }  # fmt: skip
+
+
+def test_defaults_keep_robots_apart_and_fit_the_rates_of_the_file():
+    assert AVOIDANCE in defaults(load("robotic-park").experiment)
+    assert "rates.body_hz=50" in defaults(load("robotic-park").experiment)
+    avoiding = load("robotic-park", 'avoidance.kind="potential"', "rates.pose_hz=100").experiment
+    assert defaults(avoiding) == list(ALWAYS)
