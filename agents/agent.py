@@ -101,7 +101,8 @@ class Agent:
         self.all_guided = bool(self._guided.all())
         self._holding = Holding(self.deciding.ground)
         self.life = Lifecycle(flies, assignment.hover, assignment.duration)
-        self._voice = Voice(assignment.trigger, rows, assignment.predictor)
+        self._voice = Voice(assignment.trigger, rows, assignment.predictor, kinds=assignment.kinds)
+        self._setpoint = np.full((rows, 4), np.nan)
         self.outside, self.hazards = Outside(), Hazards(flies, assignment.limits)
         self._detector, self._preflight = Detector(assignment), Preflight(assignment)
         self.begun = False
@@ -254,6 +255,7 @@ class Agent:
         return self._voice.speak(
             t, state.position, state.velocity,
             error=self.error, energy=energy, start=life.start_at, offset=self.offset,
+            setpoint=self._setpoint,
         )  # fmt: skip
 
     def act(self, t: float, state: BodyState, said: Said) -> Actions:
@@ -291,7 +293,7 @@ class Agent:
             passive = ((phase < AIRBORNE) | (phase > RUNNING)) & ~aside
             setpoint = np.where(passive[:, None], np.where(self._flies, np.nan, 0.0)[:, None], setpoint)
             changed, avoided, self._wild = changed & ~passive, avoided & ~passive, self._wild & ~passive
-        self.tick += 1
+        self.tick, self._setpoint = self.tick + 1, setpoint
         return Actions(said.rows, setpoint, self._duties, changed, avoided, said.position, said.velocity)
 
     def _ready(self, t: float, state: BodyState) -> Mask:

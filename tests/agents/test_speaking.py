@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agents.kinds import CRAZYFLIE, TELLO
 from agents.plugins import PluginError
 from agents.prediction import ConstantVelocity
 from agents.speaking import LowPass, Voice
@@ -50,6 +51,28 @@ def test_the_low_pass_takes_away_what_wobbles():
     said = np.array([smooth.after(k * DT, at, np.zeros((4, 3)), 0.4)[0] for k, at in enumerate(noise)])
     share = 1.0 - math.exp(-DT / 0.4)
     assert said[200:].std() == pytest.approx(0.01 * math.sqrt(share / (2.0 - share)), rel=0.05)
+
+
+def test_what_wobbles_is_carried_by_its_setpoints_and_follows_them_without_a_lag():
+    rng = np.random.default_rng(2)
+    response, speed = np.array([[CRAZYFLIE.response], [TELLO.response]]), 0.2
+    smooth, place, velocity, wobble = LowPass(2, (CRAZYFLIE, TELLO)), np.zeros((2, 3)), np.zeros((2, 3)), 0.0
+    said = []
+    for k in range(3000):
+        wobble = 0.96 * wobble + 0.28 * rng.normal(0.0, 0.01, (2, 3)) * [1.0, 1.0, 0.0]
+        asked = np.array([[speed, 0.0, 0.0]] * 2)
+        setpoint = np.zeros((2, 4))
+        setpoint[0, :3], setpoint[1, :3] = place[0] + asked[0] / response[0], asked[1]
+        position, said_velocity = smooth.after(k * DT, place + wobble, velocity + 9.0, 0.4, setpoint)
+        said.append(np.concatenate([position - place, said_velocity - asked], axis=1)[:, :2])
+        place = place + DT * asked
+    off = np.array(said)[1500:]
+    assert np.abs(off.mean(axis=0)).max() < 0.003
+    assert off.std(axis=0).max() < 0.009  # of a wobble of 0.01 m; its velocity would be 0.1 m/s and more
+    smooth = LowPass(1, (CRAZYFLIE,))
+    for k in range(200):  # who drives itself, while it takes off or lands, is believed what it measures
+        _, said_velocity = smooth.after(k * DT, np.zeros((1, 3)), np.full((1, 3), 0.3), 0.4, np.full((1, 4), np.nan))
+    np.testing.assert_allclose(said_velocity, [[0.3] * 3], atol=1e-3)
 
 
 def test_who_was_lost_begins_anew_where_it_is():
