@@ -11,11 +11,15 @@ import msgspec
 import numpy as np
 
 from agents.assignment import Assignment
+from agents.coordination import Law
 from agents.graph import Links, Rigidity, components, edges
+from agents.individual import REACHED
 from agents.planning import Planner
 from agents.redundancy import Redundancy
-from agents.rows import Array, Index, Mask
+from agents.reshaping import wanted
+from agents.rows import Array, Index, Mask, norm
 from experiments import assign
+from experiments.claim import FORGIVEN
 from experiments.experiment import Experiment
 from experiments.feasibility import (
     Shape,
@@ -28,12 +32,14 @@ from experiments.feasibility import (
 from experiments.formation import Pattern, errors
 from experiments.links import pairs
 from experiments.locate import Path
+from experiments.metrics import WINDOW_S
 from experiments.modes import Modes, modes
-from experiments.prediction import Prediction, closed, predict
+from experiments.prediction import Prediction, closed
 from experiments.residuals import as_taken
 from twins.scene import Scene
 
 MANY: Final = 500  # robots of which it is not asked any more what can be lost: the time grows with their third power
+STANDS: Final = 0.001  # [m] moved by less in `WINDOW_S`
 GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
 
 
@@ -133,13 +139,33 @@ class Analysis:
         return int(rows[self.pull[rows].argmin()]) if len(rows) else None
 
     def acquired(self, until: float) -> float | None:
-        """From when on every link keeps within the tolerance, up to `until` [s]."""
+        """From when on the mean of every link over `WINDOW_S` keeps within the tolerance, up to `until` [s]."""
         time = self.prediction.time
-        outside = self.error.max(axis=1, initial=0.0)[time <= until + 1e-9] > self.experiment.tolerance
-        if not len(outside) or outside[-1]:
+        error = self.error[time <= until + 1e-9]
+        window = max(1, round(WINDOW_S * self.experiment.rates.coordination_hz))
+        total = np.cumsum(np.concatenate([np.zeros((1, error.shape[1])), error]), axis=0)
+        end = np.arange(1, len(total))
+        before = np.maximum(end - window, 0)  # the window fills up at the start, as it does in `experiments.metrics`
+        mean = (total[end] - total[before]) / (end - before)[:, None]
+        bad = np.flatnonzero(mean.max(axis=1, initial=0.0) > self.experiment.tolerance + FORGIVEN)
+        if not len(end) or (len(bad) and bad[-1] == len(error) - 1):
             return None
-        bad = np.flatnonzero(outside)
         return float(time[bad[-1] + 1]) if len(bad) else 0.0
+
+    def stopped(self, at: int) -> Index:
+        """Robots on wheels that stand at sample `at`, because their goals are too near to drive to."""
+        time, position, pattern = self.prediction.time, self.prediction.position, self.pattern
+        links, anchors, hz = pattern.links, self.assignment.anchors, self.experiment.rates.coordination_hz
+        if pattern.changes:
+            links = wanted(links, pattern.changes, np.full(len(links), time[at]))
+        there, here = pattern.present(time[at : at + 1], position[at : at + 1]), position[at]
+        links = links if there is None else links.take(there[0])
+        offset = self.assignment.law.offset(here, here[links.speaker], links)
+        offset = offset if anchors is None else offset + anchors.offset(here)
+        stands = norm(position[at] - position[max(0, at - round(WINDOW_S * hz))]) < STANDS
+        wheels = np.array([not kind.flies for kind in self.assignment.kinds])
+        length = norm(offset[:, :2])
+        return np.flatnonzero(wheels & stands & (length > 0.1 * REACHED) & (length < 2.0 * REACHED))
 
     def link(self, number: int) -> str:
         """A link in words."""
@@ -161,19 +187,18 @@ class Analysis:
         )
 
 
-def analyse(experiment: Experiment) -> Analysis:
-    """All the numbers of one case."""
+def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
+    """All the numbers of one case that goes like `prediction`."""
     names = tuple(experiment.robots)
     bare = msgspec.structs.replace(experiment, avoidance=None, architecture="distributed")
     assignment = assign.assign(bare, names)
     pattern = Pattern.of(experiment, names)
     links, rows, hz = assignment.links, len(names), experiment.rates.coordination_hz
-    start, yaw = assign.start(experiment, names)
+    start, _ = assign.start(experiment, names)
     aloft = start.copy()
     aloft[:, 2] = np.nan_to_num(assignment.hover)
     anchored = np.zeros(0, dtype=np.intp) if assignment.anchors is None else assignment.anchors.row
     silent = np.setdiff1d(np.arange(rows), np.concatenate([links.listener, anchored]))
-    prediction = predict(assignment, aloft, yaw, silent, hz)
     standing = np.ones(len(links), dtype=bool) if pattern.presence is None else pattern.presence.at_first()
     stages: list[list[Shape]] = []
     shape, planar, spatial, spare, loop = None, None, None, None, None
@@ -189,7 +214,8 @@ def analyse(experiment: Experiment) -> Analysis:
         if planar.rigid and spatial is not None and rows <= MANY:
             spare = expendable(shape.position, here, silent)
         share = closed(assignment.kinds, hz)
-        loop = modes(assignment.law, here, shape.position, share, hz, anchors=assignment.anchors)
+        within = experiment.duration_s
+        loop = modes(assignment.law, here, shape.position, share, hz, anchors=assignment.anchors, within_s=within)
     return Analysis(
         experiment=experiment,
         assignment=assignment,
@@ -209,9 +235,14 @@ def analyse(experiment: Experiment) -> Analysis:
         spare=spare,
         modes=loop,
         prediction=prediction,
-        error=np.nan_to_num(errors(assignment.law, pattern, prediction.time, prediction.position)),
+        error=link_errors(assignment.law, pattern, prediction),
         scene=assign.scene(experiment),
     )
+
+
+def link_errors(law: Law, pattern: Pattern, prediction: Prediction) -> Array:
+    """Error of each link (T, E) along the motion [m]; 0 while it is not there."""
+    return np.nan_to_num(errors(law, pattern, prediction.time, prediction.position))
 
 
 def _best(shapes: Sequence[Shape]) -> Shape:

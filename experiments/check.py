@@ -19,13 +19,13 @@ import numpy as np
 
 from agents.wire import MAX_PAYLOAD
 from experiments import architecture, assign, document, motion, reserves, safety_checks, surroundings, theory
-from experiments.analysis import Analysis, analyse
+from experiments.analysis import Analysis, analyse, link_errors
 from experiments.claim import FORGIVEN, Claim, Severity, few, listed
 from experiments.document import Document
 from experiments.experiment import Channel, Experiment, Network
 from experiments.locate import Path, line_column, nearest, places
 from experiments.overrides import parse
-from experiments.prediction import message_rate
+from experiments.prediction import Prediction, message_rate, predict, undisturbed
 from experiments.problem import DocumentError, Problem
 from experiments.syntax import parsed
 
@@ -88,7 +88,8 @@ def telemetry(analysis: Analysis) -> Iterator[Claim]:
 SUBJECTS: Final = (
     *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
-    *(motion.starts, motion.formation, motion.walls, motion.encounters, motion.speeds, motion.rates, motion.ends),
+    *(motion.flight, motion.starts, motion.formation, motion.walls, motion.encounters),
+    *(motion.speeds, motion.rates, motion.ends),
     architecture.architecture,
     safety_checks.safety,
     chance,
@@ -120,7 +121,8 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
         vital_robots: The other robots.
         residual_mm: Worst link of the best shape.
         loop_gain: h·μ·λ_max; 2 is where the formation hunts.
-        slowest_mode_s: Time constant of the slowest mode that moves.
+        slowest_mode_s: Time constant of the slowest mode that the run is long enough for.
+        free_modes: Those that are slower: they move by themselves, or not at all.
         speed_needed: Of the fastest plan [m/s].
         speed_available: Of the slowest follower [m/s].
         acquired_s: When the formation keeps within the tolerance, before any plan begins.
@@ -152,6 +154,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     residual_mm: float | None
     loop_gain: float | None
     slowest_mode_s: float | None
+    free_modes: int
     speed_needed: float | None
     speed_available: float | None
     acquired_s: float | None
@@ -213,11 +216,16 @@ def _unreadable(problem: Problem) -> Finding:
 
 @QUIET
 def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
-    """Of each case; what differs only in trigger, channel and noise moves alike and is computed once."""
+    """Of each case; the geometry of those that differ only in trigger, channel and noise is computed once."""
+    flights: dict[bytes, Prediction] = {}
     known: dict[bytes, Analysis] = {}
     found = {}
     for name, case in cases.items():
         case = reserves.taking_part(case)  # noqa: PLW2901
+        quiet = undisturbed(case)
+        flight = msgspec.json.encode(quiet)
+        if flight not in flights:
+            flights[flight] = predict(quiet)
         bare = msgspec.structs.replace(
             case,
             trigger="periodic",
@@ -228,13 +236,21 @@ def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
             disturbance={},
             cases={},
         )
-        key = msgspec.json.encode(bare)
+        key, prediction = msgspec.json.encode(bare), flights[flight]
         if key not in known:
-            known[key] = analyse(bare)
-        told = assign.assign(case, tuple(case.robots))
-        assignment = replace(known[key].assignment, trigger=told.trigger, predictor=told.predictor)
-        found[name] = replace(known[key], experiment=case, assignment=assignment)
+            known[key] = analyse(bare, prediction)
+        found[name] = _of_case(known[key], case, prediction)
     return found
+
+
+def _of_case(known: Analysis, case: Experiment, prediction: Prediction) -> Analysis:
+    """The analysis of a case whose links, shape and plans are those of `known`."""
+    told = assign.assign(case, tuple(case.robots))
+    assignment = replace(known.assignment, trigger=told.trigger, predictor=told.predictor)
+    error = link_errors(assignment.law, known.pattern, prediction)
+    if error[-1].max(initial=0.0) > case.tolerance >= known.error[-1].max(initial=0.0):
+        known = analyse(known.experiment, prediction)  # it ends elsewhere: another shape may be near
+    return replace(known, experiment=case, assignment=assignment, prediction=prediction, error=error)
 
 
 @QUIET
@@ -353,7 +369,8 @@ def _worded(of: Figures) -> dict[str, str]:
         "single robots it can lose": _spared(of.spare_robots, len(of.vital_robots)),
         "distances met to": number(of.residual_mm, ".1f", " mm"),
         "loop gain h·μ·λ, hunts at 2": number(of.loop_gain, ".3g"),
-        "slowest mode": number(of.slowest_mode_s, ".1f", " s"),
+        "slowest mode": number(of.slowest_mode_s, ".1f", " s")
+        + (f", {of.free_modes} slower than the run: free" if of.free_modes else ""),
         "speed of the fastest plan": number(of.speed_needed, ".3f", " m/s"),
         "speed of the slowest follower": number(of.speed_available, ".3f", " m/s"),
         "formation acquired after": number(of.acquired_s, ".1f", " s"),
@@ -380,6 +397,7 @@ def _figures(analysis: Analysis) -> Figures:
         assignment.links,
         prediction,
         [assign.disturbance(experiment, name) for name in analysis.names],
+        kinds=assignment.kinds,
         predictor=assignment.predictor,
         hz=experiment.rates.pose_hz,
         rng=np.random.default_rng(experiment.seed),
@@ -407,6 +425,7 @@ def _figures(analysis: Analysis) -> Figures:
         residual_mm=_finite(1e3 * shape.worst) if shape else None,
         loop_gain=_finite(loop.gain) if loop else None,
         slowest_mode_s=_finite(loop.slowest_s) if loop else None,
+        free_modes=loop.free if loop else 0,
         speed_needed=_finite(fastest[2].speed()) if fastest else None,
         speed_available=None if follower is None else float(analysis.pull[follower]),
         acquired_s=analysis.acquired(min(analysis.departure, last)) if shape else None,

@@ -14,8 +14,7 @@ from agents.graph import Links
 from agents.rows import Array, Index, norm
 
 STEP: Final = 1e-4  # [m] of the differences that stand for the law's derivative
-STANDING: Final = 1e-6  # modes slower than the fastest by this factor do not move at all
-UNMOVED: Final = 1e-4  # of the fastest: a motion of the whole that the law answers by less is none of its business
+UNMOVED: Final = 1e-6  # of the fastest: a motion of the whole that the law answers by less is none of its business
 EVEN: Final = 1e-9  # of the fastest: a loop that is symmetric but for this has real modes, which are quicker to find
 
 
@@ -26,21 +25,31 @@ class Modes:
     Attributes:
         gain: Largest real part of the eigenvalues of H M, what a decision takes from a mode; 2 is where it hunts.
         radius: Largest |1 − λ|: above 1 something grows.
-        slowest_s: Time constant of the slowest mode that moves [s]; infinity where none does.
+        slowest_s: Time constant of the slowest mode that is not free [s]; infinity where there is none.
+        free: Modes that decay more slowly than was asked for: in that time they do not move.
     """
 
     gain: float
     radius: float
     slowest_s: float
+    free: int = 0
 
 
 def modes(
-    law: Law, links: Links, position: Array, closed: Array, hz: float, *, anchors: Anchors | None = None
+    law: Law,
+    links: Links,
+    position: Array,
+    closed: Array,
+    hz: float,
+    *,
+    anchors: Anchors | None = None,
+    within_s: float = math.inf,
 ) -> Modes:
     """Eigenvalues of p⁺ = p + H u(p) at `position`, over x and y of the robots that listen.
 
-    Translations and rotations that the law leaves alone are taken out before: left in, their rounded zeros would pass
-    for modes of hours.
+    Translations and rotations of which the law knows nothing are taken out before: left in, their rounded zeros would
+    pass for modes of hours. A law that knows no heading turns its answer with the whole, u(R p) = R u(p); where
+    distances were rounded, u is not 0 at the best shape, and a rotation is not left alone but answered by just that.
 
     Args:
         law: Its offset is differentiated numerically.
@@ -49,6 +58,7 @@ def modes(
         closed: (N,) h_i, the share of a position error that robot i closes until its next decision.
         hz: Decisions per second.
         anchors: Distances to what stands still.
+        within_s: Modes with a longer time constant than this are free [s].
     """
     anchored = np.zeros(0, dtype=np.intp) if anchors is None else anchors.row
     listeners = np.unique(np.concatenate([links.listener, anchored]))
@@ -59,18 +69,22 @@ def modes(
     # H M and H^½ M H^½ have the same eigenvalues, and the second is symmetric where M is
     root = np.sqrt(share)
     taken = root[:, None] * slope * root[None, :]
-    taken = _without(taken, _whole(position, listeners, len(position)) / root[:, None])
+    offset = law.offset(position, position[links.speaker], links)
+    offset = offset if anchors is None else offset + anchors.offset(position)
+    turned = np.stack([-offset[listeners, 1], offset[listeners, 0]], axis=1).ravel()
+    expected = np.stack([0.0 * turned, 0.0 * turned, -root * turned], axis=1)
+    taken = _without(taken, _whole(position, listeners, len(position)) / root[:, None], expected)
     scale = float(np.abs(taken).max(initial=0.0))
     if np.abs(taken - taken.T).max(initial=0.0) <= EVEN * scale:
         values = np.linalg.eigvalsh(0.5 * (taken + taken.T)).astype(complex)
     else:
         values = np.linalg.eigvals(taken).astype(complex)
-    moving = values[np.abs(values) > STANDING * np.abs(values).max(initial=0.0)]
-    left = np.abs(1.0 - moving)
-    decaying = left[left < 1.0]
+    left = np.abs(1.0 - values)
     with np.errstate(divide="ignore"):
-        slowest = -1.0 / (hz * np.log(decaying.max())) if len(decaying) else math.inf
-    return Modes(float(values.real.max(initial=0.0)), float(left.max(initial=0.0)), float(slowest))
+        lasts = -1.0 / (hz * np.log(left[left < 1.0]))
+    free = lasts > within_s
+    slowest = lasts[~free].max(initial=0.0) or math.inf
+    return Modes(float(values.real.max(initial=0.0)), float(left.max(initial=0.0)), float(slowest), int(free.sum()))
 
 
 def _derivative(law: Law, links: Links, position: Array, anchors: Anchors | None, listeners: Index) -> Array:
@@ -114,13 +128,14 @@ def _whole(position: Array, listeners: Index, rows: int) -> Array:
     return np.stack([np.stack(each, axis=1).ravel() for each in motions], axis=1)
 
 
-def _without(taken: Array, whole: Array) -> Array:
-    """The loop on what is left when the motions of the whole (2 L, 3) that it does not answer are taken out."""
-    basis, size, _ = np.linalg.svd(whole, full_matrices=False)
-    basis = basis[:, size > 1e-9 * max(1e-300, float(size.max(initial=0.0)))]
+def _without(taken: Array, whole: Array, expected: Array) -> Array:
+    """The loop on what is left when the motions of the whole (2 L, 3) are taken out that it answers as `expected`."""
+    basis, size, mixed = np.linalg.svd(whole, full_matrices=False)
+    kept = size > 1e-9 * max(1e-300, float(size.max(initial=0.0)))
+    basis = basis[:, kept]
     if not basis.size:
         return taken
-    answered = taken @ basis
+    answered = taken @ basis - expected @ (mixed[kept].T / size[kept])
     _, strength, turned = np.linalg.svd(answered, full_matrices=False)
     fastest = float(norm(taken).max(initial=0.0))
     still = basis @ turned[strength <= UNMOVED * fastest].T

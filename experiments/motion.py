@@ -8,6 +8,8 @@ from typing import Final
 
 import numpy as np
 
+from agents.graph import BY_DISTANCE
+from agents.individual import REACHED
 from agents.planning import Planner
 from agents.rows import Array, Mask, norm
 from experiments.analysis import Analysis
@@ -17,7 +19,7 @@ from experiments.theory import FAR_OFF, OFF
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
 NEARLY: Final = 0.9  # of its speed: what is left is needed to catch up
-SETTLED: Final = 1e-4  # [m] slower than this per decision, robots have come to rest
+SETTLED: Final = 1e-3  # [m] slower than this per decision, robots have come to rest
 
 
 def starts(analysis: Analysis) -> Iterator[Claim]:
@@ -44,18 +46,41 @@ def starts(analysis: Analysis) -> Iterator[Claim]:
         yield Claim("note", "starts", "every robot starts inside the arena, clear of the others")
 
 
+def flight(analysis: Analysis) -> Iterator[Claim]:
+    """Does the undisturbed flight go through: does it begin, how much of it was flown, what was wrong on the way."""
+    experiment, prediction = analysis.experiment, analysis.prediction
+    if prediction.stuck:
+        message = f"the run does not begin, even undisturbed: {prediction.stuck}"
+        yield Claim("error", "not-begun", message, "see what its robots wait for", ("robots",))
+        return
+    end = float(prediction.time[-1])
+    if _cut(analysis):
+        message = f"flown for the first {end:g} s of {experiment.duration_s:g} s only"
+        yield Claim("note", "predicted-in-part", message, "", ("duration_s",))
+    for each in prediction.incidents:
+        name = analysis.names[each.row]
+        message = f"{name} at {each.time:.1f} s, though nothing disturbs it: {each.text}"
+        yield Claim("warning", "hazard", message, "see docs/safety.md for what this means", ("robots", name))
+
+
+def _cut(analysis: Analysis) -> bool:
+    """Whether only the beginning of the run was flown."""
+    experiment = analysis.experiment
+    return bool(analysis.prediction.time[-1] < experiment.duration_s - 1.0 / experiment.rates.coordination_hz)
+
+
 def formation(analysis: Analysis) -> Iterator[Claim]:
     """Does the formation come together, and is it there at the end."""
     experiment, prediction, shape = analysis.experiment, analysis.prediction, analysis.shape
-    end = float(prediction.time[-1])
-    cut = end < experiment.duration_s - 1.0 / experiment.rates.coordination_hz
-    if cut:
-        message = f"the motion is predicted for the first {end:g} s of {experiment.duration_s:g} s only"
-        yield Claim("note", "predicted-in-part", message, "", ("duration_s",))
     last = analysis.error[-1]
-    if shape is None or shape.worst > FAR_OFF or (cut and last.max() > experiment.tolerance):
+    if (
+        shape is None
+        or shape.worst > FAR_OFF
+        or prediction.stuck
+        or (_cut(analysis) and last.max() > experiment.tolerance)
+    ):
         return
-    worst = int(last.argmax())
+    end, worst = float(prediction.time[-1]), int(last.argmax())
     left = f"{analysis.link(worst)} is {1e3 * last[worst]:.0f} mm off after {end:g} s"
     allowed = f"(tolerance {1e3 * experiment.tolerance:g} mm)"
     if last[worst] <= experiment.tolerance:
@@ -64,24 +89,52 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
         if formed is not None:
             yield Claim("note", "acquired", f"the formation is acquired after {formed:.1f} s; at the end {left}")
             return
-        then = analysis.error[prediction.time <= departure + 1e-9][-1]
+        at = int(np.searchsorted(prediction.time, departure + 1e-9)) - 1
+        then = analysis.error[at]
         early = f"{analysis.link(int(then.argmax()))} is still {1e3 * then.max():.0f} mm off {allowed}"
+        if (stopped := _stopped(analysis, at, early)) is not None:
+            yield stopped
+            return
         changes = any(each.at == departure for each in analysis.pattern.changes)
         what, path = ("shape changes", ("formation", "changes")) if changes else ("plans begin", ("timeline",))
         message = f"the formation is not acquired when the {what} at {departure:g} s: {early}"
         remedy = "begin later, start nearer to the shape, or raise the gain"
         yield Claim("warning", "acquired-late", message, remedy, path)
+    elif (stopped := _stopped(analysis, -1, f"{left} {allowed}")) is not None:
+        yield stopped
     elif analysis.shapes[0].worst > OFF:
         message = f"from these starts the robots end in another shape, a local minimum: {left} {allowed}"
         remedy = "start them nearer to the shape, in the order in which they stand in it"
         yield Claim("warning", "local-minimum", message, remedy, ("formation", "links"))
-    elif len(prediction.time) > 1 and np.ptp(prediction.position[-2:, analysis.silent], axis=0).any():
+    elif (
+        len(prediction.time) > 1
+        and np.ptp(prediction.position[-2:, analysis.silent], axis=0).max(initial=0.0) > SETTLED
+    ):
         message = f"the formation lags behind its leader: {left} {allowed}"
         yield Claim("warning", "lags", message, "lead more slowly, or raise the gain or the clamp", ("timeline",))
     else:
         message = f"the formation is not acquired in time: {left} {allowed}"
         remedy = "give a longer duration_s, start nearer to the shape, or raise the gain"
         yield Claim("warning", "not-acquired", message, remedy, ("duration_s",))
+
+
+def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:
+    """That robots on wheels which stand at sample `at` keep the formation from being acquired."""
+    experiment, links = analysis.experiment, analysis.pattern.links
+    off = np.flatnonzero(analysis.error[at] > experiment.tolerance)
+    ends = np.union1d(links.listener[off], links.speaker[off])
+    stopped = np.intersect1d(analysis.stopped(at), ends)
+    if not len(stopped) or np.setdiff1d(ends, np.union1d(stopped, analysis.silent)).size:
+        return None
+    near = f"{1e3 * REACHED:g} mm"
+    message = (
+        f"the formation is not acquired, because robots on wheels stop {near} before their goals: links may stay "
+        f"e = {near}/(μ d²) off; {left}"
+    )
+    name = "gain" if links.wants is None or (links.wants[off] == BY_DISTANCE).any() else "stiffness"
+    enough = 1.1 * getattr(experiment.formation, name) * float(analysis.error[at].max()) / experiment.tolerance
+    remedy = f"raise {name} to {enough:.2g} or more, or allow a larger tolerance"
+    return Claim("warning", "wheels-stop", message, remedy, ("formation", name))
 
 
 def walls(analysis: Analysis) -> Iterator[Claim]:
@@ -124,7 +177,7 @@ def encounters(analysis: Analysis) -> Iterator[Claim]:
             yield Claim("warning", "too-close", message, "move the start of one of them", path)
         else:
             yield Claim("note", "avoidance-acts", f"{message}: avoidance will have to act", "", path)
-    if analysis.prediction.time[-1] < analysis.experiment.duration_s - 1.0 / analysis.experiment.rates.coordination_hz:
+    if _cut(analysis) or analysis.prediction.stuck:
         return
     final, links = analysis.prediction.position[-1], analysis.assignment.links
     for row in np.flatnonzero([kind.flies for kind in kinds]):

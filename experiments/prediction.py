@@ -1,40 +1,55 @@
-"""How an experiment would go if nothing disturbed it: perfect communication, robots without inertia, an empty room.
+"""How an experiment goes undisturbed: one flight on the virtual clock, without noise, in an empty, endless room.
 
-The laws and plans are those of `agents.Agent`; this file only closes the loop, in a tenth of the time that a run in
-virtual time takes.
+Everything else is that of a run: bodies with their limits and their inertia, triggers, updates, the modelled network,
+the plans, and the 5 mm at which robots on wheels stop. Walls, obstacles and avoidance are left out, because what is
+looked for is who would meet them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Final
 
+import msgspec
 import numpy as np
 
-from agents.agent import Agent
-from agents.assignment import Assignment
-from agents.body import BodyState, Disturbance
+from agents.body import Disturbance
 from agents.coordination import Law
 from agents.graph import Links
+from agents.hazards import Incident, Outcome
 from agents.kinds import Kind
-from agents.prediction import HOLD, Predictor
-from agents.rows import Array, Index, clamp, norm
+from agents.positioning import velocity_after
+from agents.prediction import Predictor
+from agents.rows import Array, norm
 from agents.speaking import Voice
-from agents.triggers import Periodic, Trigger
+from agents.triggers import Trigger
+from experiments import assign, virtual
+from experiments.experiment import Experiment, World
 
-FAR = 1e6  # [m] walls that nobody meets
-DECISIONS = 6000  # as many are predicted: ten minutes at the usual rate
-QUESTIONS = 6000  # as often the trigger is asked
-PAIRS = 1_000_000  # distances that are held in memory at once
+FAR: Final = 1e6  # [m] walls that nobody meets
+TICK_COST: Final = 200.0  # robots whose arithmetic takes as long as what a tick costs in any case
+WORK: Final = 12e6  # robot ticks, with that added, that are flown: ten minutes of seven robots, 100 s of a thousand
+QUESTIONS: Final = 6000  # as often the trigger is asked
+PAIRS: Final = 1_000_000  # distances that are held in memory at once
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Where the robots are at each decision (T): `time` (T,) [s] after the common start, `position` (T, N, 3) [m]."""
+    """Where the robots are at each decision.
+
+    Attributes:
+        time: (T,) [s] after the common start.
+        position: (T, N, 3) [m].
+        incidents: What is wrong with robots on the way.
+        stuck: Why they do not get under way at all; empty if they do. They stay at their starts then.
+    """
 
     time: Array
     position: Array
+    incidents: tuple[Incident, ...] = ()
+    stuck: str = ""
 
 
 def closed(kinds: Sequence[Kind], hz: float) -> Array:
@@ -42,70 +57,45 @@ def closed(kinds: Sequence[Kind], hz: float) -> Array:
     return 1.0 - np.exp(-np.array([kind.response for kind in kinds]) / hz)
 
 
-def predict(assignment: Assignment, start: Array, yaw: Array, leads: Index, hz: float) -> Prediction:
-    """Positions from the common start to the end, or to the last decision that is predicted.
-
-    Args:
-        assignment: Of all robots.
-        start: (N, 3) on the floor, or wherever they are at the common start [m].
-        yaw: (N,) then [rad].
-        leads: Rows that follow their plans exactly.
-        hz: Decisions per second.
-    """
-    count = min(DECISIONS, max(1, round(assignment.duration * hz)))
-    limits = replace(assignment.limits, low=np.full(3, -FAR), high=np.full(3, FAR), separation=None)
-    agent = Agent(
-        replace(
-            assignment,
-            body_hz=hz,
-            decide_every=1,
-            pose_every=4 * DECISIONS,
-            trigger=Periodic(),
-            predictor=HOLD,
-            update=None,
-            limits=limits,
-            avoidance=None,  # it acts on what range sensors see, and here they see nothing
-            duration=2.0 * assignment.duration + 1.0,  # it must not end before the last decision
-        )
+def undisturbed(experiment: Experiment) -> Experiment:
+    """The same without noise, scatter, walls, obstacles, avoidance and shadows, as far as it is flown for `check`."""
+    quiet = {
+        name: msgspec.structs.replace(each, hover_jitter=None, position_sigma=None, yaw_sigma=None, odometry_drift=None)
+        for name, each in experiment.disturbance.items()
+    }
+    robots = {
+        name: msgspec.structs.replace(robot, shadow=None, sensors=None) for name, robot in experiment.robots.items()
+    }
+    ticks = WORK / (len(robots) + TICK_COST)
+    return msgspec.structs.replace(
+        experiment,
+        title="",
+        source="",
+        cases={},
+        duration_s=min(experiment.duration_s, max(1.0, math.floor(ticks / experiment.rates.body_hz))),
+        robots=robots,
+        disturbance=quiet,
+        arena=msgspec.structs.replace(experiment.arena, size=(FAR, FAR, FAR), walls=False, obstacles={}, starts={}),
+        world=World(),
+        avoidance=None,
+        start=msgspec.structs.replace(experiment.start, scatter=0.0, scatter_yaw=0.0),
+        safety=msgspec.structs.replace(experiment.safety, separation=None),
+        rates=msgspec.structs.replace(experiment.rates, state_hz=experiment.rates.coordination_hz),
     )
-    agent.find(np.arange(len(assignment.links)))
-    share = closed(assignment.kinds, hz)[:, None]
-    speed = np.minimum([kind.speed for kind in assignment.kinds], assignment.limits.speed)[:, None] / hz
-    flies = np.array([kind.flies for kind in assignment.kinds])[:, None]
-    position = start.copy()
-    _made_ready(agent, position, yaw, hz)
-    track = np.empty((count + 1, *start.shape))
-    for tick in range(count):
-        track[tick] = position
-        _step(agent, tick / hz, position, yaw)
-        step = share * (agent.goal - position)
-        length = np.where(flies, np.abs(step), norm(step)[:, None])  # the limit of a flying robot holds for each axis
-        position = position + step * np.minimum(1.0, speed / np.maximum(length, 1e-300))
-        position[leads] = agent.goal[leads]
-        position = np.nan_to_num(clamp(position, -FAR, FAR), nan=FAR)  # what overflowed is out of sight as well
-    track[count] = position
-    return Prediction(np.arange(count + 1) / hz, track)
 
 
-def _made_ready(agent: Agent, position: Array, yaw: Array, hz: float) -> None:
-    """Through the life of a robot to the common start at time 0."""
-    rows = range(len(position))
-    _step(agent, -4.0 / hz, position * [1.0, 1.0, 0.0], yaw)  # nobody takes off who does not stand on the floor
-    for row in rows:
-        agent.life.takeoff(row)
-    _step(agent, -3.0 / hz, position, yaw)
-    _step(agent, -2.0 / hz, position, yaw)
-    for row in rows:
-        agent.life.start(row, 0.0)
-
-
-def _step(agent: Agent, t: float, position: Array, yaw: Array) -> None:
-    """One decision of robots that stand in the air, or on the floor, and hear one another at once."""
-    links, rows = agent.assignment.links, len(position)
-    now, none = np.full(len(links), t), np.zeros((rows, 3))
-    agent.hear(np.arange(len(links)), position[links.speaker], np.zeros((len(links), 3)), now, now)
-    flying = np.array([kind.flies for kind in agent.assignment.kinds])
-    agent.step(t, BodyState(np.full(rows, t), position, none, yaw, position, yaw, np.ones(rows), flying))
+def predict(quiet: Experiment) -> Prediction:
+    """Flies what `undisturbed` made of an experiment, from the common start to the end."""
+    names = tuple(quiet.robots)
+    try:
+        log = virtual.simulate(quiet, [quiet.seed], lean=True, landing=False)
+    except virtual.Stuck as stuck:
+        position, _ = assign.start(quiet, names)
+        position[:, 2] = np.nan_to_num(assign.hover(quiet, names))
+        return Prediction(np.zeros(1), position[None], stuck=str(stuck))
+    run = log.time >= -virtual.ROUNDING_S
+    begun = [each for each in log.incidents if each.outcome > Outcome.NONE and 0.0 <= each.time < quiet.duration_s]
+    return Prediction(log.time[run], log.true_position[run], tuple(begun))
 
 
 @dataclass(frozen=True)
@@ -153,6 +143,7 @@ def message_rate(
     prediction: Prediction,
     nature: Sequence[Disturbance],
     *,
+    kinds: Sequence[Kind],
     predictor: Predictor,
     hz: float,
     rng: np.random.Generator,
@@ -165,6 +156,7 @@ def message_rate(
         links: Of the whole experiment.
         prediction: The motion.
         nature: Of each row; its hover jitter and its position noise count, because they make robots speak.
+        kinds: Of each row.
         predictor: Where neighbours believe each other to be.
         hz: How often the trigger is asked.
         rng: Of the jitter and the noise.
@@ -174,20 +166,33 @@ def message_rate(
     time = np.arange(count) / hz
     position = _between(prediction, time)
     rows = position.shape[1]
-    velocity = np.gradient(position, time, axis=0) if count > 1 else np.zeros_like(position)  # as robots know theirs
+    setpoint = np.zeros((count, rows, 4))
+    setpoint[..., :3] = _asked(position, time, kinds)
     position[..., :2] += _wobble(nature, (count, rows, 2), 1.0 / hz, rng)
-    voice, still = Voice(trigger, rows, predictor), np.zeros((rows, 3))
+    velocity, still = np.zeros((rows, 3)), np.zeros((rows, 3))
+    voice = Voice(trigger, rows, predictor, kinds=kinds)
     heard = position[:, links.speaker]
     spoken = 0
     for tick in range(count):
         link_error = law.error(position[tick], heard[tick], links)
         error, energy = links.onto_listeners(np.stack([link_error, 0.5 * link_error**2], axis=1), rows).T
         t = float(time[tick])
+        if tick:
+            velocity = velocity_after(velocity, position[tick] - position[tick - 1], 1.0 / hz)
         said = voice.speak(
-            t, position[tick], velocity[tick], error=error, energy=energy, start=np.zeros(rows), offset=still
-        )
+            t, position[tick], velocity,
+            error=error, energy=energy, start=np.zeros(rows), offset=still, setpoint=setpoint[tick],
+        )  # fmt: skip
         spoken += len(said.rows)
     return spoken * hz / count
+
+
+def _asked(position: Array, time: Array, kinds: Sequence[Kind]) -> Array:
+    """Setpoints (K, N, 3) under which robots would move like this (K, N, 3) [m]: places ahead, or velocities."""
+    velocity = np.gradient(position, time, axis=0) if len(time) > 1 else np.zeros_like(position)
+    response = np.array([kind.response for kind in kinds])[:, None]
+    by_place = np.array([kind.takes == "position" for kind in kinds])[:, None]
+    return np.where(by_place, position + velocity / response, velocity)
 
 
 def _between(prediction: Prediction, time: Array) -> Array:

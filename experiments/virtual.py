@@ -29,6 +29,7 @@ from twins.engine import Touch
 
 LEAD_S = 0.5  # from the order to the common start
 ORDERS_S = 0.5  # orders before the start fall on multiples of this, so that repetitions a few ticks apart get the same
+ROUNDING_S = 1e-9  # ticks are multiples of a period that binary fractions miss by less than this
 PATIENCE_S = 60.0  # an experiment whose robots are not ready, up or down after this long never will be
 
 
@@ -119,6 +120,7 @@ def simulate(
     seeds: Sequence[int],
     *,
     lean: bool = False,
+    landing: bool = True,
     tell: Callable[[float], object] = lambda _: None,
 ) -> Log:
     """Flies one case of an experiment once for each seed.
@@ -128,6 +130,7 @@ def simulate(
         seeds: One for each repetition.
         lean: Keep `true_position` and who sent when, and nothing of the other columns: a seventh of the memory, for
             sweeps. They are empty, and so is everything that was heard.
+        landing: Let the robots land; else the log ends with the run.
         tell: Called at state_hz with how far it is, in the time of the experiment [s]; NaN before its start is known.
 
     Raises:
@@ -173,6 +176,8 @@ def simulate(
             states.add(t, *((*blank, state.true_position, *blank) if lean else whole))
             more = () if lean else tuple(value for value in _extra(state) if value is not None)
             seen.add(nothing if lean else np.array(twin.engine.obstacles), *more)
+        if not landing and t - conductor.start_at >= experiment.duration_s - 0.5 * dt:
+            break
         conductor.look(t, dt)
         twin.begun_at = conductor.start_at
         tick += 1

@@ -71,6 +71,40 @@ def test_a_rounded_shape_without_a_leader_has_no_modes_of_hours():
     assert found.radius < 1.0
 
 
+MIXED = np.array([(0, 0, 0), (0.9, 0.1, 0), (0.4, 0.8, 0), (0.3, 0.2, 0.7), (0.6, 0.5, 0.9)])  # two above three
+LINKED = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3), (0, 4), (3, 4))  # one more than it needs
+
+
+@pytest.mark.parametrize("digits", [4, 3])
+@pytest.mark.parametrize("led", [False, True])
+def test_rounded_lengths_make_no_slow_mode_of_a_turn(digits, led):
+    shapes = [(layouts.hemisphere(n, 0.6, 0.25).position, layouts.hemisphere(n, 0.6, 0.25).pairs) for n in (5, 8, 12)]
+    shapes += [(layouts.grid(3, 3, 0.5).position, layouts.grid(3, 3, 0.5).pairs), (MIXED, LINKED)]
+    for position, linked in shapes:
+        rows = len(position)
+        pairs = [(int(i), int(j)) for i, j in linked for i, j in ((i, j), (j, i)) if not (led and i == 0)]
+        far = [float(np.linalg.norm(position[i] - position[j])) for i, j in pairs]
+        net = links(pairs, far, [1.0] * len(pairs))
+        share, moves = np.full(rows, 0.18), np.arange(rows) >= led
+        exact = modes(Distance(), net, position, share, 10.0, within_s=100.0)
+        rounded = Links(net.listener, net.speaker, np.round(net.distance, digits), net.gain)
+        shape = realise(rounded, [position], moves)[0]
+        found = modes(Distance(), rounded, shape.position, share, 10.0, within_s=100.0)
+        assert found.slowest_s == pytest.approx(exact.slowest_s, rel=10.0**-digits * 100.0)
+        assert found.free == exact.free
+
+
+def test_modes_that_are_slower_than_the_run_are_free():
+    made = layouts.hemisphere(8, 0.6, 0.25)
+    net, share = both_ways(made, 1.5), np.full(8, 0.18)
+    every = modes(Distance(), net, made.position, share, 10.0)
+    assert every.free == 0
+    few = modes(Distance(), net, made.position, share, 10.0, within_s=0.9 * every.slowest_s)
+    assert few.free >= 1
+    assert few.slowest_s < 0.9 * every.slowest_s
+    assert (few.gain, few.radius) == (every.gain, every.radius)
+
+
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 8), st.booleans())
 def test_one_link_of_every_robot_at_once_tells_as_much_as_one_robot_at_a_time(seed, rows, anchored):
