@@ -154,6 +154,7 @@ class Analysis:
 
     def stopped(self, at: int) -> Index:
         """Robots on wheels that stand at sample `at`, because their goals are too near to drive to."""
+        at %= len(self.prediction.time)
         time, position, pattern = self.prediction.time, self.prediction.position, self.pattern
         links, anchors, hz = pattern.links, self.assignment.anchors, self.experiment.rates.coordination_hz
         if pattern.changes:
