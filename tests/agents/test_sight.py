@@ -29,6 +29,7 @@ def heard(position, velocity=0.0, stamp=0.0):
     told = Heard.nothing(len(place))
     told.position[:], told.velocity[:] = place, velocity
     told.stamp[:] = told.arrived[:] = stamp
+    told.gone[:] = np.inf  # they live
     return told
 
 
