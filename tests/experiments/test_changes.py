@@ -30,7 +30,7 @@ class Clock:
     def monotonic(self) -> float:
         return self.now
 
-    def time(self) -> float:
+    def utc(self) -> float:
         return START + self.now
 
 
@@ -70,7 +70,7 @@ class View:
     """Robots that do at once what they are told, unless they hang."""
 
     def __init__(self, stage: Stage) -> None:
-        self._stage, self.robots = stage, stage.robots
+        self._stage, self.robots, self.clock = stage, stage.robots, stage.clock
         self.waiting: deque[Query] = deque()
         self.orders = self
         self.handler = self
@@ -162,7 +162,7 @@ class Stage:
     def phase(self, name: str, phase: str) -> None:
         assert phase in [each.word for each in Phase]
         self.robots[name].status = wire.Status(
-            robot=name, stamp=self.clock.time(), phase=phase, reason="", body="", battery=None, sent=0, heard=0,
+            robot=name, stamp=self.clock.utc(), phase=phase, reason="", body="", battery=None, sent=0, heard=0,
             lost={}, dropped={}, malformed=0, refused=0, ticks=0, missed=0, decisions=0, interventions=0, avoided=0,
             late_s=0.0, started=0.0, missing=[], pid=self._pid, cpu_s=0.0, rss_mb=0.0,
         )  # fmt: skip
