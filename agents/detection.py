@@ -253,16 +253,16 @@ class Detector:
         if rows.alone is not None and some(rows.alone):
             seen.append(Sighting(Cause.ALONE, rows.alone & rows.cruising, lambda row: names(row) or "none was heard"))
 
-    def _behind(self, hearing: Hearing, behind: Mask, seen: list[Sighting]) -> None:
+    def _behind(self, hearing: Hearing, behind: Array, seen: list[Sighting]) -> None:
         """Neighbours whose clocks are behind."""
-        links, heard = self._assignment.links, hearing.heard
-        late = behind & (heard.gone == np.inf)
+        links = self._assignment.links
+        late = (behind > 0.0) & (hearing.heard.gone == np.inf)
 
         def names(row: int) -> str:
             mine = np.flatnonzero(late & (links.listener == row))
             return ", ".join(
                 f"the poses of {self._assignment.speakers[links.speaker[link]]} are "
-                f"{heard.arrived[link] - heard.stamp[link]:.1f} s old when they arrive"
+                f"{behind[link]:.1f} s old when they arrive"
                 for link in mine.tolist()
             )
 

@@ -15,6 +15,8 @@ from agents.rows import Array, Index, Mask, every, some
 class Heard:
     """What was last heard on each link (E): positions and velocities (E, 3), sample and arrival times (E,) [s].
 
+    A sample time is when the pose was measured as far as its stamp can be true, see `agents.speaker.Said`.
+
     `gone` is the time since which the speaker is known to be dead, infinity while it lives, and minus infinity before
     its liveliness token was seen: a pose alone is no sign of life.
     """
@@ -51,7 +53,7 @@ class Hearing:
         live: Links that take part in the law: heard once, the speaker lives or is not gone for long, not only for
             avoidance, and there at all in a formation whose links come and go.
         links: Those, with what they ask for now.
-        behind: (E,) links whose speakers stamp their poses with a clock that is behind; None: there are none.
+        behind: (E,) age of poses on arrival [s] where clocks of speakers are behind, 0 elsewhere; None: there are none.
         unsettled: Some speaker was never heard or is gone, so that time alone can change what is live.
     """
 
@@ -65,7 +67,7 @@ class Hearing:
         """
         self.heard = Heard.nothing(len(links))
         self.unsettled = True
-        self.behind: Mask | None = None
+        self.behind: Array | None = None
         self._all, self._watched, self._silence_s = links, watched, silence_s
         self._there: Mask = np.ones(len(links), dtype=bool) if watched is None else ~watched
         self._taking_part = self._heard_of = np.zeros(len(links), dtype=bool)
@@ -103,11 +105,11 @@ class Hearing:
         heard.stamp[at] = heard.arrived[at] = -np.inf
         self.unsettled = True
 
-    def distrust(self, at: Index, behind: bool) -> None:
-        """The clocks of the speakers of links `at` are behind, or are so no longer."""
-        mask = np.zeros(len(self._all), dtype=bool) if self.behind is None else self.behind
-        mask[at] = behind
-        self.behind = mask if some(mask) else None
+    def distrust(self, at: Index, behind: float) -> None:
+        """The clocks of the speakers of links `at` are behind, poses `behind` [s] old on arrival; 0: no longer."""
+        age = np.zeros(len(self._all)) if self.behind is None else self.behind
+        age[at] = behind
+        self.behind = age if age.any() else None
 
     @property
     def greeted(self) -> Array:

@@ -106,6 +106,7 @@ class Neighbours:
     def _send(self, arrived: list[tuple[int, Said]], t: float, utc: float) -> None:
         """Gives poses, each with the link on which it arrived, to the modelled network, all of a tick at once."""
         poses = [heard.pose for _, heard in arrived]
+        measured = np.array([[heard.measured - utc] for _, heard in arrived])
         got = Samples(
             np.array([link for link, _ in arrived]),
             np.array([t] * len(arrived)),
@@ -113,6 +114,7 @@ class Neighbours:
             np.array([pose.seq for pose in poses]),
             np.array([pose.position for pose in poses]),
             np.array([pose.velocity or wire.STILL for pose in poses]),
+            measured,
         )
         if self._channel.ideal:
             self._believe(got, utc)
@@ -123,13 +125,13 @@ class Neighbours:
             one = slice(at, at + 1)
             self._channel.send(
                 got.link[one], got.seq[one], got.stamp[one], got.position[one], got.velocity[one],
-                start=start[one], size=sizes[one], now=t,
+                start=start[one], size=sizes[one], now=t, extra=measured[one],
             )  # fmt: skip
 
     def _believe(self, got: Samples, utc: float) -> None:
         """Poses have got through."""
-        # see `plausibility.taken`; what is recorded keeps its own stamp
-        self._agent.hear(got.link, got.position, got.velocity, np.minimum(got.stamp, got.arrival), got.arrival)
+        assert got.extra is not None  # all bring along when they were measured; what is recorded keeps its own stamp
+        self._agent.hear(got.link, got.position, got.velocity, got.extra[:, 0], got.arrival)
         columns = (got.link, got.seq, got.stamp, got.arrival, got.position, got.velocity)
         for link, seq, stamp, arrival, position, velocity in zip(*(c.tolist() for c in columns), strict=True):
             row, who = self._ends[link]

@@ -32,12 +32,15 @@ class Said(NamedTuple):
         pose: Checked.
         size: Of its payload [bytes].
         missed: Poses before it that never came.
+        measured: When the pose was measured (UTC [s]), as far as its stamp can be true: not after its arrival; of a
+            clock that is behind, not earlier before it than a network delays poses.
         anew: Whether it is the first of a new life: what was known of the robot is of the past.
     """
 
     pose: wire.Pose
     size: int
     missed: int
+    measured: float
     anew: bool
 
 
@@ -50,7 +53,8 @@ class Speaker:
         lost: Poses that never came; whoever listens counts them, because it knows since when they matter.
         stale: Poses that were left out because a newer one was known, or because they are of a life that is over.
         malformed: Samples that were refused.
-        behind: Whether the last poses were older on arrival than a network delays them: the robot's clock is behind.
+        behind: Age [s] of the last pose on arrival if the clock of the robot is behind: the last poses were older than
+            a network delays them. 0 if not.
     """
 
     def __init__(
@@ -86,7 +90,7 @@ class Speaker:
         self._gone = False
         self._old, self._old_at = 0, 0.0  # how often in succession poses were old on arrival, and when last
         self.lost = self.stale = self.malformed = 0
-        self.behind = False
+        self.behind = 0.0
 
     def news(self, now: float) -> Iterator[Said]:
         """Poses that have come until `now` (UTC [s]), oldest first: what cannot be true is refused, what is known left
@@ -116,7 +120,9 @@ class Speaker:
             since = pose.stamp - self._stamp
             missed = plausibility.missed(self._seq, pose.seq, since, self._rate) if self._seq else 0
             self._seq, self._stamp = pose.seq, pose.stamp
-            yield Said(pose, len(payload), missed, anew)
+            # a clock that is behind: a predictor must not carry the pose on over that time
+            measured = now - LATE_S if self.behind else plausibility.taken(pose.stamp, now)
+            yield Said(pose, len(payload), missed, measured, anew)
 
     def comings(self) -> Iterator[Coming]:
         """Changes of its liveliness, oldest first."""
@@ -146,10 +152,10 @@ class Speaker:
     def _weigh(self, now: float, age: float) -> None:
         """Counts how often, at different times, a pose was `age` [s] old when it arrived."""
         if age <= LATE_S:
-            self._old, self.behind = 0, False
+            self._old, self.behind = 0, 0.0
         elif now > self._old_at:  # what waited while this process stood still came at once, and counts once
             self._old, self._old_at = self._old + 1, now
-            self.behind = self._old >= PROOFS
+            self.behind = age if self._old >= PROOFS else 0.0
 
 
 def _session_of(sample: zenoh.Sample) -> str | None:

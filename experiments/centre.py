@@ -155,15 +155,15 @@ class CentreProcess:
             start=np.array([start]),
             size=np.array([said.size]),
             now=t,
-            extra=np.array([[nan if pose.yaw is None else pose.yaw]]),
+            extra=np.array([[nan if pose.yaw is None else pose.yaw, said.measured - self._utc]]),
         )
 
     def _believe(self, got: Samples) -> None:
         """Poses have got through."""
-        assert got.extra is not None  # all bring their yaw along
+        assert got.extra is not None  # all bring along their yaw, and when they were measured
         rows = self.centre.listens[got.link]
-        taken = np.minimum(got.stamp, got.arrival)  # see `plausibility.taken`
-        self.centre.hear(rows, got.position, got.velocity, got.extra[:, 0], taken, got.arrival)
+        yaw, measured = got.extra.T
+        self.centre.hear(rows, got.position, got.velocity, yaw, measured, got.arrival)
         start = float(self._start[self._guided].min())
         for link, stamp in zip(got.link.tolist(), got.stamp.tolist(), strict=True):
             self._heard[link] += self._within(stamp, start)

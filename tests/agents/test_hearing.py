@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import zenoh
 
 from agents import wire
 from agents.agent import Agent
+from agents.channel import Conditions
 from agents.keys import Keys
 from agents.neighbours import Neighbours
+from agents.prediction import ConstantVelocity
 from agents.speaker import LATE_S
 from experiments import assign
 from tests.agents.few import pair
@@ -37,9 +42,9 @@ class Sample:
 class Robot:
     """A, alone in its process, and B, of which the test says everything."""
 
-    def __init__(self, net: Net) -> None:
+    def __init__(self, net: Net, conditions: Conditions | None = None) -> None:
         self.net, self.agent = net, Agent(assign.assign(pair(), ("A",)))
-        self.neighbours = Neighbours(net.session, KEYS, self.agent, reach=(5.0, 5.0, 5.0))
+        self.neighbours = Neighbours(net.session, KEYS, self.agent, reach=(5.0, 5.0, 5.0), conditions=conditions)
         (self.speaker,) = self.neighbours.speakers
         self.t = 0.0
 
@@ -48,8 +53,8 @@ class Robot:
             if channel.expression.intersects(zenoh.KeyExpr(key)):
                 channel.add(Sample(key, **what))
 
-    def pose(self, seq: int, x: float, *, session: str | None, age: float = 0.0) -> None:
-        said = wire.pose("B", seq, UTC + self.t - age, [x, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0)
+    def pose(self, seq: int, x: float, *, session: str | None, age: float = 0.0, speed: float = 0.0) -> None:
+        said = wire.pose("B", seq, UTC + self.t - age, [x, 0.0, 0.0], [speed, 0.0, 0.0], 0.0)
         self.tell(KEYS.pose("B"), payload=wire.encode(said), session=session)
 
     def token(self, session: str | None, *, gone: bool = False) -> None:
@@ -202,3 +207,59 @@ def test_what_waited_while_the_listener_stood_still_is_no_proof_of_a_slow_clock(
         robot.pose(seq, 0.4, session="one", age=10.0 - seq)
     robot.after()
     assert hazards(robot) == []
+
+
+def believed(robot: Robot) -> float:
+    """Where B is believed to be now by a predictor without a horizon, x [m]."""
+    heard, predictor = robot.agent.heard, ConstantVelocity()
+    place = heard.believed(predictor, robot.t, np.array([0]))
+    np.testing.assert_array_equal(robot.agent.hearing.everywhere(predictor, robot.t), place)
+    return float(place[0, 0])
+
+
+@pytest.fixture(params=[0.0, 5.0])
+def delayed(request):
+    """A robot behind a modelled network, and its delay [s]."""
+    conditions = replace(Conditions.ideal(1), delay=np.array([request.param]))
+    with Net().worn() as net:
+        yield Robot(net, conditions), request.param
+
+
+def test_a_clock_that_is_behind_carries_no_pose_further_than_a_network_can_be_late(delayed):
+    robot, delay = delayed
+    robot.token("one")
+    for seq in range(1, 5):
+        robot.pose(seq, 0.4, session="one", age=60.0, speed=0.1)
+        robot.after(0.1)
+    robot.t += delay
+    robot.after(0.0)
+    # the last pose came 0.1 s and the delay ago: a minute would have put it 6 m away
+    assert believed(robot) == pytest.approx(0.4 + 0.1 * (LATE_S + 0.1 + delay), abs=1e-5)
+    assert hazards(robot) == ["BEHIND: the poses of B are 60.0 s old when they arrive"]
+    robot.t += 1.0
+    assert believed(robot) == pytest.approx(0.4 + 0.1 * (LATE_S + 1.1 + delay), abs=1e-5)
+    robot.pose(5, 0.7, session="one", age=0.5, speed=0.1)  # its clock was set right
+    robot.after(delay)
+    robot.after(0.0)
+    assert believed(robot) == pytest.approx(0.7 + 0.1 * (0.5 + delay), abs=1e-5)
+
+
+def test_the_last_value_of_a_robot_that_is_silent_is_carried_on_to_now(robot):
+    robot.token("one")
+    robot.pose(1, 0.4, session="one", age=20.0, speed=0.1)
+    robot.after(0.0)
+    assert believed(robot) == pytest.approx(2.4, abs=1e-5)
+
+
+@pytest.mark.parametrize("ahead", [0.2, 4.0])
+def test_a_pose_that_is_stamped_ahead_was_measured_when_it_arrived(robot, ahead):
+    robot.token("one")
+    robot.t = 7.0
+    robot.pose(1, 0.4, session="one", age=-ahead, speed=0.1)
+    robot.after(0.0)
+    heard = robot.agent.heard
+    assert (heard.stamp[0], heard.arrived[0]) == pytest.approx((7.0, 7.0), abs=1e-5)
+    robot.t += 2.0
+    assert believed(robot) == pytest.approx(0.6, abs=1e-5), "two seconds old, not younger"
+    (news,) = robot.neighbours.news[0]
+    assert news.stamp == pytest.approx(UTC + 7.0 + ahead), "recorded as it was stamped"
