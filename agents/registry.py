@@ -110,7 +110,7 @@ def registered(run: Run) -> Iterator[str]:
     """Inside, a run is found by others; gives why it is not, empty if it is."""
     file, why = None, ""
     try:
-        file = _folder() / f"{run.pid}-{run.born or 'x'}-{time.monotonic_ns()}.json"
+        file = runtime_folder() / f"{run.pid}-{run.born or 'x'}-{time.monotonic_ns()}.json"
         draft = file.with_suffix(".draft")
         draft.write_bytes(msgspec.json.encode(run))
         draft.replace(file)
@@ -131,7 +131,7 @@ def runs() -> list[Run]:
     """
     found: list[Run] = []
     try:
-        files = sorted(_folder().glob("*.json"))
+        files = sorted(runtime_folder().glob("*.json"))
     except OSError:
         return found
     for file in files:
@@ -146,7 +146,7 @@ def runs() -> list[Run]:
     return sorted(found, key=lambda run: run.since)
 
 
-def _folder() -> Path:
+def runtime_folder() -> Path:
     """The user's folder, made if need be.
 
     Raises:

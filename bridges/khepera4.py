@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from agents.body import UNANSWERED, BodyError, BodyRequest, BodyState, RangeScan, Rays
+from agents.claims import Claims
 from agents.positioning import External
 from agents.protocols import khepera4 as protocol
 from agents.protocols.settings import settings
@@ -26,6 +27,7 @@ class KheperaBody:
         self._names = request.names
         self._addresses = [Address.of(*row) for row in zip(request.names, request.addresses, strict=True)]
         self._settings = [settings(protocol.Settings, *row) for row in zip(request.names, request.device, strict=True)]
+        self._claims = Claims(request.names, [address.device for address in self._addresses])
         self._start = np.column_stack([request.start[:, :2], request.yaw])
         self._outside = np.flatnonzero(request.external)
         self._external = External(len(self._names))
@@ -33,6 +35,7 @@ class KheperaBody:
 
     def open(self) -> None:
         """See `Body.open`. Robots that do not answer are waited for while the others drive."""
+        self._claims.take()
         for name, address, chosen, (x, y, yaw) in zip(
             self._names, self._addresses, self._settings, self._start.tolist(), strict=True
         ):
@@ -108,6 +111,7 @@ class KheperaBody:
         for link in self._links:
             link.join()
         self._links = []
+        self._claims.release()
 
     @staticmethod
     def _note(link: Link, now: float) -> str:

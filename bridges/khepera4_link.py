@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from agents.body import TROUBLE, BodyError
+from agents.claims import numeric
 from agents.protocols import khepera4 as protocol
 from agents.rows import Array
 from bridges.odometry import Odometer
@@ -103,6 +104,11 @@ class Address:
 
     def __str__(self) -> str:
         return self.serial or f"{self.host}:{self.port}"
+
+    @property
+    def device(self) -> str:
+        """One spelling for each robot, whatever its host or line is called."""
+        return os.path.realpath(self.serial) if self.serial else f"{numeric(self.host)}:{self.port}"
 
     def connect(self) -> Wire:
         """Opens the line.

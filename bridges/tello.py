@@ -21,6 +21,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from agents.body import TROUBLE, BodyError, BodyRequest, BodyState, call_all
+from agents.claims import Claims
 from agents.positioning import External
 from agents.protocols import tello as protocol
 from agents.protocols.settings import settings
@@ -42,6 +43,7 @@ class TelloBody:
                 raise BodyError(f'{name}: a Tello does not know where it is: write position = "external"')
             if self._places[row][0] in [host for host, _ in self._places[:row]]:
                 raise BodyError(f"{name}: another Tello of this process has the address {self._places[row][0]}")
+        self._claims = Claims(self._names, [f"tello://{host}" for host, _ in self._places])
         rows = len(self._names)
         self._start_yaw = request.yaw
         self._external = External(rows)
@@ -54,7 +56,12 @@ class TelloBody:
 
     def open(self) -> None:
         """See `Body.open`. Drones that do not answer are waited for in flight of the others."""
-        make = _library()
+        self._claims.take()
+        try:
+            make = _library()
+        except BodyError:
+            self._claims.release()
+            raise
         self._pilots = [
             Pilot(make(*place), kind, chosen)
             for place, kind, chosen in zip(self._places, self._kinds, self._settings, strict=True)
@@ -141,7 +148,10 @@ class TelloBody:
             self._thread.join()
             self._thread = None
         pilots, self._pilots = self._pilots, []
-        call_all(pilot.leave for pilot in pilots)
+        try:
+            call_all(pilot.leave for pilot in pilots)
+        finally:
+            self._claims.release()
 
     def _run(self) -> None:
         period = 1.0 / max(chosen.rc_hz for chosen in self._settings)

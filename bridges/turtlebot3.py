@@ -13,6 +13,7 @@ import zenoh
 
 from agents import session as network
 from agents.body import Body, BodyError, BodyRequest, BodyState, Rays, call_all
+from agents.claims import Claims
 from agents.endpoint import EndpointError
 from agents.leaving import leave
 from agents.positioning import External
@@ -43,12 +44,14 @@ class TurtleBot3:
     def __init__(self, request: BodyRequest, clock: Clock = time.monotonic) -> None:
         self._clock = clock
         self._robots = [Robot(request, row) for row in range(len(request.names))]
+        self._claims = Claims([robot.name for robot in self._robots], [robot.device for robot in self._robots])
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
         self._outside = np.flatnonzero(request.external)
         self._external = External(len(self._robots))
 
     def open(self) -> None:
         """See `Body.open`: returns when every robot's odometry was heard."""
+        self._claims.take()
         deadline = self._clock() + OPEN_S
         try:
             participants: dict[tuple[object, ...], Participant] = {}
@@ -193,6 +196,7 @@ class TurtleBot3:
         for session in self._sessions.values():
             leave(session, self)
         self._sessions.clear()
+        self._claims.release()
 
 
 def open_turtlebot3(request: BodyRequest) -> Body:

@@ -86,6 +86,13 @@ class Robot:
         self._watch = network.alive_watch(participant.session, watched)
 
     @property
+    def device(self) -> str:
+        """One spelling for each robot: its namespace, and where it is reached."""
+        where = self.where
+        domain = f"?domain={where.domain}" if where.style == "rmw" else ""
+        return f"{where.style}://{where.namespace}{domain} by {', '.join(self.endpoints)}"
+
+    @property
     def odometry_key(self) -> str:
         """Where its odometry is looked for."""
         return self._odometry.key

@@ -10,12 +10,14 @@ import msgspec
 from msgspec import Meta
 
 from agents.body import BodyError
+from agents.claims import numeric
 from agents.protocols.settings import settings
 
 Positive = Annotated[float, Meta(gt=0)]
 Rate = Annotated[float, Meta(ge=1, le=100)]
 Wait = Annotated[float, Meta(gt=0, le=60)]
 PACKETS_PER_RADIO: Final = 500.0  # [1/s] about what one Crazyradio carries (cflib's maintainers, issue 258)
+DEFAULT_ADDRESS: Final = "E7E7E7E7E7"  # of a Crazyflie as it is sold, and of cflib
 ADDRESSES: Final = (
     re.compile(r"radio://[0-9A-Za-z]+/([0-9]|[1-9][0-9]|1[01][0-9]|12[0-5])/(250K|1M|2M)(/[0-9A-Fa-f]{1,10})?(\?.*)?"),
     re.compile(r"usb://[0-9]+"),
@@ -118,6 +120,18 @@ def address(name: str, given: str) -> str:
             "write radio://0/80/2M/E7E7E7E701, usb://0 or udp://127.0.0.1:19850"
         )
     return given
+
+
+def device_of(address: str) -> str:
+    """One spelling for each Crazyflie: an address without what belongs to the computer (which radio, its options)."""
+    scheme, _, rest = address.partition("?")[0].partition("://")
+    if scheme == "radio":
+        _, channel, rate, *own = rest.split("/")
+        return f"radio channel {channel}, {rate}, address {(own[0] if own else DEFAULT_ADDRESS).upper():0>10}"
+    if scheme == "udp":
+        host, _, port = rest.partition(":")
+        return f"udp://{numeric(host)}:{int(port)}"
+    return f"{scheme}://{int(rest)}"
 
 
 def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> Settings:

@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 
 from agents.body import BodyError, BodyRequest, BodyState, RangeScan, Rays
+from agents.claims import Claims
 from agents.positioning import External
-from agents.protocols.crazyflie import Lighthouse, address, chosen, crowded
+from agents.protocols.crazyflie import Lighthouse, address, chosen, crowded, device_of
 from agents.rows import Array, Index
 from bridges.crazyflie.link import prepare
 from bridges.crazyflie.pilot import Pilot
@@ -29,9 +30,11 @@ class CrazyflieBody:
             if kind.name != "crazyflie":
                 raise BodyError(f"{name} is a {kind.name}: this body flies Crazyflies")
         addresses = [address(*pair) for pair in zip(request.names, request.addresses, strict=True)]
-        twice = {one for one in addresses if addresses.count(one) > 1}
+        devices = [device_of(one) for one in addresses]
+        twice = {one for one, device in zip(addresses, devices, strict=True) if devices.count(device) > 1}
         if twice:
             raise BodyError(f"several robots have the address {', '.join(sorted(twice))}: give each its own")
+        self._claims = Claims(request.names, devices)
         settings = [
             chosen(name, device, external=outside)
             for name, device, outside in zip(request.names, request.device, request.external, strict=True)
@@ -59,9 +62,10 @@ class CrazyflieBody:
         """See `Body.open`. Of several, those that cannot be had are left out: their notes say why, and it is tried on.
 
         Raises:
-            BodyError: If none can be had.
+            BodyError: If none can be had, or another process has one.
         """
         prepare()
+        self._claims.take()
         for pilot in self._pilots:
             pilot.start()
         deadline = time.monotonic() + self._patience
@@ -133,6 +137,7 @@ class CrazyflieBody:
             pilot.close()
         for pilot in self._pilots:
             pilot.join()
+        self._claims.release()
 
     def _note(self, row: int, now: float) -> str:
         age = now - self._board.heard[row]

@@ -1,0 +1,92 @@
+"""One process for each device: the second is refused by name, and a lock ends with its process."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from agents.body import BodyError
+from agents.claims import Claims, numeric
+from agents.protocols.crazyflie import device_of
+
+HOLDER = """
+from agents.claims import Claims
+Claims(["CF07"], ["radio 80"]).take()
+print("has it", flush=True)
+input()
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("ZENPARK_RUNS", str(tmp_path / "runs"))
+    return tmp_path / "runs"
+
+
+def test_a_device_is_had_once_and_again_when_it_was_let_go(folder: Path) -> None:
+    first, second = Claims(["A", "B"], ["one", "two"]), Claims(["C", "D"], ["three", "two"])
+    first.take()
+    with pytest.raises(BodyError, match=r"^D: two is in use: this process drives it for B; end that first$"):
+        second.take()
+    second.release()  # refused: what the first has is left alone
+    assert len(list(folder.iterdir())) == 2
+    Claims(["C"], ["three"]).take()  # which the second has let go of
+    first.release()
+    second.release()
+    first.release()
+    third = Claims(["D"], ["two"])
+    third.take()
+    third.release()
+
+
+def test_another_process_is_named_and_its_death_frees_the_device(folder: Path) -> None:
+    other = subprocess.Popen(
+        [sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=dict(os.environ)
+    )
+    assert other.stdout is not None
+    try:
+        assert other.stdout.readline() == "has it\n"
+        mine = Claims(["CF01"], ["radio 80"])
+        with pytest.raises(BodyError, match=f"^CF01: radio 80 is in use: process {other.pid} drives it for CF07; end"):
+            mine.take()
+    finally:
+        other.kill()
+        other.communicate()
+    assert len(list(folder.iterdir())) == 1  # the file is left, the lock is not
+    mine.take()
+    mine.release()
+    assert list(folder.iterdir()) == []
+
+
+def test_without_a_folder_nothing_is_driven(folder: Path) -> None:
+    folder.mkdir(0o755)
+    folder.chmod(0o777)
+    with pytest.raises(BodyError, match=r"no lock on radio 80, .* set ZENPARK_RUNS to a folder that is yours alone"):
+        Claims(["CF01"], ["radio 80"]).take()
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("radio://0/80/2M", "radio://1/80/2M/e7e7e7e7e7?rate_limit=100"),
+        ("radio://0/80/2M/E7E7E7E701", "radio://0/80/2M/e7e7e7e701"),
+        ("radio://0/80/2M/1", "radio://E7ABCD/80/2M/0000000001"),
+        ("usb://0", "usb://00"),
+        ("udp://localhost:19850", "udp://127.0.0.1:19850"),
+    ],
+)
+def test_two_spellings_of_one_crazyflie(one: str, other: str) -> None:
+    assert device_of(one) == device_of(other)
+
+
+def test_different_crazyflies_are_different() -> None:
+    addresses = ["radio://0/80/2M/E7E7E7E701", "radio://0/80/2M/E7E7E7E702", "radio://0/81/2M/E7E7E7E701"]
+    addresses += ["radio://0/80/1M/E7E7E7E701", "usb://0", "usb://1", "udp://127.0.0.1:1", "udp://127.0.0.1:2"]
+    assert len({device_of(address) for address in addresses}) == len(addresses)
+
+
+def test_a_host_that_cannot_be_resolved_is_its_name() -> None:
+    assert numeric("No.Such.invalid") == "no.such.invalid"
+    assert numeric("127.1") == "127.0.0.1"

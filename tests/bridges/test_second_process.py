@@ -1,0 +1,73 @@
+"""A device that a process drives: a second body is refused before anything is sent."""
+
+import socket
+from dataclasses import replace
+
+import pytest
+
+from agents.body import BodyError
+from agents.claims import Claims
+from agents.protocols.crazyflie import device_of
+from bridges.crazyflie import open_crazyflie
+from bridges.khepera4 import open_khepera4
+from bridges.khepera4_link import Address
+from bridges.tello import open_tello
+from bridges.turtlebot3 import open_turtlebot3
+from tests.bridges import turtlebots
+from tests.twins.loopback import request
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("ZENPARK_RUNS", str(tmp_path / "runs"))
+
+
+def crazyflie(port):
+    address = f"udp://127.0.0.1:{port}"
+    return open_crazyflie(request("crazyflie", [address])), device_of(f"udp://localhost:{port}")
+
+
+def khepera(port):
+    address = Address.of("R0", f"kteam://localhost:{port}")
+    return open_khepera4(request("khepera4", [f"khepera4://127.0.0.1:{port}"])), address.device
+
+
+def tello(port):
+    return open_tello(request("tello", [f"tello://127.0.0.1:{port}"], external=True)), "tello://127.0.0.1"
+
+
+def turtlebot(port):
+    endpoint = f"tcp/127.0.0.1:{port}"
+    wanted = replace(turtlebots.request(endpoint), addresses=("ros2dds://tb3_0?distro=humble",))
+    return open_turtlebot3(wanted), f"ros2dds://tb3_0 by {endpoint}"
+
+
+@pytest.mark.parametrize("opened", [crazyflie, khepera, tello, turtlebot])
+def test_a_device_that_is_driven_gets_nothing_from_a_second(opened):
+    with socket.socket(type=socket.SOCK_DGRAM) as packets, socket.socket() as connections:
+        packets.bind(("127.0.0.1", 0))
+        port = packets.getsockname()[1]
+        connections.bind(("127.0.0.1", port))
+        connections.listen()
+        packets.setblocking(False)
+        connections.setblocking(False)
+        body, device = opened(port)
+        first = Claims(["CF07"], [device])
+        first.take()
+        with pytest.raises(BodyError, match="is in use: this process drives it for CF07; end that first"):
+            body.open()
+        body.close()
+        with pytest.raises(BlockingIOError):
+            packets.recv(1)
+        with pytest.raises(BlockingIOError):
+            connections.accept()
+        first.release()
+
+
+def test_a_body_that_cannot_be_opened_leaves_its_device_to_others():
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        body, device = khepera(nobody.getsockname()[1])  # refuses connections: it does not listen
+        with pytest.raises(BodyError, match="no Khepera answers"):
+            body.open()
+        Claims(["CF07"], [device]).take()
