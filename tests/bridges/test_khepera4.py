@@ -299,10 +299,11 @@ def test_wheels_stop_without_setpoints_and_when_the_body_closes(served, speaks):
 
 @pytest.mark.system
 @pytest.mark.parametrize("speaks", [PARK, KTEAM])
-def test_a_second_client_is_told_that_it_is_one(served, speaks, impatient):
+def test_a_second_client_is_told_that_it_is_one(served, speaks, impatient, monkeypatch, tmp_path):
     rows = request("khepera4", ["khepera4-twin"], device=speaks)
     twins = served(rows)
     with opened(open_khepera4(reached(rows, twins.addresses))) as first:
+        monkeypatch.setenv("ZENPARK_RUNS", str(tmp_path))  # another user's, or another computer's
         with pytest.raises(BodyError, match=r"no answer to .*another program may hold it"):
             open_khepera4(reached(rows, twins.addresses)).open()
         drive = Drive(first)
