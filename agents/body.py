@@ -245,6 +245,8 @@ class BodyError(RuntimeError):
     """A body that cannot be opened or driven, with the remedy."""
 
 
+FRESH_S: Final = 0.5  # a setpoint that is older is none: wheels stop, sticks are at rest
+
 UNANSWERED: Final = "the emergency stop is not answered"  # in the notes of a robot that was stopped and goes on
 
 # what a body that fails may raise, a plug-in too

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from agents.body import TROUBLE, BodyError
+from agents.body import FRESH_S, TROUBLE, BodyError
 from agents.claims import numeric
 from agents.protocols import khepera4 as protocol
 from agents.rows import Array
@@ -32,7 +32,6 @@ FAREWELL_S: Final = 3.0  # so long it is tried to stop a robot whose connection 
 AGAIN_S: Final = 0.1  # between two such attempts
 STANDING: Final = 0.02  # [m/s] slower than this it stands
 ANSWER_S: Final = 2.5  # a robot that was told to halt and is not known to stand after this is worth a word
-FRESH_S: Final = 0.5  # a setpoint that is older is none: the wheels stop
 
 
 class Unintelligible(OSError):

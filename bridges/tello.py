@@ -20,13 +20,13 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from agents.body import TROUBLE, BodyError, BodyRequest, BodyState, call_all
+from agents.body import FRESH_S, TROUBLE, BodyError, BodyRequest, BodyState, call_all
 from agents.claims import Claims
 from agents.positioning import External
 from agents.protocols import tello as protocol
 from agents.protocols.settings import settings
 from agents.rows import Array, Index
-from bridges.tello_pilot import FRESH_S, Duty, Pilot, Vendor
+from bridges.tello_pilot import Duty, Pilot, Vendor
 
 OPEN_S: Final = 3.0  # for the first state line of a drone
 

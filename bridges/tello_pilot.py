@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Any, Final, Protocol
 
-from agents.body import UNANSWERED
+from agents.body import FRESH_S, UNANSWERED
 from agents.kinds import Kind
 from agents.protocols import tello as protocol
 
@@ -24,7 +24,6 @@ TAKEOFF_S: Final = 20.0  # then it will not fly any more
 LAST: Final = 5  # the last command of a process is sent so many times, for a datagram may be lost
 STOOD_S: Final = 1.5  # its motors stand when the seconds that it counts while they run stay the same for so long,
 CUT_S: Final = 2.5  # which is known so long after an emergency stop, if that was heard
-FRESH_S: Final = 0.5  # a setpoint, or a position, that is older is none
 ATTENDED_S: Final = 2.0  # a process that did not read for longer does not drive its robots: they land
 STILL_S: Final = 3.0  # low for this long, motors not running: it is on the ground
 GONE_S: Final = 20.0  # silent for this long: it has landed by itself

@@ -13,7 +13,7 @@ import numpy as np
 import zenoh
 
 from agents import session as network
-from agents.body import UNANSWERED, BodyError, BodyRequest, RangeScan
+from agents.body import FRESH_S, UNANSWERED, BodyError, BodyRequest, RangeScan
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
 from agents.protocols.settings import settings
@@ -159,7 +159,7 @@ class Robot:
     # ------------------------------------------------------------------ what it is told
 
     def drive(self, v: float, w: float, now: float) -> None:
-        """Must move at v [m/s], ω [rad/s] until told otherwise, or until nobody has commanded it for `SILENCE_S`."""
+        """Must move at v [m/s], ω [rad/s] until told otherwise, or until nobody has commanded it for `FRESH_S`."""
         self._commanded = now
         if v or w:
             self._halted = np.inf
@@ -183,7 +183,7 @@ class Robot:
 
     def speak(self, now: float) -> None:
         """Sends the command when it is due."""
-        if self._wanted != (0.0, 0.0) and now - min(self._commanded, self.heard) > SILENCE_S:
+        if self._wanted != (0.0, 0.0) and (now - self._commanded > FRESH_S or now - self.heard > SILENCE_S):
             self._want((0.0, 0.0), now)
         twist = self._wanted
         moving = twist != (0.0, 0.0)

@@ -1,4 +1,9 @@
-"""Differential robots: a unicycle on two wheels with limits of speed and acceleration."""
+"""Differential robots: a unicycle on two wheels with limits of speed and acceleration.
+
+Without a new command the wheels stop after `FRESH_S`, for this model stands for a robot together with its bridge: the
+bridges of Khepera IV and TurtleBot3 do that. The robots themselves do not: when the process of the bridge is frozen or
+dead they drive on (docs/hanging.md). Their protocol twins show that.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,9 @@ from typing import Final
 
 import numpy as np
 
+from agents.body import FRESH_S
 from agents.kinds import Kind
 from agents.rows import Array, Index, Mask, clamp, every
-
-COMMAND_TIMEOUT_S: Final = 0.5  # without a new command the wheels stop, as the robots' own firmware does it
 
 
 @dataclass(frozen=True)
@@ -61,10 +65,10 @@ class Differential:
         given = np.isfinite(wanted[0])
         if every(given):
             self._wanted = wanted
-            self._patience[:] = COMMAND_TIMEOUT_S
+            self._patience[:] = FRESH_S
         else:
             np.copyto(self._wanted, wanted, where=given)
-            self._patience[given] = COMMAND_TIMEOUT_S
+            self._patience[given] = FRESH_S
 
     def halt(self, rows: Index) -> None:
         """Wheels to zero speed."""

@@ -151,9 +151,9 @@ def kteam(robot: _Robot, line: str) -> str:
 class _Server:
     """One robot's port: it serves one client; others wait unanswered until that one has gone."""
 
-    def __init__(self, robot: _Robot, speaks: str, faults: Faults, listener: socket.socket) -> None:
+    def __init__(self, robot: _Robot, chosen: protocol.Settings, faults: Faults, listener: socket.socket) -> None:
         self.robot, self.listener = robot, listener
-        self._speaks, self._faults = speaks, faults
+        self._speaks, self._stops_alone, self._faults = chosen.protocol, chosen.stops_alone, faults
         self._client: socket.socket | None = None
         self._begun = b""
         self._outbox: deque[tuple[float, bytes]] = deque()
@@ -194,12 +194,13 @@ class _Server:
                     self.hang_up()
 
     def hang_up(self) -> None:
-        """The client has gone; a robot that nobody drives stops, as the later server has it."""
+        """The client has gone: the robot stops if its server does that, else it drives on."""
         if self._client is not None:
             self._client.close()
         self._client, self._begun = None, b""
         self._outbox.clear()
-        self.robot.halt()
+        if self._stops_alone:
+            self.robot.halt()
 
     def _answer(self, received: bytes) -> bytes:
         if self._speaks == "park":
@@ -226,7 +227,7 @@ class KheperaDevice:
             for name, address, choice in zip(body.names, body.addresses, chosen, strict=True):
                 listener = _listen(name, address)
                 robot = _Robot(choice, request.faults)
-                self._servers.append(_Server(robot, choice.protocol, request.faults, listener))
+                self._servers.append(_Server(robot, choice, request.faults, listener))
                 host, port = listener.getsockname()
                 addresses.append(f"{SCHEMES[choice.protocol]}://{host}:{port}")
         except BodyError:

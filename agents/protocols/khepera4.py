@@ -44,6 +44,11 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     silence_s: float = 0.5  # [s] without an answer after which the link is made anew
     low_battery: float = 0.05  # below this charge it stops (K-Team's protocol only; park has no battery)
 
+    @property
+    def stops_alone(self) -> bool:
+        """Whether the server stops the wheels when its client has gone: park's newest, which says x,y,θ, alone does."""
+        return self.protocol == "park" and self.odometry == "pose"
+
     def __post_init__(self) -> None:
         if not 2.0 <= self.poll_hz <= 30.0:
             raise ValueError("poll_hz must be 2 to 30: the robot wants 10 ms between two commands")

@@ -308,6 +308,7 @@ def test_it_stands_on_its_start_pose_wherever_its_odometry_is(hub):
         stage.body.open()
         stage.run(2.5, stage.constant(0.2))
         stage.run(1.0)
+        stage.body.close()
         asked = replace(asked, addresses=stage.twin.addresses)
         here, boot = (TurtleBot3(replace(asked, device=({"origin": origin},))) for origin in ("open", "boot"))
         for body, place in ((here, (1.0, 1.0)), (boot, stage.place[0])):

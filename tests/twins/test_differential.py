@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from agents.body import FRESH_S
 from agents.kinds import KHEPERA4, TURTLEBOT3
-from twins.differential import COMMAND_TIMEOUT_S, DRIVES, Differential
+from twins.differential import DRIVES, Differential
 
 DT = 0.01
 
@@ -93,7 +94,7 @@ def test_without_commands_the_wheels_stop():
         speeds.append(np.linalg.norm(twin.velocity[0]))
     moving = np.count_nonzero(np.array(speeds) > 1e-12) * DT
     ramp = 0.2 / DRIVES["khepera4"].acceleration
-    assert moving == pytest.approx(COMMAND_TIMEOUT_S + ramp, abs=0.03)
+    assert moving == pytest.approx(FRESH_S + ramp, abs=0.03)
     drive(twin, (0.2, 0.0), 0.2)
     assert np.linalg.norm(twin.velocity[0]) == pytest.approx(0.2)
 
@@ -101,7 +102,7 @@ def test_without_commands_the_wheels_stop():
 def test_nan_is_no_command():
     twin = robot()
     drive(twin, (0.2, 0.0), 0.5)
-    drive(twin, (np.nan, np.nan), COMMAND_TIMEOUT_S - 0.03)
+    drive(twin, (np.nan, np.nan), FRESH_S - 0.03)
     assert np.linalg.norm(twin.velocity[0]) == pytest.approx(0.2)
     drive(twin, (np.nan, 0.0), 0.5)
     drive(twin, (0.0, np.nan), 0.5)

@@ -117,6 +117,20 @@ def test_park_has_no_watchdog_but_stops_when_its_client_goes(talk):
     assert robot.truth() == before
 
 
+@pytest.mark.parametrize(
+    ("speaks", "odometry", "words"),
+    [("park", "increments", b"d 5 0"), ("park", "heading", b"d 5 0"), ("kteam", "pose", b"D,74,74\r")],
+)
+def test_older_servers_drive_on_when_the_client_has_gone(talk, speaks, odometry, words):
+    robot = talk(speaks, device={"odometry": odometry})
+    robot.say(words)
+    robot.wait(1.0)
+    robot.client.close()
+    robot.serve()
+    robot.wait(9.0)
+    assert robot.truth()[0] == pytest.approx(0.5, abs=0.01)
+
+
 def test_park_loses_what_is_glued_to_a_command(talk):
     robot = talk("park")
     robot.say(b"d 10.0 0.0stop")
