@@ -248,7 +248,7 @@ def _least_violation(wanted: Array, normal: Array, bound: Array) -> Array:
     x, y = normal[..., 0], normal[..., 1]
     sine, cosine = x[:, i] * y[:, j] - y[:, i] * x[:, j], x[:, i] * x[:, j] + y[:, i] * y[:, j]
     facing = (np.abs(sine) <= PARALLEL) & (cosine < 0.0)
-    raised = np.where(facing, -0.5 * (bound[:, i] + bound[:, j]), 0.0).max(axis=1)
+    raised = np.where(facing, -0.5 * (bound[:, i] + bound[:, j]), 0.0).max(axis=1, initial=0.0)  # one alone: no pair
     i, j, k = np.nonzero((sides[:, None, None] < sides[:, None]) & (sides[:, None] < sides))
     if len(i):
         weights = np.stack(

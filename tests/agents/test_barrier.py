@@ -278,3 +278,15 @@ def test_a_robot_on_wheels_is_steered_around_what_is_in_its_way():
     clear = near([0], [-0.3, 0.0], radius=0.07, heard=True)
     ahead = np.array([[1.0, 0.0, 0.0]])
     assert BARRIER.deviate(ahead, here, clear, 0.01) is ahead
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
+def test_a_velocity_of_any_size_is_answered_within_the_limits(kind):
+    """Beyond 1e8 m/s no half-plane is met exactly, and one alone has no pair that it could give way to."""
+    for exponent in range(2, 39):
+        me = own([kind], [[0.0, 0.0]], velocity=[-(10.0**exponent), 0.0, 0.0])
+        thing = near([0], [[-0.5, 0.07]], radius=0.07, heard=True, lag=0.1)
+        restrained = BARRIER.restrain(np.array([[-1.0, 0.0, 0.0, 0.0]]), me, thing)
+        assert np.isfinite(restrained).all()
+        speed = norm(restrained[:, :2]) * (kind.response if kind.takes == "position" else 1.0)
+        assert speed <= kind.speed + 1e-9
