@@ -13,6 +13,8 @@ from agents.rows import Array, clamp, every, norm, some, span
 REACHED = 0.005  # [m] nearer than this a ground robot stands; half of what a 1 cm trigger lets its neighbours know
 TURNED = math.radians(2.0)  # [rad] nearer than this to the yaw wanted it stands
 
+BROADSIDE = 0.02  # cosine of α below which a goal is abeam; there wheels turn first, and drive as much as it is not
+
 
 def wrap(angle: Array) -> Array:
     """Angle in (−π, π]."""
@@ -78,7 +80,9 @@ def drive(
 
     They cannot move sideways (paper, eq. (1)): the pose error is turned into distance and bearing. The law is that of
     Farias et al. for the Khepera IV, v = K d (π − |α|)/π and ω = K_α sin α; α is taken to the nearer end of the robot,
-    which drives backward as well as forward, because formation goals lie behind it as often as before it.
+    which drives backward as well as forward, because formation goals lie behind it as often as before it. Toward a goal
+    exactly abeam v is 0: wheels that accelerate drive before they turn, which would put the goal behind the end that
+    drives ahead: the robot would change ends at each tick and never leave.
 
     Args:
         way: (n, 2) goal less position [m].
@@ -97,6 +101,7 @@ def drive(
     alpha = np.arctan2(ahead * across, ahead * along)
     twist = np.empty((len(way), 2))
     twist[:, 0] = ahead * np.minimum(response * distance * (1.0 - np.abs(alpha) / math.pi), speed)
+    twist[:, 0] *= np.minimum(np.cos(alpha) / BROADSIDE, 1.0)
     twist[:, 1] = turn_response * np.sin(alpha)
     there = distance <= REACHED
     if some(there):

@@ -82,6 +82,29 @@ def test_they_drive_backward_to_what_lies_behind():
     np.testing.assert_allclose(twist, [[0.2, 0.0], [-0.2, 0.0]], atol=1e-15)
 
 
+@pytest.mark.parametrize("late", [0, 2], ids=["at once", "two ticks late"])
+def test_they_choose_one_end_and_arrive_wherever_the_goal_lies(late):
+    """Abeam to the last bit too, without any noise: the end that drives ahead is chosen once."""
+    bearings = np.radians([*range(-180, 180, 30), 88.0, 89.0, 89.9, 90.1, 91.0, 92.0])
+    ways = [(kind, yaw, bearing, distance) for kind in GROUND for yaw in (0.0, 0.3, -2.0) for bearing in bearings
+            for distance in (0.02, 0.3, 1.0)]  # fmt: skip
+    kinds, (yaw, bearing, distance) = tuple(way[0] for way in ways), np.array([way[1:] for way in ways]).T
+    goal = distance[:, None] * np.stack([np.cos(yaw + bearing), np.sin(yaw + bearing), np.zeros(len(ways))], axis=1)
+    goal[(yaw == 0.0) & (np.abs(goal[:, 0]) < 1e-12), 0] = 0.0
+    twin, control = Differential(kinds, np.zeros_like(goal), yaw, 0.02), Individual(kinds)
+    last, changes = np.zeros(len(ways)), np.zeros(len(ways))
+    seen = [(twin.position.copy(), twin.yaw.copy())] * late
+    for _ in range(800):
+        seen.append((twin.position.copy(), twin.yaw.copy()))
+        setpoint = control.setpoint(goal, np.full(len(ways), np.nan), *seen[-1 - late])
+        changes += setpoint[:, 0] * last < 0.0
+        last = np.where(setpoint[:, 0] == 0.0, last, setpoint[:, 0])
+        twin.command(setpoint[:, :2])
+        twin.advance()
+    assert np.linalg.norm(twin.position - goal, axis=1).max() <= REACHED
+    assert not changes.any()
+
+
 def test_farias_law():
     limits = {
         "response": np.ones(1), "turn_response": np.array([1.5]), "speed": np.ones(1), "turn_rate": np.ones(1) * 9
