@@ -26,6 +26,7 @@ def test_a_router_dies_the_clock_steps_a_name_is_taken_twice_and_the_launcher_di
     result = json.loads(done.stdout)
     assert sorted(each["fault"]["kind"] for each in result["outcomes"]) == sorted(kinds), done.stderr
     assert all(each["recovered"] for each in result["outcomes"]), done.stderr
+    assert [each["violations"] for each in result["outcomes"] if each["fault"]["kind"] == "double"] == [[]]
     assert not any("left behind" in text for each in result["rounds"] for text in each["violations"])
     assert json.loads((folder / "chaos.json").read_text()) == result
     assert (folder / "chaos.html").stat().st_size > 1000
