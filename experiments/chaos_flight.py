@@ -98,6 +98,7 @@ class _Running:
     before: Array
     lifted: float | None = None
     well_since: float | None = None
+    why: str = ""  # it was not well last
     held_at: Array | None = None
     utc: float = field(default_factory=time.time)
     there: set[str] = field(default_factory=set)  # who was under way before
@@ -293,12 +294,13 @@ class Flight:
         if running.lifted is None:
             return
         why = self._unwell(running, injector, eyes, t, now)
+        running.why = why or running.why
         running.well_since = None if why else (running.well_since or now)
         settled = running.well_since is not None and now - running.well_since >= SETTLED_S
         if not settled and now < running.lifted + HEAL_S + fault.nature.heals_s:
             return
         if not settled:
-            running.violations.append(f"not well {now - running.lifted:.0f} s later: {why}")
+            running.violations.append(f"not well {now - running.lifted:.0f} s later: {running.why}")
         self._close(running, running.well_since, eyes)
 
     def _close(self, running: _Running, well: float | None, eyes: Eyes) -> None:
@@ -391,6 +393,8 @@ class Flight:
             return f"the body of {victim} was told neither to land nor to stop"
         if eyes.invariants.up(victim):
             return f"{victim} has not come down yet"
+        if not self._lost_since(running):  # it lands for as long as a landing may take, for it sees nothing of it
+            return f"the process of {victim} has not ended yet"
         return self._after_kill(running, injector, eyes, live)
 
     def _after_clock_behind(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:

@@ -96,7 +96,9 @@ NATURES: Final[Mapping[str, Nature]] = {
         signed=True,
     ),
     "double": Nature("A second process of a robot's name is started: it must be refused, and touch nothing."),
-    "read-error": Nature("Reading a robot's body raises: it must be told to land or to stop all the same.", most=1),
+    "read-error": Nature(
+        "Reading a robot's body raises: it must be told to land or to stop all the same.", heals_s=12.0, most=1
+    ),
     "disk": Nature("The recording can grow no more.", victim=False, most=1),
     "corrupt": Nature("Payloads of nonsense on every key that a robot believes.", 1.0),
 }
