@@ -422,8 +422,9 @@ class Flight:
     def _after_double(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
         victim, second = running.victim, injector.second
         assert second is not None
+        over = time.monotonic() - (self._started or 0.0) > self._setting.experiment.duration_s - NOTICE_S
         for order in eyes.orders:
-            if order.robot == victim:
+            if order.robot == victim and not over:  # then the conductor lands everybody
                 running.deplore(f"the body of {victim} was told to {order.action}")
         if second.alive:
             return f"the second process of {victim} is not refused yet"

@@ -12,6 +12,7 @@ from agents import wire
 from agents.keys import Keys
 from agents.leaving import held
 from agents.settings import ASK_S
+from experiments.overview import ROUTER_S
 
 
 class Emergency:
@@ -37,13 +38,22 @@ class Emergency:
         return network.Alarm(session, keys.estop, self._heed)
 
     @contextmanager
-    def throughout(self, endpoints: Sequence[str], keys: Keys, identity: str) -> Iterator[None]:
+    def throughout(
+        self, endpoints: Sequence[str], keys: Keys, identity: str, *, starting: bool = False
+    ) -> Iterator[None]:
         """Hears stops by a session of its own: those of the cases are closed between them.
+
+        Args:
+            endpoints: Routers.
+            keys: Of the realm.
+            identity: Whose certificate is shown, in a lab.
+            starting: The routers were started just now, which takes seconds on a busy machine.
 
         Raises:
             Unreachable: If no router answers.
         """
-        opened = network.open_session(endpoints, name="emergency stops", identity=identity, wait_s=ASK_S)
+        wait_s = ROUTER_S if starting else ASK_S
+        opened = network.open_session(endpoints, name="emergency stops", identity=identity, wait_s=wait_s)
         with held(opened) as (session, declared):
             declared.append(self.listen(session, keys))
             yield

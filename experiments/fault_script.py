@@ -95,7 +95,9 @@ NATURES: Final[Mapping[str, Nature]] = {
         size=(0.5, 4.5),
         signed=True,
     ),
-    "double": Nature("A second process of a robot's name is started: it must be refused, and touch nothing."),
+    "double": Nature(
+        "A second process of a robot's name is started: it must be refused, and touch nothing.", heals_s=6.0
+    ),
     "read-error": Nature(
         "Reading a robot's body raises: it must be told to land or to stop all the same.", heals_s=12.0, most=1
     ),

@@ -25,7 +25,8 @@ from agents.wire import HostClock
 from experiments import certificates, clocks, ssh, version
 from experiments.experiment import Experiment, Host
 from experiments.launcher import Launcher, Process
-from experiments.station import RUN, Answer, Question
+from experiments.processes import RUN
+from experiments.station import Answer, Question
 
 HELLO_S: Final = 60.0  # the first start of a zenpark that was changed brings its packages up to date
 ANSWER_S: Final = 5.0

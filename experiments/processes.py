@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from experiments.station import RUN
-
+RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run, here or on a host: how they are found again
 PAGE: Final = resource.getpagesize()
 TICKS: Final = os.sysconf("SC_CLK_TCK")
 PROC: Final = Path("/proc")

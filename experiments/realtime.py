@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -122,7 +123,9 @@ def conduct(
         hosts = Hosts(launcher, endpoints if meshed else listening)
         # of a mesh nobody is there yet: only the session of each case hears it there
         keys = Keys(network.realm)
-        hears = nullcontext() if meshed else emergency.throughout(endpoints, keys, staging.identity)
+        hears = (
+            nullcontext() if meshed else emergency.throughout(endpoints, keys, staging.identity, starting=own_router)
+        )
         with show, hears:
             for name, experiment in embodied.items():
                 if interrupted() or emergency:

@@ -30,8 +30,8 @@ from agents.endpoint import EndpointError
 from agents.lifeline import SILENCE_S
 from experiments import certificates, version
 from experiments.launcher import LAND_S
+from experiments.processes import RUN
 
-RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run on a host: how they are found again
 POLL_S: Final = 0.1
 FROZEN_S: Final = 2.0  # after the loss of the lifeline; who hangs for longer than that is killed
 REACH_S: Final = 3.0

@@ -11,7 +11,8 @@ import psutil
 import pytest
 
 from experiments import version
-from experiments.station import RUN, Answer, Question, answer, devices
+from experiments.processes import RUN
+from experiments.station import Answer, Question, answer, devices
 from tests.system.lab import ENVIRONMENT, ROOT
 
 

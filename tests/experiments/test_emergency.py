@@ -1,0 +1,37 @@
+"""Stops are heard from before the first case: a router of the run's own may take its time to start."""
+
+import threading
+
+import pytest
+
+from agents.endpoint import free_endpoint
+from agents.keys import Keys
+from agents.router import serve_router
+from agents.session import Unreachable
+from experiments import emergency
+from experiments.emergency import Emergency
+
+KEYS = Keys("park")
+
+
+@pytest.fixture
+def endpoint(monkeypatch):
+    monkeypatch.setattr(emergency, "ASK_S", 0.2)
+    return free_endpoint(preferred_port=0)
+
+
+def test_a_router_that_was_started_just_now_is_waited_for(endpoint):
+    over = threading.Event()
+    late = threading.Timer(0.6, serve_router, ([endpoint], over))
+    late.start()
+    try:
+        with Emergency().throughout([endpoint], KEYS, "operator", starting=True):
+            pass
+    finally:
+        over.set()
+        late.join()
+
+
+def test_one_of_somebody_else_is_not(endpoint):
+    with pytest.raises(Unreachable), Emergency().throughout([endpoint], KEYS, "operator"):
+        pass
