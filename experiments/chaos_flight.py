@@ -297,7 +297,9 @@ class Flight:
         running.why = why or running.why
         running.well_since = None if why else (running.well_since or now)
         settled = running.well_since is not None and now - running.well_since >= SETTLED_S
-        if not settled and now < running.lifted + HEAL_S + fault.nature.heals_s:
+        # who avoids others needs up to 35 s to come up with a leader that drives, without any fault
+        driven = max((leg.at_s for leg in self._setting.experiment.timeline if leg.at_s <= t), default=-math.inf)
+        if not settled and (now < running.lifted + HEAL_S + fault.nature.heals_s or t < driven + FORM_S):
             return
         if not settled:
             running.violations.append(f"not well {now - running.lifted:.0f} s later: {running.why}")
