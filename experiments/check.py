@@ -121,8 +121,8 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
         vital_robots: The other robots.
         residual_mm: Worst link of the best shape.
         loop_gain: h·μ·λ_max; 2 is where the formation hunts.
-        slowest_mode_s: Time constant of the slowest mode that the run is long enough for.
-        free_modes: Those that are slower: they move by themselves, or not at all.
+        slowest_mode_s: Time constant of the slowest mode that moves.
+        free_modes: Modes that are slower than the run: nothing brings them back in time.
         speed_needed: Of the fastest plan [m/s].
         speed_available: Of the slowest follower [m/s].
         acquired_s: When the formation keeps within the tolerance, before any plan begins.

@@ -14,6 +14,7 @@ from agents.graph import Links
 from agents.rows import Array, Index, norm
 
 STEP: Final = 1e-4  # [m] of the differences that stand for the law's derivative
+STANDING: Final = 1e-6  # modes slower than the fastest by this factor do not move at all
 UNMOVED: Final = 1e-6  # of the fastest: a motion of the whole that the law answers by less is none of its business
 EVEN: Final = 1e-9  # of the fastest: a loop that is symmetric but for this has real modes, which are quicker to find
 
@@ -25,8 +26,8 @@ class Modes:
     Attributes:
         gain: Largest real part of the eigenvalues of H M, what a decision takes from a mode; 2 is where it hunts.
         radius: Largest |1 − λ|: above 1 something grows.
-        slowest_s: Time constant of the slowest mode that is not free [s]; infinity where there is none.
-        free: Modes that decay more slowly than was asked for: in that time they do not move.
+        slowest_s: Time constant of the slowest mode that moves [s]; infinity where none does.
+        free: Modes that decay more slowly than was asked for, or not at all: in that time nothing brings them back.
     """
 
     gain: float
@@ -82,9 +83,10 @@ def modes(
     left = np.abs(1.0 - values)
     with np.errstate(divide="ignore"):
         lasts = -1.0 / (hz * np.log(left[left < 1.0]))
-    free = lasts > within_s
-    slowest = lasts[~free].max(initial=0.0) or math.inf
-    return Modes(float(values.real.max(initial=0.0)), float(left.max(initial=0.0)), float(slowest), int(free.sum()))
+    moves = lasts < lasts.min(initial=math.inf) / STANDING
+    free = len(left) - int((lasts <= within_s).sum()) if math.isfinite(within_s) else 0
+    slowest = lasts[moves].max(initial=0.0) or math.inf
+    return Modes(float(values.real.max(initial=0.0)), float(left.max(initial=0.0)), float(slowest), free)
 
 
 def _derivative(law: Law, links: Links, position: Array, anchors: Anchors | None, listeners: Index) -> Array:

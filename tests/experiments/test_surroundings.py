@@ -47,7 +47,7 @@ def said(tmp_path):
 def test_a_path_into_an_obstacle_is_found_in_time(said):
     found = said(LOW)["hits-obstacle"]
     assert found.severity == "warning"
-    assert found.message == "KH01 would run into 'post' at 14.4 s, around (0.34, 0.00)"
+    assert found.message == "KH01 would run into 'post' at 15.3 s, around (0.34, 0.00)"
     assert "[avoidance]" in found.remedy
     assert found.where.endswith("one.toml:3:1")
 
