@@ -234,6 +234,10 @@ class Flight:
         nature = self._left[0].nature
         return t > duration - nature.lasts_s - max(LATEST_S, nature.heals_s)
 
+    def _over(self) -> bool:
+        """Whether the run's time is over: then the conductor lands everybody, and nobody is let in again."""
+        return time.monotonic() - (self._started or 0.0) > self._setting.experiment.duration_s - NOTICE_S
+
     def _judge(self, eyes: Eyes, now: float) -> None:
         """Gives what is wrong to the fault that is under way, or to the round."""
         wrong = eyes.judge()
@@ -310,7 +314,7 @@ class Flight:
         well = now if well is None else well
         if running.fault.kind == "read-error" or running.died:
             self._dead[running.victim] = now
-        left = set() if self._conductor_dead else running.there - self._dead.keys()
+        left = set() if self._conductor_dead or self._over() else running.there - self._dead.keys()
         down = [name for name in sorted(left) if self._down(name, eyes)]
         reasons = [f"{name}: {eyes.status[name].reason}" for name in down]
         outcome = Outcome(
@@ -407,7 +411,7 @@ class Flight:
             self._off.add(victim)
             running.restarted = time.monotonic()
             injector.restart(victim, eyes.session, eyes.keys)
-        if why := injector.answer.reason or injector.answer.refused.get(victim):
+        if (why := injector.answer.reason or injector.answer.refused.get(victim)) and not self._over():
             running.deplore(f"{victim} is not let in again: {why}")
             return ""
         if victim not in eyes.alive:
@@ -424,9 +428,8 @@ class Flight:
     def _after_double(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
         victim, second = running.victim, injector.second
         assert second is not None
-        over = time.monotonic() - (self._started or 0.0) > self._setting.experiment.duration_s - NOTICE_S
         for order in eyes.orders:
-            if order.robot == victim and not over:  # then the conductor lands everybody
+            if order.robot == victim and not self._over():
                 running.deplore(f"the body of {victim} was told to {order.action}")
         if second.alive:
             return f"the second process of {victim} is not refused yet"
