@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +54,19 @@ def command(
     if print_config:
         print(json.dumps(of_zenohd(endpoints, linked, rights), indent=1))
         return 0
-    with registered(mine("router", "a router by hand", list(map(from_here, endpoints)))) as why:
+    with registered(mine("router", "a router by hand", _places(endpoints))) as why:
         if why:
             print(f"zenpark: {why}", file=sys.stderr)
         return serve(endpoints, link=linked, lifeline=lifeline, rights=rights)
+
+
+def _places(endpoints: Sequence[str]) -> list[str]:
+    """Where this machine finds a router; not at a port that the system chooses, nor at what `serve` will refuse."""
+    places = []
+    for endpoint in endpoints:
+        with suppress(ValueError):
+            places.append(from_here(endpoint))
+    return places
 
 
 def of_zenohd(endpoints: Sequence[str], link: Sequence[str] = (), rights: Rights | None = None) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 import threading
@@ -236,6 +237,7 @@ def test_a_real_router_knows_who_owns_a_name_and_a_frozen_one_says_nothing(route
         for token in owned:
             token.undeclare()
         router.process.send_signal(signal.SIGSTOP)
+        os.waitpid(router.process.pid, os.WUNTRACED)  # until it has stopped: else it may still answer
         try:
             with pytest.raises(network.Unreachable):
                 claim(two, [KEY], began=1.0)

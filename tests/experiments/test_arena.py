@@ -178,7 +178,7 @@ def test_findings_of_the_check_point_into_the_arena_file(lab):
     file = lab(ONE + plan)
     (found,) = [each for each in check(read(file)) if each.code == "hits-obstacle"]
     assert found.where == f"{file.parent / 'lab.toml'}:6:1"
-    assert "KH01 would run into 'post' at 13.8 s" in found.message
+    assert "KH01 would run into 'post' at 14.7 s" in found.message
 
 
 def test_the_catalogue_has_arena_files_that_are_no_experiments(tmp_path):

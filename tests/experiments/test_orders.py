@@ -8,6 +8,7 @@ import pytest
 
 from agents import session as network
 from agents import wire
+from agents.clock import Clock
 from agents.keys import Keys
 from experiments import orders
 from experiments.overview import Overview
@@ -56,6 +57,7 @@ def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProc
 
 def test_when_a_robot_began_is_its_first_status_of_the_experiment() -> None:
     view = Overview.__new__(Overview)
+    view.clock = Clock()
     view._progress = Progress("case", "running", None, 1.0, {"TB01": Seen()})
     view.robots = view._progress.robots
     view.say = lambda *_, **__: None  # type: ignore[method-assign]
