@@ -1,4 +1,4 @@
-"""One process for each device on this machine: a lock on the device's address, held as long as a body is open.
+"""Exclusive use of a device on this machine: a lock on the device's address, held as long as a body is open.
 
 The locks are files of the user's runtime folder (`agents.registry`) and end with their process. Other machines and
 other users are not seen.

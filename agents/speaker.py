@@ -18,7 +18,7 @@ PROOFS: Final = 3  # so many late poses in succession: one may be the last value
 
 
 class Coming(Enum):
-    """What happened to the liveliness of a robot."""
+    """A change of the liveliness of a robot."""
 
     CAME = 1
     WENT = 2

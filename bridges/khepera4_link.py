@@ -106,7 +106,7 @@ class Address:
 
     @property
     def device(self) -> str:
-        """One spelling for each robot, whatever its host or line is called."""
+        """Canonical address of a robot, whatever its host or line is called."""
         return os.path.realpath(self.serial) if self.serial else f"{numeric(self.host)}:{self.port}"
 
     def connect(self) -> Wire:

@@ -87,7 +87,7 @@ class Robot:
 
     @property
     def device(self) -> str:
-        """One spelling for each robot: its namespace, and where it is reached."""
+        """Canonical address of a robot: its namespace and its endpoint."""
         where = self.where
         domain = f"?domain={where.domain}" if where.style == "rmw" else ""
         return f"{where.style}://{where.namespace}{domain} by {', '.join(self.endpoints)}"

@@ -75,7 +75,7 @@ def command(
 
 
 def defaults(experiment: Experiment) -> list[str]:
-    """What the laboratory sets of an experiment, where `--set` does not."""
+    """Settings of the laboratory, which `--set` overrides."""
     made = list(ALWAYS)
     if experiment.avoidance is None:
         made.append(AVOIDANCE)

@@ -110,7 +110,7 @@ class _Running:
     violations: list[str] = field(default_factory=list)
 
     def deplore(self, text: str) -> None:
-        """What must not happen, once."""
+        """A violation of an invariant, reported once."""
         if text not in self.violations:
             self.violations.append(text)
 

@@ -123,7 +123,7 @@ def address(name: str, given: str) -> str:
 
 
 def device_of(address: str) -> str:
-    """One spelling for each Crazyflie: an address without what belongs to the computer (which radio, its options)."""
+    """Canonical address of a Crazyflie, without what belongs to the computer (which radio, its options)."""
     scheme, _, rest = address.partition("?")[0].partition("://")
     if scheme == "radio":
         _, channel, rate, *own = rest.split("/")
