@@ -26,6 +26,21 @@ os.environ["ZENPARK_RUNS"] = tempfile.mkdtemp(prefix="zenpark-tests-")
 
 ROOT = Path(__file__).resolve().parent.parent
 
+# The background of a shell ignores Ctrl-C, and whatever a test starts would inherit that; a handler is not inherited.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Refuses two tests for one mechanism: each costs seconds in which nothing else runs."""
+    shown: dict[str, str] = {}
+    for item in items:
+        if (marker := item.get_closest_marker("mechanism")) is not None:
+            (name,) = marker.args
+            if item.get_closest_marker("system") is None:
+                raise pytest.UsageError(f"{item.nodeid}: the mark `mechanism` is for tests with the mark `system`")
+            if (other := shown.setdefault(name, item.nodeid)) != item.nodeid:
+                raise pytest.UsageError(f"{item.nodeid}: {other} shows the mechanism {name!r} already")
+
 
 PATIENT = """
 import signal, sys, zenoh

@@ -52,6 +52,7 @@ def test_nothing_is_lost_before_it_is(pipe):
     line.join(10.0)
 
 
+@pytest.mark.mechanism("lifeline: the router ends with its starter")
 @pytest.mark.system
 def test_router_ends_with_its_starter():
     endpoint = free_endpoint(preferred_port=0)

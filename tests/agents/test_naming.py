@@ -223,6 +223,7 @@ def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_i
         assert CountedToken.live == shown[1:]
 
 
+@pytest.mark.mechanism("name ownership")
 @pytest.mark.system
 def test_a_real_router_knows_who_owns_a_name_and_a_frozen_one_says_nothing(router: RouterProcess, monkeypatch):
     monkeypatch.setattr(naming, "ANSWER_S", 0.5)

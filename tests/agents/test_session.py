@@ -119,6 +119,7 @@ def test_router_says_when_its_port_is_taken(router):
         serve_router([router.endpoint], threading.Event())
 
 
+@pytest.mark.mechanism("last pose for a late joiner")
 @pytest.mark.system
 def test_late_joiner_hears_the_last_pose(router, eventually):
     with open_session([router.endpoint], name="CF01") as speaker:
@@ -134,6 +135,7 @@ def test_late_joiner_hears_the_last_pose(router, eventually):
             assert heard == [b"3", b"4"]
 
 
+@pytest.mark.mechanism("transmission while the router is down")
 @pytest.mark.system
 def test_pose_said_while_the_router_was_down_arrives(router, eventually):
     with (
@@ -153,6 +155,7 @@ def test_pose_said_while_the_router_was_down_arrives(router, eventually):
         assert heard[-1] == b"while down"
 
 
+@pytest.mark.mechanism("client at a second router")
 @pytest.mark.system
 def test_client_fails_over_to_the_second_router(router, eventually):
     second = type(router)()
@@ -365,6 +368,7 @@ sys.stdin.read()
 """
 
 
+@pytest.mark.mechanism("exit with an open session")
 @pytest.mark.system
 def test_interpreter_exits_although_a_session_was_left_open(router):
     done = subprocess.run(
@@ -393,6 +397,7 @@ def test_an_inbox_keeps_the_newest_wanted_items(router, eventually):
         assert list(received(inbox)) == []
 
 
+@pytest.mark.mechanism("liveliness")
 @pytest.mark.system
 def test_a_killed_robot_is_noticed(router, eventually):
     robot = subprocess.Popen(
@@ -417,6 +422,7 @@ def test_a_killed_robot_is_noticed(router, eventually):
         own.undeclare()
 
 
+@pytest.mark.mechanism("emergency stop before everything else that came")
 @pytest.mark.system
 def test_an_alarm_is_obeyed_at_once_and_keeps_what_came(router, eventually):
     whole = b'{"who": "ana", "reason": "fire"}'

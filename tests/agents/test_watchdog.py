@@ -116,6 +116,7 @@ print("over", flush=True)
 """
 
 
+@pytest.mark.mechanism("watchdog: suspended process")
 @pytest.mark.system
 def test_a_process_that_was_frozen_is_not_a_loop_that_hangs():
     process = subprocess.Popen([sys.executable, "-c", FROZEN], cwd=ROOT, stdout=subprocess.PIPE, text=True)

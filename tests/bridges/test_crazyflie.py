@@ -40,6 +40,7 @@ def lighthouse_file(folder: Path, *numbers: int) -> str:
     return str(path)
 
 
+@pytest.mark.mechanism("Crazyflie bridge: flight")
 def test_flight_and_next_session():
     """Take-off, a goal by streamed positions, landing; and again by another client, which the first must not hinder."""
     begin = time.monotonic()
@@ -79,6 +80,7 @@ def test_other_ways_of_control(control):
         process.cut()
 
 
+@pytest.mark.mechanism("Crazyflie bridge: emergency stop")
 def test_emergency_stop():
     """Motors off in mid-air; the twin is locked, says so, and refuses to fly again."""
     with flown() as (twin, process):

@@ -80,6 +80,7 @@ def test_each_fails_in_its_own_way_and_the_others_fly_on():
         other.kill()
 
 
+@pytest.mark.mechanism("Crazyflie bridge: no more setpoints")
 @pytest.mark.system
 def test_loop_that_stops_commanding():
     """A robot whose loop hangs is landed by its own thread."""

@@ -319,6 +319,7 @@ def test_every_setpoint_is_said_once_and_rows_of_nan_are_left_alone(body: Extern
     assert far.actions("TE01", "drive") == []
 
 
+@pytest.mark.mechanism("external body: orders are repeated")
 @pytest.mark.system
 def test_orders_are_repeated_until_they_are_seen_to_be_obeyed(body: ExternalBody, far: FarEnd) -> None:
     drive = Drive(body)
@@ -385,6 +386,7 @@ def test_a_robot_that_lands_unseen_is_taken_for_down_in_the_end(
     assert drive.state.notes[0].startswith("no position for")
 
 
+@pytest.mark.mechanism("external body: router loss")
 @pytest.mark.system
 def test_it_outlives_its_router(body: ExternalBody, far: FarEnd, router: RouterProcess) -> None:
     drive = Drive(body)

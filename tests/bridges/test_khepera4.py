@@ -256,6 +256,7 @@ def test_what_goes_wrong_with_one_leaves_the_others_driving(served):
     assert np.isnan(drive.state.position[4]).all()
 
 
+@pytest.mark.mechanism("Khepera IV bridge: link loss")
 @pytest.mark.system
 def test_a_link_that_was_lost_comes_back_and_goes_on(served):
     rows = request("khepera4", ["khepera4-twin"])
@@ -274,7 +275,9 @@ def test_a_link_that_was_lost_comes_back_and_goes_on(served):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("speaks", [PARK, KTEAM])
+@pytest.mark.parametrize(
+    "speaks", [pytest.param(PARK, marks=pytest.mark.mechanism("Khepera IV bridge: no more setpoints")), KTEAM]
+)
 def test_wheels_stop_without_setpoints_and_when_the_body_closes(served, speaks):
     rows = request("khepera4", ["khepera4-twin"], device=speaks)
     twins = served(rows)

@@ -274,6 +274,7 @@ def bridge(router):
     process.stdout.close()
 
 
+@pytest.mark.mechanism("ROS 2 bridge")
 @pytest.mark.system
 def test_robots_are_in_the_graph_of_ros(router, bridge, eventually):
     with (

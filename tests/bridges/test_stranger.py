@@ -75,6 +75,7 @@ def test_the_triangle_forms_up_in_a_strangers_simulator(
         assert robot["lost"] == 0
 
 
+@pytest.mark.mechanism("foreign simulator hangs")
 @pytest.mark.system
 def test_when_the_simulator_hangs_robots_land_and_the_others_stay(router: RouterProcess, tmp_path: Path) -> None:
     flying = Simulator(router.endpoint, "CF01")

@@ -426,6 +426,7 @@ def test_the_bridge_flies_two_twins():
     assert flown["notes"] == ["", ""]
 
 
+@pytest.mark.mechanism("Tello bridge: one of several fails")
 @pytest.mark.system
 def test_what_goes_wrong_with_one_leaves_the_others_flying():
     flown = fly("faults")

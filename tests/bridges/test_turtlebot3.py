@@ -257,7 +257,9 @@ def test_nobody_commands_and_it_stands(hub):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("how", ["land", "stop", "close"])
+@pytest.mark.parametrize(
+    "how", ["land", pytest.param("stop", marks=pytest.mark.mechanism("TurtleBot3 bridge: emergency stop")), "close"]
+)
 def test_ends_standing(hub, how):
     with Stage(request(hub.endpoint)) as stage:
         stage.body.open()
@@ -352,7 +354,9 @@ def test_a_robot_that_does_not_move_is_said_so(hub):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("watchdog", [None, 0.5])
+@pytest.mark.parametrize(
+    "watchdog", [None, pytest.param(0.5, marks=pytest.mark.mechanism("TurtleBot3 bridge: silent robot"))]
+)
 def test_a_silent_robot_gets_zeros_until_it_hears_them(hub, watchdog):
     device = {"watchdog_s": watchdog} if watchdog else {}
     with Stage(request(hub.endpoint, device=device), faults=Faults(silent_from_s=3.0, silent_for_s=3.0)) as stage:

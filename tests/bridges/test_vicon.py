@@ -363,6 +363,7 @@ def test_it_ends_with_its_starter(start: Start) -> None:
 # ---------------------------------------------------------------------- robots
 
 
+@pytest.mark.mechanism("motion capture: occlusion")
 @pytest.mark.system
 def test_a_robot_flies_on_through_a_short_occlusion_and_lands_in_a_long_one(
     start: Start, router: RouterProcess, tmp_path: Path

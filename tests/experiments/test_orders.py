@@ -19,6 +19,7 @@ from tests.experiments.recordings import START, status
 KEYS = Keys()
 
 
+@pytest.mark.mechanism("orders to several robots at once")
 @pytest.mark.system
 def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProcess) -> None:
     """The first answers only when the last has the order: whoever is asked one after the other waits in vain."""

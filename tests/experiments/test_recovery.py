@@ -32,6 +32,7 @@ while True:
 """
 
 
+@pytest.mark.mechanism("recovery of an unfinished recording")
 @pytest.mark.system
 def test_a_killed_recorder_leaves_a_recording(path, tmp_path, recorded):
     code = KILLED.format(path=str(path))

@@ -108,6 +108,7 @@ def test_it_sweeps_up_its_own_run_only():
             process.wait(5)
 
 
+@pytest.mark.mechanism("station: way out on a host")
 @pytest.mark.system
 def test_it_waits_for_robots_that_land_and_kills_those_that_do_not():
     started, frozen = Started("run.lab1"), sleeper("run.lab1")

@@ -1,4 +1,4 @@
-"""A million spoilt inputs: `zenpark test --nightly`, which is `python -m tests.fuzz`.
+"""A million spoilt inputs: `python -m tests.fuzz`, a part of `./zenpark test --all`.
 
 Each target runs in a process of its own, so that a crash, a hang or a thirst for memory ends that alone; what was tried
 last is then known all the same. `--replay FILE` tries one kept input again.
@@ -117,7 +117,7 @@ def _line(name: str, tally: Tally, inputs: int) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="zenpark test --nightly", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=MILLION, metavar="N", help="in all, shared out by the table")
     parser.add_argument("--seed", type=int, default=0, help="of the inputs; 0: of today, and printed")
     parser.add_argument("--target", action="append", choices=sorted(PLACES), help="only these, with all the inputs")

@@ -30,6 +30,7 @@ def experiment(folder: Path, endpoint: str) -> str:
     return str(file)
 
 
+@pytest.mark.mechanism("adoption of robots started by hand")
 def test_who_is_there_is_adopted_and_who_has_flown_is_not(router: RouterProcess, tmp_path: Path) -> None:
     file = experiment(tmp_path, router.endpoint)
     short = ("--case", "event", *SHORT)

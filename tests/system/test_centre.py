@@ -44,6 +44,7 @@ plan = {{ kind = "line", move_by = [-0.9, 0.0], speed = 0.1 }}
 HYBRID = '{ kind = "hybrid", robots = ["TB01", "KH01"] }'
 
 
+@pytest.mark.mechanism("central controller: killed")
 @pytest.mark.timeout(120)
 def test_robots_hold_while_the_centre_is_dead_and_go_on_when_it_is_back(tmp_path: Path) -> None:
     file, folder = tmp_path / "three.toml", tmp_path / "run"

@@ -17,6 +17,7 @@ def chaos(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return zenpark("chaos", *arguments, "--out", folder, timeout_s=150.0)
 
 
+@pytest.mark.mechanism("chaos")
 def test_a_router_dies_the_clock_steps_a_name_is_taken_twice_and_the_launcher_dies(tmp_path: Path) -> None:
     folder = tmp_path / "chaos"
     kinds = ["router", "clock", "double", "conductor"]

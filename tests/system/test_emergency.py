@@ -36,6 +36,7 @@ def estop(endpoint: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=30)
 
 
+@pytest.mark.mechanism("emergency stop of every run of the machine")
 @pytest.mark.timeout(120)
 def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

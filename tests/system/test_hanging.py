@@ -76,6 +76,7 @@ def fly(watcher: Truth) -> None:
     watcher.until(lambda: watcher.phase("TE01") == "airborne", "it is up")
 
 
+@pytest.mark.mechanism("watchdog: control loop hangs")
 def test_a_loop_that_hangs_is_landed_said_and_ended(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
     (tmp_path / "hangs.py").write_text(HANGS)
     about = tmp_path / "hangs-1.dist-info"
@@ -112,6 +113,7 @@ def test_a_loop_that_hangs_is_landed_said_and_ended(router: RouterProcess, watch
             process.wait(5)
 
 
+@pytest.mark.mechanism("robot frozen in the air")
 def test_what_was_frozen_in_the_air_is_landed_and_knows_it(
     router: RouterProcess, watcher: Truth, tmp_path: Path
 ) -> None:

@@ -34,6 +34,7 @@ def written(folder: Path, safety: str) -> Path:
     return file
 
 
+@pytest.mark.mechanism("hazard: separation")
 def test_who_comes_too_near_holds_and_the_run_says_so(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, str(written(tmp_path, "separation = 0.5")), "--no-report")
@@ -50,6 +51,7 @@ def test_who_comes_too_near_holds_and_the_run_says_so(tmp_path: Path) -> None:
     assert [incident.text[:5] for incident in status.incidents] == ["hold:"]
 
 
+@pytest.mark.mechanism("hazard: battery")
 def test_a_drone_whose_battery_is_low_lands_and_the_others_go_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     low = ("--set", "safety.battery_low=0.985", "--set", "duration_s=8")  # it flies for 7 minutes on a charge
@@ -80,6 +82,7 @@ def test_nobody_takes_off_without_charge_and_the_reason_is_shown(router: RouterP
         assert robots.end() == 0
 
 
+@pytest.mark.mechanism("hazard: conductor lost")
 def test_without_the_conductor_robots_end_if_the_file_says_so(router: RouterProcess, tmp_path: Path) -> None:
     watcher = Watcher(router.endpoint)
     token = network.alive_token(watcher.session, watcher.keys.conductor)

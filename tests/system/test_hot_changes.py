@@ -86,6 +86,7 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
     made.close()
 
 
+@pytest.mark.mechanism("hot change: restart")
 def test_a_killed_robot_is_started_again_and_takes_part(lab: Lab) -> None:
     lab.fly()
     first = lab.watcher.status["CF01"].pid
@@ -115,6 +116,7 @@ def test_a_killed_robot_is_started_again_and_takes_part(lab: Lab) -> None:
     assert "takes part again after" in page
 
 
+@pytest.mark.mechanism("hot change: pause, remove, add")
 def test_robots_pause_leave_and_come_while_the_others_go_on(lab: Lab) -> None:
     lab.fly()
     watcher = lab.watcher
@@ -211,6 +213,7 @@ def test_who_was_started_by_hand_leaves_and_is_let_in_again(router: RouterProces
                 robot.end()
 
 
+@pytest.mark.mechanism("hot change: spare")
 def test_a_spare_takes_over_by_itself_when_a_robot_is_lost(lab: Lab) -> None:
     lab.fly("on_loss=replace")
     os.kill(lab.watcher.status["KH01"].pid, signal.SIGKILL)

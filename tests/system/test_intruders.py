@@ -78,7 +78,9 @@ def settled(laboratory: Laboratory, seconds: float = 0.5) -> None:
 # ---------------------------------------------------------------------- who is not let in
 
 
-@pytest.mark.parametrize("protocol", ["tcp", "tls", "quic"])
+@pytest.mark.parametrize(
+    "protocol", ["tcp", pytest.param("tls", marks=pytest.mark.mechanism("intruder without a certificate")), "quic"]
+)
 def test_without_a_certificate_nobody_gets_in(laboratory: Laboratory, protocol: str) -> None:
     address = laboratory.plain.partition("/")[2]
     chosen = config(settings("client", connect=[f"{protocol}/{address}"], name="intruder"))
@@ -144,7 +146,18 @@ def test_a_router_elsewhere_than_its_certificate_says_is_refused(laboratory: Lab
 # ---------------------------------------------------------------------- who is let in, and wants more than its due
 
 
-@pytest.mark.parametrize("who", ["KH03", "observer", "recorder", "world", "positioning", "twin", "router"])
+@pytest.mark.parametrize(
+    "who",
+    [
+        pytest.param("KH03", marks=pytest.mark.mechanism("intruder with the certificate of another robot")),
+        "observer",
+        "recorder",
+        "world",
+        "positioning",
+        "twin",
+        "router",
+    ],
+)
 def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory: Laboratory, who: str) -> None:
     heard = network.subscriber(laboratory.watcher.session, "park/**", 20_000)
     with laboratory.session(who) as session:
@@ -161,7 +174,17 @@ def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory: Laboratory, wh
     assert not keys
 
 
-@pytest.mark.parametrize("who", ["KH03", "observer", "recorder", "world", "centre", "ros2"])
+@pytest.mark.parametrize(
+    "who",
+    [
+        "KH03",
+        pytest.param("observer", marks=pytest.mark.mechanism("orders from others than the operator")),
+        "recorder",
+        "world",
+        "centre",
+        "ros2",
+    ],
+)
 def test_orders_are_the_operators(laboratory: Laboratory, who: str) -> None:
     with laboratory.session(who) as session:
         reply = orders.give(session, KEYS, ["CF01"], wire.Order("land"))["CF01"]

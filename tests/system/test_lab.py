@@ -23,6 +23,7 @@ pytestmark = pytest.mark.system
 KEYS = Keys()
 
 
+@pytest.mark.mechanism("run in a lab")
 def test_one_command_runs_it_and_others_look_and_stop_it(tmp_path: Path) -> None:
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
@@ -107,6 +108,9 @@ class Ear:
         return word in self._seen
 
 
+@pytest.mark.parametrize(
+    "laboratory", [pytest.param("tls", marks=pytest.mark.mechanism("revocation")), "quic"], indirect=True
+)
 def test_a_revoked_key_is_refused_by_a_router_that_runs(laboratory: Laboratory, tmp_path: Path) -> None:
     stolen = copy(laboratory.folder, tmp_path / "stolen")
     key = KEYS.pose("KH01")

@@ -24,6 +24,7 @@ pytestmark = pytest.mark.system
 CUT_OFF_S = 3.0  # until the loss of the router is noticed: before that good-byes are still taken
 
 
+@pytest.mark.mechanism("way out: frozen router")
 def test_a_robot_leaves_a_router_that_does_not_answer(router: RouterProcess) -> None:
     watcher = Watcher(router.endpoint)
     robot = RobotProcess(router.endpoint, "triangle", "KH01")
@@ -73,6 +74,7 @@ def test_a_session_is_left_in_time_and_a_live_one_at_once(router: RouterProcess)
                 thread.join(15.0)
 
 
+@pytest.mark.mechanism("emergency stop: frozen router")
 def test_an_estop_that_nobody_answers_ends(router: RouterProcess) -> None:
     command = [sys.executable, "-m", "tools.guard", "estop", "--connect", router.endpoint]
     router.process.send_signal(signal.SIGSTOP)
@@ -86,7 +88,9 @@ def test_an_estop_that_nobody_answers_ends(router: RouterProcess) -> None:
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("bodies", ["twin", "world"])
+@pytest.mark.parametrize(
+    "bodies", ["twin", pytest.param("world", marks=pytest.mark.mechanism("way out: frozen robot, killed launcher"))]
+)
 def test_a_frozen_robot_keeps_nobody_when_the_launcher_is_killed(tmp_path: Path, bodies: str) -> None:
     flight = Flight(tmp_path / "run", "triangle", "--bodies", bodies, "--set", "duration_s=60")
     flight.until_said("formation")

@@ -135,6 +135,7 @@ def test_a_centre_here_guides_robots_elsewhere_and_all_stamp_by_one_clock(lab: M
         assert -0.01 < old < 0.5 * OFFSET_S, robot
 
 
+@pytest.mark.mechanism("hosts: way out")
 def test_after_the_death_of_the_launcher_everybody_lands_and_all_is_gone_in_five_seconds(
     lab: Machines, tmp_path: Path
 ) -> None:
@@ -165,6 +166,7 @@ def said(logs: Path, robot: str) -> str:
     return file.read_text() if file.exists() else ""
 
 
+@pytest.mark.mechanism("hosts: cut off")
 def test_a_machine_that_is_cut_off_lands_its_robots_and_the_others_go_on(lab: Machines, tmp_path: Path) -> None:
     file, folder = triangle(lab, tmp_path, 8.0), tmp_path / "run"
     flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--anyway", "--no-report")

@@ -80,6 +80,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
     assert run.notes == ("event: lost CF02",) or "event" in run.traces
 
 
+@pytest.mark.mechanism("mesh: link loss")
 def test_a_robot_that_is_cut_off_from_everybody_holds(tmp_path: Path) -> None:
     flight = Flight(
         tmp_path / "run", "triangle", "--case", "periodic", "--no-report",

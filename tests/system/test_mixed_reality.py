@@ -75,6 +75,7 @@ def ahead(scan: wire.Ranges) -> float:
     return min(seen, default=math.nan)
 
 
+@pytest.mark.mechanism("mixed reality")
 @pytest.mark.timeout(120)
 def test_real_robots_that_stand_in_the_way_of_twins_are_seen_and_avoided(tmp_path: Path, router: RouterProcess) -> None:
     flights = []

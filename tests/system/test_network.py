@@ -36,6 +36,7 @@ def virtual(duration_s: float) -> Trace:
     return Logbook(simulate(experiment, [experiment.seed]), experiment, "periodic").trace()
 
 
+@pytest.mark.mechanism("modelled channel in real time")
 def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     changes = [part for change in (*BAD, "duration_s=3") for part in ("--set", change)]

@@ -30,6 +30,7 @@ def robots(router: RouterProcess, watcher: Watcher) -> Iterator[dict[str, RobotP
         yield made
 
 
+@pytest.mark.mechanism("frozen neighbour")
 def test_a_killed_and_a_frozen_neighbour_are_noticed(robots: dict[str, RobotProcess], watcher: Watcher) -> None:
     with watcher.session.liveliness().declare_token("park/**"):  # somebody who says that everybody lives ...
         watcher.until(lambda: "KH01" in watcher.state, "they go on")
@@ -48,6 +49,7 @@ def test_a_killed_and_a_frozen_neighbour_are_noticed(robots: dict[str, RobotProc
     watcher.until(lambda: watcher.status["KH01"].missing == ["CF01"], "it is dead")
 
 
+@pytest.mark.mechanism("emergency stop from any Zenoh client")
 def test_an_emergency_stop_reaches_every_process(robots: dict[str, RobotProcess], watcher: Watcher) -> None:
     key = watcher.keys.estop
     watcher.session.delete(key)  # no stop

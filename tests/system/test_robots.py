@@ -50,7 +50,9 @@ def zids(session: zenoh.Session) -> dict[str, str]:
     return named
 
 
-@pytest.mark.parametrize("file", ["robotic-park", "convoy"])  # nobody listens to the last robot of a convoy
+@pytest.mark.parametrize(
+    "file", ["robotic-park", pytest.param("convoy", marks=pytest.mark.mechanism("subscriptions of neighbours only"))]
+)  # nobody listens to the last robot of a convoy
 def test_each_robot_hears_exactly_its_neighbours(router: RouterProcess, watcher: Watcher, file: str) -> None:
     experiment = document.read(file).experiment
     wanted = {
@@ -93,6 +95,7 @@ def test_a_late_joiner_and_a_restarted_robot_hear_the_last_poses_at_once(
         assert again.process.poll() is None
 
 
+@pytest.mark.mechanism("orders")
 def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, watcher: Watcher) -> None:
     with ExitStack() as stack:
         fly(stack, router, "triangle", *TRIANGLE)
@@ -174,6 +177,7 @@ def nonsense() -> list[tuple[bytes, str]]:
     ]
 
 
+@pytest.mark.mechanism("malformed messages")
 def test_nonsense_on_every_key_is_counted_and_moves_nobody(router: RouterProcess, watcher: Watcher) -> None:
     with ExitStack() as stack:
         fly(stack, router, "triangle", *TRIANGLE)
@@ -200,6 +204,7 @@ def test_nonsense_on_every_key_is_counted_and_moves_nobody(router: RouterProcess
         assert math.dist(state.position[:2], state.goal[:2] if state.goal else (9.0, 9.0)) < 0.1
 
 
+@pytest.mark.mechanism("lifeline: a robot lands with its starter")
 def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher: Watcher) -> None:
     with ExitStack() as stack:
         robot = RobotProcess(router.endpoint, "triangle", *TRIANGLE, lifeline=True)

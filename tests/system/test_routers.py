@@ -37,6 +37,7 @@ def routers(flight: Flight) -> list[tuple[psutil.Process, str]]:
     return sorted(found, key=lambda pair: endpoints.index(pair[1]))
 
 
+@pytest.mark.mechanism("two routers: one killed")
 def test_a_killed_router_holds_nobody_up(tmp_path: Path) -> None:
     changes = ("--set", "network.routers=2", "--set", "duration_s=8", "--case", "periodic", "--no-report")
     flight = Flight(tmp_path / "run", "triangle", *changes)
@@ -129,6 +130,7 @@ def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[L
         assert after[name].lost == before[name].lost
 
 
+@pytest.mark.mechanism("router frozen")
 def test_robots_hold_while_a_router_with_a_long_lease_is_frozen(patient_router: RouterProcess, tmp_path: Path) -> None:
     changes = ("--set", f'network.connect=["{patient_router.endpoint}"]', "--set", "duration_s=8", "--no-report")
     flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", *changes)

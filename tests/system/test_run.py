@@ -39,6 +39,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
     return Whole(folder, code, out, flight.said())
 
 
+@pytest.mark.mechanism("run")
 def test_a_run_forms_up_loses_nothing_and_reports(whole: Whole) -> None:
     folder = whole.folder
     assert whole.code == 0, whole.said
@@ -93,6 +94,7 @@ def test_a_recording_opens_elsewhere_with_typed_messages(whole: Whole) -> None:
     assert {"experiment.toml", "experiment.json"} <= set(names)
 
 
+@pytest.mark.mechanism("way out: Ctrl-C")
 def test_ctrl_c_lands_everybody_and_leaves_a_valid_recording(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", "--no-report")
@@ -109,6 +111,7 @@ def test_ctrl_c_lands_everybody_and_leaves_a_valid_recording(tmp_path: Path) -> 
     assert typed(folder / "event.mcap", "/CF01/status")[-1].phase == "done"
 
 
+@pytest.mark.mechanism("robot killed")
 def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", "--json", "--no-report", *SHORT)
@@ -129,6 +132,7 @@ def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> Non
     assert list(typed(folder / "event.mcap", "/KH01/status")[-1].missing) == ["KH02"]
 
 
+@pytest.mark.mechanism("router killed")
 def test_a_killed_router_comes_back_and_the_formation_holds(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", "--json", "--no-report", "--set", "duration_s=8")
@@ -151,6 +155,7 @@ def test_a_killed_router_comes_back_and_the_formation_holds(tmp_path: Path) -> N
         assert np.abs(side - target).mean() < 0.05
 
 
+@pytest.mark.mechanism("way out: killed conductor")
 def test_a_killed_conductor_leaves_no_orphan_and_a_recording_that_opens(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event")

@@ -67,6 +67,7 @@ def whole(tmp_path_factory):
     return tables(folder)
 
 
+@pytest.mark.mechanism("sweep: Ctrl-C")
 def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, whole):
     with zenpark(tmp_path, "--processes", "2") as process:
         until(lambda: seeds_done(tmp_path), "a cell is done")

@@ -153,6 +153,7 @@ def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
         assert np.abs(apart - (link if isinstance(link, float) else link.distance)).mean() < 0.03, text
 
 
+@pytest.mark.mechanism("world: killed")
 def test_a_world_that_is_killed_is_started_again_and_robots_go_on_where_they_were(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(
@@ -303,6 +304,7 @@ def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
 # ---------------------------------------------------------------------- robots
 
 
+@pytest.mark.mechanism("world: no more setpoints")
 def test_robots_that_are_told_nothing_hold_and_then_land(world: WorldProcess, desk: Desk) -> None:
     for name in ("CF01", "TE01"):
         desk.tell(name, "takeoff", height=0.6)

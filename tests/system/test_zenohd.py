@@ -104,6 +104,7 @@ def test_an_experiment_at_a_router_of_somebody_else(tmp_path: Path, start: Route
     assert reopen(flight.folder).metrics["periodic"].lost == 0
 
 
+@pytest.mark.mechanism("zenohd")
 @NEEDED
 def test_a_plain_zenohd_is_read_by_rest_and_may_freeze(tmp_path: Path) -> None:
     """No file: a lease of 10 s. What the README says of REST."""

@@ -1,8 +1,8 @@
 """Build of zenohd with its REST and storage plugins from crates.io, once per version, into a cache.
 
 `python -m tests.system.zenohd` builds it in about ten minutes, goes on where an earlier attempt was ended, and prints
-the folder; `./zenpark test` does so behind the tests. Neither PyPI nor Debian has a zenohd. Without cargo or crates.io
-the tests that need one are skipped and say why.
+the folder; `./zenpark test --all` does so before its tests of processes. Neither PyPI nor Debian has a zenohd. Without
+one the tests that need it are skipped and say why.
 """
 
 from __future__ import annotations
@@ -13,16 +13,10 @@ import os
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Sequence
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final
-
-import psutil
-
-from tests.system.lab import gone
 
 VERSION: Final = version("eclipse-zenoh")  # the same as the library of the robots
 CRATES: Final = ("zenohd", "zenoh-plugin-rest", "zenoh-plugin-storage-manager")
@@ -73,7 +67,7 @@ def folder() -> Path:
         return BUILT
     if shutil.which("cargo") is None:
         raise NotBuilt(NO_CARGO)
-    why = REASON.read_text().strip() if REASON.exists() else "`python -m tests.system.zenohd` builds one"
+    why = REASON.read_text().strip() if REASON.exists() else "`./zenpark test --all` builds one"
     raise NotBuilt(f"no zenohd on PATH or in {BUILT}: {why}")
 
 
@@ -147,15 +141,8 @@ def _cargo(*arguments: str, where: Path) -> str:
     return done.stdout
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Builds; with `--after PID`, when that process has ended."""
-    if arguments:
-        option, pid = arguments
-        assert option == "--after"
-        with suppress(psutil.NoSuchProcess):
-            first = [psutil.Process(int(pid))]
-            while not gone(first):
-                time.sleep(1.0)
+def main() -> int:
+    """Builds it and prints its folder."""
     try:
         print(build(jobs=os.cpu_count() or 1))
     except NotBuilt as not_built:
@@ -165,4 +152,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

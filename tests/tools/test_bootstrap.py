@@ -1,13 +1,10 @@
 import re
-import subprocess
 import tomllib
 from pathlib import Path
 
-import psutil
 import pytest
 
 from tests.system import zenohd
-from tests.system.lab import gone, until
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -99,19 +96,45 @@ def test_what_tests_need_besides_is_installed_by_root_only(bootstrap, monkeypatc
     assert not installs or run[1][-2:] == ["openssh-server", "iproute2"]
 
 
-def test_a_build_of_zenohd_that_takes_too_long_ends_with_all_that_it_started(bootstrap, monkeypatch, tmp_path, capsys):
-    builder, child = tmp_path / "python", tmp_path / "child"
-    builder.write_text(f"#!/bin/sh\nsleep 600 & echo $! > {child}.half; mv {child}.half {child}; wait\n")
-    builder.chmod(0o755)
-    monkeypatch.setattr(bootstrap, "PYTHON", builder)
-    monkeypatch.setattr(bootstrap, "QUICK_S", 0.01)
-    monkeypatch.setattr(bootstrap, "BUILD_S", 0.01)
-    with subprocess.Popen(["true"]) as first, bootstrap.built_behind(first, []) as wait:
-        until(child.exists, "it has begun")
-        wait()
-    assert "no zenohd yet; the next build goes on there" in capsys.readouterr().err
-    left = int(child.read_text())
-    until(lambda: not psutil.pid_exists(left) or gone([psutil.Process(left)]), "its compiler is gone")
+@pytest.mark.parametrize("command", ["test", "hardware", "install"])
+@pytest.mark.parametrize("option", ["--help", "-h"])
+def test_help_installs_nothing(bootstrap, monkeypatch, capsys, command, option):
+    monkeypatch.setattr(bootstrap, "prepare", lambda level: pytest.fail(f"{level} was prepared"))
+    assert bootstrap.main([command, "--quick", option]) == 0
+    assert capsys.readouterr().out.startswith(f"usage: ./zenpark {command}")
+
+
+@pytest.fixture
+def started(bootstrap, monkeypatch):
+    """The modules that `./zenpark test` starts; those of tests fail."""
+    modules = []
+    monkeypatch.setattr(bootstrap, "add_needed", lambda: None)
+    monkeypatch.setattr(bootstrap, "python", lambda module: modules.append(module) or int(module[0] == "pytest"))
+    return modules
+
+
+def test_tests_run_in_two_parts_and_none_is_tried_again(bootstrap, started, capsys):
+    assert bootstrap.test([]) == 1
+    assert [module[0] for module in started] == ["ruff", "ruff", "mypy", "pytest", "pytest"]
+    computing, processes = started[3:]
+    assert computing[2] == "not system and not nightly"
+    assert processes[2:5] == ["mechanism", "-n", "1"]
+    said = capsys.readouterr().err
+    titles = ["part 1 of 2, computing, on all cores", "part 2 of 2, real processes, one at a time"]
+    assert [line for line in said.splitlines() if line.endswith(tuple(titles))] == [f"zenpark: {t}" for t in titles]
+    assert re.search(rf"{titles[1]}: failed in \d+ s\n$", said)
+
+
+def test_all_builds_a_zenohd_before_the_tests_of_processes_and_spoils_a_million_inputs(bootstrap, started):
+    bootstrap.test(["--all"])
+    modules = [module[0] for module in started[3:]]
+    assert modules == ["pytest", "tests.fuzz", "tests.system.zenohd", "pytest"]
+    assert [module[2] for module in (started[3], started[6])] == ["not system", "system"]
+
+
+def test_arguments_go_to_pytest_in_place_of_the_parts(bootstrap, started):
+    bootstrap.test(["--quick", "tests/agents", "-x"])
+    assert started[3:] == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
 
 
 def test_why_there_is_no_zenohd_is_said_by_the_tests_that_are_skipped(monkeypatch, tmp_path):
@@ -124,7 +147,7 @@ def test_why_there_is_no_zenohd_is_said_by_the_tests_that_are_skipped(monkeypatc
     cargo = tmp_path / "cargo"
     cargo.write_text("#!/bin/sh\necho error: no crates.io >&2; exit 101\n")
     cargo.chmod(0o755)
-    with pytest.raises(zenohd.NotBuilt, match=r"`python -m .* builds one"):
+    with pytest.raises(zenohd.NotBuilt, match=r"`\./zenpark test --all` builds one"):
         zenohd.folder()
     for asked in (lambda: zenohd.build(1), zenohd.folder):
         with pytest.raises(zenohd.NotBuilt, match=r"cargo metadata failed: error: no crates\.io"):

@@ -163,6 +163,7 @@ def prepared(home, bootstrap):
     (folder / ".venv" / "zenpark.stamp").write_text(f"{bootstrap.fingerprint()} core\n")
 
 
+@pytest.mark.mechanism("hosts: installation")
 @pytest.mark.system
 def test_install_puts_this_one_there_once(home, tmp_path, capsys, bootstrap):
     file = experiment(tmp_path, lab1={"address": "lab1", "robots": ["CF01"]})

@@ -89,6 +89,7 @@ def test_cadence_counts_per_window_and_keeps_the_last_stamp():
     assert str(a).split() == ["0.00", "0", "-", "-", "-", "-", "a"]
 
 
+@pytest.mark.mechanism("keys")
 @pytest.mark.system
 def test_keys_shows_who_holds_what(router, eventually):
     with (
@@ -143,6 +144,7 @@ def test_echo_ends_after_its_time(router):
     assert lines == []
 
 
+@pytest.mark.mechanism("echo: Ctrl-C")
 @pytest.mark.system
 def test_ctrl_c_ends_echo_quietly(router):
     with open_session([router.endpoint], name="CF01") as robot:

@@ -188,6 +188,7 @@ def test_cuts_and_limits_speeds_and_holds_them(listen):
         assert (twist.linear.x, twist.angular.z) == pytest.approx(made, abs=1e-5)
 
 
+@pytest.mark.mechanism("TurtleBot3 twin: watchdog")
 @pytest.mark.system
 def test_a_watchdog_stops_it(listen):
     listener = listen(device={"watchdog_s": 0.5})

@@ -331,6 +331,7 @@ def test_the_process_shows_the_truth_that_it_hears(process: subprocess.Popen[str
     assert process.wait(5) == 0
 
 
+@pytest.mark.mechanism("lifeline: motion capture stays until the robots are down")
 @pytest.mark.system
 def test_the_process_ends_with_its_starter_but_not_before_the_robots(
     process: subprocess.Popen[str], router: RouterProcess
