@@ -30,7 +30,7 @@ from agents.leaving import leave
 from agents.lifecycle import Phase
 from agents.lifeline import Lifeline
 from agents.measured import MeasuredPositions
-from agents.naming import NameTaken, claim
+from agents.naming import ANSWER_S, Doubt, NameTaken, claim
 from agents.neighbours import Neighbours
 from agents.orders import LAND, STOP, carry_out
 from agents.process import told_to_end
@@ -44,6 +44,8 @@ from agents.watchdog import AGAIN_S, Watchdog
 
 HUSH_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
 ROUTER_S: Final = 0.045  # between two looks at the router
+STOOD_S: Final = 0.5 * network.ROBOT_LEASE_S  # a process that stood still for longer may have lost its name
+_CLOCK: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # goes on while the machine sleeps
 
 
 class Runtime:
@@ -65,6 +67,10 @@ class Runtime:
         self._airborne = False  # a row was in the air when its body said so last, or took off since
         self._joined = False
         self._utc = self._now = self._next = 0.0
+        self._looked = np.inf  # when the process ran last, on `_CLOCK` [s]
+        self._doubt = Doubt([setup.keys.alive(name) for name in assignment.names])
+        self._hands_off = False  # another process may drive the bodies, or does
+        self._told: Callable[[], str | None] = lambda: None
         self._reach = plausibility.reach_of(assignment.limits.low, assignment.limits.high)
         self._everyone = np.arange(len(self._names))
         self._began = setup.clock.utc()
@@ -79,7 +85,8 @@ class Runtime:
 
         Raises:
             BodyError: If the body cannot be opened.
-            NameTaken: If another process owns the name of a robot.
+            NameTaken: If another process owns the name of a robot, or took it while this one stood still or was cut
+                off: then the body is left as it is, for it is the other one's.
             network.Unreachable: If no router answers.
         """
         lost = threading.Event()
@@ -100,14 +107,19 @@ class Runtime:
             )
             out.callback(leave, session, self)
             self._take_names(session, asked)
+            out.callback(self._doubt.end)
             self._body.open()
-            out.callback(self._body.close)
+            out.callback(self._let_go)
             out.callback(self._watchdog.end)
             out.callback(self._order_down, self._body.stop, STOPPED_S)
             out.callback(self._come_down)
             self._join(session)
             self._loop(lambda: rope.reason if lost.is_set() else self._told_to_end(asked.is_set()))
         return 0
+
+    def _let_go(self) -> None:
+        if not self._hands_off:
+            self._body.close()
 
     def _told_to_end(self, asked: bool) -> str | None:
         if asked:
@@ -116,6 +128,8 @@ class Runtime:
 
     def _come_down(self) -> None:
         """Lands what is still in the air, because something broke on the way, before the motors are switched off."""
+        if self._hands_off:
+            return
         self._coming_down = True
         self._watchdog.start()
         failures: list[Exception] = []
@@ -133,11 +147,14 @@ class Runtime:
         A body that does not say how it is gets all of that time if it was in the air before. The first error is raised
         at the end.
         """
+        if self._hands_off:
+            return
         failures: list[Exception] = []
         zero, begin, again = time.monotonic(), self._now, -np.inf
         obeyed = False
         while True:
             self._watchdog.beat()
+            self._make_sure()
             if self._now >= again:
                 again = self._now + AGAIN_S
                 obeyed = False
@@ -171,11 +188,54 @@ class Runtime:
         try:
             self._owned = claim(session, tokens, began=self._began, endpoints=setup.endpoints, stop=stop)
         except NameTaken as taken:
-            names = ", ".join(keys.whose(token) or token for token in str(taken).split(", "))
             raise NameTaken(
-                f"{names}: a robot of this name is on the network already; end it first "
+                f"{self._whose(taken)}: a robot of this name is on the network already; end it first "
                 "(`zenpark keys` shows who is there), or choose another router with --connect"
             ) from None
+
+    def _whose(self, taken: NameTaken) -> str:
+        return ", ".join(self._setup.keys.whose(token) or token for token in str(taken).split(", "))
+
+    def _mine(self) -> bool:
+        """Whether the names are this process's, as far as is known.
+
+        Raises:
+            NameTaken: If another process has taken one of them.
+        """
+        try:
+            return self._doubt.over()
+        except NameTaken as taken:
+            self._hands_off = True
+            raise NameTaken(
+                f"{self._whose(taken)}: another process has taken this name while this one stood still or was cut off; "
+                "it leaves, and its body to the other one"
+            ) from None
+
+    def _make_sure(self) -> bool:
+        """Whether the process stood still since the last call: then it has waited until it knew that its names are its
+        own. Until then it must not tell its bodies anything, for another process may drive them.
+
+        Raises:
+            NameTaken: If another process has taken one of them.
+            network.Unreachable: If the process was told to end, and no router has said so within `ANSWER_S`.
+        """
+        last, self._looked = self._looked, time.clock_gettime(_CLOCK)
+        if self._looked - last < STOOD_S or self._watchdog.tripped:  # one that is watched over does not stand still
+            return False
+        woke, self._hands_off = self._looked, True
+        self._doubt.begin(self._session)
+        while not self._mine():
+            if self._looked - woke > ANSWER_S and self._told() is not None:
+                names = ", ".join(self._names)
+                raise network.Unreachable(
+                    f"{names}: told to end after it stood still, and no router says who owns the name now; its body is "
+                    "left as it is"
+                )
+            self._watchdog.beat()
+            time.sleep(self._dt)
+            self._looked = time.clock_gettime(_CLOCK)
+        self._hands_off = False
+        return True
 
     def _join(self, session: zenoh.Session) -> None:
         keys, names = self._setup.keys, self._names
@@ -273,7 +333,10 @@ class Runtime:
         """Since when the routers are gone [s]; infinity while one is there."""
         if t >= self._router_due:  # a look at the router costs as much as a law
             self._router_due = t + ROUTER_S
-            self._silent_since = self._router.silent_since(t, self._neighbours.arrived)
+            before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
+            if before < np.inf and self._silent_since == np.inf:
+                self._doubt.begin(self._session)  # it was cut off
+            self._mine()
         return self._silent_since
 
     def _cut(self, _stop: wire.Stop) -> None:
@@ -329,7 +392,8 @@ class Runtime:
         zero = time.monotonic()
         # one reading: a step of the wall clock in mid-run does not move the experiment
         self._utc = self._telemetry.utc = self._setup.clock.utc()
-        self._joined = True
+        self._joined, self._told = True, stopping
+        self._looked = time.clock_gettime(_CLOCK)
         self._watchdog.start()
         self._go_round(zero, stopping)
 
@@ -345,6 +409,8 @@ class Runtime:
             behind = max(0, int(-wait / self._dt))
             if wait > 0.0:
                 time.sleep(wait)
+            if self._make_sure():
+                continue
             self._counts.missed += behind
             self._next += behind * self._dt
             self.agent.skip(behind)
@@ -431,6 +497,7 @@ class Runtime:
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""
         duties = actions.duties
+        stale = self._make_sure()
         overruled = self._cut_off or self._watchdog.tripped  # another thread has told the body to stop or to land
         if duties is not None:
             told = ((self._body.stop, duties.stop), (self._body.land, duties.land))
@@ -438,7 +505,7 @@ class Runtime:
             if len(duties.takeoff) and not overruled:
                 self._airborne = True
                 self._body.takeoff(duties.takeoff, self._assignment.hover[duties.takeoff])
-        if not overruled:
+        if not overruled and not stale:
             self._body.command(actions.setpoint)
 
     def _say(self, row: int, said: Said, yaw: float, t: float) -> None:

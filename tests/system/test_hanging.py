@@ -139,6 +139,41 @@ def test_what_was_frozen_in_the_air_is_landed_and_knows_it(
         world.end()
 
 
+def test_what_was_frozen_and_replaced_leaves_its_body_to_the_new_one(
+    router: RouterProcess, watcher: Truth, tmp_path: Path
+) -> None:
+    world = WorldProcess(router.endpoint, lonely(tmp_path))
+    started = [RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01")]
+    try:
+        fly(watcher)
+        old = started[0].process
+        old.send_signal(signal.SIGSTOP)
+        watcher.until(lambda: watcher.height("TE01") < 0.02, "the world lands it")
+        watcher.until(lambda: "TE01" not in watcher.alive, "its lease is over")
+        watcher.status.clear()
+        started.append(RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01"))
+        fly(watcher)
+        high = watcher.height("TE01")
+        old.send_signal(signal.SIGCONT)
+        heights = []
+
+        def left() -> bool:
+            heights.append(watcher.height("TE01"))
+            return old.poll() is not None
+
+        watcher.until(left, "the old one leaves")
+        assert old.returncode == 2
+        assert old.stdout is not None
+        assert "TE01: another process has taken this name" in old.stdout.read()
+        assert min(heights) > high - 0.05
+        assert watcher.phase("TE01") == "airborne"
+    finally:
+        for robot in started:
+            robot.process.send_signal(signal.SIGCONT)
+            robot.end()
+        world.end()
+
+
 def test_a_stop_behind_a_flood_of_what_is_none_is_obeyed(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
     world = WorldProcess(router.endpoint, lonely(tmp_path))
     robot = RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01")
