@@ -138,17 +138,21 @@ class Analysis:
         rows = np.setdiff1d(self.assignment.links.listener, planned)
         return int(rows[self.pull[rows].argmin()]) if len(rows) else None
 
+    @property
+    def mean_error(self) -> Array:
+        """(T, E) of each link over the last `WINDOW_S` [m]."""
+        window = max(1, round(WINDOW_S * self.experiment.rates.coordination_hz))
+        total = np.cumsum(np.concatenate([np.zeros((1, self.error.shape[1])), self.error]), axis=0)
+        end = np.arange(1, len(total))
+        before = np.maximum(end - window, 0)  # the window fills up at the start, as it does in `experiments.metrics`
+        return np.asarray((total[end] - total[before]) / (end - before)[:, None])
+
     def acquired(self, until: float) -> float | None:
         """From when on the mean of every link over `WINDOW_S` keeps within the tolerance, up to `until` [s]."""
         time = self.prediction.time
-        error = self.error[time <= until + 1e-9]
-        window = max(1, round(WINDOW_S * self.experiment.rates.coordination_hz))
-        total = np.cumsum(np.concatenate([np.zeros((1, error.shape[1])), error]), axis=0)
-        end = np.arange(1, len(total))
-        before = np.maximum(end - window, 0)  # the window fills up at the start, as it does in `experiments.metrics`
-        mean = (total[end] - total[before]) / (end - before)[:, None]
+        mean = self.mean_error[time <= until + 1e-9]
         bad = np.flatnonzero(mean.max(axis=1, initial=0.0) > self.experiment.tolerance + FORGIVEN)
-        if not len(end) or (len(bad) and bad[-1] == len(error) - 1):
+        if not len(mean) or (len(bad) and bad[-1] == len(mean) - 1):
             return None
         return float(time[bad[-1] + 1]) if len(bad) else 0.0
 

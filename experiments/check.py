@@ -88,7 +88,7 @@ def telemetry(analysis: Analysis) -> Iterator[Claim]:
 SUBJECTS: Final = (
     *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
-    *(motion.flight, motion.starts, motion.formation, motion.walls, motion.encounters),
+    *(motion.flight, motion.starts, motion.formation, motion.softness, motion.walls, motion.encounters),
     *(motion.speeds, motion.rates, motion.ends),
     architecture.architecture,
     safety_checks.safety,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -12,13 +13,14 @@ from agents.graph import BY_DISTANCE
 from agents.individual import REACHED
 from agents.planning import Planner
 from agents.rows import Array, Mask, norm
-from experiments.analysis import Analysis
+from experiments.analysis import Analysis, link_errors
 from experiments.claim import FORGIVEN, Claim
-from experiments.prediction import approaches
+from experiments.prediction import approaches, isolated, repeat, repetitions, undisturbed
 from experiments.theory import FAR_OFF, OFF
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
 NEARLY: Final = 0.9  # of its speed: what is left is needed to catch up
+SOFT: Final = 3.0  # time constants of a mode, of whose error 5 % are left then, that are to fit into the run
 SETTLED: Final = 1e-3  # [m] slower than this per decision, robots have come to rest
 
 
@@ -116,6 +118,53 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
         message = f"the formation is not acquired in time: {left} {allowed}"
         remedy = "give a longer duration_s, start nearer to the shape, or raise the gain"
         yield Claim("warning", "not-acquired", message, remedy, ("duration_s",))
+
+
+def softness(analysis: Analysis) -> Iterator[Claim]:
+    """Does a soft formation that is acquired without noise stay so with the noise of its file."""
+    experiment, loop, shape = analysis.experiment, analysis.modes, analysis.shape
+    bare, end = isolated(experiment), float(analysis.prediction.time[-1])
+    if (
+        loop is None
+        or not (loop.free or SOFT * loop.slowest_s > experiment.duration_s)
+        or shape is None
+        or shape.worst > FAR_OFF
+        or analysis.prediction.stuck
+        or bare == undisturbed(experiment)
+    ):
+        return
+    spans = []
+    for until in dict.fromkeys((min(analysis.departure, end), end)):
+        formed = analysis.acquired(until)
+        if formed is None:
+            return
+        spans.append((formed, until))
+    count = repetitions(bare)
+    lost, worst, said = 0, experiment.tolerance + FORGIVEN, ""
+    for flight in repeat(bare, count):
+        if flight.stuck:
+            continue
+        error, time = link_errors(analysis.assignment.law, analysis.pattern, flight), flight.time
+        due = np.any([(time > (formed + until) / 2.0) & (time <= until + 1e-9) for formed, until in spans], axis=0)
+        off = replace(analysis, prediction=flight, error=error).mean_error[due]
+        largest = float(off.max(initial=0.0))
+        lost += largest > experiment.tolerance + FORGIVEN
+        if largest > worst:
+            worst = largest
+            at, link = np.unravel_index(off.argmax(), off.shape)
+            said = f"{analysis.link(int(link))} is {1e3 * worst:.0f} mm off at {time[due][at]:.1f} s"
+    if lost < min(2, count):  # one of five may be chance: of such experiments one in four was lost with other seeds
+        return
+    free = f"{loop.free} mode{'s' * (loop.free > 1)} slower than the run"
+    modes = free if loop.free else f"slowest mode {loop.slowest_s:.1f} s"
+    seeds = f"seed {experiment.seed}" if count == 1 else f"seeds {experiment.seed} to {experiment.seed + count - 1}"
+    message = (
+        f"soft formation, {modes}: acquired after {spans[0][0]:.1f} s without noise, but with the noise of "
+        f"[disturbance] outside the tolerance of {1e3 * experiment.tolerance:g} mm later, in {lost} of {count} flights "
+        f"({seeds}): {said}"
+    )
+    remedy = "raise the gain, add links that stiffen the formation, or allow a larger tolerance"
+    yield Claim("warning", "soft", message, remedy, ("formation", "links"))
 
 
 def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:

@@ -31,6 +31,7 @@ from experiments.experiment import Experiment, World
 FAR: Final = 1e6  # [m] walls that nobody meets
 TICK_COST: Final = 200.0  # robots whose arithmetic takes as long as what a tick costs in any case
 WORK: Final = 6e6  # robot ticks, with that added, that are flown: 290 s of seven robots, 50 s of a thousand
+REPETITIONS: Final = 5  # flights with noise, each with another seed
 QUESTIONS: Final = 6000  # as often the trigger is asked
 PAIRS: Final = 1_000_000  # distances that are held in memory at once
 
@@ -58,11 +59,16 @@ def closed(kinds: Sequence[Kind], hz: float) -> Array:
 
 
 def undisturbed(experiment: Experiment) -> Experiment:
-    """The same without noise, scatter, walls, obstacles, avoidance and shadows, as far as it is flown for `check`."""
+    """The same as `isolated`, without noise."""
     quiet = {
         name: msgspec.structs.replace(each, hover_jitter=None, position_sigma=None, yaw_sigma=None, odometry_drift=None)
         for name, each in experiment.disturbance.items()
     }
+    return msgspec.structs.replace(isolated(experiment), disturbance=quiet)
+
+
+def isolated(experiment: Experiment) -> Experiment:
+    """The same without scatter, walls, obstacles, avoidance and shadows, as far as it is flown for `check`."""
     robots = {
         name: msgspec.structs.replace(robot, shadow=None, sensors=None) for name, robot in experiment.robots.items()
     }
@@ -74,7 +80,6 @@ def undisturbed(experiment: Experiment) -> Experiment:
         cases={},
         duration_s=min(experiment.duration_s, max(1.0, math.floor(ticks / experiment.rates.body_hz))),
         robots=robots,
-        disturbance=quiet,
         arena=msgspec.structs.replace(experiment.arena, size=(FAR, FAR, FAR), walls=False, obstacles={}, starts={}),
         world=World(),
         avoidance=None,
@@ -84,18 +89,33 @@ def undisturbed(experiment: Experiment) -> Experiment:
     )
 
 
-def predict(quiet: Experiment) -> Prediction:
-    """Flies what `undisturbed` made of an experiment, from the common start to the end."""
-    names = tuple(quiet.robots)
+def predict(bare: Experiment) -> Prediction:
+    """Flight of what `undisturbed` or `isolated` made of an experiment, from the common start to the end."""
+    return repeat(bare, 1)[0]
+
+
+def repetitions(bare: Experiment) -> int:
+    """Number of flights with different seeds, side by side, that take twice as long as one flight at most."""
+    return max(1, min(REPETITIONS, int(TICK_COST) // len(bare.robots)))
+
+
+def repeat(bare: Experiment, count: int) -> list[Prediction]:
+    """`count` flights, the first with the seed of the experiment, each other one with the next seed; see `predict`."""
+    names = tuple(bare.robots)
     try:
-        log = virtual.simulate(quiet, [quiet.seed], lean=True, landing=False)
+        log = virtual.simulate(bare, [bare.seed + k for k in range(count)], lean=True, landing=False)
     except virtual.Stuck as stuck:
-        position, _ = assign.start(quiet, names)
-        position[:, 2] = np.nan_to_num(assign.hover(quiet, names))
-        return Prediction(np.zeros(1), position[None], stuck=str(stuck))
+        position, _ = assign.start(bare, names)
+        position[:, 2] = np.nan_to_num(assign.hover(bare, names))
+        return [Prediction(np.zeros(1), position[None], stuck=str(stuck))] * count
     run = log.time >= -virtual.ROUNDING_S
-    begun = [each for each in log.incidents if each.outcome > Outcome.NONE and 0.0 <= each.time < quiet.duration_s]
-    return Prediction(log.time[run], log.true_position[run], tuple(begun))
+    begun = [each for each in log.incidents if each.outcome > Outcome.NONE and 0.0 <= each.time < bare.duration_s]
+    flights = []
+    for k in range(count):
+        first, end = k * len(names), (k + 1) * len(names)
+        mine = tuple(each._replace(row=each.row - first) for each in begun if first <= each.row < end)
+        flights.append(Prediction(log.time[run], log.true_position[run, first:end], mine))
+    return flights
 
 
 @dataclass(frozen=True)
