@@ -241,7 +241,7 @@ class Runtime:
         keys, names = self._setup.keys, self._names
         self._session = session
         self._router_due, self._silent_since = -np.inf, np.inf
-        self._router = network.RouterWatch(session, keys.alive(names[0]))
+        self._router = network.RouterWatch(session, keys.alive(names[0]), self._setup.endpoints)
         self._poses = [network.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [network.last_value(session, keys.pose(name), self._mime) for name in names]
         self._orders = [network.orders(session, keys.order(name)) for name in names]

@@ -31,6 +31,7 @@ from zenoh.handlers import Callback, Handler, RingChannel
 
 from agents import access, lab, topology, wire
 from agents.endpoint import EndpointError
+from agents.hangup import hang_up
 from agents.promptness import prompt_threads
 from agents.settings import ASK_S, LEASE_S, config, reason, settings
 
@@ -169,21 +170,26 @@ class RouterWatch:
     60 s with rmw_zenohd. Until then a frozen router, or a pulled cable, looks like a quiet one. A router answers a
     liveliness query from its own tables, so the end of its answer is a sign of life. Nothing waits for it: an answer
     is polled. A member of a mesh is not asked, for its lease is ours.
+
+    Where there are several routers, one that is silent for `LEASE_S` is left for the next one, as one of ours would be
+    by its lease (`agents.hangup`).
     """
 
-    def __init__(self, session: zenoh.Session, key: str) -> None:
+    def __init__(self, session: zenoh.Session, key: str, endpoints: Sequence[str] = ()) -> None:
         """Begins with the first `silent_since`.
 
         Args:
             session: Whose router is watched.
             key: What is asked for; in a lab, a liveliness key that this session may watch.
+            endpoints: Of the session.
         """
-        self._session, self._key = session, key
+        self._session, self._key, self._others = session, key, len(endpoints) > 1
         self._waiting: deque[tuple[float, Polled[zenoh.Reply]]] = deque(maxlen=ASKED)
         # Times of a clock that stands while nobody looks: a process that gets no processor cannot blame the router.
         self._now, self._asked, self._unanswered = 0.0, -inf, inf  # the latter: when the oldest question was asked
         self._looked = inf
         self._silent_since = inf
+        self._left = 0.0  # when a silent router was left last, or the silence or the time without any link began
         self._arrived = 0
         self._answers = 0  # since the silence began
 
@@ -199,7 +205,7 @@ class RouterWatch:
         info = self._session.info
         if not info.routers_zid():
             self._waiting.clear()
-            self._asked, self._unanswered, self._answers = -inf, inf, 0
+            self._asked, self._unanswered, self._answers, self._left = -inf, inf, 0, self._now
             self._silent_since = inf if info.peers_zid() else min(self._silent_since, t)
             return self._silent_since
         if self._answered():
@@ -216,6 +222,10 @@ class RouterWatch:
                 self._asked, self._unanswered = self._now, inf
         if self._now - self._unanswered > ANSWER_S and self._silent_since == inf:
             self._silent_since, self._answers = t - (self._now - self._unanswered), 0
+            self._left = self._unanswered
+        if self._others and self._silent_since < inf and self._now - self._left > LEASE_S:
+            self._left = self._now
+            hang_up(self._session)
         if self._now - self._asked >= ASK_EVERY_S:
             handler = self._session.liveliness().get(self._key, RingChannel(1), timeout=10.0 * ASKED * ASK_EVERY_S)
             self._waiting.append((self._now, handler))

@@ -58,11 +58,14 @@ class CentreTaken(RuntimeError):
 class CentreProcess:
     """Paces a centre, and carries its words."""
 
-    def __init__(self, experiment: Experiment, session: zenoh.Session, keys: Keys) -> None:
-        """Declares everything but the token: whoever sees that is listened to."""
+    def __init__(
+        self, experiment: Experiment, session: zenoh.Session, keys: Keys, endpoints: Sequence[str] = ()
+    ) -> None:
+        """Declares everything but the token: whoever sees that is listened to. `endpoints` are those of the session."""
         assignment = assign_centre(experiment)
         self.centre = centre = Centre(assignment)
         self._names, self._session, self._keys = assignment.names, session, keys
+        self._router = network.RouterWatch(session, keys.centre_alive, endpoints)
         self._encoding: wire.Encoding = experiment.network.encoding
         self._period = assignment.decide_every / assignment.body_hz
         # what robots say on the tick of a decision is on its way then: half a tick more, and it counts
@@ -111,6 +114,7 @@ class CentreProcess:
 
     def _listen(self, t: float) -> None:
         """Takes in what has arrived since the last decision."""
+        self._router.silent_since(t)
         for row, statuses in self._statuses.items():
             for sample in network.received(statuses.handler):
                 self._heed(row, sample)
@@ -259,7 +263,7 @@ def serve(
                     f"a centre guides the robots of the realm '{keys.realm}' already: end it first, choose another "
                     "router with --connect, or another network.realm in the experiment file"
                 ) from None
-            process = CentreProcess(experiment, session, keys)
+            process = CentreProcess(experiment, session, keys, endpoints)
             declared.append(process)
             heard = [name for name in experiment.robots if name not in steered]
             print(

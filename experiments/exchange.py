@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from math import inf
 from typing import Final
 
@@ -51,8 +51,10 @@ class Exchange:
         trouble: The last thing that was wrong; empty if nothing was.
     """
 
-    def __init__(self, experiment: Experiment, population: Population, session: zenoh.Session) -> None:
-        """Listens; `enter` declares the rest."""
+    def __init__(
+        self, experiment: Experiment, population: Population, session: zenoh.Session, endpoints: Sequence[str] = ()
+    ) -> None:
+        """Listens; `enter` declares the rest. `endpoints` are those of the session."""
         self._population, self._session = population, session
         keys = self._keys = Keys(experiment.network.realm)
         self._encoding = experiment.network.encoding
@@ -67,7 +69,7 @@ class Exchange:
         self.utc = self._clock.utc()
         self.contacts = self.refused = self.malformed = 0
         self.trouble = ""
-        self._router = network.RouterWatch(session, keys.world_alive)
+        self._router = network.RouterWatch(session, keys.world_alive, endpoints)
         self._setpoints = network.subscriber(session, keys.setpoint("*"), DEPTH)
         self._statuses = network.pose_subscriber(session, keys.status("*"), 1024)
         self._contacts = network.publisher(session, keys.contact, wire.JSON)

@@ -90,7 +90,7 @@ class Overview:
         self._recorder_watch = network.alive_watch(self._session, keys.recorder)
         self.recording_begun = False
         self._cut_off = -inf
-        self._router = network.RouterWatch(self._session, keys.conductor)
+        self._router = network.RouterWatch(self._session, keys.conductor, endpoints)
         self._safety, self._mesh = experiment.safety, topology.is_mesh(endpoints)
 
     @property

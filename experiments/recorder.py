@@ -240,13 +240,16 @@ def record(file: str, target: Path, *, case: str, source: Path, connect: Sequenc
         ),
         Recording(target, experiment, text, case=case, seed=experiment.seed, clock="real") as recording,
     ):
-        recorder = Recorder(session, Keys(experiment.network.realm), recording)
+        keys = Keys(experiment.network.realm)
+        recorder = Recorder(session, keys, recording)
         declared.append(recorder)
+        router = network.RouterWatch(session, keys.recorder, connect)
         flush_at = time.monotonic() + FLUSH_S
         last = float("inf")
         while not asked.wait(POLL_S):
             recorder.take()
             now = time.monotonic()
+            router.silent_since(now)
             if now > flush_at:
                 recorder.complain()
                 recording.flush()

@@ -72,14 +72,19 @@ class WorldProcess:
     """Paces a population, and obeys."""
 
     def __init__(
-        self, experiment: Experiment, population: Population, session: zenoh.Session, lost: threading.Event
+        self,
+        experiment: Experiment,
+        population: Population,
+        session: zenoh.Session,
+        lost: threading.Event,
+        endpoints: Sequence[str] = (),
     ) -> None:
-        """`lost` is set when it shall end as soon as its robots are down."""
+        """`lost` is set when it shall end as soon as its robots are down; `endpoints` are those of the session."""
         self._population, self._session, self._lost = population, session, lost
         self._keys = Keys(experiment.network.realm)
         self._engine = plugins.split(experiment.world.engine)[0]
         self._dt = 1.0 / experiment.rates.body_hz
-        self._exchange = Exchange(experiment, population, session)
+        self._exchange = Exchange(experiment, population, session, endpoints)
         self._reports = network.pose_publisher(session, self._keys.world, wire.JSON)
         self._orders = network.orders(session, self._keys.world_order)
         self._pace = Pace()
@@ -260,7 +265,7 @@ def serve(
                 ) from None
             # before anything watches those tokens: a session that has begun to watch answers from what it has heard
             there = _alive(session, keys)
-            world = WorldProcess(experiment, population, session, lost)
+            world = WorldProcess(experiment, population, session, lost, endpoints)
             declared.append(world)
             back = world.find(there)
             print(_ready(experiment, population, endpoints, back), flush=True)

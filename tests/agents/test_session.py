@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from math import inf
 from pathlib import Path
 
@@ -25,6 +27,7 @@ from agents.session import (
     alive_watch,
     connected,
     last_value,
+    links,
     open_session,
     orders,
     pose_publisher,
@@ -33,8 +36,9 @@ from agents.session import (
     received,
     subscriber,
 )
-from agents.settings import config, settings
+from agents.settings import LEASE_S, config, settings
 from agents.wire import JSON, MSGPACK, Stop
+from tests.conftest import RouterProcess
 from tests.fuzz.loopnet import Net
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -278,6 +282,67 @@ def test_a_router_by_which_samples_come_is_not_asked():
     assert next(t for t, since in looked if since < inf) == pytest.approx(asked + ANSWER_S, abs=0.05)
     assert looked[-1][1] == pytest.approx(asked, abs=0.05)
     assert watch.silent_since(looked[-1][0] + 0.02, len(ticks) + 1) < inf, "what was on its way is no answer"
+
+
+def test_a_router_that_stays_silent_is_left_only_where_there_is_another(monkeypatch):
+    left = []
+    monkeypatch.setattr("agents.session.hang_up", left.append)
+    for endpoints, times in ((["one"], 0), (["one", "other"], 1)):
+        session = Asked()
+        watch = RouterWatch(session, "park/CF01/alive", endpoints)
+        looks(watch, 0.0, LEASE_S)
+        assert not left, "as long as one of ours would be waited for"
+        looks(watch, LEASE_S + 0.02, LEASE_S + 0.1)
+        assert len(left) == times
+    session.routers = []
+    looks(watch, LEASE_S + 0.12, 2.0 * LEASE_S + 0.5)
+    session.routers = ["other"]
+    looks(watch, 2.0 * LEASE_S + 0.52, 2.0 * LEASE_S + 0.54)
+    assert len(left) == 1, "the next one has as much time"
+
+
+@pytest.mark.system
+def test_at_a_frozen_first_router_with_a_long_lease_all_goes_on_at_the_second(patient_router, eventually):
+    second = RouterProcess(lease_s=60.0)
+    ends = [patient_router.endpoint, second.endpoint]
+    with open_session(ends, name="CF01") as robot, open_session(ends, name="CF02") as listener:
+        begun = time.monotonic()
+        watches = [RouterWatch(each, "park/CF01/alive", ends) for each in (robot, listener)]
+        token = alive_token(robot, "park/CF01/alive")
+        poses, heard = pose_publisher(robot, POSE, JSON), pose_subscriber(listener, POSE)
+        alive, here = alive_watch(listener, "park/*/alive"), [zenoh.SampleKind.DELETE]
+        got: list[int] = []
+        said = 0
+
+        def goes_round() -> None:
+            nonlocal said
+            for watch in watches:
+                watch.silent_since(time.monotonic() - begun, len(got) if watch is watches[1] else 0)
+            said += 1
+            poses.put(str(said).encode())
+            got.extend(int(payload) for payload in payloads(heard.handler))
+            here[:] = [*here, *(sample.kind for sample in received(alive.handler))][-1:]
+
+        def until(true: Callable[[], object]) -> None:
+            eventually(lambda: (goes_round(), true())[1])
+
+        def arrived() -> None:
+            mark = said
+            until(lambda: got and got[-1] > mark)
+            assert got == sorted(set(got)), "each once, in order"
+            until(lambda: here == [zenoh.SampleKind.PUT])
+
+        arrived()
+        old = {str(zid) for zid in robot.info.routers_zid()}
+        with patient_router.frozen():
+            os.waitpid(patient_router.process.pid, os.WUNTRACED)
+            until(lambda: {str(zid) for zid in robot.info.routers_zid()} not in (old, set()))
+            arrived()
+            assert links(robot) == links(listener) == 1
+        arrived()
+        token.undeclare()
+        until(lambda: here == [zenoh.SampleKind.DELETE])
+    assert second.stop() == 0
 
 
 def test_members_of_a_mesh_are_not_asked():

@@ -142,3 +142,22 @@ def test_robots_hold_while_a_router_with_a_long_lease_is_frozen(patient_router: 
     code, _ = flight.finish()
     assert code == 0, flight.logs()
     assert_held_in_time(flight, "periodic", stopped)
+
+
+def test_a_run_goes_on_at_the_second_router_while_the_first_with_a_long_lease_is_frozen(
+    patient_router: RouterProcess, tmp_path: Path
+) -> None:
+    second = RouterProcess(lease_s=60.0)
+    try:
+        both = f'network.connect=["{patient_router.endpoint}", "{second.endpoint}"]'
+        flight = Flight(
+            tmp_path / "run", "triangle", "--case", "periodic", "--set", both, "--set", "duration_s=8", "--no-report"
+        )
+        flight.until_said("phase conductor: formation")
+        with patient_router.frozen() as stopped:
+            flight.until_said(r"router conductor: a router answers again, after \d\.\d s")
+            code, _ = flight.finish()
+            assert code == 0, flight.logs()
+        assert_held_in_time(flight, "periodic", stopped)
+    finally:
+        second.stop()
