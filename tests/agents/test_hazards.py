@@ -422,7 +422,7 @@ def occur(agent, event, t):
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(
     st.lists(st.tuples(SPOILT, EVENTS, st.integers(1, 80)), max_size=8),
     st.sampled_from(["drop", "hold", "land"]),

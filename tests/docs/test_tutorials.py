@@ -50,7 +50,9 @@ def test_a_lesson_is_a_notebook(lesson):
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("lesson", FIGURES)
+@pytest.mark.parametrize(
+    "lesson", ["consensus", *(pytest.param(lesson, marks=pytest.mark.nightly) for lesson in ("rigidity", "events"))]
+)
 def test_what_a_lesson_claims_is_true(lesson, tmp_path):
     done = subprocess.run(
         [sys.executable, "-W", "error", FOLDER / f"{lesson}.py", tmp_path / "figures"],

@@ -480,7 +480,7 @@ def experiments(draw: st.DrawFn) -> Experiment:
 
 
 @pytest.mark.slow
-@settings(max_examples=30)
+@settings(max_examples=10)
 @given(experiments())
 def test_every_error_and_warning_has_a_remedy_and_a_place(made):
     found = check(of(made))

@@ -24,7 +24,7 @@ def test_the_gap_is_narrower_than_the_formation():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["periodic", "event"])
+@pytest.mark.parametrize("case", [pytest.param("periodic", marks=pytest.mark.nightly), "event"])
 def test_it_passes_without_contact_and_recovers(case):
     experiment = read("obstacle-course").cases()[case]
     log = virtual.simulate(experiment, [experiment.seed])

@@ -172,11 +172,18 @@ def test_repetitions_side_by_side_are_what_each_is_alone_with_all_of_it(park):
 
 # ---------------------------------------------------------------- what it is good for
 
+SEEDS = range(1, 5)  # parameters were chosen on 1001 to 1010
+
+
+@pytest.fixture(scope="module")
+def whole(park):
+    """Runs that transmit periodically."""
+    return measured(park, SEEDS)
+
 
 @pytest.mark.slow
-def test_prediction_on_a_smoothed_value_saves_97_percent_and_costs_little(park):
-    seeds = range(1, 11)  # chosen on 1001 to 1010
-    periodic, predictive = measured(park, seeds), measured(changed(park, trigger=CHOSEN), seeds)
+def test_prediction_on_a_smoothed_value_saves_97_percent_and_costs_little(park, whole):
+    periodic, predictive = whole, measured(changed(park, trigger=CHOSEN), SEEDS)
     assert mean(predictive, "f_hz") <= 0.03 * mean(periodic, "f_hz")
     assert mean(predictive, "iae") <= 1.02 * mean(periodic, "iae")
     assert mean(predictive, "itae") <= 1.05 * mean(periodic, "itae")
@@ -184,11 +191,11 @@ def test_prediction_on_a_smoothed_value_saves_97_percent_and_costs_little(park):
 
 
 @pytest.mark.slow
-def test_a_maximum_silence_keeps_prediction_from_running_away_on_a_bad_network(park):
+def test_a_maximum_silence_keeps_prediction_from_running_away_on_a_bad_network(park, whole):
     bad = changed(park, trigger={**CHOSEN, "maximum_silence_s": 2.0}, channel=Channel(delay_s=0.05, loss=0.1))
-    cases = measured(bad, range(1, 6))
+    cases = measured(bad, SEEDS)
     assert all(None not in case.acquired_s for case in cases)
-    assert mean(cases, "iae") < 1.03 * mean(measured(park, range(1, 6)), "iae")
+    assert mean(cases, "iae") < 1.03 * mean(whole, "iae")
 
 
 def test_a_formation_without_links_has_no_law_to_gate(park):

@@ -383,6 +383,7 @@ def test_the_drones_are_what_the_engine_flies():
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_reference_formation_needs_half_the_gain():
     """With the attitude's lag in the loop the file's gain of 3 hunts; see docs/mujoco.md."""
     park = document.read("robotic-park").cases()["periodic"]
