@@ -7,6 +7,8 @@ import pytest
 from experiments.check import check, command, figures
 from experiments.document import read
 
+pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
+
 HEAD = """title = "One"
 duration_s = 20.0
 """

@@ -66,7 +66,7 @@ def tuned(tmp_path_factory):
     return tune("triangle", given, "messages, iae<=1.02", **options), given, options
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_search_finds_the_fewest_messages_within_the_limit(tuned):
     found, given, options = tuned
     reference, best = found.rows
@@ -83,7 +83,7 @@ def test_the_search_finds_the_fewest_messages_within_the_limit(tuned):
     assert (again.rows, again.tried) == (found.rows, found.tried)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_command_tells_on_which_seeds(tuned, capsys):
     found, given, options = tuned
     request = Request(
