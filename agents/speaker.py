@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from enum import Enum
+from math import inf
 from typing import Final, NamedTuple
 
 import zenoh
@@ -88,6 +89,7 @@ class Speaker:
         self._past: set[str] = set()
         self._owned = False  # the token of that session is there: no other one speaks for the robot
         self._gone = False
+        self._heard_at = -inf  # when news came last (UTC [s])
         self._old, self._old_at = 0, 0.0  # how often in succession poses were old on arrival, and when last
         self.lost = self.stale = self.malformed = 0
         self.behind = 0.0
@@ -98,6 +100,7 @@ class Speaker:
 
         A new session of the robot, or a clock that was set back in one session, begins anew.
         """
+        before = self._heard_at  # what waited with others while this process stood still was not heard then
         for sample in network.received(self._poses.handler):
             payload = sample.payload.to_bytes()
             try:
@@ -120,8 +123,11 @@ class Speaker:
             since = pose.stamp - self._stamp
             missed = plausibility.missed(self._seq, pose.seq, since, self._rate) if self._seq else 0
             self._seq, self._stamp = pose.seq, pose.stamp
-            # a clock that is behind: a predictor must not carry the pose on over that time
-            measured = now - LATE_S if self.behind else plausibility.taken(pose.stamp, now)
+            # A clock that is behind: a predictor must not carry the pose on over that time. News from before the last
+            # news came, too late for a network, tell it at once; the first pose ever may be one of a silent robot.
+            slow = self.behind or (pose.stamp < before and now - pose.stamp > LATE_S)
+            measured = now - LATE_S if slow else plausibility.taken(pose.stamp, now)
+            self._heard_at = now
             yield Said(pose, len(payload), missed, measured, anew)
 
     def comings(self) -> Iterator[Coming]:

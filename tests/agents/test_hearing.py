@@ -244,6 +244,37 @@ def test_a_clock_that_is_behind_carries_no_pose_further_than_a_network_can_be_la
     assert believed(robot) == pytest.approx(0.7 + 0.1 * (0.5 + delay), abs=1e-5)
 
 
+def test_a_clock_that_is_behind_is_not_followed_from_the_second_pose_on(robot):
+    robot.token("one")
+    robot.pose(1, 0.4, session="one", age=60.0, speed=0.1)
+    robot.after(0.1)
+    robot.pose(2, 0.4, session="one", age=60.0, speed=0.1)
+    robot.after(0.0)
+    assert believed(robot) == pytest.approx(0.4 + 0.1 * LATE_S, abs=1e-5)
+    assert hazards(robot) == []
+
+
+def test_a_robot_that_begins_anew_with_a_clock_that_is_behind_is_not_followed_from_the_first_pose_on(robot):
+    robot.token("one")
+    robot.pose(1, 0.4, session="one", speed=0.1)
+    robot.after(0.1)
+    robot.token("one", gone=True)
+    robot.token("two")
+    robot.pose(1, 0.4, session="two", age=60.0, speed=0.1)
+    robot.after(0.0)
+    assert believed(robot) == pytest.approx(0.4 + 0.1 * LATE_S, abs=1e-5)
+
+
+def test_the_last_value_that_was_said_while_the_listener_was_cut_off_is_carried_on_to_now(robot):
+    robot.token("one")
+    robot.pose(1, 0.1, session="one", speed=0.1)
+    robot.after(0.1)
+    robot.t += 30.0
+    robot.pose(2, 0.4, session="one", age=20.0, speed=0.1)
+    robot.after(0.0)
+    assert believed(robot) == pytest.approx(2.4, abs=1e-5)
+
+
 def test_the_last_value_of_a_robot_that_is_silent_is_carried_on_to_now(robot):
     robot.token("one")
     robot.pose(1, 0.4, session="one", age=20.0, speed=0.1)
