@@ -120,13 +120,13 @@ def patient_router() -> Iterator[RouterProcess]:
 
 @pytest.fixture
 def eventually() -> Callable[[Callable[[], object]], None]:
-    """Waits until something is true, and fails when it is not after 10 s."""
+    """Waits until something is true, and fails when it is not after 30 s."""
 
     def wait(true: Callable[[], object]) -> None:
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + 30.0
         pause = threading.Event()
         while not true():
-            assert time.monotonic() < deadline, "it did not become true in 10 s"
+            assert time.monotonic() < deadline, "it did not become true in 30 s"
             pause.wait(0.005)
 
     return wait

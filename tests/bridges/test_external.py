@@ -128,7 +128,7 @@ class Drive:
             self.body.command(self.silent if setpoint is None else setpoint)
             return true()
 
-        until(tick, what, 15.0)
+        until(tick, what)
 
 
 # ---------------------------------------------------------------------- opening
@@ -309,7 +309,7 @@ def test_every_setpoint_is_said_once_and_rows_of_nan_are_left_alone(body: Extern
     sent[:, 1] = np.nan
     for setpoint in sent:
         body.command(setpoint)
-    until(lambda: len(far.look()) >= 20, "they arrive", 5.0)
+    until(lambda: len(far.look()) >= 20, "they arrive")
     for row, name in ((0, "CF01"), (2, "KH01")):
         drives = far.actions(name, "drive")
         assert [command.setpoint for command in drives] == [tuple(values) for values in sent[:, row].tolist()]

@@ -57,7 +57,7 @@ class Drive:
         self.slowest = max(self.slowest, time.monotonic() - begin)
         return t
 
-    def until(self, true, patience=5.0):
+    def until(self, true, patience=30.0):
         begin = self.once()
         while not true():
             assert self.once() - begin < patience, self.state
@@ -190,7 +190,7 @@ def test_robots_drive_to_their_goals(served, speaks):
     goals = np.array([[0.25, 0.1], [-0.2, 0.95]])
     with opened(open_khepera4(reached(rows, twins.addresses))) as body:
         drive = Drive(body, goals)
-        drive.until(lambda: np.abs(twins.truth()[0][:, :2] - goals).max() < 0.008, 8.0)
+        drive.until(lambda: np.abs(twins.truth()[0][:, :2] - goals).max() < 0.008)
         drive.goal = None
         body.land(np.arange(2))
         drive.until(lambda: np.abs(drive.state.velocity).max() < 0.01)
@@ -218,7 +218,7 @@ def test_a_position_from_outside_takes_the_place_of_odometry(served):
         drive.once()
         assert np.isnan(drive.state.position).all()
         drive.truth = twins.truth
-        drive.until(lambda: np.abs(twins.truth()[0][0, :2] - [0.5, 0.1]).max() < 0.008, 8.0)
+        drive.until(lambda: np.abs(twins.truth()[0][0, :2] - [0.5, 0.1]).max() < 0.008)
         assert drive.state.position[0] == pytest.approx(twins.truth()[0][0], abs=0.004)
 
 
@@ -244,7 +244,7 @@ def test_what_goes_wrong_with_one_leaves_the_others_driving(served):
         drive.until(lambda: drive.state.notes[2])
         drive.until(lambda: drive.tick * TICK - drive.state.time[2] > 0.5)
         notes = drive.state.notes
-        drive.until(lambda: abs(good.truth()[0][0, 0] - 0.3) < 0.008, 8.0)
+        drive.until(lambda: abs(good.truth()[0][0, 0] - 0.3) < 0.008)
         assert drive.state.notes[0] == ""
         assert drive.slowest < 0.5
     assert notes[1].startswith("silent for")
@@ -270,7 +270,7 @@ def test_a_link_that_was_lost_comes_back_and_goes_on(served):
         place = first.addresses[0].replace("khepera4://", "khepera4-twin://")
         second = served(request("khepera4", [place], start=[[stood, 0.0, 0.0]]))
         drive.until(lambda: not drive.state.notes[0])
-        drive.until(lambda: abs(second.truth()[0][0, 0] - 0.5) < 0.008, 8.0)
+        drive.until(lambda: abs(second.truth()[0][0, 0] - 0.5) < 0.008)
         assert drive.state.position[0, 0] == pytest.approx(second.truth()[0][0, 0], abs=0.004)
 
 

@@ -184,7 +184,7 @@ class BridgeProcess:
             self.lines.append(line.rstrip())
 
     def until_said(self, words: str, times: int = 1) -> None:
-        until(lambda: sum(words in line for line in self.lines) >= times, f"{words!r} in {self.lines}", 10.0)
+        until(lambda: sum(words in line for line in self.lines) >= times, f"{words!r} in {self.lines}")
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> int:
         if self.process.poll() is None:
@@ -233,7 +233,7 @@ class Listener:
 
     def until(self, more: int) -> None:
         wanted = self.look() + more
-        until(lambda: self.look() >= wanted, f"{more} more positions", 10.0)
+        until(lambda: self.look() >= wanted, f"{more} more positions")
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ def test_who_is_there_is_adopted_and_who_has_flown_is_not(router: RouterProcess,
         flight.until_said("adopted KH02: is ")
         watcher.until(lambda: watcher.phase("KH02") == "running", "it takes part")
         assert at_boot.wait() == 0, "with --once it ends when it is down, so that its service starts it anew"
-        watcher.until(lambda: watcher.status["KH02"].reason == "finished", "it knew what --set had changed", 3.0)
+        watcher.until(lambda: watcher.status["KH02"].reason == "finished", "it knew what --set had changed")
         assert watcher.order("CF01", wire.Order("land")).ok, "its own file has twenty seconds"
     finally:
         watcher.close()

@@ -50,7 +50,7 @@ def test_robots_hold_while_the_centre_is_dead_and_go_on_when_it_is_back(tmp_path
     file, folder = tmp_path / "three.toml", tmp_path / "run"
     file.write_text(FAST.format(duration=6.5, architecture=HYBRID))
     flight = Flight(folder, str(file), "--json", "--no-report")
-    flight.until_said(r"phase conductor: TB01 under way", 40.0)
+    flight.until_said(r"phase conductor: TB01 under way", 60.0)
     everyone = list(flight.children().values())
     watcher = Watcher(flight.endpoint())
     names = ("TB01", "KH01")
@@ -167,7 +167,7 @@ def test_a_lab_lets_the_centre_decide_and_nobody_else(tmp_path: Path) -> None:
     authority.create(tmp_path / "lab", {**{role: role for role in authority.SERVICES}, **robots})
     (tmp_path / "lab" / "ca.key").unlink()  # no run needs it
     flight = Flight(folder, str(file), "--json", "--no-report")
-    flight.until_said(r"phase conductor: TB01 under way", 40.0)
+    flight.until_said(r"phase conductor: TB01 under way", 60.0)
     watcher = Watcher(flight.endpoint())
     watcher.until(lambda: {"TB01", "KH01", "KH02"} <= {*watcher.state}, "telemetry")
     goal, own = (network.subscriber(watcher.session, key) for key in (KEYS.goal("KH01"), KEYS.ranges("KH02")))

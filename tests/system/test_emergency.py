@@ -44,9 +44,9 @@ def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
     file, folder = tmp_path / "two.toml", tmp_path / "run"
     file.write_text(TWO_CASES.format(duration=90.0))
     flight = Flight(folder, str(file), "--no-report")
-    flight.until_said(r"phase conductor: formation", 40.0)
+    flight.until_said(r"phase conductor: formation", 60.0)
     other = Flight(tmp_path / "other", str(file), "--no-report")
-    other.until_said(r"phase conductor: formation", 40.0)
+    other.until_said(r"phase conductor: formation", 60.0)
     assert (
         f"another run is up with robots of these names (CF01, KH01): two that stay together, {folder}" in other.said()
     )
@@ -61,9 +61,9 @@ def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
         for each, (endpoint,) in zip((flight, other), up, strict=True)
     ]
     other.until_said(r"stop conductor: emergency stop by operator: person in arena; the run ends here")
-    assert other.finish(30.0)[0] == 1
+    assert other.finish()[0] == 1
     flight.until_said(r"stop conductor: emergency stop by operator: person in arena; the run ends here")
-    code, _ = flight.finish(30.0)
+    code, _ = flight.finish()
     assert registry.runs() == []
     said = flight.said()
     assert code == 1
@@ -81,9 +81,9 @@ def test_before_the_common_start_too(tmp_path: Path) -> None:
     file, folder = tmp_path / "two.toml", tmp_path / "run"
     file.write_text(TWO_CASES.format(duration=30.0))
     flight = Flight(folder, str(file), "--no-report")
-    flight.until_said(r"ready conductor: 2 robots", 40.0)
+    flight.until_said(r"ready conductor: 2 robots", 60.0)
     assert estop(flight.endpoint()).stdout == "stopped: CF01, KH01\n"
-    code, out = flight.finish(30.0)
+    code, out = flight.finish()
     assert code == 1
     assert "common start" not in flight.said()
     assert "emergency stop by operator: person in arena, before the common start" in out

@@ -94,7 +94,7 @@ def test_without_the_conductor_robots_end_if_the_file_says_so(router: RouterProc
             assert watcher.order(name, wire.Order("takeoff")).ok
         watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["airborne"] * 2, "waiting for the start")
         token.undeclare()  # type: ignore[no-untyped-call]
-        watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["done"] * 2, "down", 8.0)
+        watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["done"] * 2, "down")
         status = watcher.status["A"]
         assert status.reason == "the conductor is gone"
         assert status.hazard.startswith("land: the conductor is gone: for 2.")

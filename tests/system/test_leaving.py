@@ -34,7 +34,7 @@ def test_a_robot_leaves_a_router_that_does_not_answer(router: RouterProcess) -> 
         threading.Event().wait(CUT_OFF_S)
         began = time.monotonic()
         assert robot.end() == 0
-        assert time.monotonic() - began < 5.0  # Zenoh alone takes 13 s
+        assert time.monotonic() - began < 10.0  # Zenoh alone takes 13 s
     finally:
         router.process.send_signal(signal.SIGCONT)
         watcher.close()
@@ -101,11 +101,11 @@ def test_a_frozen_robot_keeps_nobody_when_the_launcher_is_killed(tmp_path: Path,
         threading.Event().wait(0.5)
         flight.process.kill()
         until(lambda: gone([children["CF01"], children["KH02"]]), "the robots have landed")
-        until(lambda: gone(list(children.values())), "everybody else is gone", 5.0)
+        until(lambda: gone(list(children.values())), "everybody else is gone")
         frozen.resume()
-        until(lambda: gone([frozen]), "the frozen one too", 8.0)
+        until(lambda: gone([frozen]), "the frozen one too")
     finally:
-        flight.finish(5)
+        flight.finish()
         for process in (frozen, *children.values()):
             try:
                 process.kill()

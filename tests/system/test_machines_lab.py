@@ -74,7 +74,7 @@ class Laboratory:
     def flew(self, duration_s: float = 2.0) -> None:
         code, out = self.fly(duration_s)
         assert code == 0, out
-        until(lambda: not busy(self.lab), "nothing is left", 5.0)
+        until(lambda: not busy(self.lab), "nothing is left")
         trace = playback.read(self.out / "event.mcap").trace
         assert not trace.lost.any()
         for robot in trace.robots:

@@ -98,7 +98,7 @@ def test_real_robots_that_stand_in_the_way_of_twins_are_seen_and_avoided(tmp_pat
                     seen.append(ahead(wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Ranges)))
             return all(len(seen) >= 12 for seen in readings)
 
-        until(enough, "range readings", 10.0)
+        until(enough, "range readings")
     for flight, seen, (realm, _, _, twin, real, kind) in zip(flights, readings, RUNS, strict=True):
         code, said = flight.finish(60.0)
         assert code == 0, said

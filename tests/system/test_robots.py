@@ -85,7 +85,7 @@ def test_a_late_joiner_and_a_restarted_robot_hear_the_last_poses_at_once(
         late = fly(stack, router, "triangle", "CF01")
         watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
         late.kill()
-        watcher.until(lambda: "CF01" not in watcher.alive, "the token is gone", 2.0)
+        watcher.until(lambda: "CF01" not in watcher.alive, "the token is gone")
         watcher.until(lambda: watcher.status["KH01"].missing == ["CF01"], "its death is known")
         before = watcher.status["CF01"].pid
         again = fly(stack, router, "triangle", "CF01")
@@ -140,9 +140,9 @@ def test_an_emergency_stop_cuts_all_motors(router: RouterProcess, watcher: Watch
         watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
         stop = wire.Stop("a test", "to see it fall")
         watcher.session.put(watcher.keys.estop, wire.encode(stop), encoding=wire.JSON)
-        watcher.until(lambda: watcher.phase("CF01") == "done", "motors off", 2.0)
+        watcher.until(lambda: watcher.phase("CF01") == "done", "motors off")
         assert watcher.status["CF01"].reason == "emergency stop by a test: to see it fall"
-        watcher.until(lambda: watcher.state["CF01"].position[2] < 0.03, "it fell", 2.0)
+        watcher.until(lambda: watcher.state["CF01"].position[2] < 0.03, "it fell")
 
 
 def nonsense() -> list[tuple[bytes, str]]:
@@ -209,11 +209,16 @@ def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher
     with ExitStack() as stack:
         robot = RobotProcess(router.endpoint, "triangle", *TRIANGLE, lifeline=True)
         stack.callback(lambda: robot.process.returncode is not None or robot.end())
-        assert robot.process.stdin is not None
-        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready", 2.9)
-        robot.process.stdin.write("\n")
-        robot.process.stdin.flush()
-        watcher.order("CF01", wire.Order("takeoff"))
+        stdin = robot.process.stdin
+        assert stdin is not None
+
+        def starter_is_heard_and_all_are_ready() -> bool:
+            stdin.write("\n")
+            stdin.flush()
+            return all(watcher.phase(name) == "ready" for name in TRIANGLE)
+
+        watcher.until(starter_is_heard_and_all_are_ready, "all are ready")
+        assert watcher.order("CF01", wire.Order("takeoff")).ok
         watcher.until(
             lambda: watcher.status["CF01"].reason.startswith("nothing from the starter"), "silence is noticed"
         )

@@ -45,14 +45,14 @@ def test_a_killed_router_holds_nobody_up(tmp_path: Path) -> None:
     (first, one), (_, other) = routers(flight)
     watcher = Watcher(other)
     try:
-        watcher.until(lambda: len(watcher.state) == 3 == len(watcher.alive), "robots at one are seen at the other", 5.0)
+        watcher.until(lambda: len(watcher.state) == 3 == len(watcher.alive), "robots at one are seen at the other")
         first.kill()
         told = {name: state.seq for name, state in watcher.state.items()}
-        watcher.until(lambda: all(watcher.state[name].seq > told[name] + 10 for name in told), "all go on", 3.0)
+        watcher.until(lambda: all(watcher.state[name].seq > told[name] + 10 for name in told), "all go on")
         flight.until_said(r"the router ended \(killed by SIGKILL\); started again: all go on at another meanwhile")
         late = Watcher(one)
         try:
-            late.until(lambda: len(late.state) == 3 == len(late.alive), "a newcomer at the first sees all", 10.0)
+            late.until(lambda: len(late.state) == 3 == len(late.alive), "a newcomer at the first sees all")
         finally:
             late.close()
         watcher.until(lambda: all(not status.missing for status in watcher.status.values()), "nobody is missed")
@@ -100,7 +100,7 @@ def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[L
     assert msgspec.json.decode(made.rights.read_bytes(), type=Rights).linked
     looker = Watcher(other)  # as operator: through the link everything is seen, and orders are carried
     try:
-        looker.until(lambda: all(looker.phase(name) == "running" for name in FLOWN), "seen through the link", 10.0)
+        looker.until(lambda: all(looker.phase(name) == "running" for name in FLOWN), "seen through the link")
         assert looker.order("KH01", wire.Order("get", name="speed")).robot == "KH01"
     finally:
         looker.close()

@@ -118,7 +118,7 @@ def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> Non
     flight.until_said(r"phase conductor: formation")
     everyone = list(flight.children().values())
     flight.children()["KH02"].kill()
-    flight.until_said(r"lost KH02: its process ended \(killed by SIGKILL\)", 3.0)
+    flight.until_said(r"lost KH02: its process ended \(killed by SIGKILL\)")
     code, out = flight.finish()
     assert code == 0
     assert gone(everyone)
@@ -139,7 +139,7 @@ def test_a_killed_router_comes_back_and_the_formation_holds(tmp_path: Path) -> N
     flight.until_said(r"phase conductor: formation")
     everyone = list(flight.children().values())
     flight.children()["router"].kill()
-    flight.until_said(r"the router ended \(killed by SIGKILL\); started again", 3.0)
+    flight.until_said(r"the router ended \(killed by SIGKILL\); started again")
     code, _ = flight.finish()
     assert code == 0
     assert gone(everyone)

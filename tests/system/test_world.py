@@ -100,7 +100,7 @@ class Desk(Looking):
                 self.tell(name, "drive", setpoint=setpoint)
             return true()
 
-        self.until(seen, what, 10.0)
+        self.until(seen, what)
 
     def close(self) -> None:
         self.session.close()  # type: ignore[no-untyped-call]
@@ -166,7 +166,7 @@ def test_a_world_that_is_killed_is_started_again_and_robots_go_on_where_they_wer
         watcher.until(lambda: time.time() > begun + 1.0, "they are on their way")
         before = dict(watcher.state)
         flight.children()["world"].kill()
-        flight.until_said(r"world conductor: the world ended \(killed by SIGKILL\); started again", 5.0)
+        flight.until_said(r"world conductor: the world ended \(killed by SIGKILL\); started again")
         assert {state.phase for state in before.values()} == {"running"}
         code, out = flight.finish(60.0)
         assert code == 0
@@ -204,13 +204,13 @@ def test_climbs_and_landings_go_on_in_the_next_world(router: RouterProcess, file
             assert watcher.order(name, wire.Order("takeoff")).ok
         watcher.until(lambda: min(map(height, both)) > 0.25, "they climb")
         world = again()
-        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in both), "they arrive", 15.0)
+        watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in both), "they arrive")
         assert min(map(height, both)) > 0.54
         for name in both:
             assert watcher.order(name, wire.Order("land")).ok
         watcher.until(lambda: max(map(height, both)) < 0.4, "they sink")
         world = again()
-        watcher.until(lambda: all(watcher.phase(name) == "done" for name in both), "they are down", 8.0)
+        watcher.until(lambda: all(watcher.phase(name) == "done" for name in both), "they are down")
         assert max(map(height, both)) < 0.06
     finally:
         robots.end()
@@ -312,7 +312,7 @@ def test_robots_that_are_told_nothing_hold_and_then_land(world: WorldProcess, de
     desk.tell("TE01", "drive", setpoint=(0.4, 0.0, 0.0, 0.0))
     desk.tell("CF01", "drive", setpoint=(1.0, 1.0, 0.6, 0.0))
     desk.until(lambda: desk.x("TE01")[0] > -0.95, "it moves")
-    desk.until(lambda: desk.x("TE01")[2] == 0.0 and desk.x("CF01")[2] == 0.0, "they land", 15.0)
+    desk.until(lambda: desk.x("TE01")[2] == 0.0 and desk.x("CF01")[2] == 0.0, "they land")
     assert -0.95 < desk.x("TE01")[0] < -0.55, "half a second at 0.4 m/s, and what it takes to stop"
     assert 0.2 < desk.x("CF01")[0] < 0.6, "where it was when it had not been told anything for half a second"
     assert {event.source for event in desk.events if event.kind == "silent"} == {"CF01", "TE01"}

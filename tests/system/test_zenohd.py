@@ -52,7 +52,7 @@ def started(endpoint: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]
     """A zenohd that listens."""
     process = subprocess.Popen([zenohd.folder() / "zenohd", *arguments], stdin=subprocess.DEVNULL)
     try:
-        until(lambda: answers(endpoint, process), "zenohd answers", 10.0)
+        until(lambda: answers(endpoint, process), "zenohd answers")
         yield process
     finally:
         process.send_signal(signal.SIGCONT)
