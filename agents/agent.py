@@ -13,26 +13,26 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from agents.assignment import Assignment
-from agents.avoidance import Avoidance, Nearby, Self
-from agents.body import BodyState
-from agents.deciding import Deciding, Holding
-from agents.detection import Detector, Outside, Standing
-from agents.graph import Links
-from agents.guidance import Guidance
-from agents.hazards import Hazards, Outcome
-from agents.hearing import Heard, Hearing
-from agents.individual import Individual
-from agents.landing import Landing
-from agents.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, Duties, Lifecycle, Phase
-from agents.plugins import FAILURES, PluginError
-from agents.preflight import Preflight
-from agents.rows import Array, Index, Mask, some
-from agents.safety import Safety, Whereabouts
-from agents.sight import Sight
-from agents.speaking import Said, Voice
-from agents.triggers import Told, Trigger
-from agents.wire import Setpoint
+from agents.arrays import Array, Index, Mask, some
+from agents.body.interface import BodyState
+from agents.decision.assignment import Assignment
+from agents.decision.centralised import Guidance
+from agents.decision.goals import Deciding, Holding
+from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, Duties, Lifecycle, Phase
+from agents.decision.neighbours import Heard, Hearing
+from agents.decision.perception import Sight
+from agents.decision.position_control import Individual
+from agents.decision.transmission import Said, Voice
+from agents.formation.graph import Links
+from agents.network.messages import Setpoint
+from agents.plugins.avoidance import Avoidance, Nearby, Self
+from agents.plugins.registry import FAILURES, PluginError
+from agents.plugins.triggers import Told, Trigger
+from agents.safety.detection import Detector, Outside, Standing
+from agents.safety.hazards import Hazards, Outcome
+from agents.safety.landing import Landing
+from agents.safety.preflight import Preflight
+from agents.safety.setpoint_filter import Safety, Whereabouts
 
 
 class Actions(msgspec.Struct, frozen=True):

@@ -15,15 +15,15 @@ import msgspec
 import numpy as np
 import zenoh
 
-from agents import session as network
-from agents import wire
-from agents.body import UNANSWERED, BodyError, BodyRequest, BodyState
-from agents.endpoint import EndpointError
-from agents.leaving import leave
-from agents.measured import MeasuredPositions
-from agents.positioning import External
-from agents.ranging import HeardRanges
-from agents.rows import Array, Index, Mask, norm, some
+from agents.arrays import Array, Index, Mask, norm, some
+from agents.body.external_pose import External
+from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState
+from agents.body.measured_positions import MeasuredPositions
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.endpoints import EndpointError
+from agents.network.shutdown import leave
+from agents.runtime.range_inbox import HeardRanges
 
 Action = Literal["drive", "takeoff", "land", "stop"]
 
@@ -53,12 +53,12 @@ class _Standing(msgspec.Struct):
     soon as the first one died, and it knows of no earlier order.
     """
 
-    order: wire.Command
+    order: messages.Command
     until: float
 
 
 class ExternalBody:
-    """Rows whose robots live in another process; implements `agents.body.Body`.
+    """Rows whose robots live in another process; implements `agents.body.interface.Body`.
 
     Its own clock is the monotonic one, from when it was made; `read` tells how the clock of its caller lies to it.
     """
@@ -107,12 +107,12 @@ class ExternalBody:
             self._session = network.open_session(self._endpoints, name=name, wait_s=OPEN_S, identity=self._names[0])
         except (network.Unreachable, EndpointError) as error:
             raise BodyError(f"{', '.join(self._names)}: {error}") from None
-        session, keys, mime = self._session, self._keys, wire.MIME["json"]
+        session, keys, mime = self._session, self._keys, messages.MIME["json"]
         rows = range(len(self._names))
         self._positions = MeasuredPositions(session, keys, self._names, rows, REACH)
         self._ranges = HeardRanges(session, keys, self._names, rows)
-        self._setpoints = [network.publisher(session, keys.setpoint(name), mime) for name in self._names]
-        self._orders = [network.urgent_publisher(session, keys.setpoint(name), mime) for name in self._names]
+        self._setpoints = [pubsub.publisher(session, keys.setpoint(name), mime) for name in self._names]
+        self._orders = [pubsub.urgent_publisher(session, keys.setpoint(name), mime) for name in self._names]
         pause = threading.Event()
         while (missing := self._missing()) and time.monotonic() < deadline:
             pause.wait(LOOK_S)
@@ -283,7 +283,7 @@ class ExternalBody:
 
     # ------------------------------------------------------------------ what the far end is told
 
-    def _drive(self, row: int, setpoint: wire.Setpoint) -> None:
+    def _drive(self, row: int, setpoint: messages.Setpoint) -> None:
         with self._lock:
             if self._stopped[row]:
                 return  # while the setpoint was decided
@@ -299,17 +299,17 @@ class ExternalBody:
             self._put(row, order)
 
     def _command(
-        self, row: int, action: Action, setpoint: wire.Setpoint | None = None, height: float | None = None
-    ) -> wire.Command:
+        self, row: int, action: Action, setpoint: messages.Setpoint | None = None, height: float | None = None
+    ) -> messages.Command:
         self._sent[row] += 1
-        return wire.Command(self._names[row], self._sent[row], self._stamp(), action, setpoint, height)
+        return messages.Command(self._names[row], self._sent[row], self._stamp(), action, setpoint, height)
 
-    def _put(self, row: int, command: wire.Command) -> None:
+    def _put(self, row: int, command: messages.Command) -> None:
         if self._session is None:
             return  # `stop` may come after `close`
         try:
             publishers = self._setpoints if command.action == "drive" else self._orders
-            publishers[row].put(wire.encode(command))
+            publishers[row].put(messages.encode(command))
         except zenoh.ZError as error:
             self._positions.trouble[row] = f"cannot be told anything: {error}"
 

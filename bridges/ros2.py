@@ -17,16 +17,16 @@ from typing import Final, get_args
 
 import zenoh
 
-from agents import plausibility, wire
-from agents import session as network
-from agents.body import BodyError
-from agents.endpoint import EndpointError
-from agents.keys import Keys
-from agents.lifeline import Lifeline
-from agents.process import add_network, reached, told_to_end
+from agents.body.interface import BodyError
+from agents.network import messages, pubsub, validation
+from agents.network import session as network
+from agents.network.endpoints import EndpointError
+from agents.network.keys import Keys
 from agents.protocols import ros2
 from agents.protocols.ros2 import Distro, Message, Types
-from agents.rosnode import Participant, Publisher, Subscriber
+from agents.protocols.ros2_node import Participant, Publisher, Subscriber
+from agents.runtime.command_line import add_network, reached, told_to_end
+from agents.runtime.lifeline import Lifeline
 
 NODE: Final = "zenpark"
 FRAME: Final = "map"  # the arena, as rviz and nav2 name the fixed frame; goals must be in it
@@ -69,10 +69,10 @@ class Graph:
         self._node = participant.node(NODE)
         self._diagnostics = self._node.publisher("/diagnostics", ros2.DIAGNOSTIC_ARRAY)
         self._robots: dict[str, _Robot] = {}
-        self._states = network.subscriber(session, keys.state("*"), 1024)
-        self._statuses = network.pose_subscriber(session, keys.status("*"), 256)
-        self._alive = network.alive_watch(session, keys.alive("*"))
-        self._centres = network.alive_watch(session, keys.centre_alive)
+        self._states = pubsub.subscriber(session, keys.state("*"), 1024)
+        self._statuses = pubsub.pose_subscriber(session, keys.status("*"), 256)
+        self._alive = pubsub.alive_watch(session, keys.alive("*"))
+        self._centres = pubsub.alive_watch(session, keys.centre_alive)
         self._guided = False
         self._clock = participant.clock
         self._seq = round(self._clock.utc() * 1e3)  # beyond whatever somebody else who decided had reached
@@ -116,7 +116,7 @@ class Graph:
             self._node.publisher(f"/{chunk}/pose", ros2.POSE_STAMPED),
             self._node.publisher(f"/{chunk}/velocity", ros2.TWIST_STAMPED),
             self._node.subscriber(f"/{chunk}/goal", ros2.POSE_STAMPED, depth=8),
-            network.publisher(self._session, self._keys.goal(name), wire.JSON),
+            pubsub.publisher(self._session, self._keys.goal(name), messages.JSON),
         )
 
     def _moves(self) -> None:
@@ -127,9 +127,9 @@ class Graph:
             if name is None or robot is None:
                 continue
             try:
-                state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
-                plausibility.check_state(state, robot=name, now=self._clock.utc(), reach=REACH)
-            except wire.Malformed:
+                state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
+                validation.check_state(state, robot=name, now=self._clock.utc(), reach=REACH)
+            except messages.Malformed:
                 self.malformed += 1
                 continue
             robot.stamp = state.stamp
@@ -143,8 +143,8 @@ class Graph:
         found = []
         for sample in network.received(self._statuses.handler):
             try:
-                status = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Status)
-            except wire.Malformed:
+                status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
+            except messages.Malformed:
                 self.malformed += 1
                 continue
             if status.robot in self._robots:
@@ -162,8 +162,8 @@ class Graph:
         turned = q.x or q.y or q.z or q.w  # a quaternion of zeros: whoever asks does not care
         yaw = atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z)) if turned else None
         self._seq += 1
-        goal = wire.Goal(name, self._seq, self._clock.utc(), (place.x, place.y, place.z), yaw, robot.stamp)
-        robot.out.put(wire.encode(goal))
+        goal = messages.Goal(name, self._seq, self._clock.utc(), (place.x, place.y, place.z), yaw, robot.stamp)
+        robot.out.put(messages.encode(goal))
 
 
 def ros_name(robot: str) -> str:
@@ -172,7 +172,7 @@ def ros_name(robot: str) -> str:
     return f"_{name}" if name[:1].isdigit() else name
 
 
-def pose(types: Types, state: wire.State, position: wire.Vector) -> Message:
+def pose(types: Types, state: messages.State, position: messages.Vector) -> Message:
     """A PoseStamped in the arena; only the yaw of the robot is known, and 0 stands for one that is not."""
     x, y, z = position
     place = types.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
@@ -182,13 +182,13 @@ def pose(types: Types, state: wire.State, position: wire.Vector) -> Message:
     return types.make(ros2.POSE_STAMPED, header=types.header(state.stamp, FRAME), pose=stamped)
 
 
-def velocity(types: Types, state: wire.State, moves: wire.Vector) -> Message:
+def velocity(types: Types, state: messages.State, moves: messages.Vector) -> Message:
     """A TwistStamped along the axes of the arena; its angular part is not known and zero."""
     twist = types.twist(moves, (0.0, 0.0, 0.0))
     return types.make(ros2.TWIST_STAMPED, header=types.header(state.stamp, FRAME), twist=twist)
 
 
-def diagnosis(types: Types, status: wire.Status) -> Message:
+def diagnosis(types: Types, status: messages.Status) -> Message:
     """A DiagnosticStatus: a warning while the robot, its body or the network has something to complain of."""
     level = WARN if status.body or status.missing or status.hazard else OK
     said = "; ".join(part for part in (status.phase, status.reason, status.hazard, status.body) if part)

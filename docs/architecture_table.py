@@ -14,10 +14,11 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from experiments import assign, goals, virtual
-from experiments.experiment import Channel, Experiment
-from experiments.run import load
-from experiments.sweep_runs import Figures, figures_of
+from experiments.definition import assignment
+from experiments.definition.experiment import Channel, Experiment
+from experiments.file.document import load
+from experiments.sweep.runs import Figures, figures_of
+from experiments.virtual_time import simulation
 
 SEEDS: Final = 20
 BATCH: Final = 10  # seeds side by side: more take more memory, not less time
@@ -30,11 +31,11 @@ TRIGGERS: Final[dict[str, dict[str, Any]]] = {
 
 def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[Figures], float, float, float]:
     """Figures of each seed; of a run, on average: messages of the network, deliveries, and the delay of goals [s]."""
-    listeners = np.bincount(assign.heard_links(experiment).speaker, minlength=len(experiment.robots))
+    listeners = np.bincount(assignment.heard_links(experiment).speaker, minlength=len(experiment.robots))
     found: list[Figures] = []
     messages, deliveries, delay = [], [], []
     for begin in range(0, len(seeds), BATCH):
-        log = virtual.simulate(experiment, seeds[begin : begin + BATCH], lean=True)
+        log = simulation.simulate(experiment, seeds[begin : begin + BATCH], lean=True)
         found += figures_of(log, experiment)
         rows, (time, row, *_) = len(log.names), log.sent
         within = (time >= -1e-9) & (time < experiment.duration_s - 1e-9)
@@ -42,7 +43,7 @@ def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[Figures], 
         for copy, sent in enumerate(poses):
             told, heard = 0, 0
             if log.steered is not None:
-                seen = goals.of_log(log.steered, log.names, copy * rows, experiment.duration_s, "json")
+                seen = log.of_log(log.steered, log.names, copy * rows, experiment.duration_s, "json")
                 told, heard = len(seen.time), int(seen.heard.sum())
                 delay.append(float(seen.delay.mean()))
             messages.append(int(sent.sum()) + told)

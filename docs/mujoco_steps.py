@@ -8,11 +8,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.kinds import CRAZYFLIE
-from agents.rows import Array
-from experiments.drawing import CASES, STYLE
-from twins.attitude import Drones
-from twins.quadrotor import LEANING, RESPONSES, Quadrotor
+from agents.arrays import Array
+from agents.body.kinds import CRAZYFLIE
+from experiments.report.style import CASES, STYLE
+from twins.engines.mujoco_engine import Drones
+from twins.models.quadrotor import LEANING, RESPONSES, Quadrotor
 from twins.scene import Scene
 
 DT, SECONDS, HEIGHT = 0.01, 4.0, 1.0

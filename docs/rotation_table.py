@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from agents import plugins
-from experiments import document, virtual
-from experiments.experiment import Experiment, Formation, Link, Robot, Start
-from experiments.formation import Pattern, errors
-from experiments.seeds import spread
-from experiments.signals import net_rotation
+from agents.plugins import registry
+from experiments.definition.experiment import Experiment, Formation, Link, Robot, Start
+from experiments.definition.formation import Pattern, errors
+from experiments.file import document
+from experiments.metrics.signals import net_rotation
+from experiments.metrics.statistics import spread
+from experiments.virtual_time import simulation
 
 SEEDS = tuple(range(200, 224))
 EVENT = {"kind": "send-on-delta", "threshold": 0.01}
@@ -46,12 +47,12 @@ class Row:
 
 def measured(name: str, experiment: Experiment) -> Row:
     """Of one experiment, from 40 s on."""
-    log = virtual.simulate(experiment, SEEDS)
+    log = simulation.simulate(experiment, SEEDS)
     late = (log.time >= SETTLED_S) & (log.time < experiment.duration_s)
     rows, time = len(log.names), log.time[late]
     follow = [row for row, each in enumerate(log.names) if each != experiment.formation.leader]
     pattern = Pattern.of(experiment, log.names)
-    law = plugins.build(plugins.LAWS, experiment.formation.law)
+    law = registry.build(registry.LAWS, experiment.formation.law)
     rate, error = [], []
     for copy in range(len(SEEDS)):
         position = log.true_position[late, copy * rows : (copy + 1) * rows]

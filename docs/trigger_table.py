@@ -14,11 +14,12 @@ from typing import Any, Final
 
 import msgspec
 
-from experiments import metrics, virtual
-from experiments.experiment import Channel, Experiment
-from experiments.logbook import Logbook
-from experiments.measured import CaseMetrics
-from experiments.run import load
+from experiments.definition.experiment import Channel, Experiment
+from experiments.file.document import load
+from experiments.metrics import measure
+from experiments.metrics.results import CaseMetrics
+from experiments.virtual_time import simulation
+from experiments.virtual_time.log import Logbook
 
 TUNING: Final = tuple(range(1001, 1011))
 REPORTED: Final = tuple(range(1, 51))
@@ -57,8 +58,8 @@ def measured(experiment: Experiment, seeds: Sequence[int]) -> list[CaseMetrics]:
     found = []
     for begin in range(0, len(seeds), BATCH):
         batch = seeds[begin : begin + BATCH]
-        log = virtual.simulate(experiment, batch)
-        found += [metrics.measure(Logbook(log, experiment, "", copy).trace()) for copy in range(len(batch))]
+        log = simulation.simulate(experiment, batch)
+        found += [measure.measure(Logbook(log, experiment, "", copy).trace()) for copy in range(len(batch))]
     return found
 
 

@@ -1,45 +1,76 @@
-"""Runs experiments in virtual time, and reads back what any run has left: from Python and from the command line.
+"""Figures in a notebook, and in a script that opens as one.
 
-In a notebook:
-
-    from experiments.run import load, simulate
-    run = simulate(load("robotic-park", "cases.event.trigger.threshold=0.02"))
-    run.traces["event"].true_position      # (T, N, 3) [m]
-    run.metrics["event"].mean["iae"]
-    run.figures()["errors"].savefig("errors.pdf")
-
-An experiment may stand in the notebook itself: `loads` takes its text. `experiments.notebook` shows figures there.
+from experiments.run import show
+show(run.figures()["errors"], "figures/errors")     # the last line of a cell: shown below it, and kept as a file
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-import shutil
-import signal
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
-from experiments import document, metrics, playback, reserves, results, virtual
-from experiments.document import Document
-from experiments.experiment import Experiment
-from experiments.logbook import Logbook
-from experiments.measured import CaseMetrics
-from experiments.problem import DocumentError, Problem
-from experiments.trace import Trace
+from matplotlib.figure import Figure
+
+from experiments.definition import standby
+from experiments.definition.experiment import Experiment
+from experiments.file import document
+from experiments.file.document import Document, chosen
+from experiments.file.problems import DocumentError, Problem
+from experiments.metrics import measure
+from experiments.metrics.results import CaseMetrics
+from experiments.recording import playback
+from experiments.recording.run_folder import SOURCE
+from experiments.recording.trace import Trace
+from experiments.report import metrics_files, style
+from experiments.virtual_time import simulation
+from experiments.virtual_time.log import Logbook
+
+CHECKOUT: Final = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure that shows itself below a cell; `files` are where it is kept, SVG and PDF."""
+
+    figure: Figure
+    files: tuple[Path, ...] = ()
+
+    def _repr_svg_(self) -> str:
+        """What notebooks ask for. The figures are drawn without pyplot, by which notebooks would find them."""
+        return style.svg(self.figure)
+
+
+def show(figure: Figure, file: str | Path | None = None) -> Picture:
+    """A figure for the end of a cell.
+
+    Args:
+        figure: Any of matplotlib's.
+        file: Where to keep it, as SVG and PDF; without a suffix.
+    """
+    if file is None:
+        return Picture(figure)
+    return Picture(figure, style.save(figure, Path(file).parent, Path(file).name))
+
+
+def folder(default: str) -> Path:
+    """Where a script keeps its figures: its first argument; `default` if there is none, and in a notebook.
+
+    Args:
+        default: From the checkout, wherever the script or the notebook was started.
+    """
+    given = [] if "ipykernel" in sys.modules else sys.argv[1:]  # a kernel's arguments are its own
+    return Path(given[0]) if given else CHECKOUT / default
+
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-RUNS: Final = Path("runs")
-SOURCE: Final = "experiment.toml"
 MOST_SAMPLES: Final = 2e7  # states of one robot; each takes about 300 bytes
 
 
@@ -69,46 +100,14 @@ class Run:
 
     def figures(self) -> dict[str, Figure]:
         """The figures of the report, by name."""
-        from experiments import figures, shadow_figures  # noqa: PLC0415 - matplotlib takes 0.6 s
+        from experiments.report import figures  # noqa: PLC0415 - matplotlib takes 0.6 s
 
         traces = list(self.traces.values())
-        return figures.every(list(self.metrics.values()), traces) | shadow_figures.every(traces)
+        return figures.every(list(self.metrics.values()), traces) | figures.shadow_figures(traces)
 
     def summary(self) -> dict[str, Any]:
         """The figures for scripts, as `zenpark run --json` prints them."""
-        return results.document(str(self.folder or ""), self.seed, list(self.metrics.values()))
-
-
-def load(file: str | Path, *changes: str) -> Document:
-    """An experiment by its file or its name in the catalogue, with fields changed as behind `--set`.
-
-    Raises:
-        DocumentError: With everything that is wrong and where.
-    """
-    return document.read(file, changes)
-
-
-def loads(text: str, *changes: str) -> Document:
-    """As `load`, of an experiment that is written where it is used, in a notebook or a script.
-
-    Raises:
-        DocumentError: With everything that is wrong and where.
-    """
-    return document.read_text(text, changes)
-
-
-def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Experiment]:
-    """The cases of an experiment, all or those named, in the order of the file.
-
-    Raises:
-        DocumentError: If it has no case of that name.
-    """
-    cases = read.cases()
-    for name in names:
-        if name not in cases:
-            hint = f"its cases: {', '.join(cases)}"
-            raise DocumentError([Problem(f"--case {name}", 0, 0, "no such case in this experiment", hint)])
-    return {name: case for name, case in cases.items() if not names or name in names}
+        return metrics_files.document(str(self.folder or ""), self.seed, list(self.metrics.values()))
 
 
 Told = Callable[[str, int, int], None]  # a case, seconds of it that are simulated, and how many it has
@@ -145,8 +144,8 @@ def simulate_seeds(
     _refuse_too_much(read.experiment, len(seeds))
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     for name, experiment in chosen(read, cases).items():
-        experiment = reserves.taking_part(experiment)  # noqa: PLW2901
-        log = virtual.simulate(experiment, seeds, tell=partial(_pass_on, tell, name, experiment.duration_s))
+        experiment = standby.taking_part(experiment)  # noqa: PLW2901
+        log = simulation.simulate(experiment, seeds, tell=partial(_pass_on, tell, name, experiment.duration_s))
         _pass_on(tell, name, experiment.duration_s, math.inf)
         for copy in range(len(seeds)):
             logbook = Logbook(log, experiment, name, copy)
@@ -177,7 +176,7 @@ def reopen(folder: Path) -> Run:
     Raises:
         RecordingError: If there is no recording, or one cannot be read.
     """
-    from experiments.records import RecordingError  # noqa: PLC0415
+    from experiments.recording.reader import RecordingError  # noqa: PLC0415
 
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is no folder of a run; `zenpark run` prints the folder that it makes")
@@ -215,72 +214,6 @@ def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]
 def _measured(
     title: str, traces: Mapping[str, Trace], folder: Path | None, source: str, notes: Sequence[str] = ()
 ) -> Run:
-    measured = {case: metrics.measure(trace) for case, trace in traces.items()}
+    measured = {case: measure.measure(trace) for case, trace in traces.items()}
     seed = next((trace.seed for trace in traces.values()), 0)
     return Run(title, seed, dict(traces), measured, folder, source, tuple(notes))
-
-
-def new_folder(read: Document, out: str | None) -> Path:
-    """Makes the folder of a run: `out`, or one below `runs` that tells experiment and time.
-
-    Raises:
-        DocumentError: If it holds something already, or cannot be made.
-    """
-    folder = RUNS if out is None else Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if out is None:
-            return _folder_of_now(folder, read.path.stem)
-        taken = any(folder.iterdir())
-    except OSError as error:
-        hint = "choose a place that may be written to with --out"
-        raise DocumentError([Problem(str(folder), 0, 0, f"cannot be made: {error.strerror}", hint)]) from None
-    if taken:
-        raise DocumentError([Problem(str(folder), 0, 0, "holds something already", "name a new folder with --out")])
-    return folder
-
-
-def _folder_of_now(runs: Path, name: str) -> Path:
-    """Makes a folder that nobody else has, however many runs begin in the same second."""
-    stamp = datetime.now().astimezone().strftime("%Y-%m-%dT%H-%M-%S")
-    for number in itertools.count(1):
-        folder = runs / (f"{name}-{stamp}" if number == 1 else f"{name}-{stamp}-{number}")
-        with suppress(FileExistsError):
-            folder.mkdir()
-            return folder
-    raise AssertionError
-
-
-def remove_unused(folder: Path) -> None:
-    """Removes the folder of a run in which nothing was run: there is no recording, and no process has said anything."""
-    if not any(folder.glob("*.mcap")) and not any(folder.glob("logs/*")):
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-class Interrupts:
-    """Ctrl-C, SIGTERM and SIGHUP as a question: the first asks to land, the second ends at once.
-
-    A SIGHUP that `nohup` has set aside stays so.
-    """
-
-    def __init__(self) -> None:
-        self.asked = False
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Interrupts:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                self._before[number] = signal.signal(number, self._ask)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def __call__(self) -> bool:
-        return self.asked
-
-    def _ask(self, _signal: int, _frame: FrameType | None) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
-        self.asked = True

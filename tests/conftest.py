@@ -17,7 +17,7 @@ import psutil
 import pytest
 from hypothesis import settings as hypothesis_settings
 
-from agents.endpoint import free_endpoint
+from agents.network.endpoints import free_endpoint
 
 hypothesis_settings.register_profile("zenpark", deadline=None)  # no test depends on how fast this machine is
 hypothesis_settings.load_profile("zenpark")
@@ -44,7 +44,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 PATIENT = """
 import signal, sys, zenoh
-from agents.settings import config, settings
+from agents.network.zenoh_config import config, settings
 signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
 endpoint, lease_s = sys.argv[1:]
 with zenoh.open(config(settings("router", listen=[endpoint], name="router", lease_s=float(lease_s)))):
@@ -61,7 +61,7 @@ class RouterProcess:
 
     def __init__(self, lease_s: float | None = None) -> None:
         self.endpoint = free_endpoint(preferred_port=0)
-        own = ["-m", "agents.router", "--listen", self.endpoint]
+        own = ["-m", "agents.runtime.router", "--listen", self.endpoint]
         self._command = own if lease_s is None else ["-c", PATIENT, self.endpoint, str(lease_s)]
         self.process: subprocess.Popen[str]
         self.start()

@@ -49,12 +49,12 @@ def _lean(words: list[str]) -> None:
     Returns if it is not that.
     """
     if words == ["station"]:
-        from experiments.station import serve  # noqa: PLC0415 (not before the check)
+        from experiments.real_time.hosts.station import serve  # noqa: PLC0415 (not before the check)
 
         sys.exit(serve())
     if words[:1] == ["agent"] and "--lifeline" in words:
-        from agents.leaving import end  # noqa: PLC0415
-        from experiments.robot import main as robot  # noqa: PLC0415
+        from agents.network.shutdown import end  # noqa: PLC0415
+        from experiments.real_time.processes.robot import main as robot  # noqa: PLC0415
 
         end(robot(words[1:]))
 
@@ -68,7 +68,7 @@ def main() -> None:
         sys.exit(2)
     try:
         _lean(sys.argv[1:])
-        from tools.cli import main as command_line  # noqa: PLC0415 (not before the check)
+        from tools.cli.main import main as command_line  # noqa: PLC0415 (not before the check)
 
         command_line()
     except KeyboardInterrupt:

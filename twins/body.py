@@ -6,16 +6,16 @@ from math import inf, isfinite
 
 import numpy as np
 
-from agents import plugins
-from agents.body import BodyRequest, BodyState
-from agents.positioning import PATIENCE_S, External, velocity_after
-from agents.rows import Array, Index, Mask, every, span
-from twins.disturbance import Drift, HoverJitter, Latency, Measurement
-from twins.engine import Engine, EngineFactory, Stage, Touch
-from twins.noise import Noise
-from twins.pointmass import PointMass, PointMassEngine
-from twins.sensors import RangeSensors
-from twins.world import World
+from agents.arrays import Array, Index, Mask, every, span
+from agents.body.external_pose import PATIENCE_S, External, velocity_after
+from agents.body.interface import BodyRequest, BodyState
+from agents.plugins import registry
+from twins.engines.engine import Engine, EngineFactory, Stage, Touch
+from twins.engines.point_mass import PointMass, PointMassEngine
+from twins.models.disturbance import Drift, HoverJitter, Latency, Measurement
+from twins.models.noise import Noise
+from twins.scene import World
+from twins.sensing.range_sensors import RangeSensors
 
 CATCH_UP_S = 1.0  # a process that was frozen for longer resumes where it was: time it could not see did not pass
 FULL_WOBBLE = 0.2  # [m] from the ground up to here hover jitter grows: a robot that stands does not wobble
@@ -23,7 +23,8 @@ ENDURANCE_S = {"crazyflie": 420.0, "tello": 780.0, "khepera4": 18000.0, "turtleb
 
 
 class TwinBody:
-    """Rows of any simulated kinds; implements `agents.body.Body`. Advances itself to the time at which it is read.
+    """Rows of any simulated kinds; implements `agents.body.interface.Body`. Advances itself to the time at which it is
+    read.
 
     Attributes:
         engine: What moves the rows.
@@ -47,7 +48,7 @@ class TwinBody:
         stage = Stage(
             kinds, request.start, request.yaw, self._dt, self._world.copy, self._world.mirrored, self._world.scene
         )
-        factory: EngineFactory = PointMass() if world is None else plugins.build(plugins.ENGINES, self._world.engine)
+        factory: EngineFactory = PointMass() if world is None else registry.build(registry.ENGINES, self._world.engine)
         self.engine: Engine = factory.build(stage)
         flies = np.array([k.flies for k in kinds])
         names, seeds, nature = request.names, request.seeds, request.disturbance

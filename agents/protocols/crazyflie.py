@@ -9,9 +9,8 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from agents.body import BodyError
-from agents.claims import numeric
-from agents.protocols.settings import settings
+from agents.body.device_locks import numeric
+from agents.body.interface import BodyError, settings
 
 Positive = Annotated[float, Meta(gt=0)]
 Rate = Annotated[float, Meta(ge=1, le=100)]

@@ -14,7 +14,7 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from agents.rows import Array
+from agents.arrays import Array
 
 PARK_PORT: Final = 50000
 GAP_S: Final = 0.010  # between two park commands: glued in one segment, the second is lost

@@ -15,7 +15,7 @@ from functools import cache
 from math import floor
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
-from agents.body import BodyError
+from agents.body.interface import BodyError
 
 Style = Literal["ros2dds", "rmw"]
 Distro = Literal["humble", "jazzy", "kilted", "lyrical", "rolling"]

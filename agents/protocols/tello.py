@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from agents.body import BodyError
+from agents.body.interface import BodyError
 
 HOST: Final = "192.168.10.1"  # of a Tello that is its own access point
 CONTROL_PORT: Final = 8889  # at the drone for commands; djitellopy binds the same number here for the answers

@@ -15,7 +15,7 @@ from urllib.parse import parse_qsl
 import msgspec
 from msgspec import Meta
 
-from agents.body import BodyError
+from agents.body.interface import BodyError
 from agents.protocols import ros2
 from agents.protocols.ros2 import Distro, Style
 

@@ -1,5 +1,1 @@
 """Crazyflies, real or at the far end of a protocol twin, through cflib (GPL-3.0: imported when one is opened)."""
-
-from bridges.crazyflie.body import open_crazyflie
-
-__all__ = ["open_crazyflie"]

@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from agents.body import BodyError, BodyRequest, BodyState, RangeScan, Rays
-from agents.claims import Claims
-from agents.positioning import External
+from agents.arrays import Array, Index
+from agents.body.device_locks import Claims
+from agents.body.external_pose import External
+from agents.body.interface import BodyError, BodyRequest, BodyState, RangeScan, Rays
 from agents.protocols.crazyflie import Lighthouse, address, chosen, crowded, device_of
-from agents.rows import Array, Index
 from bridges.crazyflie.link import prepare
 from bridges.crazyflie.pilot import Pilot
 from bridges.crazyflie.telemetry import BEARING, ELEVATION, Board, Telemetry
@@ -22,7 +22,7 @@ POLL_S: Final = 0.01
 
 
 class CrazyflieBody:
-    """Crazyflies; implements `agents.body.Body`."""
+    """Crazyflies; implements `agents.body.interface.Body`."""
 
     def __init__(self, request: BodyRequest) -> None:
         self._names = request.names

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Final
 
-from agents.body import UNANSWERED
-from agents.kinds import CRAZYFLIE
+from agents.body.interface import UNANSWERED
+from agents.body.kinds import CRAZYFLIE
 from agents.protocols.crazyflie import Settings
 from agents.protocols.crtp import HighLevel, Info, Status
 from bridges.crazyflie.link import Link

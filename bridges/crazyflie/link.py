@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from agents.body import BodyError
+from agents.body.interface import BodyError
 from agents.protocols.crtp import Port
 
 FIRST_S: Final = 0.6  # to the first packet; the first two questions are never repeated by cflib

@@ -7,9 +7,9 @@ import time
 from math import cos, inf, isfinite, sin
 from typing import Final
 
-from agents.body import TROUBLE, BodyError
+from agents.arrays import Array
+from agents.body.interface import TROUBLE, BodyError
 from agents.protocols.crazyflie import Outside, Settings
-from agents.rows import Array
 from bridges.crazyflie.flight import Flight, Phase, Target
 from bridges.crazyflie.link import Link, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure

@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.body import BodyError
+from agents.arrays import Array
+from agents.body.interface import BodyError
 from agents.protocols import crtp
 from agents.protocols.crazyflie import Lighthouse, Loco, Outside, Settings
-from agents.rows import Array
 from bridges.crazyflie.link import Link, LinkError
 
 ESTIMATORS: Final = {"auto": 0, "complementary": 1, "kalman": 2, "ukf": 3}

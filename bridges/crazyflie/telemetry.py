@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
+from agents.arrays import Array
 from agents.protocols.crtp import MM, Info, Power
-from agents.rows import Array
 from bridges.crazyflie.link import Link
 
 POSE: Final = {f"stateEstimate.{name}": "float" for name in ("x", "y", "z", "vx", "vy", "vz")} | {

@@ -14,17 +14,16 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.graph import components, laplacian, links
-from agents.kinds import CRAZYFLIE
-from agents.rows import Array
-from experiments.check import check, figures
-from experiments.document import Document
-from experiments.drawing import CASES, MAGENTA, WIDTH, styled
-from experiments.feasibility import algebraic_connectivity
-from experiments.notebook import folder, show
-from experiments.prediction import closed
-from experiments.run import loads, simulate
-from experiments.trace import Trace
+from agents.arrays import Array
+from agents.body.kinds import CRAZYFLIE
+from agents.formation.graph import components, laplacian, links
+from experiments.check.check import check, figures
+from experiments.check.ideal_run import closed
+from experiments.check.realisation import algebraic_connectivity
+from experiments.file.document import Document, loads
+from experiments.recording.trace import Trace
+from experiments.report.style import CASES, MAGENTA, WIDTH, styled
+from experiments.run import folder, show, simulate
 
 OUT = folder("docs/tutorials/out")
 N = 6

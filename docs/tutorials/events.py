@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from agents.rows import Array, norm
-from experiments.notebook import folder, show
-from experiments.pareto import front
-from experiments.run import load, simulate
-from experiments.signals import beliefs, links_of
-from experiments.sweep import sweep
-from experiments.trace import Trace
+from agents.arrays import Array, norm
+from experiments.file.document import load
+from experiments.metrics.signals import beliefs, links_of
+from experiments.recording.trace import Trace
+from experiments.run import folder, show, simulate
+from experiments.sweep.pareto import front
+from experiments.sweep.sweep import sweep
 
 OUT = folder("docs/tutorials/out")
 

@@ -14,15 +14,14 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.graph import rigid_motions, rigidity, rigidity_matrix
-from agents.kinds import CRAZYFLIE
-from agents.rows import Array, Mask, norm
-from experiments.check import check, figures
-from experiments.document import Document
-from experiments.drawing import CASES, MAGENTA, WIDTH, styled
-from experiments.notebook import folder, show
-from experiments.prediction import closed
-from experiments.run import load, loads, simulate
+from agents.arrays import Array, Mask, norm
+from agents.body.kinds import CRAZYFLIE
+from agents.formation.rigidity import rigid_motions, rigidity, rigidity_matrix
+from experiments.check.check import check, figures
+from experiments.check.ideal_run import closed
+from experiments.file.document import Document, load, loads
+from experiments.report.style import CASES, MAGENTA, WIDTH, styled
+from experiments.run import folder, show, simulate
 
 OUT = folder("docs/tutorials/out")
 Pairs = list[tuple[int, int]]

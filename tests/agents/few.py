@@ -1,8 +1,8 @@
 """Experiments of one, two and three robots."""
 
-from agents.body import Disturbance, Jitter
-from experiments import document
-from experiments.experiment import Formation, Robot
+from agents.body.interface import Disturbance, Jitter
+from experiments.definition.experiment import Formation, Robot
+from experiments.file import document
 from tests.agents.swarm import Swarm
 
 PERIODIC = {"kind": "periodic", "period_s": 0.02}

@@ -6,10 +6,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from agents.prediction import HOLD, Predictor
-from agents.rows import norm
-from agents.speaking import Voice
-from agents.triggers import Trigger
+from agents.arrays import norm
+from agents.decision.transmission import Voice
+from agents.plugins.predictors import HOLD, Predictor
+from agents.plugins.triggers import Trigger
 
 DT = 0.02
 

@@ -11,10 +11,10 @@ import msgspec
 import numpy as np
 
 from agents.agent import Actions, Agent, links_by_speaker
-from agents.body import BodyState
-from agents.lifecycle import AIRBORNE, READY, RUNNING
-from experiments import assign
-from experiments.experiment import Experiment
+from agents.body.interface import BodyState
+from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
+from experiments.definition import assignment, bodies
+from experiments.definition.experiment import Experiment
 from twins.body import TwinBody
 
 LEAD_S = 0.5
@@ -25,9 +25,9 @@ class Group:
 
     def __init__(self, experiment: Experiment, names: Sequence[str]) -> None:
         self.names = tuple(names)
-        self.assignment = assign.assign(experiment, self.names)
+        self.assignment = assignment.assign(experiment, self.names)
         self.agent = Agent(self.assignment)
-        self.body = TwinBody(assign.request(experiment, self.names, [experiment.seed]))
+        self.body = TwinBody(bodies.request(experiment, self.names, [experiment.seed]))
         self.agent.find(np.arange(len(self.assignment.links)))
         self.by_speaker = links_by_speaker(self.assignment.links, self.assignment.speakers)
         self.state: BodyState

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from agents.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING, Phase
+from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING, Phase
 from tests.agents.few import drone, pair
 from tests.agents.swarm import Swarm
 

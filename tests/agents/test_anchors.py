@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.anchors import Anchors
+from agents.formation.anchors import Anchors
 from tests.agents.test_coordination import slope_of
 
 FEW = settings(max_examples=25)

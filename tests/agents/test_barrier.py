@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from agents.barrier import Barrier, _closest
-from agents.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
-from agents.rows import norm
+from agents.arrays import norm
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
+from agents.plugins.barrier import Barrier, _closest
 from tests.agents.things import NOTHING, near, own
 
 FEW = settings(max_examples=50)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from agents.chance import key, uniform
+from agents.network.channel_model import key, uniform
 
 COUNT = 200_000
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.chance import key, uniform
-from agents.channel import LOSS, USES, Channel, Conditions, Outage, Samples
+from agents.network.channel_model import LOSS, USES, Channel, Conditions, Outage, Samples, key, uniform
 
 MANY = 40_000
 

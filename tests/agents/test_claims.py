@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from agents.body import BodyError
-from agents.claims import Claims, numeric
+from agents.body.device_locks import Claims, numeric
+from agents.body.interface import BodyError
 from agents.protocols.crazyflie import device_of
 
 HOLDER = """
-from agents.claims import Claims
+from agents.body.device_locks import Claims
 Claims(["CF07"], ["radio 80"]).take()
 print("has it", flush=True)
 input()

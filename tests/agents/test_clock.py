@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.clock import SLEW, STEP_S, Clock, said
-from agents.graph import links
-from agents.hearing import Hearing
-from agents.prediction import HOLD, ConstantVelocity, Predictor
-from experiments.launcher import Launcher
+from agents.decision.neighbours import Hearing
+from agents.formation.graph import links
+from agents.plugins.predictors import HOLD, ConstantVelocity, Predictor
+from experiments.real_time.hosts.launcher import Launcher
 
 AHEAD_S = 0.2
 SPEED = 0.3  # [m/s] of a neighbour along x
@@ -59,18 +59,17 @@ def test_a_step_of_the_wall_clock_moves_no_clock_that_was_read_before(monkeypatc
     assert clock.at(4.0) == 999.5
 
 
-DATES = {  # of reports and figures, which nobody moves by, and chaos, which steps the clocks of others
-    "chaos_flight.py", "chaos_report.py", "report.py", "run.py", "soak_verdict.py", "sweep_page.py", "faulty.py",
-}  # fmt: skip
+# of reports and figures: no robot moves by them
+DATES = {"experiments/report/report.py", "experiments/run.py", "experiments/sweep/page.py"}
 
 
 def test_no_process_of_a_run_reads_the_wall_clock_but_by_its_clock():
     root = Path(__file__).resolve().parents[2]
     readers = {
-        file.name: [line.strip() for line in file.read_text().splitlines() if "time.time" in line]
+        file: [line.strip() for line in file.read_text().splitlines() if "time.time" in line]
         for folder in ("agents", "bridges", "twins", "experiments")
         for file in sorted((root / folder).rglob("*.py"))
-        if file.name not in DATES
+        if file.relative_to(root).as_posix() not in DATES
     }
     once = [line for lines in readers.values() for line in lines if "= time.time() - time.monotonic()" not in line]
     assert once == []
@@ -81,7 +80,7 @@ def test_a_process_that_is_started_after_a_step_of_the_wall_clock_reads_the_cloc
     launcher.clock = first = Clock()
     environments = []
     monkeypatch.setattr(launcher, "spawn", lambda name, command, environment: environments.append(environment))
-    launcher.start("CF01", "experiments.robot")
+    launcher.start("CF01", "experiments.real_time.processes.robot")
     wall = time.time
     monkeypatch.setattr(time, "time", lambda: wall() + 60.0)
     assert Clock().utc() > first.utc() + 59.0, "on a machine of its own"

@@ -7,17 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from agents import session as network
-from agents import wire
 from agents.agent import Agent
-from agents.body import BodyState
-from agents.keys import Keys
-from agents.lifecycle import AIRBORNE, READY, RUNNING
-from agents.orders import carry_out
-from agents.runtime import Runtime
-from agents.setup import Setup
-from experiments import assign
-from experiments.experiment import Formation, Leg, Robot
+from agents.body.interface import BodyState
+from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
+from agents.network import messages
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.runtime.loop import Runtime
+from agents.runtime.orders import carry_out
+from agents.runtime.setup import Setup
+from experiments.definition import assignment
+from experiments.definition.experiment import Formation, Leg, Robot
 from tests.agents.few import pair
 from tests.agents.test_way_out import Airborne
 from tests.fuzz.loopnet import Net
@@ -39,23 +39,23 @@ def leader(*, listens: bool = False):
 class Life:
     """A process of A, at a place, `late_s` after the common start."""
 
-    def __init__(self, place, late_s: float, origin: wire.Setpoint | None = None, *, listens: bool = False) -> None:
-        self.agent = Agent(assign.assign(leader(listens=listens), ("A",)))
+    def __init__(self, place, late_s: float, origin: messages.Setpoint | None = None, *, listens: bool = False) -> None:
+        self.agent = Agent(assignment.assign(leader(listens=listens), ("A",)))
         links = np.arange(len(self.agent.assignment.links))
         self.agent.find(links)
         self.t, self.place = 0.0, np.array([[*place, 0.0]])
         if len(links):
             self.agent.hear(links, np.array([[0.6, 0.6, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
         self.step(READY)
-        assert self.order(wire.Order("takeoff")) == ""
+        assert self.order(messages.Order("takeoff")) == ""
         self.step(AIRBORNE)
-        self.start = wire.Order("start", at=UTC + self.t - late_s, origin=origin)
+        self.start = messages.Order("start", at=UTC + self.t - late_s, origin=origin)
         assert self.order(self.start) == ""
         self.step(RUNNING)
         for _ in range(20):
             self.step(RUNNING)
 
-    def order(self, order: wire.Order) -> str:
+    def order(self, order: messages.Order) -> str:
         return carry_out(self.agent, 0, order, self.t, UTC)[0]
 
     def step(self, phase: int) -> None:
@@ -101,19 +101,19 @@ def test_the_plan_of_a_robot_that_listens_begins_where_its_first_leg_did():
 def test_a_start_with_an_origin_that_is_not_known_is_refused():
     life = Life(START, 0.0)
     life.agent.life.phase[0] = AIRBORNE
-    start = wire.Order("start", at=UTC + life.t, origin=(0.0, math.nan, 0.0, 0.0))
+    start = messages.Order("start", at=UTC + life.t, origin=(0.0, math.nan, 0.0, 0.0))
     assert "origin" in life.order(start)
 
 
 def test_a_start_that_is_repeated_does_not_move_the_ticks_of_a_robot_that_runs():
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
     with Net().worn() as net:
-        robot = Runtime(assign.assign(pair(), ("A",)), Airborne(), setup)
+        robot = Runtime(assignment.assign(pair(), ("A",)), Airborne(), setup)
         robot._join(net.session)
         robot._utc, robot._now, robot._next = UTC, 7.0, 7.01
 
         def order(at: float) -> None:
-            net.deliver(sent("park/A/order", wire.Order("start", at=UTC + at))[0])
+            net.deliver(sent("park/A/order", messages.Order("start", at=UTC + at))[0])
             for query in network.received(robot._orders[0].handler):
                 robot._obey(0, query, robot._now)
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import plugins
-from agents.coordination import Bearing, Displacement, Distance, Mixed, goal, tracking
-from agents.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, links
+from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, links
+from agents.plugins import registry
+from agents.plugins.laws import Bearing, Displacement, Distance, Mixed, goal, tracking
 
 SEEDS = st.integers(0, 2**32 - 1)
 FEW = settings(max_examples=25)
@@ -120,11 +120,11 @@ def test_who_does_not_know_where_it_is_moves_nobody_else():
     assert np.isnan(part[2]).all() == bool((net.listener == 2).any())
 
 
-@pytest.mark.parametrize("name", plugins.names(plugins.LAWS))
+@pytest.mark.parametrize("name", registry.names(registry.LAWS))
 @FEW
 @given(seed=SEEDS)
 def test_a_law_gives_each_row_what_it_gives_it_alone(name, seed):
-    law = plugins.build(plugins.LAWS, name)
+    law = registry.build(registry.LAWS, name)
     position, net = told_more(seed)
     heard = position[net.speaker] + 0.03
     whole, error = law.offset(position, heard, net), law.error(position, heard, net)

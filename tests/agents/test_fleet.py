@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents import fleet, plugins
-from agents.body import BodyError, BodyState
-from agents.fleet import Fleet, assemble
-from experiments import assign
-from experiments.experiment import Experiment, Robot
+from agents.body import fleet
+from agents.body.fleet import Fleet, assemble
+from agents.body.interface import BodyError, BodyState
+from agents.plugins import registry
+from experiments.definition import bodies
+from experiments.definition.experiment import Experiment, Robot
 from twins.body import TwinBody
 
 
@@ -116,7 +117,7 @@ def request(*addresses):
         f"R{k}": Robot(kind="crazyflie" if k == 1 else "khepera4", start=[0.5 * k, 0.0], body=address, hover=0.5)
         for k, address in enumerate(addresses)
     }
-    return assign.request(Experiment(title="Bodies", robots=robots, duration_s=1.0), tuple(robots), [7])
+    return bodies.request(Experiment(title="Bodies", robots=robots, duration_s=1.0), tuple(robots), [7])
 
 
 def test_addresses_choose_the_bodies(monkeypatch):
@@ -129,11 +130,11 @@ def test_addresses_choose_the_bodies(monkeypatch):
 
         return opened
 
-    monkeypatch.setattr(fleet.plugins, "load", load)
+    monkeypatch.setattr(fleet.registry, "load", load)
     assemble(request("radio://0/80", "twin", "radio://0/81"))
     assert asked == [
-        (plugins.BODIES, "radio", ("R0", "R2"), ("radio://0/80", "radio://0/81"), [0.0, 1.0]),
-        (plugins.BODIES, "twin", ("R1",), ("twin",), [0.5]),
+        (registry.BODIES, "radio", ("R0", "R2"), ("radio://0/80", "radio://0/81"), [0.0, 1.0]),
+        (registry.BODIES, "twin", ("R1",), ("twin",), [0.5]),
     ]
 
 
@@ -144,5 +145,5 @@ def test_twins_share_one_body():
 
 
 def test_an_unknown_body_is_named():
-    with pytest.raises(plugins.UnknownPlugin, match="hovercraft"):
+    with pytest.raises(registry.UnknownPlugin, match="hovercraft"):
         assemble(request("hovercraft://1"))

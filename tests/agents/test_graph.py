@@ -8,18 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.graph import (
-    Links,
-    adjacency,
-    components,
-    degree,
-    edges,
-    laplacian,
-    links,
-    reached,
-    rigidity,
-    rigidity_matrix,
-)
+from agents.formation.graph import Links, adjacency, components, degree, edges, laplacian, links, reached
+from agents.formation.rigidity import rigidity, rigidity_matrix
 
 NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
 PLACES = np.array(

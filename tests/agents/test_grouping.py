@@ -4,9 +4,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.lifecycle import DONE
-from experiments import document
-from experiments.experiment import Leg
+from agents.decision.lifecycle import DONE
+from experiments.definition.experiment import Leg
+from experiments.file import document
 from tests.agents.few import NOISY
 from tests.agents.swarm import Swarm, changed
 

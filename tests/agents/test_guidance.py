@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from agents.agent import Agent
-from agents.body import BodyState
-from agents.guidance import Guidance
-from agents.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING
-from experiments import assign
-from experiments.experiment import Experiment, Formation, Hybrid, Robot, Start
+from agents.body.interface import BodyState
+from agents.decision.centralised import Guidance
+from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING
+from experiments.definition import assignment
+from experiments.definition.experiment import Experiment, Formation, Hybrid, Robot, Start
 
 NAN = np.nan
 
@@ -33,7 +33,7 @@ class Bench:
     """The rows of an experiment on a clock, where they are put."""
 
     def __init__(self, experiment, names=("A", "B")):
-        self.agent = Agent(assign.assign(experiment, names))
+        self.agent = Agent(assignment.assign(experiment, names))
         self.agent.find(np.arange(len(self.agent.assignment.links)))
         self.position = np.array([[-0.4, 0.0, 0.0], [0.4, 0.1, 0.8]])[: len(names)]
         self.t = 0.0
@@ -200,20 +200,20 @@ def test_safety_has_the_last_word_on_goals_too():
 
 
 def test_who_is_guided_listens_to_nobody_but_to_keep_clear():
-    assert len(assign.assign(pair(), ["A", "B"]).links) == 0
-    told = assign.assign(pair(avoidance={"kind": "barrier", "hears": "neighbours"}), ["A"])
+    assert len(assignment.assign(pair(), ["A", "B"]).links) == 0
+    told = assignment.assign(pair(avoidance={"kind": "barrier", "hears": "neighbours"}), ["A"])
     assert told.watched.tolist() == [True]
     assert told.speakers[told.links.speaker[0]] == "B"
 
 
 def test_in_a_hybrid_only_the_others_have_a_law_of_their_own():
     hybrid = pair(architecture=Hybrid(kind="hybrid", robots=["B"]))
-    told = assign.assign(hybrid, ["A", "B"])
+    told = assignment.assign(hybrid, ["A", "B"])
     assert told.guided.tolist() == [False, True]
     assert told.links.listener.tolist() == [0]
     assert told.links.speaker.tolist() == [1]
     assert (
-        not Agent(assign.assign(hybrid, ["A"]))
+        not Agent(assignment.assign(hybrid, ["A"]))
         .hear_goal(np.array([0]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
         .any()
     )  # who decides for himself takes no goals

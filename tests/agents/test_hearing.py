@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import zenoh
 
-from agents import wire
 from agents.agent import Agent
-from agents.channel import Conditions
-from agents.keys import Keys
-from agents.neighbours import Neighbours
-from agents.prediction import ConstantVelocity
-from agents.speaker import LATE_S
-from experiments import assign
+from agents.network import messages
+from agents.network.channel_model import Conditions
+from agents.network.keys import Keys
+from agents.plugins.predictors import ConstantVelocity
+from agents.runtime.pose_inbox import LATE_S, Neighbours
+from experiments.definition import assignment
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net, Payload
 
@@ -31,7 +30,7 @@ class Sample:
     """What Zenoh hands out: of a token, or of a pose from a session."""
 
     timestamp = attachment = None
-    encoding = wire.JSON
+    encoding = messages.JSON
 
     def __init__(self, key: str, payload: bytes = b"", *, gone: bool = False, session: str | None = None) -> None:
         self.key_expr, self.payload = key, Payload(payload)
@@ -43,7 +42,7 @@ class Robot:
     """A, alone in its process, and B, of which the test says everything."""
 
     def __init__(self, net: Net, conditions: Conditions | None = None) -> None:
-        self.net, self.agent = net, Agent(assign.assign(pair(), ("A",)))
+        self.net, self.agent = net, Agent(assignment.assign(pair(), ("A",)))
         self.neighbours = Neighbours(net.session, KEYS, self.agent, reach=(5.0, 5.0, 5.0), conditions=conditions)
         (self.speaker,) = self.neighbours.speakers
         self.t = 0.0
@@ -54,8 +53,8 @@ class Robot:
                 channel.add(Sample(key, **what))
 
     def pose(self, seq: int, x: float, *, session: str | None, age: float = 0.0, speed: float = 0.0) -> None:
-        said = wire.pose("B", seq, UTC + self.t - age, [x, 0.0, 0.0], [speed, 0.0, 0.0], 0.0)
-        self.tell(KEYS.pose("B"), payload=wire.encode(said), session=session)
+        said = messages.pose("B", seq, UTC + self.t - age, [x, 0.0, 0.0], [speed, 0.0, 0.0], 0.0)
+        self.tell(KEYS.pose("B"), payload=messages.encode(said), session=session)
 
     def token(self, session: str | None, *, gone: bool = False) -> None:
         """The tokens of B, as they come and go together."""

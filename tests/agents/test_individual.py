@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.individual import REACHED, TURNED, Individual, drive, wrap
-from agents.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
-from agents.rows import every, some, span
-from twins.differential import Differential
+from agents.arrays import every, some, span
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
+from agents.decision.position_control import REACHED, TURNED, Individual, drive, wrap
+from twins.models.differential import Differential
 
 FEW = settings(max_examples=25)
 SEEDS = st.integers(0, 2**32 - 1)

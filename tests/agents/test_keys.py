@@ -2,7 +2,7 @@
 
 import pytest
 
-from agents.keys import Keys
+from agents.network.keys import Keys
 
 
 @pytest.mark.parametrize("key", ["**", "park/**", "lab/KH01/pose", "park", "park/", "park//pose", ""])

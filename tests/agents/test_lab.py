@@ -1,11 +1,11 @@
 import pytest
 
-from agents import lab
-from agents.access import Grant, Rights
-from agents.endpoint import EndpointError
-from agents.lab import LabError, bare, files, of, options, register, require, secured
-from agents.settings import config, settings
-from tools import authority
+from agents.network import lab
+from agents.network.access_control import Grant, Rights
+from agents.network.endpoints import EndpointError
+from agents.network.lab import LabError, bare, files, of, options, register, require, secured
+from agents.network.zenoh_config import config, settings
+from tools.commands import authority
 
 
 @pytest.fixture(scope="module")

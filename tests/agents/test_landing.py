@@ -5,14 +5,14 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from agents.body import BodyState
-from agents.hazards import Cause
-from agents.hearing import Hearing
-from agents.landing import NEAR, PATIENCE_S, ROOM, Landing
-from agents.lifecycle import DONE, LANDING, Duties
-from agents.safety import Safety
-from experiments import assign
-from experiments.experiment import Arena, Experiment, Formation, Robot
+from agents.body.interface import BodyState
+from agents.decision.lifecycle import DONE, LANDING, Duties
+from agents.decision.neighbours import Hearing
+from agents.safety.hazards import Cause
+from agents.safety.landing import NEAR, PATIENCE_S, ROOM, Landing
+from agents.safety.setpoint_filter import Safety
+from experiments.definition import assignment as assign
+from experiments.definition.experiment import Arena, Experiment, Formation, Robot
 from tests.agents.swarm import Swarm
 
 DT = 0.01

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from agents.endpoint import free_endpoint
-from agents.lifeline import Lifeline
+from agents.network.endpoints import free_endpoint
+from agents.runtime.lifeline import Lifeline
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -57,7 +57,7 @@ def test_nothing_is_lost_before_it_is(pipe):
 def test_router_ends_with_its_starter():
     endpoint = free_endpoint(preferred_port=0)
     process = subprocess.Popen(
-        [sys.executable, "-m", "agents.router", "--lifeline", "--listen", endpoint],
+        [sys.executable, "-m", "agents.runtime.router", "--lifeline", "--listen", endpoint],
         cwd=ROOT,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,

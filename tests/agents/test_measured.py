@@ -5,15 +5,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from agents import wire
-from agents.detection import stamped
-from agents.fleet import assemble
-from agents.keys import Keys
-from agents.measured import MeasuredPositions
-from agents.runtime import Runtime
-from agents.setup import Setup
-from experiments import assign
-from experiments.experiment import Formation, Robot
+from agents.body.fleet import assemble
+from agents.body.measured_positions import MeasuredPositions
+from agents.network import messages
+from agents.network.keys import Keys
+from agents.runtime.loop import Runtime
+from agents.runtime.setup import Setup
+from agents.safety.detection import stamped
+from experiments.definition import assignment, bodies
+from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
@@ -25,7 +25,7 @@ PLACE = (0.1, 0.2, 0.0)
 
 
 def position(stamp: float, robot: str = "T") -> bytes:
-    return sent(KEYS.position("T"), wire.Position(robot, stamp, PLACE, 0.3))[0]
+    return sent(KEYS.position("T"), messages.Position(robot, stamp, PLACE, 0.3))[0]
 
 
 def test_a_position_stamped_ahead_counts_as_now_and_one_that_is_refused_is_told_of_as_well() -> None:
@@ -59,9 +59,9 @@ def flown(ahead: Callable[[float], float | None], seconds: float) -> tuple[Runti
     said: list[tuple[float, str]] = []
     net = Net()
     with net.worn():
-        body = assemble(assign.request(few, ("T",), [1]))
+        body = assemble(bodies.request(few, ("T",), [1]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True])
-        runtime = Runtime(assign.assign(few, ("T",)), body, setup)
+        runtime = Runtime(assignment.assign(few, ("T",)), body, setup)
         body.open()
         runtime._join(net.session)  # type: ignore[arg-type]
         runtime._utc = runtime._telemetry.utc = UTC
@@ -69,7 +69,7 @@ def flown(ahead: Callable[[float], float | None], seconds: float) -> tuple[Runti
         for tick in range(1, round(seconds / DT)):
             t = tick * DT
             if (off := ahead(t)) is not None:
-                place = wire.Position("T", UTC + t + off, (0.1, 0.2, 0.5 if agent.life.phase[0] > 1 else 0.0), 0.0)
+                place = messages.Position("T", UTC + t + off, (0.1, 0.2, 0.5 if agent.life.phase[0] > 1 else 0.0), 0.0)
                 net.deliver(sent(KEYS.position("T"), place)[0])
             runtime._tick(t)
             if agent.life.phase[0] == 1:

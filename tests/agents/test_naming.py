@@ -12,14 +12,15 @@ from typing import ClassVar
 
 import pytest
 
-from agents import naming, runtime
-from agents import session as network
-from agents.keys import Keys
-from agents.naming import NameTaken, claim, keep
-from agents.runtime import Runtime
-from agents.setup import Setup
-from experiments import assign
-from experiments.experiment import Formation, Robot
+from agents.network import name_ownership, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.network.name_ownership import NameTaken, claim, keep
+from agents.runtime import loop
+from agents.runtime.loop import Runtime
+from agents.runtime.setup import Setup
+from experiments.definition import assignment
+from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import pair
 from tests.agents.test_way_out import Airborne
 from tests.conftest import RouterProcess
@@ -113,10 +114,10 @@ def faked(monkeypatch):
             table.step(session.who)
             return set(table.tokens) if table.answers else None
 
-        monkeypatch.setattr(network, "alive_token", declared)
+        monkeypatch.setattr(pubsub, "alive_token", declared)
         monkeypatch.setattr(network, "here", here)
         monkeypatch.setattr(network, "connected", lambda _session: True)
-        monkeypatch.setattr(naming.time, "monotonic", lambda: table.now)
+        monkeypatch.setattr(name_ownership.time, "monotonic", lambda: table.now)
         monkeypatch.setattr(network, "RETRY_S", 0.0)
         return table
 
@@ -232,14 +233,14 @@ def test_the_silence_of_a_router_is_not_taken_for_a_free_name(faked):
     ],
 )
 def test_a_process_without_its_name_touches_no_body(reply, error, monkeypatch):
-    monkeypatch.setattr(naming, "GHOST_S", 0.0)
-    monkeypatch.setattr(naming, "ANSWER_S", 0.0)
+    monkeypatch.setattr(name_ownership, "GHOST_S", 0.0)
+    monkeypatch.setattr(name_ownership, "ANSWER_S", 0.0)
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
     body = Airborne()
     with Net().worn() as net:
         net.replies = [reply]
-        robot = Runtime(assign.assign(experiment, ("F",)), body, setup)
+        robot = Runtime(assignment.assign(experiment, ("F",)), body, setup)
         with pytest.raises(error):
             robot.run()
     assert body.calls == []
@@ -258,20 +259,20 @@ class Woken(Airborne):
 
 @pytest.mark.parametrize("way", ["still", "cut off"])
 def test_who_wakes_and_finds_its_name_taken_leaves_the_body_as_it_is(way, monkeypatch):
-    monkeypatch.setattr(naming, "GHOST_S", 0.0)
+    monkeypatch.setattr(name_ownership, "GHOST_S", 0.0)
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
     body = Woken()
     told: list[int] = []
     with Net().worn() as net:
-        robot = Runtime(assign.assign(experiment, ("F",)), body, setup)
+        robot = Runtime(assignment.assign(experiment, ("F",)), body, setup)
 
         def looks() -> None:
             if not told:
                 told.append(body.commands)
                 net.replies = [Reply(Sample(Keys.life(Keys().alive("F"), "beef"), "", b""), good=True)]
                 if way == "still":
-                    monkeypatch.setattr(runtime, "STOOD_S", 0.0)
+                    monkeypatch.setattr(loop, "STOOD_S", 0.0)
                 else:
                     robot._silent_since = 0.0  # until the router answers again
 
@@ -300,8 +301,8 @@ class CountedToken:
 def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_is_undeclared_twice(monkeypatch):
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False, False])
     with Net().worn() as net, monkeypatch.context() as patched:
-        patched.setattr(network, "alive_token", CountedToken)
-        robot = Runtime(assign.assign(pair(), ("A", "B")), Airborne(), setup)
+        patched.setattr(pubsub, "alive_token", CountedToken)
+        robot = Runtime(assignment.assign(pair(), ("A", "B")), Airborne(), setup)
         robot._join(net.session)
         robot._joined = True
         shown = [Keys().alive("A"), Keys().alive("B")]
@@ -328,13 +329,13 @@ def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_i
 @pytest.mark.mechanism("name ownership")
 @pytest.mark.system
 def test_a_real_router_knows_who_owns_a_name_and_a_frozen_one_says_nothing(router: RouterProcess, monkeypatch):
-    monkeypatch.setattr(naming, "ANSWER_S", 0.5)
+    monkeypatch.setattr(name_ownership, "ANSWER_S", 0.5)
     with (
         network.open_session([router.endpoint], name="one") as one,
         network.open_session([router.endpoint], name="two") as two,
     ):
         owned = claim(one, [KEY], began=2.0)
-        monkeypatch.setattr(naming, "GHOST_S", 0.0)
+        monkeypatch.setattr(name_ownership, "GHOST_S", 0.0)
         with pytest.raises(NameTaken):
             claim(two, [KEY], began=1.0)
         for token in owned:

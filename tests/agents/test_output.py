@@ -1,6 +1,6 @@
 import os
 
-from agents.output import Output
+from agents.runtime.command_line import Output
 
 
 def test_it_prints(pipe):

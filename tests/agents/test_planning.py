@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import plugins
-from agents.planning import Circle, Hold, Itinerary, Leg, Lemniscate, Line, Waypoints
+from agents.plugins import registry
+from agents.plugins.planners import Circle, Hold, Itinerary, Leg, Lemniscate, Line, Waypoints
 
 PLANS = [
     {"kind": "hold"},
@@ -28,7 +28,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def built(plan):
-    return plugins.build(plugins.PLANNERS, plan)
+    return registry.build(registry.PLANNERS, plan)
 
 
 def anchors(seed, rows=3):
@@ -43,7 +43,7 @@ def path(planner, times, anchor, heading):
 
 
 def test_every_registered_planner_is_tried_here():
-    assert {plan["kind"] for plan in PLANS} == set(plugins.names(plugins.PLANNERS))
+    assert {plan["kind"] for plan in PLANS} == set(registry.names(registry.PLANNERS))
 
 
 @pytest.mark.parametrize("plan", PLANS, ids=str)

@@ -5,16 +5,16 @@ import math
 import msgspec
 import pytest
 
-from agents import plausibility
-from agents.wire import Command, Goal, Malformed, Pose, State
+from agents.network import validation
+from agents.network.messages import Command, Goal, Malformed, Pose, State
 
 POSE = Pose("KH01", 3, 1000.0, (0.1, -0.2, 0.0), (0.01, 0.0, 0.0), 1.5)
 REACH = (2.0, 2.0, 3.5)
 
 
 def test_an_honest_pose_passes():
-    plausibility.check_pose(POSE, robot="KH01", now=1000.0, reach=REACH)
-    plausibility.check_pose(POSE, robot="KH01", now=1e9, reach=REACH)  # late joiners get old ones
+    validation.check_pose(POSE, robot="KH01", now=1000.0, reach=REACH)
+    validation.check_pose(POSE, robot="KH01", now=1e9, reach=REACH)  # late joiners get old ones
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_an_honest_pose_passes():
 def test_a_pose_that_no_robot_can_have(change, says):
     pose = msgspec.structs.replace(POSE, **change)
     with pytest.raises(Malformed, match=says):
-        plausibility.check_pose(pose, robot="KH01", now=1000.0, reach=REACH)
+        validation.check_pose(pose, robot="KH01", now=1000.0, reach=REACH)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_a_pose_that_no_robot_can_have(change, says):
 )
 def test_commands_that_no_body_can_carry_out(command: Command, why: str) -> None:
     with pytest.raises(Malformed, match=why):
-        plausibility.check_command(command, robot="KH01")
+        validation.check_command(command, robot="KH01")
 
 
 @pytest.mark.parametrize(
@@ -77,9 +77,9 @@ def test_commands_that_no_body_can_carry_out(command: Command, why: str) -> None
 )
 def test_states_of_mirrored_robots_that_cannot_be(changes: dict[str, object]) -> None:
     state = State("KH01", 1, 1000.0, "running", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.5, None, None, 0.0)
-    plausibility.check_state(state, robot="KH01", now=1000.0, reach=(2.0, 2.0, 2.0))
+    validation.check_state(state, robot="KH01", now=1000.0, reach=(2.0, 2.0, 2.0))
     with pytest.raises(Malformed):
-        plausibility.check_state(
+        validation.check_state(
             msgspec.structs.replace(state, **changes), robot="KH01", now=1000.0, reach=(2.0, 2.0, 2.0)
         )
 
@@ -88,9 +88,7 @@ GOAL = Goal("KH01", 7, 999.9, (0.5, -0.5, 0.0), 0.25, 999.85)
 
 
 def check_goal(**changes):
-    plausibility.check_goal(
-        msgspec.structs.replace(GOAL, **changes), robot="KH01", now=1000.0, reach=REACH, oldest_s=1.0
-    )
+    validation.check_goal(msgspec.structs.replace(GOAL, **changes), robot="KH01", now=1000.0, reach=REACH, oldest_s=1.0)
 
 
 def test_an_honest_goal_passes():
@@ -136,4 +134,4 @@ def test_a_goal_that_no_robot_can_follow(changes, says):
     ],
 )
 def test_a_gap_counts_as_far_as_the_time_allows(last: int, seq: int, since: float, lost: int) -> None:
-    assert plausibility.missed(last, seq, since, 50.0) == lost
+    assert validation.missed(last, seq, since, 50.0) == lost

@@ -3,10 +3,10 @@ from importlib.metadata import EntryPoint
 import msgspec
 import pytest
 
-from agents import plugins
-from agents.plugins import BODIES, LAWS, PLANNERS, TRIGGERS
+from agents.plugins import registry
+from agents.plugins.registry import BODIES, LAWS, PLANNERS, TRIGGERS
 
-REGISTERED = [(group, name) for group in (BODIES, TRIGGERS, LAWS, PLANNERS) for name in plugins.names(group)]
+REGISTERED = [(group, name) for group in (BODIES, TRIGGERS, LAWS, PLANNERS) for name in registry.names(group)]
 STRUCTS = [(group, name) for group, name in REGISTERED if group != BODIES]
 
 
@@ -29,18 +29,18 @@ def foreign(monkeypatch):
         "misnamed": EntryPoint("misnamed", f"{here}:Puls", "test"),
         "function": EntryPoint("function", f"{here}:foreign", "test"),
     }
-    monkeypatch.setattr(plugins, "_registered", lambda group: entries)
+    monkeypatch.setattr(registry, "_registered", lambda group: entries)
     return "test"
 
 
 @pytest.mark.parametrize(("group", "name"), REGISTERED)
 def test_everything_registered_loads(group, name):
-    assert callable(plugins.load(group, name))
+    assert callable(registry.load(group, name))
 
 
 @pytest.mark.parametrize(("group", "name"), STRUCTS)
 def test_every_trigger_law_and_planner_is_a_frozen_strict_struct(group, name):
-    config = plugins.struct(group, name).__struct_config__
+    config = registry.struct(group, name).__struct_config__
     assert config.frozen
     assert config.forbid_unknown_fields
 
@@ -48,68 +48,68 @@ def test_every_trigger_law_and_planner_is_a_frozen_strict_struct(group, name):
 @pytest.mark.parametrize(("group", "name"), STRUCTS)
 def test_an_unknown_parameter_is_refused_by_every_plugin(group, name):
     with pytest.raises(msgspec.ValidationError, match="nonsense"):
-        plugins.build(group, {"kind": name, "nonsense": 1})
+        registry.build(group, {"kind": name, "nonsense": 1})
 
 
 def test_names_are_sorted_and_the_basic_ones_are_there():
-    assert plugins.names(TRIGGERS) == sorted(plugins.names(TRIGGERS))
-    assert {"periodic", "send-on-delta"} <= set(plugins.names(TRIGGERS))
-    assert {"hold", "line", "waypoints", "circle", "lemniscate"} <= set(plugins.names(PLANNERS))
-    assert plugins.names("zenpark.nothing") == []
+    assert registry.names(TRIGGERS) == sorted(registry.names(TRIGGERS))
+    assert {"periodic", "send-on-delta"} <= set(registry.names(TRIGGERS))
+    assert {"hold", "line", "waypoints", "circle", "lemniscate"} <= set(registry.names(PLANNERS))
+    assert registry.names("zenpark.nothing") == []
 
 
 def test_build_by_name_and_by_table():
-    assert plugins.build(TRIGGERS, "periodic").period_s == 0.02
-    assert plugins.build(TRIGGERS, {"kind": "send-on-delta", "threshold": 0.25}).threshold == 0.25
+    assert registry.build(TRIGGERS, "periodic").period_s == 0.02
+    assert registry.build(TRIGGERS, {"kind": "send-on-delta", "threshold": 0.25}).threshold == 0.25
 
 
 def test_build_leaves_the_table_as_it_was():
     choice = {"kind": "periodic", "period_s": 0.5}
-    plugins.build(TRIGGERS, choice)
+    registry.build(TRIGGERS, choice)
     assert choice == {"kind": "periodic", "period_s": 0.5}
 
 
 def test_a_bad_parameter_keeps_its_path(foreign):
     with pytest.raises(msgspec.ValidationError, match=r"Expected `float`, got `str` - at `\$\.width`"):
-        plugins.build(foreign, {"kind": "pulse", "width": "wide"})
+        registry.build(foreign, {"kind": "pulse", "width": "wide"})
     with pytest.raises(msgspec.ValidationError, match="missing required field `width`"):
-        plugins.build(foreign, "pulse")
+        registry.build(foreign, "pulse")
     with pytest.raises(msgspec.ValidationError, match="width must be positive"):
-        plugins.build(foreign, {"kind": "pulse", "width": -1.0})
+        registry.build(foreign, {"kind": "pulse", "width": -1.0})
 
 
 @pytest.mark.parametrize(("choice", "message"), [({}, "required field `kind`"), ({"kind": 3}, r"at `\$\.kind`")])
 def test_a_table_must_say_its_kind(choice, message):
     with pytest.raises(msgspec.ValidationError, match=message):
-        plugins.build(TRIGGERS, choice)
+        registry.build(TRIGGERS, choice)
 
 
 def test_an_unknown_name_is_answered_with_the_nearest():
-    with pytest.raises(plugins.UnknownPlugin, match=r"no 'periodc' among the triggers; did you mean 'periodic'?"):
-        plugins.load(TRIGGERS, "periodc")
-    with pytest.raises(plugins.UnknownPlugin, match=r"known: .*periodic.*send-on-delta"):
-        plugins.load(TRIGGERS, "xyzzy")
-    with pytest.raises(plugins.UnknownPlugin, match="none is installed"):
-        plugins.load("zenpark.nothing", "xyzzy")
+    with pytest.raises(registry.UnknownPlugin, match=r"no 'periodc' among the triggers; did you mean 'periodic'?"):
+        registry.load(TRIGGERS, "periodc")
+    with pytest.raises(registry.UnknownPlugin, match=r"known: .*periodic.*send-on-delta"):
+        registry.load(TRIGGERS, "xyzzy")
+    with pytest.raises(registry.UnknownPlugin, match="none is installed"):
+        registry.load("zenpark.nothing", "xyzzy")
 
 
 def test_a_plugin_that_fails_to_import_says_whose_it_is_and_why(foreign):
-    with pytest.raises(plugins.PluginError, match=r"'gone' .*unnamed distribution.*No module named 'no_such_module"):
-        plugins.load(foreign, "gone")
-    with pytest.raises(plugins.PluginError, match=r"AttributeError: .*Puls"):
-        plugins.load(foreign, "misnamed")
+    with pytest.raises(registry.PluginError, match=r"'gone' .*unnamed distribution.*No module named 'no_such_module"):
+        registry.load(foreign, "gone")
+    with pytest.raises(registry.PluginError, match=r"AttributeError: .*Puls"):
+        registry.load(foreign, "misnamed")
 
 
 def test_a_plugin_of_the_wrong_sort_is_refused(foreign):
-    with pytest.raises(plugins.PluginError, match=r"no msgspec.Struct"):
-        plugins.build(foreign, "function")
+    with pytest.raises(registry.PluginError, match=r"no msgspec.Struct"):
+        registry.build(foreign, "function")
 
 
 @pytest.mark.parametrize(
     ("address", "name"), [("radio://0/80/2M/E7E7E7E701", "radio"), ("twin", "twin"), ("", ""), ("a:b", "a:b")]
 )
 def test_body_name(address, name):
-    assert plugins.body_name(address) == name
+    assert registry.body_name(address) == name
 
 
 @pytest.mark.parametrize(
@@ -122,4 +122,4 @@ def test_body_name(address, name):
     ],
 )
 def test_did_you_mean(word, known, answer):
-    assert plugins.did_you_mean(word, known) == answer
+    assert registry.did_you_mean(word, known) == answer

@@ -7,25 +7,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import plugins
-from agents.hearing import Heard
-from agents.prediction import HOLD, ConstantVelocity, Hold, Predictor
+from agents.decision.neighbours import Heard
+from agents.plugins import registry
+from agents.plugins.predictors import HOLD, ConstantVelocity, Hold, Predictor
 
-NAMES = plugins.names(plugins.PREDICTORS)
+NAMES = registry.names(registry.PREDICTORS)
 FEW = settings(max_examples=25)
 SEEDS = st.integers(0, 2**32 - 1)
 
 
 def test_both_are_registered():
     assert {"hold", "constant-velocity"} <= set(NAMES)
-    assert plugins.build(plugins.PREDICTORS, "hold") == HOLD == Hold()
+    assert registry.build(registry.PREDICTORS, "hold") == HOLD == Hold()
 
 
 @pytest.mark.parametrize("name", NAMES)
 @FEW
 @given(SEEDS)
 def test_rows_are_predicted_as_if_each_were_alone_and_nothing_is_changed(name, seed):
-    predictor: Predictor = plugins.build(plugins.PREDICTORS, name)
+    predictor: Predictor = registry.build(registry.PREDICTORS, name)
     rng = np.random.default_rng(seed)
     position, velocity, age = rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), rng.uniform(-1.0, 4.0, 5)
     kept = position.copy(), velocity.copy(), age.copy()

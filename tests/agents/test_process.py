@@ -6,8 +6,8 @@ import signal
 
 import pytest
 
-from agents.endpoint import DEFAULT_ENDPOINT, EndpointError
-from agents.process import add_network, reached, told_to_end
+from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.runtime.command_line import add_network, reached, told_to_end
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.promptness import SLICE_NS, prompt_threads
+from agents.network.session import SLICE_NS, prompt_threads
 
 
 def granted() -> int:

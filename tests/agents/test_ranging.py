@@ -10,15 +10,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents import plausibility, ranging, wire
-from agents import session as network
-from agents.body import RangeScan, Rays
-from agents.keys import Keys
-from agents.ranging import HeardRanges, instead
+from agents.body.interface import RangeScan, Rays
+from agents.network import messages, validation
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.runtime import range_inbox
+from agents.runtime.range_inbox import HeardRanges, instead
 from tests.conftest import RouterProcess
 
 KEYS = Keys()
-GOOD = wire.Ranges("KH01", 1000.0, [0.0, 1.5], [0.0, 0.0], [0.25, None])
+GOOD = messages.Ranges("KH01", 1000.0, [0.0, 1.5], [0.0, 0.0], [0.25, None])
 
 
 def scan(t: float, *distance: float) -> RangeScan:
@@ -27,9 +28,9 @@ def scan(t: float, *distance: float) -> RangeScan:
 
 
 def test_a_sweep_as_a_message() -> None:
-    said = ranging.message("KH01", 1000.0, scan(2.5, 0.12345678, np.nan, 1.0))
-    assert said == wire.Ranges("KH01", 1002.5, [0.0, 0.5, 1.0], [0.0, 0.0, 0.0], [0.123457, None, 1.0])
-    plausibility.check_ranges(said, robot="KH01", now=1002.5)
+    said = range_inbox.message("KH01", 1000.0, scan(2.5, 0.12345678, np.nan, 1.0))
+    assert said == messages.Ranges("KH01", 1002.5, [0.0, 0.5, 1.0], [0.0, 0.0, 0.0], [0.123457, None, 1.0])
+    validation.check_ranges(said, robot="KH01", now=1002.5)
 
 
 @pytest.mark.parametrize(
@@ -49,9 +50,9 @@ def test_a_sweep_as_a_message() -> None:
     ],
 )
 def test_what_no_sensor_sees_is_refused(field: str, value: object, why: str) -> None:
-    plausibility.check_ranges(GOOD, robot="KH01", now=1000.0)
-    with pytest.raises(wire.Malformed, match=why):
-        plausibility.check_ranges(msgspec.structs.replace(GOOD, **{field: value}), robot="KH01", now=1000.0)
+    validation.check_ranges(GOOD, robot="KH01", now=1000.0)
+    with pytest.raises(messages.Malformed, match=why):
+        validation.check_ranges(msgspec.structs.replace(GOOD, **{field: value}), robot="KH01", now=1000.0)
 
 
 def test_what_is_heard_takes_the_place_of_what_is_seen() -> None:
@@ -77,8 +78,8 @@ def test_the_newest_sweep_of_each_row_is_known_until_it_is_old(
 
         def say(*distance: float | None, at: float, robot: str = "KH01") -> None:
             angles = [0.0] * len(distance)
-            message = wire.Ranges(robot, utc + at, angles, angles, list(distance))
-            session.put(KEYS.ranges("KH01"), wire.encode(message), encoding=wire.JSON)
+            message = messages.Ranges(robot, utc + at, angles, angles, list(distance))
+            session.put(KEYS.ranges("KH01"), messages.encode(message), encoding=messages.JSON)
 
         say(0.5, None, at=10.0)
         eventually(lambda: listener.read(utc, 10.0) is not None)

@@ -3,8 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.graph import rigidity
-from agents.redundancy import redundancy
+from agents.formation.rigidity import redundancy, rigidity
 
 
 def planar(rows):

@@ -9,9 +9,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from agents import registry
-from agents.endpoint import free_endpoint
-from agents.registry import Run, born, mine, registered, runs
+from agents.network.endpoints import free_endpoint
+from agents.runtime import run_registry
+from agents.runtime.run_registry import Run, born, mine, registered, runs
 
 
 @pytest.fixture(autouse=True)
@@ -75,7 +75,7 @@ def test_another_process_of_the_same_number_is_not_the_run() -> None:
         b'{"what":"run","pid":-1,"born":"","since":0,"title":"","folder":"","endpoints":["tcp/127.0.0.1:1"]}',
         b'{"what":"run","pid":1,"born":"","since":0,"title":"","folder":"","endpoints":["nonsense"]}',
         b'{"what":"run","pid":1,"born":"","since":0,"title":"","folder":"","endpoints":[]}',
-        b" " * (registry.LARGEST + 1),
+        b" " * (run_registry.LARGEST + 1),
     ],
     ids=range(8),
 )

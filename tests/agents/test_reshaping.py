@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.graph import Links
-from agents.reshaping import Change, Presence, Reshaping, progress, wanted
+from agents.formation.changes import Change, Presence, Reshaping, progress, wanted
+from agents.formation.graph import Links
 from tests.agents.test_coordination import told_more
 
 FEW = settings(max_examples=25)

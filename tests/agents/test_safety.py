@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from agents.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO
-from agents.safety import ESCAPED, Limits, Safety
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO
+from agents.body.limits import Limits
+from agents.safety.setpoint_filter import ESCAPED, Safety
 
 FEW = settings(max_examples=60)
 ALL = tuple(KINDS.values())

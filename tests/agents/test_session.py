@@ -13,31 +13,33 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from agents.endpoint import EndpointError, free_endpoint
-from agents.router import serve_router
-from agents.session import (
-    ANSWER_S,
-    ASK_EVERY_S,
-    NO_ORDER,
+from agents.network.endpoints import EndpointError, free_endpoint
+from agents.network.messages import JSON, MSGPACK, Stop
+from agents.network.pubsub import (
     Alarm,
-    Inbox,
-    RouterWatch,
-    Unreachable,
     alive_token,
     alive_watch,
-    connected,
     last_value,
-    links,
-    open_session,
     orders,
     pose_publisher,
     pose_subscriber,
     publisher,
-    received,
     subscriber,
 )
-from agents.settings import LEASE_S, config, settings
-from agents.wire import JSON, MSGPACK, Stop
+from agents.network.session import (
+    ANSWER_S,
+    ASK_EVERY_S,
+    NO_ORDER,
+    Inbox,
+    RouterWatch,
+    Unreachable,
+    connected,
+    links,
+    open_session,
+    received,
+)
+from agents.network.zenoh_config import LEASE_S, config, settings
+from agents.runtime.router import serve_router
 from tests.conftest import RouterProcess
 from tests.fuzz.loopnet import Net
 
@@ -286,7 +288,7 @@ def test_a_router_by_which_samples_come_is_not_asked():
 
 def test_a_router_that_stays_silent_is_left_only_where_there_is_another(monkeypatch):
     left = []
-    monkeypatch.setattr("agents.session.hang_up", left.append)
+    monkeypatch.setattr("agents.network.session.hang_up", left.append)
     for endpoints, times in ((["one"], 0), (["one", "other"], 1)):
         session = Asked()
         watch = RouterWatch(session, "park/CF01/alive", endpoints)
@@ -420,7 +422,7 @@ def test_telemetry_keeps_the_newest(router, eventually):
 
 ROBOT = """
 import sys
-from agents.session import alive_token, open_session, orders, pose_publisher, pose_subscriber
+from agents.network.session import alive_token, open_session, orders, pose_publisher, pose_subscriber
 session = open_session([sys.argv[1]], name="CF01")
 held = [
     alive_token(session, "park/CF01/alive"),

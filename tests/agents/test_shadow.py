@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.body import BodyRequest, BodyState, Disturbance
-from agents.keys import Keys
-from agents.kinds import KINDS
-from agents.shadow import Shadowed, shadowed
+from agents.body.interface import BodyRequest, BodyState, Disturbance
+from agents.body.kinds import KINDS
+from agents.body.shadow_twin import Shadowed, shadowed
+from agents.network.keys import Keys
 
 DT = 0.1
 

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from agents.body import BodyState, Rays
-from agents.graph import links
-from agents.hearing import Heard
-from agents.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
-from agents.safety import Limits
-from agents.sight import AHEAD_S, DESCENT_S, REACH, SCAN_S, Sight
+from agents.body.interface import BodyState, Rays
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
+from agents.body.limits import Limits
+from agents.decision.neighbours import Heard
+from agents.decision.perception import AHEAD_S, DESCENT_S, REACH, SCAN_S, Sight
+from agents.formation.graph import links
 
 LIMITS = Limits(np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 2.5]), speed=0.5)
 

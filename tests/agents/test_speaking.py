@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.kinds import CRAZYFLIE, TELLO
-from agents.plugins import PluginError
-from agents.prediction import ConstantVelocity
-from agents.speaking import LowPass, Voice
-from agents.triggers import SendOnDelta, Trigger
+from agents.body.kinds import CRAZYFLIE, TELLO
+from agents.decision.transmission import LowPass, Voice
+from agents.plugins.predictors import ConstantVelocity
+from agents.plugins.registry import PluginError
+from agents.plugins.triggers import SendOnDelta, Trigger
 
 DT = 0.02
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agents import session as network
-from agents import wire
 from agents.agent import Agent
-from agents.keys import Keys
-from agents.neighbours import NEWS, Neighbours
-from agents.telemetry import Counts, Telemetry
-from experiments import assign
+from agents.network import messages, pubsub
+from agents.network.keys import Keys
+from agents.runtime.pose_inbox import NEWS, Neighbours
+from agents.runtime.telemetry import Counts, Telemetry
+from experiments.definition import assignment, bodies
 from tests.agents.few import pair
 from twins.body import TwinBody
 
@@ -22,10 +21,10 @@ class Taken:
     """In the place of a publisher, or of a subscriber to which nobody speaks."""
 
     def __init__(self) -> None:
-        self.states: list[wire.State] = []
+        self.states: list[messages.State] = []
 
     def put(self, payload: bytes) -> None:
-        self.states.append(wire.decode(payload, wire.JSON, wire.State))
+        self.states.append(messages.decode(payload, messages.JSON, messages.State))
 
     @property
     def handler(self) -> Taken:
@@ -40,10 +39,10 @@ class Robot:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         for name in ("publisher", "pose_publisher", "pose_subscriber", "alive_watch"):
-            monkeypatch.setattr(network, name, lambda *_: Taken())
+            monkeypatch.setattr(pubsub, name, lambda *_: Taken())
         experiment = pair()
-        self.agent = Agent(assign.assign(experiment, ("A",)))
-        self.body = TwinBody(assign.request(experiment, ("A",), [1]))
+        self.agent = Agent(assignment.assign(experiment, ("A",)))
+        self.body = TwinBody(bodies.request(experiment, ("A",), [1]))
         self.body.open()
         nowhere = None
         self.neighbours = Neighbours(nowhere, Keys(), self.agent, reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
@@ -56,10 +55,10 @@ class Robot:
     def hear(self, count: int, first: int = 1) -> None:
         for seq in range(first, first + count):
             self.neighbours.news[0].append(
-                wire.Heard("B", seq, UTC + 0.02 * seq, UTC + 0.02 * seq, (0.4, 0.1, 0.0), (0.123456, 0.0, 0.0))
+                messages.Heard("B", seq, UTC + 0.02 * seq, UTC + 0.02 * seq, (0.4, 0.1, 0.0), (0.123456, 0.0, 0.0))
             )
 
-    def tell(self, t: float, **changed: float) -> list[wire.State]:
+    def tell(self, t: float, **changed: float) -> list[messages.State]:
         """One sample of telemetry, some columns of the body's state `changed`."""
         state = self.body.read(t)
         for name, value in changed.items():

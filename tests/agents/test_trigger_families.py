@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.prediction import HOLD, ConstantVelocity
-from agents.rows import norm
-from agents.trigger_families import (
+from agents.arrays import norm
+from agents.decision.control_updates import Input
+from agents.plugins.predictors import HOLD, ConstantVelocity
+from agents.plugins.trigger_families import (
     Decaying,
     Dynamic,
     Integral,
@@ -21,8 +22,7 @@ from agents.trigger_families import (
     RelativeControl,
     SelfTriggered,
 )
-from agents.triggers import Periodic, SendOnDelta, View
-from agents.updating import Input
+from agents.plugins.triggers import Periodic, SendOnDelta, View
 from tests.agents.signals import DT, Play, wander
 
 SEEDS = st.integers(0, 2**32 - 1)

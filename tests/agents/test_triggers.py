@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import plugins
-from agents.prediction import HOLD
-from agents.triggers import Periodic, SendOnDelta, Told, Trigger, View
+from agents.plugins import registry
+from agents.plugins.predictors import HOLD
+from agents.plugins.triggers import Periodic, SendOnDelta, Told, Trigger, View
 from tests.agents.signals import DT, Play, wander
 
-NAMES = plugins.names(plugins.TRIGGERS)
+NAMES = registry.names(registry.TRIGGERS)
 FAMILIES = {
     "periodic", "send-on-delta", "relative", "mixed", "decaying", "dynamic", "integral", "predictive",
     "self-triggered", "lyapunov", "relative-control",
@@ -26,9 +26,9 @@ FEW = settings(max_examples=10)
 
 def made(name, **parameters):
     """A trigger with its defaults; parameters without one get a small number."""
-    kind = plugins.struct(plugins.TRIGGERS, name)
+    kind = registry.struct(registry.TRIGGERS, name)
     needed = {f.encode_name for f in msgspec.structs.fields(kind) if f.required}
-    return plugins.build(plugins.TRIGGERS, {"kind": name, **dict.fromkeys(needed, 0.05), **parameters})
+    return registry.build(registry.TRIGGERS, {"kind": name, **dict.fromkeys(needed, 0.05), **parameters})
 
 
 def gaps(fired):
@@ -113,7 +113,7 @@ def test_evaluated_periodically_it_is_as_if_it_were_asked_that_seldom(name, seed
 
 @pytest.mark.parametrize("name", NAMES)
 def test_parameters_have_units_in_their_descriptions(name):
-    kind = plugins.struct(plugins.TRIGGERS, name)
+    kind = registry.struct(registry.TRIGGERS, name)
     hints = get_type_hints(kind, include_extras=True)
     assert kind.__struct_fields__
     for field in kind.__struct_fields__:
@@ -185,7 +185,7 @@ def test_the_table_of_the_docs_has_every_family_with_its_defaults():
     told = {name: parameters for name, parameters in rows if name in NAMES}
     assert set(told) >= FAMILIES
     for name, parameters in told.items():
-        kind = plugins.struct(plugins.TRIGGERS, name)
+        kind = registry.struct(registry.TRIGGERS, name)
         defaults = {field.name: field.default for field in msgspec.structs.fields(kind)}
         own = set(kind.__struct_fields__) - set(Trigger.__struct_fields__)
         said = {field: float(value) for field, value in re.findall(r"`(\w+)` ([0-9]+(?:\.[0-9]+)?)", parameters)}

@@ -4,10 +4,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.trigger_families import RelativeControl, SelfTriggered
-from agents.triggers import SendOnDelta
-from experiments import assign
-from experiments.experiment import Experiment, Formation, Leg, Robot
+from agents.plugins.trigger_families import RelativeControl, SelfTriggered
+from agents.plugins.triggers import SendOnDelta
+from experiments.definition import assignment
+from experiments.definition.experiment import Experiment, Formation, Leg, Robot
 from tests.agents.swarm import Swarm
 
 LINKS = {"A - B": 0.5, "C > A": 0.5, "C > B": 0.5}
@@ -98,7 +98,7 @@ def test_what_moved_is_the_largest_change_on_a_link(trigger):
     (group,) = swarm.groups
     agent, state = group.agent, group.state
     view = agent.deciding.input(swarm.t, state.position, state.velocity, agent.life.start_at)
-    links = assign.all_links(swarm.experiment)
+    links = assignment.all_links(swarm.experiment)
     apart = state.position[links.listener] - agent.heard.position
     moved = np.linalg.norm(apart - agent.deciding._updating._apart, axis=1)
     for row in range(2):

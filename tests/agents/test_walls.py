@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from agents.body import Disturbance
-from agents.kinds import KINDS, TELLO
-from agents.lifecycle import RUNNING
-from agents.safety import Limits, Safety
-from experiments.experiment import Formation, Robot
+from agents.body.interface import Disturbance
+from agents.body.kinds import KINDS, TELLO
+from agents.body.limits import Limits
+from agents.decision.lifecycle import RUNNING
+from agents.safety.setpoint_filter import Safety
+from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import pair
 from tests.agents.swarm import Group
 

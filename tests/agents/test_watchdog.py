@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from agents.rows import Index
-from agents.watchdog import HUNG, Watchdog
+from agents.arrays import Index
+from agents.runtime.watchdog import HUNG, Watchdog
 from tests.conftest import ROOT
 
 SILENCE_S = 0.1
@@ -102,7 +102,7 @@ def test_one_that_hangs_for_good_is_told_again_cut_and_ended(stuck: str, eventua
 
 FROZEN = """
 import sys, threading
-from agents.watchdog import Watchdog
+from agents.runtime.watchdog import Watchdog
 class Body:
     def land(self, rows): print("landed", flush=True)
     stop = land

@@ -7,13 +7,14 @@ import threading
 import numpy as np
 import pytest
 
-from agents import runtime, wire
-from agents.body import BodyState, call_all
-from agents.keys import Keys
-from agents.runtime import Runtime
-from agents.setup import Setup
-from experiments import assign
-from experiments.experiment import Formation, Robot
+from agents.body.interface import BodyState, call_all
+from agents.network import messages
+from agents.network.keys import Keys
+from agents.runtime import loop
+from agents.runtime.loop import Runtime
+from agents.runtime.setup import Setup
+from experiments.definition import assignment
+from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
@@ -83,14 +84,14 @@ def run(body: Airborne, silence_s: float = 5.0) -> Net:
     with Net().worn() as net:
         body.net = net
         setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], loop_silence_s=silence_s)
-        Runtime(assign.assign(experiment, ("F",)), body, setup).run()
+        Runtime(assignment.assign(experiment, ("F",)), body, setup).run()
     return net
 
 
 @pytest.fixture(autouse=True)
 def short_waits(monkeypatch):
-    monkeypatch.setattr(runtime, "FAREWELL_S", 0.3)
-    monkeypatch.setattr(runtime, "STOPPED_S", 0.1)
+    monkeypatch.setattr(loop, "FAREWELL_S", 0.3)
+    monkeypatch.setattr(loop, "STOPPED_S", 0.1)
 
 
 @pytest.mark.parametrize("broken", [(), ("read",), ("land",), ("stop",), ("close",), ("read", "land", "stop", "close")])
@@ -114,7 +115,7 @@ def test_a_robot_is_stopped_when_it_is_down_and_not_before():
 
 
 def test_a_body_that_does_not_say_how_it_is_gets_the_time_of_a_landing(monkeypatch):
-    monkeypatch.setattr(runtime, "AGAIN_S", 0.02)
+    monkeypatch.setattr(loop, "AGAIN_S", 0.02)
     body = Airborne("read")
     with pytest.raises(OSError, match="read fails"):
         run(body)
@@ -123,7 +124,7 @@ def test_a_body_that_does_not_say_how_it_is_gets_the_time_of_a_landing(monkeypat
 
 
 def test_what_does_not_stop_is_told_again(monkeypatch):
-    monkeypatch.setattr(runtime, "AGAIN_S", 0.02)
+    monkeypatch.setattr(loop, "AGAIN_S", 0.02)
     body = Airborne("stop", steps=0)
     with pytest.raises(OSError, match="stop fails"):
         run(body)
@@ -132,12 +133,12 @@ def test_what_does_not_stop_is_told_again(monkeypatch):
 
 
 def test_an_emergency_stop_is_obeyed_while_a_robot_comes_down(monkeypatch):
-    monkeypatch.setattr(runtime, "FAREWELL_S", 30.0)
+    monkeypatch.setattr(loop, "FAREWELL_S", 30.0)
     body = Airborne(steps=10**9)
 
     def stop() -> None:
         if body.landing and not body.stopped:
-            body.net.deliver(sent("park/estop", wire.Stop("a test", "to see"))[0])
+            body.net.deliver(sent("park/estop", messages.Stop("a test", "to see"))[0])
 
     body.looks = stop
     with pytest.raises(OSError, match="the loop breaks"):

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import plausibility, wire
-from agents.wire import (
+from agents.network import messages as wire
+from agents.network import validation
+from agents.network.messages import (
     JSON,
     MSGPACK,
     CentreState,
@@ -142,10 +143,12 @@ def test_fields_of_other_types_are_malformed(value, field):
         return
     assert isinstance(value, int | float | str | list) or (value is None and field in {"velocity", "yaw"})
     try:
-        plausibility.check_pose(pose, robot="KH01", now=1000.0, reach=REACH)
+        validation.check_pose(pose, robot="KH01", now=1000.0, reach=REACH)
     except Malformed:
         return
-    assert all(math.isfinite(number) for number in (*pose.position, *pose.velocity, pose.yaw, pose.stamp))
+    assert all(
+        math.isfinite(number) for number in (*pose.position, *(pose.velocity or ()), pose.yaw or 0.0, pose.stamp)
+    )
 
 
 @pytest.mark.parametrize(
@@ -221,8 +224,8 @@ def test_a_yaw_is_within_half_a_turn_however_far_a_robot_has_turned():
         for said in poses:
             assert abs(said.yaw) <= math.pi
             assert math.cos(said.yaw - yaw) == pytest.approx(1.0, abs=1e-9)
-        plausibility.check_pose(poses[0], robot="KH01", now=1000.0, reach=REACH)
-        plausibility.check_position(poses[1], robot="KH01", now=1000.0, reach=REACH)
+        validation.check_pose(poses[0], robot="KH01", now=1000.0, reach=REACH)
+        validation.check_position(poses[1], robot="KH01", now=1000.0, reach=REACH)
     assert wire.heading(1.234567890123) == 1.234567890123
 
 

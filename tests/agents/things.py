@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from agents.avoidance import Nearby, Self
-from agents.kinds import KHEPERA4
+from agents.body.kinds import KHEPERA4
+from agents.plugins.avoidance import Nearby, Self
 
 
 def own(kinds, position, *, yaw=0.0, velocity=0.0):

@@ -6,10 +6,10 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from bridges.crazyflie import open_crazyflie
+from bridges.crazyflie.body import open_crazyflie
 from tests.twins.loopback import Served, request
-from twins.crazyflie import open_device
-from twins.crazyflie.supervisor import State
+from twins.devices.crazyflie.device import open_device
+from twins.devices.crazyflie.supervisor import State
 
 NOTHING = (np.nan,) * 4
 PATIENCE_S = 10.0

@@ -13,12 +13,12 @@ import types
 
 import numpy as np
 
-from agents.body import BodyError
-from agents.individual import Individual
-from bridges import tello as bridge
-from bridges.tello import open_tello
+from agents.body.interface import BodyError
+from agents.decision.position_control import Individual
+from bridges.tello import body as bridge
+from bridges.tello.body import open_tello
 from tests.twins.loopback import Served, reached, request
-from twins.tello import open_device
+from twins.devices.tello import open_device
 
 TICK = 0.01
 NOBODY = np.full(4, np.nan)

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.body import BodyError
+from agents.body.interface import BodyError
 from agents.protocols.crtp import Memory
-from bridges.crazyflie import open_crazyflie
+from bridges.crazyflie.body import open_crazyflie
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import request
-from twins.crazyflie.supervisor import State
+from twins.devices.crazyflie.supervisor import State
 
 pytestmark = pytest.mark.system
 

@@ -8,15 +8,15 @@ import time
 import numpy as np
 import pytest
 
-from agents.body import BodyError
+from agents.body.interface import BodyError
 from agents.protocols.crtp import Info
-from bridges.crazyflie import open_crazyflie
+from bridges.crazyflie.body import open_crazyflie
 from bridges.crazyflie.telemetry import Board, Telemetry
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import Served, request
-from twins.crazyflie import open_device
-from twins.crazyflie.supervisor import State
-from twins.device import Faults
+from twins.devices.crazyflie.device import open_device
+from twins.devices.crazyflie.supervisor import State
+from twins.devices.device import Faults
 
 RADIO = "radio://0/80/2M/E7E7E7E70{}"
 

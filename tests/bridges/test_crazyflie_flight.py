@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from agents.body import UNANSWERED
+from agents.body.interface import UNANSWERED
 from agents.protocols.crazyflie import Settings
 from agents.protocols.crtp import Info
 from bridges.crazyflie import flight as module

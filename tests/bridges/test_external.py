@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents import session as network
-from agents import wire
-from agents.body import UNANSWERED, BodyError, BodyRequest, Disturbance
-from agents.endpoint import free_endpoint
-from agents.keys import Keys
-from agents.kinds import KINDS
+from agents.body.interface import UNANSWERED, BodyError, BodyRequest, Disturbance
+from agents.body.kinds import KINDS
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.endpoints import free_endpoint
+from agents.network.keys import Keys
 from bridges import external
 from bridges.external import ExternalBody, open_external
 from tests.conftest import RouterProcess
@@ -57,8 +57,8 @@ class FarEnd:
 
     def __init__(self, endpoint: str) -> None:
         self.session = network.open_session([endpoint], name="far end")
-        self._subscriber = network.subscriber(self.session, KEYS.setpoint("*"), 4096)
-        self.told: list[wire.Command] = []
+        self._subscriber = pubsub.subscriber(self.session, KEYS.setpoint("*"), 4096)
+        self.told: list[messages.Command] = []
         self.place = {name: [0.0, 0.0, 0.0] for name in ROWS}
         self._quiet = threading.Event()
         self._thread: threading.Thread | None = None
@@ -84,12 +84,12 @@ class FarEnd:
         if self._thread is not None:
             self._thread.join()
 
-    def look(self) -> list[wire.Command]:
+    def look(self) -> list[messages.Command]:
         for sample in network.received(self._subscriber.handler):
-            self.told.append(wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Command))
+            self.told.append(messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Command))
         return self.told
 
-    def actions(self, name: str, action: str) -> list[wire.Command]:
+    def actions(self, name: str, action: str) -> list[messages.Command]:
         return [command for command in self.look() if (command.robot, command.action) == (name, action)]
 
     def close(self) -> None:
@@ -226,7 +226,7 @@ def test_poses_are_as_they_were_said_and_grow_old(body: ExternalBody, far: FarEn
     far.session.put(KEYS.position("CF01"), b"\xff\x00", encoding="application/json")
     far.say("CF01", [float("nan"), 0.0, 0.0])
     far.say("CF01", [0.0, 0.0, 0.0], stamp=time.time() + 3600.0)
-    far.session.put(KEYS.position("CF01"), b'{"robot":"KH01","stamp":1.0,"position":[0,0,0]}', encoding=wire.JSON)
+    far.session.put(KEYS.position("CF01"), b'{"robot":"KH01","stamp":1.0,"position":[0,0,0]}', encoding=messages.JSON)
     drive.until(lambda: "4 positions refused" in drive.state.notes[0], "nonsense is counted")
     assert drive.state.position[0] == pytest.approx([0.145, 0.0, 0.0], abs=1e-12)
     far.talk(*ROWS)
@@ -241,8 +241,8 @@ def test_what_robots_see_comes_from_the_far_end(body: ExternalBody, far: FarEnd)
 
     def say(name: str, *distance: float | None, robot: str | None = None) -> None:
         angles = [0.1 * k for k in range(len(distance))]
-        sweep = wire.Ranges(robot or name, time.time(), angles, [0.0] * len(distance), list(distance))
-        far.session.put(KEYS.ranges(name), wire.encode(sweep), encoding=wire.JSON)
+        sweep = messages.Ranges(robot or name, time.time(), angles, [0.0] * len(distance), list(distance))
+        far.session.put(KEYS.ranges(name), messages.encode(sweep), encoding=messages.JSON)
 
     say("KH01", 0.25, None, 1.5)
     say("CF01", 2.0)

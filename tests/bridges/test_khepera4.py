@@ -14,18 +14,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.body import BodyError
-from agents.individual import Individual
-from agents.kinds import KHEPERA4
+from agents.body.interface import BodyError
+from agents.body.kinds import KHEPERA4
+from agents.decision.position_control import Individual
 from agents.protocols import khepera4 as protocol
-from bridges import khepera4
-from bridges.khepera4 import OPEN_S, open_khepera4
-from bridges.khepera4_link import Address, Heard, Link
-from bridges.odometry import Odometer
+from bridges.khepera4 import body as khepera4
+from bridges.khepera4.body import OPEN_S, open_khepera4
+from bridges.khepera4.link import Address, Heard, Link
+from bridges.khepera4.odometry import Odometer
 from tests.twins.loopback import Served, reached, request
-from twins import khepera4 as twin
-from twins.device import Faults
-from twins.khepera4 import open_device
+from twins.devices import khepera4 as twin
+from twins.devices.device import Faults
+from twins.devices.khepera4 import open_device
 
 TICK = 0.01
 PARK, KTEAM = {"protocol": "park"}, {"protocol": "kteam"}

@@ -19,10 +19,11 @@ from rosbags.typesys import Stores, get_typestore
 from zenoh.ext import Int64, z_serialize
 from zenoh.handlers import RingChannel
 
-from agents import plausibility, wire
-from agents.keys import Keys
+from agents.network import messages, validation
+from agents.network.keys import Keys
+from agents.network.pubsub import alive_token, pose_publisher, publisher
+from agents.network.session import open_session, received
 from agents.protocols import ros2
-from agents.session import alive_token, open_session, pose_publisher, publisher, received
 from bridges.ros2 import main, ros_name
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -226,11 +227,11 @@ class Realm:
         self.tokens.pop(name).undeclare()
 
     def state(self, name, position, velocity, yaw):
-        state = wire.State(name, 1, 1700000000.5, "running", position, velocity, yaw, None, None, 0.0)
-        self.out[name][0].put(wire.encode(state))
+        state = messages.State(name, 1, 1700000000.5, "running", position, velocity, yaw, None, None, 0.0)
+        self.out[name][0].put(messages.encode(state))
 
     def status(self, name, body=""):
-        status = wire.Status(
+        status = messages.Status(
             name,
             time.time(),
             "running",
@@ -255,7 +256,7 @@ class Realm:
             0.5,
             30,
         )
-        self.out[name][1].put(wire.encode(status))
+        self.out[name][1].put(messages.encode(status))
 
 
 @pytest.fixture
@@ -395,9 +396,9 @@ def test_goals_come_in(router, bridge, eventually):
         send("", 2.5, (0.0, 0.0))
         samples = []
         eventually(lambda: samples.extend(received(goals)) or len(samples) >= 2)
-        first, second = (wire.decode(s.payload.to_bytes(), str(s.encoding), wire.Goal) for s in samples)
+        first, second = (messages.decode(s.payload.to_bytes(), str(s.encoding), messages.Goal) for s in samples)
         for goal in (first, second):
-            plausibility.check_goal(goal, robot="CF01", now=time.time(), reach=(3.0, 3.0, 3.0), oldest_s=1.0)
+            validation.check_goal(goal, robot="CF01", now=time.time(), reach=(3.0, 3.0, 3.0), oldest_s=1.0)
         assert (second.seq - first.seq, first.pose) == (1, 1700000000.5)
         assert (first.robot, first.position) == ("CF01", (1.5, 0.25, 0.5))
         assert first.yaw == pytest.approx(0.5)

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import pytest
 
-from agents.body import BodyError
-from agents.claims import Claims
+from agents.body.device_locks import Claims
+from agents.body.interface import BodyError
 from agents.protocols.crazyflie import device_of
-from bridges.crazyflie import open_crazyflie
-from bridges.khepera4 import open_khepera4
-from bridges.khepera4_link import Address
-from bridges.tello import open_tello
-from bridges.turtlebot3 import open_turtlebot3
+from bridges.crazyflie.body import open_crazyflie
+from bridges.khepera4.body import open_khepera4
+from bridges.khepera4.link import Address
+from bridges.tello.body import open_tello
+from bridges.turtlebot3.body import open_turtlebot3
 from tests.bridges import turtlebots
 from tests.twins.loopback import request
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from agents import session as network
-from agents import wire
+from agents.network import messages, pubsub
+from agents.network import session as network
 from tests.bridges.test_external import ALONE, KEYS, PLACES
 from tests.conftest import ROOT, RouterProcess
 from tests.system.lab import Flight, RobotProcess, Watcher, until
@@ -88,8 +88,8 @@ def test_when_the_simulator_hangs_robots_land_and_the_others_stay(router: Router
     robots = RobotProcess(router.endpoint, changed, "KH01", "KH02", "CF01")
     try:
         watcher.until(lambda: watcher.phase("CF01") == "ready", "it is ready")
-        assert watcher.order("CF01", wire.Order("takeoff")).ok
-        assert watcher.order("KH01", wire.Order("takeoff")).ok
+        assert watcher.order("CF01", messages.Order("takeoff")).ok
+        assert watcher.order("KH01", messages.Order("takeoff")).ok
         watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
         flying.process.send_signal(signal.SIGSTOP)
         watcher.until(lambda: watcher.phase("CF01") == "landing", "silence is noticed")
@@ -116,7 +116,7 @@ def test_when_the_robots_process_dies_the_simulator_lands_it(router: RouterProce
     )
     simulator = Simulator(router.endpoint, "TE01")
     watcher = Watcher(router.endpoint)
-    positions = network.subscriber(watcher.session, KEYS.position("TE01"), 64)
+    positions = pubsub.subscriber(watcher.session, KEYS.position("TE01"), 64)
     height = [0.0]
 
     def look() -> float:
@@ -127,7 +127,7 @@ def test_when_the_robots_process_dies_the_simulator_lands_it(router: RouterProce
     robot = RobotProcess(router.endpoint, file, "TE01")
     try:
         watcher.until(lambda: watcher.phase("TE01") == "ready", "it is ready")
-        assert watcher.order("TE01", wire.Order("takeoff")).ok
+        assert watcher.order("TE01", messages.Order("takeoff")).ok
         watcher.until(lambda: watcher.phase("TE01") == "airborne", "it is up")
         assert look() == pytest.approx(0.6, abs=0.06)
         robot.kill()

@@ -12,12 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.body import UNANSWERED, BodyError
-from agents.kinds import TELLO
+from agents.body.interface import UNANSWERED, BodyError, settings
+from agents.body.kinds import TELLO
 from agents.protocols import tello as protocol
-from agents.protocols.settings import settings
-from bridges.tello import open_tello
-from bridges.tello_pilot import Duty, Pilot
+from bridges.tello.body import open_tello
+from bridges.tello.pilot import Duty, Pilot
 from tests.twins.loopback import request
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -19,16 +19,16 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from zenoh.handlers import RingChannel
 
-from agents.body import UNANSWERED, BodyError
-from agents.kinds import KHEPERA4
+from agents.body.interface import UNANSWERED, BodyError
+from agents.body.kinds import KHEPERA4
+from agents.network.session import open_session
 from agents.protocols import ros2, turtlebot3
-from agents.session import open_session
-from bridges import turtlebot3 as bridge
-from bridges.turtlebot3 import DIAGNOSIS_S, OPEN_S, TurtleBot3, open_turtlebot3
-from bridges.turtlebot3_robot import ranges
+from bridges.turtlebot3 import body as bridge
+from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3, open_turtlebot3
+from bridges.turtlebot3.robot import ranges
 from tests.bridges.turtlebots import Stage, clock, request
 from tests.conftest import RouterProcess
-from twins.device import Faults
+from twins.devices.device import Faults
 
 ROOT = Path(__file__).resolve().parents[2]
 NOWHERE = "tcp/127.0.0.1:9"
@@ -408,8 +408,8 @@ def test_one_that_cannot_be_told_keeps_nobody_from_being_stopped():
 TWIN = """
 import select, sys, time
 from tests.bridges.turtlebots import request
-from twins.device import DeviceRequest, Faults
-from twins.turtlebot3 import open_device
+from twins.devices.device import DeviceRequest, Faults
+from twins.devices.turtlebot3 import open_device
 twin = open_device(DeviceRequest(request(sys.argv[1]), Faults()))
 print(twin.addresses[0], flush=True)
 zero = time.monotonic()

@@ -18,19 +18,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents import session as network
-from agents import wire
-from agents.keys import Keys
-from agents.protocols import datastream
-from agents.protocols.datastream import Segment
-from bridges import vicon
-from bridges.datastream import Frame
-from bridges.vicon import Sieve, heading, pairs, split
-from experiments import document
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.protocols import vicon_datastream
+from agents.protocols.vicon_datastream import Segment
+from bridges.vicon import publisher
+from bridges.vicon.client import Frame
+from bridges.vicon.publisher import Sieve, heading, pairs, split
+from experiments.file import document
 from tests.conftest import ROOT, RouterProcess
 from tests.system.lab import RobotProcess, Watcher, until
 from tests.twins.camera import Camera
-from twins.vicon import upright
+from twins.devices.vicon import upright
 
 UPRIGHT = tuple(upright(0.3).ravel().tolist())
 
@@ -59,7 +59,7 @@ class Frames:
 @pytest.mark.parametrize("step", [-1.0, 3.0])
 def test_a_step_of_the_wall_clock_moves_no_position(monkeypatch: pytest.MonkeyPatch, step: float) -> None:
     Frames.steady, wall = 5.0, 1.8e9
-    monkeypatch.setattr(vicon, "Reader", Frames)
+    monkeypatch.setattr(publisher, "Reader", Frames)
     monkeypatch.setattr(time, "monotonic", lambda: Frames.steady)
     monkeypatch.setattr(time, "time", lambda: wall + Frames.steady + (step if Frames.steady > 6.0 else 0.0))
     stamps: list[float] = []
@@ -69,7 +69,7 @@ def test_a_step_of_the_wall_clock_moves_no_position(monkeypatch: pytest.MonkeyPa
             stamps.append(stamp)
 
     sieve = Sieve({"CF01": "CF01"}, lambda _: None)
-    bridge = vicon.Bridge("nowhere", 1, sieve, Ear(), lambda _: None)  # type: ignore[arg-type]
+    bridge = publisher.Bridge("nowhere", 1, sieve, Ear(), lambda _: None)  # type: ignore[arg-type]
     assert bridge.run(lambda: Frames.steady > 7.0)
     assert len(stamps) > 150
     np.testing.assert_allclose(np.diff(stamps), 0.01, atol=1e-6)
@@ -163,11 +163,11 @@ def test_the_command_line_is_understood_or_refused() -> None:
 
 
 class BridgeProcess:
-    """`python -m bridges.vicon` and what it says."""
+    """`python -m bridges.vicon.publisher` and what it says."""
 
     def __init__(self, endpoint: str, server: str, *arguments: str) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "bridges.vicon", server, "--connect", endpoint, *arguments],
+            [sys.executable, "-m", "bridges.vicon.publisher", server, "--connect", endpoint, *arguments],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -223,12 +223,12 @@ class Listener:
     """Positions of a robot, as it would hear them."""
 
     def __init__(self, session: network.zenoh.Session, robot: str) -> None:
-        self._subscriber = network.subscriber(session, Keys().position(robot), 4096)
-        self.heard: list[wire.Position] = []
+        self._subscriber = pubsub.subscriber(session, Keys().position(robot), 4096)
+        self.heard: list[messages.Position] = []
 
     def look(self) -> int:
         for sample in network.received(self._subscriber.handler):
-            self.heard.append(wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position))
+            self.heard.append(messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position))
         return len(self.heard)
 
     def until(self, more: int) -> None:
@@ -308,14 +308,14 @@ def test_a_server_that_goes_and_one_that_talks_nonsense_are_survived(
         bridge = start(camera.twin.address, "--map", "CF01")
         listener.until(20)
     bridge.until_said(f"lost {camera.twin.address}")
-    offer = datastream.pack_kinds(datastream.POSES)
-    good = datastream.packet(datastream.pack_frame_number(1))
+    offer = vicon_datastream.pack_kinds(vicon_datastream.POSES)
+    good = vicon_datastream.packet(vicon_datastream.pack_frame_number(1))
     for nonsense, words in (
         (b"HTTP/1.1 400 Bad Request\r\n\r\n", "a packet begins with 0x50545448"),
-        (datastream.pack_kinds([1]), "no segments to offer"),
+        (vicon_datastream.pack_kinds([1]), "no segments to offer"),
         (offer + good[:-3] + b"\x00" * 40, "a packet begins with"),
-        (offer + datastream.packet(datastream.block(9, b"\x01")), "cut off"),
-        (offer + datastream.block(datastream.MAGIC, b"\x05\x00\x00\x00\xff\xff\xff\xff"), "a block of"),
+        (offer + vicon_datastream.packet(vicon_datastream.block(9, b"\x01")), "cut off"),
+        (offer + vicon_datastream.block(vicon_datastream.MAGIC, b"\x05\x00\x00\x00\xff\xff\xff\xff"), "a block of"),
     ):
         with socket.create_server(("127.0.0.1", port)) as server:
             server.settimeout(10.0)
@@ -339,8 +339,8 @@ def test_a_wrong_host_is_said_and_ends_it(
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as closed:
         port = closed.getsockname()[1]
-    monkeypatch.setattr(vicon, "FIRST_S", 0.8)
-    assert vicon.main([f"127.0.0.1:{port}", "--map", "CF01", "--connect", router.endpoint]) == 2
+    monkeypatch.setattr(publisher, "FIRST_S", 0.8)
+    assert publisher.main([f"127.0.0.1:{port}", "--map", "CF01", "--connect", router.endpoint]) == 2
     first, *_, last = capsys.readouterr().err.splitlines()
     assert first == f"vicon: no connection to 127.0.0.1:{port}: Connection refused; trying again"
     assert f"nobody answered at 127.0.0.1:{port} in 0.8 s" in last
@@ -374,11 +374,11 @@ def test_a_robot_flies_on_through_a_short_occlusion_and_lands_in_a_long_one(
     file.write_text(text, encoding="utf-8")
     watcher = Watcher(router.endpoint)
     keys, heights = watcher.keys, [0.0]
-    states = network.subscriber(watcher.session, keys.state("CF01"), 64)
+    states = pubsub.subscriber(watcher.session, keys.state("CF01"), 64)
 
     def look() -> None:
         for sample in network.received(states.handler):
-            state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
+            state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
             assert state.true_position is not None
             heights.append(state.true_position[2])
             camera.twin.place(0, np.array(state.true_position), upright(state.true_yaw or 0.0))
@@ -392,7 +392,7 @@ def test_a_robot_flies_on_through_a_short_occlusion_and_lands_in_a_long_one(
         robots = RobotProcess(router.endpoint, file, "KH01", "KH02", "CF01")
         stack.callback(lambda: robots.process.returncode is not None or robots.end())
         watcher.until(lambda: watcher.phase("CF01") == "ready", "it is ready")
-        assert watcher.order("CF01", wire.Order("takeoff")).ok
+        assert watcher.order("CF01", messages.Order("takeoff")).ok
         watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
         camera.occlude(0.3)
         flown = len(heights)

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from agents.body import BodyRequest, Disturbance
-from agents.individual import drive
-from agents.keys import Keys
-from agents.kinds import TURTLEBOT3
-from bridges.turtlebot3 import open_turtlebot3
-from twins.device import DeviceRequest, Faults
-from twins.turtlebot3 import open_device
+from agents.body.interface import BodyRequest, Disturbance
+from agents.body.kinds import TURTLEBOT3
+from agents.decision.position_control import drive
+from agents.network.keys import Keys
+from bridges.turtlebot3.body import open_turtlebot3
+from twins.devices.device import DeviceRequest, Faults
+from twins.devices.turtlebot3 import open_device
 
 FAST = 4.0
 DT = 0.01

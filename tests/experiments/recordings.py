@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from agents.wire import Contact, Event, Heard, HostClock, Pose, Standing, State, Status, WorldState
-from experiments.experiment import Experiment, Rates, Robot
-from experiments.recording import Recording
+from agents.network.messages import Contact, Event, Heard, HostClock, Pose, Standing, State, Status, WorldState
+from experiments.definition.experiment import Experiment, Rates, Robot
+from experiments.recording.writer import Recording
 
 START = 1_760_000_000.0
 

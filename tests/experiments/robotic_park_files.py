@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments import layouts
+from experiments.authoring import layouts
 
 SECTIONS = """# an experiment in the structure of Robotic Park
 Operation:

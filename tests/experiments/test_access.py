@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.access import Rights, rules, sizes
-from agents.keys import Keys
-from agents.lab import ROLES, Identity, LabError, Register
-from experiments import access
-from experiments.experiment import Experiment, Formation, Hybrid, Network, Robot
-from experiments.run import load
-from experiments.standins import choose_bodies
+from agents.network.access_control import Rights, rules, sizes
+from agents.network.keys import Keys
+from agents.network.lab import ROLES, Identity, LabError, Register
+from experiments.definition import access_rights
+from experiments.definition.bodies import choose_bodies
+from experiments.definition.experiment import Experiment, Formation, Hybrid, Network, Robot
+from experiments.file.document import load
 from tests.agents.acl import ACTIONS, held, may, permitted
 
 KEYS = Keys()
@@ -29,7 +29,7 @@ def register(robots):
 
 
 def control(experiment):
-    return rules(access.rights([experiment]), register(experiment.robots))
+    return rules(access_rights.rights([experiment]), register(experiment.robots))
 
 
 def experiment(links, processes=(), architecture="distributed", **more):
@@ -200,7 +200,7 @@ def test_avoidance_gives_ears_and_nothing_else():
     """Who keeps clear of those that it hears must hear them, though no link says so."""
     read = load("crowd")
     one = next(iter(read.cases().values()))
-    grants = access.rights([one]).robots
+    grants = access_rights.rights([one]).robots
     mates = [name for name, robot in one.robots.items() if robot.process == "squad_E1"]
     assert [key for key in grants[mates[0]].hear if key.endswith("/pose")] == ["park/*/pose"], "all forty of them"
     assert grants[mates[0]].say == [f"park/{mate}/**" for mate in mates]
@@ -251,18 +251,18 @@ def test_a_rmw_robot_has_its_domain():
 
 def test_cases_that_share_a_router_share_their_rights():
     one, other = experiment({(0, 1)}), experiment({(2, 1)})
-    both = access.rights([one, other])
+    both = access_rights.rights([one, other])
     made = rules(both, register(one.robots))
     assert may(made, "R1", "hear", "park/R0/pose")
     assert may(made, "R1", "hear", "park/R2/pose")
     assert not may(made, "R1", "hear", "park/R3/pose")
     elsewhere = msgspec.structs.replace(one, network=Network(realm="yard"))
     with pytest.raises(LabError, match=r"realms park and yard share no router"):
-        access.rights([one, elsewhere])
+        access_rights.rights([one, elsewhere])
 
 
 def test_rights_go_through_a_file():
-    made = access.rights(load("robotic-park").cases().values())
+    made = access_rights.rights(load("robotic-park").cases().values())
     assert msgspec.json.decode(msgspec.json.encode(made), type=Rights) == made
 
 
@@ -270,7 +270,7 @@ def test_a_certificate_on_an_earlier_name_gives_no_right():
     four = experiment({(0, 1)})
     known = register(four.robots)
     moved = msgspec.structs.replace(known.identities["R0"], common_name="R0.2")
-    made = rules(access.rights([four]), Register({**known.identities, "R0": moved}))
+    made = rules(access_rights.rights([four]), Register({**known.identities, "R0": moved}))
     assert not may(made, "R0", "put", "park/R0/pose")
     assert may(made, "R0.2", "put", "park/R0/pose")
 
@@ -280,11 +280,11 @@ def test_a_robot_cannot_take_the_name_of_an_office():
     known = register(four.robots)
     clash = Register({**known.identities, "R0": Identity("operator", "R0", "1", "2100-01-01")})
     with pytest.raises(LabError, match=r"'R0' is a robot of the experiment and operator of the lab"):
-        rules(access.rights([four]), clash)
+        rules(access_rights.rights([four]), clash)
 
 
 def test_sizes_bound_what_robots_say_and_not_the_experiment():
-    (limit,) = sizes(access.rights([experiment(set())]))
+    (limit,) = sizes(access_rights.rights([experiment(set())]))
     assert limit["size_limit"] == 65536
     assert "park/R0/**" in limit["key_exprs"]
     assert "park/R0/**/@adv/**" in limit["key_exprs"]
@@ -293,7 +293,7 @@ def test_sizes_bound_what_robots_say_and_not_the_experiment():
 
 def test_needed_identities():
     reference = load("robotic-park").cases()["event"]
-    assert set(access.needed(reference)) == {"router", "operator", "recorder", *reference.robots}
-    assert {"world"} < set(access.needed(choose_bodies(reference, "world")))
-    assert {"centre"} < set(access.needed(load("architectures").cases()["hybrid"]))
-    assert {"twin", "positioning"} < set(access.needed(choose_bodies(reference, "protocol")))
+    assert set(access_rights.needed(reference)) == {"router", "operator", "recorder", *reference.robots}
+    assert {"world"} < set(access_rights.needed(choose_bodies(reference, "world")))
+    assert {"centre"} < set(access_rights.needed(load("architectures").cases()["hybrid"]))
+    assert {"twin", "positioning"} < set(access_rights.needed(choose_bodies(reference, "protocol")))

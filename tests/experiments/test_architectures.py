@@ -6,13 +6,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.rows import norm
-from experiments import assign, check, document, metrics, playback, report, results, virtual
-from experiments.experiment import Channel, Experiment, Formation, Hybrid, Leg, Robot
-from experiments.logbook import Logbook
-from experiments.problem import DocumentError
-from experiments.report_architecture import architecture_table
-from experiments.verdict import findings
+from agents.arrays import norm
+from experiments.check import check
+from experiments.definition import assignment
+from experiments.definition.experiment import Channel, Experiment, Formation, Hybrid, Leg, Robot
+from experiments.file import document
+from experiments.file.problems import DocumentError
+from experiments.metrics import measure
+from experiments.recording import playback
+from experiments.report import metrics_files, report
+from experiments.report.feature_tables import architecture_table
+from experiments.report.verdict import findings
+from experiments.virtual_time import simulation
+from experiments.virtual_time.log import Logbook
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -36,8 +42,8 @@ def with_delay(experiment, delay_s, architecture="distributed", **more):
 
 
 def measured(experiment, seed=1):
-    log = virtual.simulate(experiment, [seed])
-    return metrics.measure(Logbook(log, experiment, str(experiment.architecture)[:11]).trace())
+    log = simulation.simulate(experiment, [seed])
+    return measure.measure(Logbook(log, experiment, str(experiment.architecture)[:11]).trace())
 
 
 def assert_same_motion(first, second):
@@ -55,9 +61,9 @@ def assert_same_motion(first, second):
 @pytest.mark.parametrize("architecture", ["centralised", HYBRID])
 def test_without_delay_the_reference_experiment_moves_the_same_wherever_it_is_decided(cases, architecture):
     park = cases["periodic"]
-    first = virtual.simulate(with_delay(park, 0.0), [1])
+    first = simulation.simulate(with_delay(park, 0.0), [1])
     assert first.time[-1] > park.duration_s
-    assert_same_motion(first, virtual.simulate(with_delay(park, 0.0, architecture), [1]))
+    assert_same_motion(first, simulation.simulate(with_delay(park, 0.0, architecture), [1]))
 
 
 @pytest.mark.parametrize("update", [None, "relative-control"])
@@ -65,9 +71,9 @@ def test_so_it_does_when_the_law_is_computed_on_events_and_for_several_seeds(cas
     formation = msgspec.structs.replace(cases["periodic"].formation, update=update)
     park = short(cases["periodic"], duration_s=4.0, timeline=[Leg(at_s=2.0, robot="TB01", plan=LINE)],
                  formation=formation)  # fmt: skip
-    first = virtual.simulate(with_delay(park, 0.0), [1, 2])
+    first = simulation.simulate(with_delay(park, 0.0), [1, 2])
     for architecture in ("centralised", HYBRID):
-        second = virtual.simulate(with_delay(park, 0.0, architecture), [1, 2])
+        second = simulation.simulate(with_delay(park, 0.0, architecture), [1, 2])
         assert_same_motion(first, second)
         np.testing.assert_array_equal(second.updates >= first.updates, True)  # goals are said again now and then
 
@@ -75,7 +81,7 @@ def test_so_it_does_when_the_law_is_computed_on_events_and_for_several_seeds(cas
 def test_what_a_robot_believes_of_itself_is_all_that_differs_with_events(cases):
     """Poses are said on events: the centre knows of a robot what its neighbours know."""
     park = short(cases["event"])
-    first, second = (virtual.simulate(with_delay(park, 0.0, a), [1]) for a in ("distributed", "centralised"))
+    first, second = (simulation.simulate(with_delay(park, 0.0, a), [1]) for a in ("distributed", "centralised"))
     apart = norm(first.true_position - second.true_position).max()
     assert 1e-4 < apart < 0.05
 
@@ -95,7 +101,7 @@ def test_delay_makes_the_centre_worse_and_itself_known(cases):
 
 def test_goals_come_as_late_as_the_network_and_the_grid_of_decisions_make_them(cases):
     park = with_delay(short(cases["periodic"]), 0.031, "centralised")
-    log = virtual.simulate(park, [1])
+    log = simulation.simulate(park, [1])
     delay = Logbook(log, park, "").trace().goals.delay
     # said at 0, 20, 40, 60 ms before a decision: the newest that is there is 40 ms old; the goal acts on the next tick
     np.testing.assert_allclose(delay, 0.04 + 0.04, atol=1e-9)
@@ -111,7 +117,7 @@ def test_the_default_network_is_one_tick(cases):
 
 def test_seeds_side_by_side_are_as_alone(cases):
     park = with_delay(short(cases["event"], duration_s=3.0, timeline=[]), 0.03, HYBRID, jitter_s=0.01, loss=0.1)
-    many, alone = virtual.simulate(park, [4, 5]), virtual.simulate(park, [5])
+    many, alone = simulation.simulate(park, [4, 5]), simulation.simulate(park, [5])
     np.testing.assert_array_equal(many.true_position[:, 7:], alone.true_position)
     both, one = Logbook(many, park, "", 1).trace().goals, Logbook(alone, park, "").trace().goals
     for field in fields(one):
@@ -122,13 +128,13 @@ def test_seeds_side_by_side_are_as_alone(cases):
 def test_robots_that_decide_for_themselves_do_not_feel_that_others_are_guided(cases):
     """Who is guided moves as before where it hears at once; what it says is heard as ever."""
     park = short(cases["periodic"], duration_s=3.0, timeline=[])
-    first = virtual.simulate(with_delay(park, 0.0), [1])
-    second = virtual.simulate(with_delay(park, 0.0, HYBRID), [1])
+    first = simulation.simulate(with_delay(park, 0.0), [1])
+    second = simulation.simulate(with_delay(park, 0.0, HYBRID), [1])
     np.testing.assert_array_equal(first.sent[1], second.sent[1])
     names = np.array(first.names)
-    links = assign.heard_links(with_delay(park, 0.0, HYBRID))
+    links = assignment.heard_links(with_delay(park, 0.0, HYBRID))
     assert not set(names[links.listener]) & set(HYBRID.robots)
-    assert len(second.heard[0]) == len(first.heard[0]) * len(links) / len(assign.heard_links(park))
+    assert len(second.heard[0]) == len(first.heard[0]) * len(links) / len(assignment.heard_links(park))
 
 
 def test_lost_poses_and_goals_are_counted(cases):
@@ -147,8 +153,8 @@ def test_lost_poses_and_goals_are_counted(cases):
 
 def test_links_of_avoidance_stay_with_the_robots(cases):
     park = with_delay(short(cases["periodic"], duration_s=2.0, timeline=[], avoidance={"kind": "barrier"}), 0.0)
-    first = virtual.simulate(park, [1])
-    second = virtual.simulate(msgspec.structs.replace(park, architecture="centralised"), [1])
+    first = simulation.simulate(park, [1])
+    second = simulation.simulate(msgspec.structs.replace(park, architecture="centralised"), [1])
     assert_same_motion(first, second)
     np.testing.assert_array_equal(first.setpoint, second.setpoint)
 
@@ -158,7 +164,7 @@ def test_links_of_avoidance_stay_with_the_robots(cases):
 
 def test_a_recording_tells_the_same(tmp_path, cases):
     park = with_delay(short(cases["event"], duration_s=4.0, timeline=[]), 0.03, HYBRID, loss=0.05)
-    log = virtual.simulate(park, [3])
+    log = simulation.simulate(park, [3])
     book = Logbook(log, park, "hybrid")
     book.record(tmp_path / "hybrid.mcap", "")
     first, second = book.trace().goals, playback.read(tmp_path / "hybrid.mcap").trace.goals
@@ -182,7 +188,7 @@ def test_messages_of_the_whole_network_are_counted_alike(cases):
     assert centralised.network_messages == centralised.deliveries == poses + 7 * 40
     # of 21 links 10 are those of KH02, CF02, CF03; the centre hears all but the leader
     listened = {robot.robot: robot.listeners for robot in hybrid.robots}
-    links = assign.heard_links(with_delay(park, 0.0, HYBRID))
+    links = assignment.heard_links(with_delay(park, 0.0, HYBRID))
     assert hybrid.deliveries == (len(links) + 6) * 200 + 3 * 40
     assert sum(listened.values()) == len(links) + 6
     assert centralised.guidance.goals_hz == pytest.approx(70.0)
@@ -197,8 +203,8 @@ def test_the_report_compares_them(tmp_path, cases):
     traces = []
     for name, architecture in (("apart", "distributed"), ("together", "centralised")):
         experiment = with_delay(park, 0.05, architecture)
-        traces.append(Logbook(virtual.simulate(experiment, [1]), experiment, name).trace())
-    found = [metrics.measure(trace) for trace in traces]
+        traces.append(Logbook(simulation.simulate(experiment, [1]), experiment, name).trace())
+    found = [measure.measure(trace) for trace in traces]
     table = architecture_table(found)
     cells = {row.cells[0]: row.cells[1:] for row in table.rows}
     assert cells["Decides"] == ("every robot", "the centre")
@@ -211,12 +217,12 @@ def test_the_report_compares_them(tmp_path, cases):
     assert "Architecture</h2>" in page
     alone = report.write(tmp_path, traces[:1], measured=found[:1], name="one.html").read_text()
     assert "Architecture</h2>" not in alone
-    results.write_csv(tmp_path / "metrics.csv", found)
+    metrics_files.write_csv(tmp_path / "metrics.csv", found)
     header, *rows = (tmp_path / "metrics.csv").read_text().splitlines()
     columns = dict(zip(header.split(","), rows[9].split(","), strict=True))
     assert (columns["case"], columns["goals"]) == ("together", "40")
     assert float(columns["delay_p95_s"]) == pytest.approx(0.11)
-    together = results.document("", 1, found)["cases"]["together"]
+    together = metrics_files.document("", 1, found)["cases"]["together"]
     assert together["guidance"]["goals"] == 280
     assert together["network"]["messages"] == found[1].network_messages
 
@@ -278,15 +284,15 @@ def test_check_says_what_it_means(tmp_path):
 
 def test_who_is_guided(cases):
     park = cases["periodic"]
-    assert assign.guided(park) == ()
-    assert assign.guided(with_delay(park, 0.0, "centralised")) == tuple(park.robots)
-    assert assign.guided(with_delay(park, 0.0, HYBRID)) == ("KH02", "CF02", "CF03")
+    assert assignment.guided(park) == ()
+    assert assignment.guided(with_delay(park, 0.0, "centralised")) == tuple(park.robots)
+    assert assignment.guided(with_delay(park, 0.0, HYBRID)) == ("KH02", "CF02", "CF03")
 
 
 def test_robots_without_a_formation_are_guided_too():
     robots = {"A": Robot(kind="khepera4", start=[0.0, 0.0])}
     plan = Leg(at_s=0.0, robot="A", plan={"kind": "waypoints", "points": [[0.3, 0.0]], "speed": 0.1})
     one = Experiment(title="one", duration_s=5.0, robots=robots, timeline=[plan], formation=Formation())
-    first, second = (virtual.simulate(with_delay(one, 0.0, a), [1]) for a in ("distributed", "centralised"))
+    first, second = (simulation.simulate(with_delay(one, 0.0, a), [1]) for a in ("distributed", "centralised"))
     assert_same_motion(first, second)
     assert second.true_position[-1, 0, 0] > 0.25

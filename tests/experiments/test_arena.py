@@ -5,9 +5,11 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from experiments import catalogue, document, entries
-from experiments.check import check
-from experiments.document import DocumentError, read
+from experiments.catalogue import index
+from experiments.check.check import check
+from experiments.file import catalogue as entries
+from experiments.file import document
+from experiments.file.document import DocumentError, read
 from twins.scene import Obstacle
 
 LAB = """# A lab
@@ -182,13 +184,13 @@ def test_findings_of_the_check_point_into_the_arena_file(lab):
 
 
 def test_the_catalogue_has_arena_files_that_are_no_experiments(tmp_path):
-    assert catalogue.arenas() == ["gate.arena.toml"]
-    assert "obstacle-course" in catalogue.names()
-    assert not any("arena" in name for name in catalogue.names())
+    assert index.arenas() == ["gate.arena.toml"]
+    assert "obstacle-course" in index.names()
+    assert not any("arena" in name for name in index.names())
     made = entries.copy("obstacle-course", tmp_path)
     assert read(made).experiment == read("obstacle-course").experiment
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(
-        [made.name, "gate.arena.toml", catalogue.SCHEMA]
+        [made.name, "gate.arena.toml", index.SCHEMA]
     )  # fmt: skip
     (tmp_path / "gate.arena.toml").write_text("[arena]\n")
     with pytest.raises(DocumentError, match="is another arena"):

@@ -6,13 +6,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.body import Disturbance, Jitter
-from agents.coordination import Distance
-from agents.kinds import CRAZYFLIE, KHEPERA4, TURTLEBOT3
-from agents.planning import Line
-from agents.triggers import Periodic, SendOnDelta
-from experiments import assign, document
-from experiments.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Safety, Start
+from agents.body.interface import Disturbance, Jitter
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TURTLEBOT3
+from agents.plugins.laws import Distance
+from agents.plugins.planners import Line
+from agents.plugins.triggers import Periodic, SendOnDelta
+from experiments.definition import assignment, bodies
+from experiments.definition.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Safety, Start
+from experiments.file import document
 from twins.scene import Obstacle
 
 NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
@@ -24,7 +25,7 @@ def park():
 
 
 def test_everybody_together(park):
-    made = assign.assign(park, NAMES)
+    made = assignment.assign(park, NAMES)
     assert made.names == made.speakers == NAMES
     assert made.kinds == (TURTLEBOT3, KHEPERA4, KHEPERA4, KHEPERA4, CRAZYFLIE, CRAZYFLIE, CRAZYFLIE)
     np.testing.assert_array_equal(made.hover, [np.nan] * 4 + [0.8] * 3)
@@ -41,7 +42,7 @@ def test_everybody_together(park):
 
 def test_the_links_of_the_paper(park):
     """Eq. (11) and figure 11: 12 edges, three of them from the leader only."""
-    net = assign.all_links(park)
+    net = assignment.all_links(park)
     heard = {NAMES[i]: {NAMES[j] for j in net.speaker[net.listener == i]} for i in range(7)}
     assert heard == {
         "TB01": set(),
@@ -60,7 +61,7 @@ def test_the_links_of_the_paper(park):
 
 @pytest.mark.parametrize("names", [("CF01",), ("KH02", "CF03"), ("CF03", "TB01", "KH02")])
 def test_some_robots_in_any_order_know_their_own_part(park, names):
-    made, whole = assign.assign(park, names), assign.all_links(park)
+    made, whole = assignment.assign(park, names), assignment.all_links(park)
     assert made.names == names
     assert made.speakers == NAMES
 
@@ -74,19 +75,19 @@ def test_some_robots_in_any_order_know_their_own_part(park, names):
 
 
 def test_repetitions_stand_side_by_side(park):
-    made = assign.assign(park, NAMES, copies=3)
+    made = assignment.assign(park, NAMES, copies=3)
     assert made.names == made.speakers == NAMES * 3
-    assert len(made.links) == 3 * len(assign.all_links(park))
+    assert len(made.links) == 3 * len(assignment.all_links(park))
     assert (made.links.listener // 7 == made.links.speaker // 7).all()
     ((rows, _),) = made.legs
     assert rows.tolist() == [0, 7, 14]
     assert made.hover.shape == (21,)
     with pytest.raises(ValueError, match="only the whole experiment can be repeated"):
-        assign.assign(park, NAMES[1:], copies=2)
+        assignment.assign(park, NAMES[1:], copies=2)
 
 
 def test_bodies_of_repetitions_differ_in_their_seeds_only(park):
-    made = assign.request(park, NAMES, [5, 6])
+    made = bodies.request(park, NAMES, [5, 6])
     assert made.names == NAMES * 2
     assert made.seeds == (5,) * 7 + (6,) * 7
     assert made.addresses == ("twin",) * 14
@@ -106,24 +107,24 @@ def experiment(**parts):
 
 
 def test_starts_are_on_the_floor_with_a_yaw():
-    position, yaw = assign.start(experiment(), ("B", "A"))
+    position, yaw = bodies.start(experiment(), ("B", "A"))
     np.testing.assert_array_equal(position, [[0.0, 0.25, 0.0], [0.5, -0.5, 0.0]])
     np.testing.assert_array_equal(yaw, [0.0, 1.5])
 
 
 def test_limits_are_the_arena_and_the_safety_of_the_file():
     given = experiment(arena=Arena(size=(2.0, 3.0, 4.0)), safety=Safety(speed=0.3, goal_step=0.2, margin=0.1))
-    made = assign.limits(given, [])
+    made = assignment.limits(given, [])
     np.testing.assert_array_equal(made.low, [-1.0, -1.5, 0.0])
     np.testing.assert_array_equal(made.high, [1.0, 1.5, 4.0])
     assert (made.speed, made.goal_step, made.margin) == (0.3, 0.2, 0.1)
     assert (made.own_silence_s, made.link_silence_s) == (0.5, 1.0)
-    assert assign.limits(experiment(), []).speed == np.inf
+    assert assignment.limits(experiment(), []).speed == np.inf
 
 
 def test_links_may_have_gains_of_their_own():
     given = {"A > B": Link(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": Link(distance=1.0)}
-    net = assign.all_links(experiment(formation=Formation(gain=2.0, links=given)))
+    net = assignment.all_links(experiment(formation=Formation(gain=2.0, links=given)))
     table = zip(*(column.tolist() for column in (net.listener, net.speaker, net.distance, net.gain)), strict=True)
     assert list(table) == [(0, 2, 1.0, 2.0), (1, 0, 0.5, 7.0), (1, 2, 0.6, 2.0), (2, 1, 0.6, 2.0)]
 
@@ -139,7 +140,7 @@ def test_links_may_have_gains_of_their_own():
     ],
 )
 def test_who_leads(formation, leaders):
-    assert assign.leaders(experiment(formation=formation)) == leaders
+    assert assignment.leaders(experiment(formation=formation)) == leaders
 
 
 def test_disturbances_merge_field_by_field_the_narrower_wins():
@@ -149,21 +150,21 @@ def test_disturbances_merge_field_by_field_the_narrower_wins():
         "B": Disturbance(position_sigma=0.0),
     }
     made = experiment(disturbance=given)
-    assert assign.disturbance(made, "A") == given["all"]
-    assert assign.disturbance(made, "B") == Disturbance(Jitter(0.01), 0.0, 0.01, 0.2)
-    assert assign.disturbance(experiment(), "A") == Disturbance()
+    assert bodies.disturbance(made, "A") == given["all"]
+    assert bodies.disturbance(made, "B") == Disturbance(Jitter(0.01), 0.0, 0.01, 0.2)
+    assert bodies.disturbance(experiment(), "A") == Disturbance()
 
 
 def test_rates_patience_and_triggers():
     rates = Rates(body_hz=200.0, pose_hz=40.0, coordination_hz=20.0)
     trigger = {"kind": "send-on-delta", "threshold": 0.02, "maximum_silence_s": 1.0}
-    made = assign.assign(
+    made = assignment.assign(
         experiment(rates=rates, start=Start(deadline_s=7.0, missing="go-on"), trigger=trigger), ("A", "B", "C")
     )
     assert (made.body_hz, made.pose_every, made.decide_every, made.patience_s) == (200.0, 5, 10, 7.0)
     assert made.trigger == SendOnDelta(threshold=0.02, maximum_silence_s=1.0)
     with pytest.raises(msgspec.ValidationError, match="threshold"):
-        assign.assign(experiment(trigger={**trigger, "threshold": -1.0}), ("A",))
+        assignment.assign(experiment(trigger={**trigger, "threshold": -1.0}), ("A",))
 
 
 def test_robots_are_not_scattered_into_obstacles():
@@ -172,7 +173,7 @@ def test_robots_are_not_scattered_into_obstacles():
     given = Experiment(
         title="t", duration_s=1.0, robots=robots, arena=Arena(obstacles={"post": post}), start=Start(scatter=0.6)
     )
-    place = np.array([assign.scattered(given, ("A", "B"), seed)[0][:, :2] for seed in range(100)])
+    place = np.array([bodies.scattered(given, ("A", "B"), seed)[0][:, :2] for seed in range(100)])
     gap = np.hypot(place[..., 0], place[..., 1]) - 0.3 - 0.07
-    assert gap.min() > assign.CLEAR
+    assert gap.min() > bodies.CLEAR
     assert gap.min() < 0.1  # it is near enough to be in the way

@@ -4,8 +4,8 @@ import io
 
 import pytest
 
-from experiments import bar as module
-from experiments.bar import Bar
+from tools.commands import progress as module
+from tools.commands.progress import Bar
 
 
 class Terminal(io.StringIO):

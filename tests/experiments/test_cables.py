@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from experiments.cables import GOOD, Cables, Condition
+from tools.reliability.cables import GOOD, Cables, Condition
 
 
 def answer_everything(listener):

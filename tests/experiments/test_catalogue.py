@@ -9,12 +9,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.graph import edges, links, rigidity
-from agents.kinds import KINDS
-from experiments import catalogue, document, entries
-from experiments.document import DocumentError, parse_links, read
+from agents.body.kinds import KINDS
+from agents.formation.graph import edges, links
+from agents.formation.rigidity import rigidity
+from experiments.catalogue import index
+from experiments.file import catalogue as entries
+from experiments.file import document
+from experiments.file.document import DocumentError, parse_links, read
 
-PARK = catalogue.FOLDER / "robotic-park.toml"
+PARK = index.FOLDER / "robotic-park.toml"
 
 
 # The catalogue
@@ -30,7 +33,7 @@ def test_names_and_titles():
         entries.path("convoi")
 
 
-@pytest.mark.parametrize("name", catalogue.names())
+@pytest.mark.parametrize("name", index.names())
 def test_robots_of_the_catalogue_start_apart_and_inside(name):
     experiment = read(name).experiment
     half = np.array(experiment.arena.size[:2]) / 2 - experiment.safety.margin
@@ -72,7 +75,7 @@ def test_the_leader_of_the_convoy_stays_inside_and_below_its_top_speed():
 def test_copy_gives_an_experiment_that_reads_and_never_overwrites(tmp_path):
     target = entries.copy("triangle", tmp_path / "mine.toml")
     assert read(target).experiment == read("triangle").experiment
-    assert json.loads((tmp_path / catalogue.SCHEMA).read_bytes()) == document.schema()
+    assert json.loads((tmp_path / index.SCHEMA).read_bytes()) == document.schema()
     with pytest.raises(DocumentError, match="exists already"):
         entries.copy("convoy", target)
     assert read(target).experiment == read("triangle").experiment
@@ -87,15 +90,15 @@ def test_copy_gives_an_experiment_that_reads_and_never_overwrites(tmp_path):
 
 
 def test_the_schema_beside_the_catalogue_is_the_one_that_is_generated(tmp_path):
-    document.write_schema(tmp_path / catalogue.SCHEMA)
-    fresh = (tmp_path / catalogue.SCHEMA).read_text("utf-8")
+    document.write_schema(tmp_path / index.SCHEMA)
+    fresh = (tmp_path / index.SCHEMA).read_text("utf-8")
     remedy = "call document.write_schema(catalogue.FOLDER / catalogue.SCHEMA) and look at what changed"
-    assert (catalogue.FOLDER / catalogue.SCHEMA).read_text("utf-8") == fresh, remedy
+    assert (index.FOLDER / index.SCHEMA).read_text("utf-8") == fresh, remedy
 
 
 def test_every_entry_of_the_catalogue_shows_the_schema_to_editors():
-    for name in catalogue.names():
-        assert entries.path(name).read_text("utf-8").startswith(f"#:schema ./{catalogue.SCHEMA}\n")
+    for name in index.names():
+        assert entries.path(name).read_text("utf-8").startswith(f"#:schema ./{index.SCHEMA}\n")
 
 
 def test_the_schema_is_draft_7_and_knows_the_plugins():

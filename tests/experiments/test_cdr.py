@@ -12,8 +12,8 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from agents.wire import Event, Heard, Pose, State, Status
-from experiments.cdr import (
+from agents.network.messages import Event, Heard, Pose, State, Status
+from experiments.recording.cdr import (
     POSE_STAMPED,
     POSE_STAMPED_SCHEMA,
     Codec,
@@ -22,7 +22,7 @@ from experiments.cdr import (
     codec,
     pose_stamped,
 )
-from experiments.recording import SentPose
+from experiments.recording.writer import SentPose
 
 
 class Inner(msgspec.Struct):

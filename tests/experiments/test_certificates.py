@@ -5,10 +5,20 @@ import time
 
 import pytest
 
-from agents.lab import register
-from experiments.certificates import Holding, days_left, ended, faults, fingerprint, held, of_host, strays, unnamed
-from experiments.experiment import Host
-from tools import authority
+from agents.network.lab import register
+from experiments.definition.experiment import Host
+from experiments.real_time.hosts.certificates import (
+    Holding,
+    days_left,
+    ended,
+    faults,
+    fingerprint,
+    held,
+    of_host,
+    strays,
+    unnamed,
+)
+from tools.commands import authority
 
 ROBOTS = ["KH01", "CF01"]
 

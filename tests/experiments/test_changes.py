@@ -10,13 +10,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents import wire
-from agents.keys import Keys
-from agents.lifecycle import Phase
-from experiments import changes, document
-from experiments.changes import HotChanges
-from experiments.experiment import Experiment, Robot
-from experiments.seen import Seen
+from agents.decision.lifecycle import Phase
+from agents.network import messages
+from agents.network.keys import Keys
+from experiments.definition.experiment import Experiment, Robot
+from experiments.file import document
+from experiments.real_time.conductor import hot_changes
+from experiments.real_time.conductor.hot_changes import HotChanges
+from experiments.real_time.conductor.run_view import Seen
 
 KEYS = Keys()
 START = 1000.0
@@ -45,8 +46,8 @@ class Payload:
 class Query:
     """An order to the conductor, and its answer."""
 
-    encoding = wire.JSON
-    reply_sent: wire.RunReply | None = None
+    encoding = messages.JSON
+    reply_sent: messages.RunReply | None = None
     error = b""
 
     def __init__(self, payload: bytes) -> None:
@@ -60,7 +61,7 @@ class Query:
 
     def reply(self, key: str, payload: bytes, encoding: str) -> None:
         assert (key, self.reply_sent) == (KEYS.run_order, None)
-        self.reply_sent = wire.decode(payload, encoding, wire.RunReply)
+        self.reply_sent = messages.decode(payload, encoding, messages.RunReply)
 
     def reply_err(self, payload: bytes, encoding: str) -> None:
         self.error = payload
@@ -83,17 +84,17 @@ class View:
     def say(self, kind: str, source: str, text: str) -> None:
         self.said.append((kind, source, text))
 
-    def order(self, names: Sequence[str], order: wire.Order) -> dict[str, wire.Reply]:
+    def order(self, names: Sequence[str], order: messages.Order) -> dict[str, messages.Reply]:
         return {name: self._order(name, order) for name in names}
 
-    def _order(self, name: str, order: wire.Order) -> wire.Reply:
+    def _order(self, name: str, order: messages.Order) -> messages.Reply:
         self.given.append((name, order.order))
         if name in self._stage.hung:
-            return wire.Reply(name, ok=False, phase="unknown", reason="no answer")
+            return messages.Reply(name, ok=False, phase="unknown", reason="no answer")
         if order.order == "start":
             assert order.at == START
         self._stage.told(name, order.order)
-        return wire.Reply(name, ok=True, phase=self.robots[name].phase)
+        return messages.Reply(name, ok=True, phase=self.robots[name].phase)
 
 
 class Crew:
@@ -139,7 +140,7 @@ class Stage:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **more: Any) -> None:
         self.clock = Clock()
-        monkeypatch.setattr(changes, "time", self.clock)
+        monkeypatch.setattr(hot_changes, "time", self.clock)
         spare = Robot(kind="crazyflie", start=[0.8, 0.8], hover=0.5)
         experiment = msgspec.structs.replace(document.read("triangle").experiment, spares={"S1": spare}, **more)
         self.experiment: Experiment = experiment
@@ -161,7 +162,7 @@ class Stage:
 
     def phase(self, name: str, phase: str) -> None:
         assert phase in [each.word for each in Phase]
-        self.robots[name].status = wire.Status(
+        self.robots[name].status = messages.Status(
             robot=name, stamp=self.clock.utc(), phase=phase, reason="", body="", battery=None, sent=0, heard=0,
             lost={}, dropped={}, malformed=0, refused=0, ticks=0, missed=0, decisions=0, interventions=0, avoided=0,
             late_s=0.0, started=0.0, missing=[], pid=self._pid, cpu_s=0.0, rss_mb=0.0,
@@ -180,8 +181,8 @@ class Stage:
         if not self.changes.expects(name, "its process ended"):
             self.changes.lose(name)
 
-    def ask(self, what: wire.ChangeKind, *names: str, **more: Any) -> Query:
-        query = Query(wire.encode(wire.RunOrder(what, list(names), **more)))
+    def ask(self, what: messages.ChangeKind, *names: str, **more: Any) -> Query:
+        query = Query(messages.encode(messages.RunOrder(what, list(names), **more)))
         self.view.waiting.append(query)
         return query
 
@@ -190,7 +191,7 @@ class Stage:
             self.changes.go_on()
             self.clock.now += 0.5
 
-    def after(self, query: Query, seconds: float = 1.0) -> wire.RunReply:
+    def after(self, query: Query, seconds: float = 1.0) -> messages.RunReply:
         self.go_on(seconds)
         assert query.reply_sent is not None, self.view.said
         return query.reply_sent

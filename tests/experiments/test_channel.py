@@ -6,12 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import wire
-from agents.channel import Samples
-from agents.graph import links
-from experiments.channel import EPOCH, Channel
-from experiments.experiment import Channel as Parameters
-from experiments.experiment import Experiment, LinkChannel, Network, Outage, Robot
+from agents.formation.graph import links
+from agents.network import messages
+from agents.network.channel_model import Samples
+from experiments.definition.experiment import Channel as Parameters
+from experiments.definition.experiment import Experiment, LinkChannel, Network, Outage, Robot
+from experiments.recording.trace import EPOCH
+from experiments.virtual_time.network import Channel
 
 DT = 0.01
 # 0 and 1 hear each other, 2 hears both
@@ -180,8 +181,8 @@ def test_what_is_sent_has_the_size_that_it_has_on_the_wire(encoding):
     _, got = talk.all()
     sizes = {}
     for row, name in enumerate("AB"):
-        pose = wire.pose(name, 1, EPOCH, [float(row), 0.0, 1.0], [-float(row), -0.0, -1.0], 0.0)
-        sizes[row] = len(wire.encode(pose, encoding))
+        pose = messages.pose(name, 1, EPOCH, [float(row), 0.0, 1.0], [-float(row), -0.0, -1.0], 0.0)
+        sizes[row] = len(messages.encode(pose, encoding))
     assert sizes[0] > 60
     for link, speaker in enumerate(NET.speaker):
         assert got.arrival[got.link == link] == pytest.approx(8.0 * sizes[speaker] / bandwidth, abs=1e-12)

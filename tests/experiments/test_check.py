@@ -14,15 +14,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body import Disturbance, Jitter
-from agents.individual import REACHED
-from experiments import document, entries, virtual
-from experiments.check import Figures, check, command, figures, schema_command
-from experiments.document import Document
-from experiments.experiment import Arena, Experiment, Formation, Leg, Robot
-from experiments.prediction import REPETITIONS, isolated, predict, repeat, repetitions, undisturbed
-from experiments.problem import DocumentError
-from experiments.sweep_runs import figures_of
+from agents.body.interface import Disturbance, Jitter
+from agents.decision.position_control import REACHED
+from experiments.check.check import Figures, check, command, figures, schema_command
+from experiments.check.ideal_run import REPETITIONS, isolated, predict, repeat, repetitions, undisturbed
+from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
+from experiments.file import catalogue, document
+from experiments.file.document import Document
+from experiments.file.problems import DocumentError
+from experiments.sweep.runs import figures_of
+from experiments.virtual_time import simulation
 
 pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
 
@@ -80,7 +81,7 @@ def test_the_reference_is_feasible_but_its_leader_is_quick():
     assert "0.095 m/s" in message
     assert "0.15 m/s" in message
     assert "clamp" in remedy
-    lines = entries.path(PARK).read_text("utf-8").splitlines()
+    lines = catalogue.path(PARK).read_text("utf-8").splitlines()
     (line,) = (number for number, line in enumerate(lines, 1) if line.startswith("plan = "))
     assert where.endswith(f"robotic-park.toml:{line}:8")
 
@@ -118,7 +119,7 @@ def test_robots_on_wheels_stop_before_a_weak_formation_is_acquired_as_they_do_in
     assert "robots on wheels stop 5 mm before their goals: links may stay e = 5 mm/(μ d²) off" in found.message
     numbers = figures(weak)
     assert numbers.acquired_s is None
-    log = virtual.simulate(msgspec.structs.replace(weak, seed=7), [7], lean=True)
+    log = simulation.simulate(msgspec.structs.replace(weak, seed=7), [7], lean=True)
     (run,) = figures_of(log, weak)
     assert run.acquired_s is None
     last = log.true_position[log.time <= weak.duration_s][-1]
@@ -162,7 +163,7 @@ def flat_strip(gain: float, jitter: float = 0.01) -> Experiment:
 
 def late(experiment: Experiment, seeds: list[int]) -> int:
     """Number of runs with these seeds that acquire after 15 s, in the mean of the robots, or not at all."""
-    runs = figures_of(virtual.simulate(experiment, seeds, lean=True), experiment)
+    runs = figures_of(simulation.simulate(experiment, seeds, lean=True), experiment)
     return sum(run.acquired_s is None or run.acquired_s > 15.0 for run in runs)
 
 
@@ -188,7 +189,7 @@ def test_a_formation_that_is_not_shaken_is_not_called_soft(made):
 
 
 def test_formations_that_settle_well_within_the_run_are_not_flown_with_noise(monkeypatch):
-    monkeypatch.setattr("experiments.motion.repeat", lambda *_: pytest.fail("flown again"))
+    monkeypatch.setattr("experiments.check.motion.repeat", lambda *_: pytest.fail("flown again"))
     codes = {each.code for each in check(of(document.read(PARK).cases()["event"]))}
     assert "acquired" in codes
 
@@ -205,9 +206,9 @@ def test_flights_with_noise_are_those_of_their_seeds():
 
 def test_an_experiment_whose_robots_do_not_get_under_way_is_told_why(monkeypatch):
     def stuck(*_, **__):
-        raise virtual.Stuck("not ready after 60 s: KH01 (its law wants something that is not finite)")
+        raise simulation.Stuck("not ready after 60 s: KH01 (its law wants something that is not finite)")
 
-    monkeypatch.setattr(virtual, "simulate", stuck)
+    monkeypatch.setattr(simulation, "simulate", stuck)
     found = {each.code: each for each in check(of(robots_on_wheels(1.0)))}
     assert found["not-begun"].severity == "error"
     assert "not ready after 60 s: KH01" in found["not-begun"].message
@@ -386,7 +387,7 @@ def test_only_the_case_at_fault_is_named():
 
 
 def test_the_place_is_in_the_case_that_changes_it(tmp_path):
-    text = entries.path(PARK).read_text("utf-8")
+    text = catalogue.path(PARK).read_text("utf-8")
     file = tmp_path / "mine.toml"
     file.write_text(f"{text}\n[cases.wild]\nformation = {{ gain = 12.0 }}\n", encoding="utf-8")
     (hunts,) = (each for each in check(document.read(file)) if each.code == "hunts")

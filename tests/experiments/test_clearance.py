@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.kinds import CRAZYFLIE, KHEPERA4, TURTLEBOT3
-from agents.wire import Contact
-from experiments.clearance import Clearance, collisions
-from experiments.experiment import Arena
-from experiments.measured import Approach, Collision
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TURTLEBOT3
+from agents.network.messages import Contact
+from experiments.definition.experiment import Arena
+from experiments.metrics.clearance import Clearance, collisions
+from experiments.metrics.results import Approach, Collision
 from tests.experiments.traces import STEP, experiment, trace
 from twins.scene import Obstacle
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.wire import Followed, HostClock, State
-from experiments.clocks import Correction, Sample, offset
+from agents.network.messages import Followed, HostClock, State
+from experiments.recording.clocks import Correction, Sample, offset
 
 SMALL = st.floats(0.0, 0.5)
 

@@ -4,9 +4,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents import chance
-from experiments import assign, checks, conditions
-from experiments.experiment import Channel, Experiment, Formation, LinkChannel, Outage, Robot
+from agents.network import channel_model
+from experiments.definition import assignment, link_conditions
+from experiments.definition.experiment import Channel, Experiment, Formation, LinkChannel, Outage, Robot
+from experiments.file import consistency
 
 NAMES = ("A", "B", "C")
 
@@ -25,20 +26,20 @@ def experiment(channel=None, **parts):
 
 def virtual(channel, seeds=(1,)):
     chosen = experiment(channel)
-    return conditions.virtual(chosen, assign.assign(chosen, NAMES, copies=len(seeds)).links, seeds)
+    return link_conditions.virtual(chosen, assignment.assign(chosen, NAMES, copies=len(seeds)).links, seeds)
 
 
 def at(channel, *names):
     chosen = experiment(channel)
-    return conditions.at_listeners(chosen, assign.assign(chosen, names).links, names)
+    return link_conditions.at_listeners(chosen, assignment.assign(chosen, names).links, names)
 
 
 def test_the_default_is_a_millisecond_and_nothing_at_a_real_listener():
     assert virtual(Channel()).delay.tolist() == [0.001] * 4
     assert at(Channel(), "A").delay.tolist() == [0.0]
     assert at(Channel(delay_s=0.02), "A").delay.tolist() == [0.02]
-    assert not conditions.modelled(experiment())
-    assert conditions.modelled(experiment(Channel(loss=0.1)))
+    assert not link_conditions.modelled(experiment())
+    assert link_conditions.modelled(experiment(Channel(loss=0.1)))
 
 
 def test_links_have_their_own():
@@ -74,10 +75,10 @@ def test_keys_come_from_the_seed_and_the_names_wherever_the_link_is():
     channel = Channel(loss=0.2, links={"A > C": LinkChannel(loss=0.5)})
     both = virtual(channel, seeds=(1, 7))
     ends = [("B", "A"), ("A", "B"), ("A", "C"), ("B", "C")]
-    assert both.key.tolist() == [chance.key(seed, *names) for seed in (1, 7) for names in ends]
+    assert both.key.tolist() == [channel_model.key(seed, *names) for seed in (1, 7) for names in ends]
     for names in (("A",), ("B",), ("C",), ("C", "A"), NAMES):  # processes with some of the robots
         here = at(channel, *names)
-        links = assign.assign(experiment(channel), names).links
+        links = assignment.assign(experiment(channel), names).links
         for k, (i, j) in enumerate(zip(links.listener, links.speaker, strict=True)):
             k_all = ends.index((NAMES[j], names[i]))
             assert here.key[k] == both.key[k_all]
@@ -89,12 +90,12 @@ def test_another_robot_does_not_change_the_luck_of_the_others():
     bigger = experiment(channel)
     robots = {"Z": Robot(kind="khepera4", start=[0.0, 1.0]), **bigger.robots}
     bigger = msgspec.structs.replace(bigger, robots=robots)
-    made = conditions.virtual(bigger, assign.assign(bigger, tuple(robots)).links, [1])
+    made = link_conditions.virtual(bigger, assignment.assign(bigger, tuple(robots)).links, [1])
     assert made.key.tolist() == virtual(channel).key.tolist()
 
 
 def wrong(channel, **parts):
-    return [(".".join(map(str, f.path)), f.message, f.hint) for f in checks.faults(experiment(channel, **parts))]
+    return [(".".join(map(str, f.path)), f.message, f.hint) for f in consistency.faults(experiment(channel, **parts))]
 
 
 @pytest.mark.parametrize(
@@ -155,7 +156,7 @@ def test_links_that_only_avoidance_hears_are_links():
     everybody = {"kind": "potential", "hears": "all"}
     assert wrong(channel, avoidance=everybody) == []
     chosen = experiment(channel, avoidance=everybody)
-    links = assign.assign(chosen, NAMES).links
-    made = conditions.virtual(chosen, links, [1])
+    links = assignment.assign(chosen, NAMES).links
+    made = link_conditions.virtual(chosen, links, [1])
     ((k),) = np.flatnonzero(made.loss)
     assert (NAMES[links.listener[k]], NAMES[links.speaker[k]]) == ("A", "C")

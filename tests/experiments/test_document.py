@@ -5,13 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from experiments import catalogue, document, entries
-from experiments.document import DocumentError, parse_links, read
+from experiments.catalogue import index
+from experiments.file import catalogue as entries
+from experiments.file import document
+from experiments.file.document import DocumentError, parse_links, read
 
 MALFORMED = Path(__file__).parent / "malformed"
 
 
-PARK = catalogue.FOLDER / "robotic-park.toml"
+PARK = index.FOLDER / "robotic-park.toml"
 
 
 MINIMAL = 'title = "One"\nduration_s = 10.0\n[robots.KH01]\nkind = "khepera4"\nstart = [0.0, 0.0]\n'
@@ -189,7 +191,7 @@ def slips(text):
 @pytest.mark.slow
 def test_every_misspelt_key_is_found_in_its_line(write):
     tried = set()
-    for name in catalogue.names():
+    for name in index.names():
         found = list(slips(entries.path(name).read_text("utf-8")))
         assert len(found) > 10
         for place, number, text in found:
@@ -367,7 +369,7 @@ def test_set_does_not_hide_what_is_wrong_in_the_file(write):
 # JSON
 
 
-@pytest.mark.parametrize("name", catalogue.names())
+@pytest.mark.parametrize("name", index.names())
 def test_json_says_the_same(name, write):
     found = read(name)
     again = read(write(document.write_json(found.experiment), "resolved.json"))

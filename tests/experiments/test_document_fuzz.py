@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import catalogue
-from experiments.document import DocumentError, read, write_json
-from experiments.problem import MOST
+from experiments.catalogue import index
+from experiments.file.document import DocumentError, read, write_json
+from experiments.file.problems import MOST
 
-PARK = (catalogue.FOLDER / "robotic-park.toml").read_text("utf-8")
+PARK = (index.FOLDER / "robotic-park.toml").read_text("utf-8")
 LINES = PARK.split("\n")
 RESOLVED = write_json(read("robotic-park").experiment).decode()
 TOKENS = st.sampled_from([

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.clock import STEP_S, Clock, said
-from agents.wire import HostClock
-from experiments import drift
-from experiments.clocks import Correction
-from experiments.hosts import HostError
+from agents.network.messages import HostClock
+from experiments.real_time.hosts import clock_drift
+from experiments.real_time.hosts.hosts import HostError
+from experiments.recording.clocks import Correction
 
 DT, UNCERTAINTY_S = 0.01, 1e-4
 
@@ -23,12 +23,12 @@ def simulated(ppm, seconds, *, follows):
     true = np.arange(round(seconds / DT)) * DT
     offset = 0.2 + ppm * 1e-6 * true
     before = HostClock("lab2", 0.0, 0.2, UNCERTAINTY_S, ["CF01"], 0.2)
-    clock, measured, left, due = Clock(-0.2), [before], [], drift.SOONEST_S
+    clock, measured, left, due = Clock(-0.2), [before], [], clock_drift.SOONEST_S
     for t, lies in zip(true, offset, strict=True):
         if t >= due:
             now = HostClock("lab2", t, lies + rng.uniform(-1, 1) * UNCERTAINTY_S, UNCERTAINTY_S, ["CF01"])
-            due = t + drift.due(measured[-1], now)
-            wanted = drift.applied(now, measured[-1].applied) if follows else 0.2
+            due = t + clock_drift.due(measured[-1], now)
+            wanted = clock_drift.applied(now, measured[-1].applied) if follows else 0.2
             clock.heed(said(-wanted).strip())
             measured.append(HostClock("lab2", t, now.offset, UNCERTAINTY_S, ["CF01"], wanted))
         clock.slew(DT)
@@ -54,7 +54,7 @@ def test_what_is_left_stays_small_however_long_the_run(ppm, most):
 
 @given(st.floats(-1.0, 1.0), st.floats(0.0, 0.1), st.floats(-1.0, 1.0))
 def test_a_measurement_never_makes_it_worse(offset, uncertainty, before):
-    now = drift.applied(HostClock("lab2", 1.0, offset, uncertainty, []), before)
+    now = clock_drift.applied(HostClock("lab2", 1.0, offset, uncertainty, []), before)
     for true in np.linspace(offset - uncertainty, offset + uncertainty, 5):
         assert abs(now - true) <= abs(before - true) + 1e-12
 
@@ -79,11 +79,11 @@ class Host:
 
 
 def test_robots_are_told_drift_and_no_jump(monkeypatch):
-    monkeypatch.setattr(drift, "SOONEST_S", 0.01)
-    monkeypatch.setattr(drift, "LATEST_S", 0.01)
+    monkeypatch.setattr(clock_drift, "SOONEST_S", 0.01)
+    monkeypatch.setattr(clock_drift, "LATEST_S", 0.01)
     host, pause = Host([0.21, 0.21 + 2 * STEP_S, 0.22]), threading.Event()
     measured, trouble = [], []
-    with drift.Drift([(host, ["CF01"])]) as following:
+    with clock_drift.Drift([(host, ["CF01"])]) as following:
         deadline = time.monotonic() + 20.0
         while len(trouble) < 2 and time.monotonic() < deadline:
             more = following.news()
@@ -96,5 +96,5 @@ def test_robots_are_told_drift_and_no_jump(monkeypatch):
 
 
 def test_nobody_abroad_nothing_to_follow():
-    with drift.Drift([]) as following:
+    with clock_drift.Drift([]) as following:
         assert following.news() == ([], [])

@@ -4,11 +4,12 @@ import re
 
 import pytest
 
-from experiments import commands, report_tables
-from experiments.check import check
-from experiments.document import read
-from experiments.realtime import Staging
-from experiments.run import load, simulate
+from experiments.check.check import check
+from experiments.file.document import load, read
+from experiments.real_time.conductor.conduct import Staging
+from experiments.report import page
+from experiments.run import simulate
+from tools.commands import run as commands
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -75,5 +76,5 @@ def test_a_robot_without_links_goes_its_own_way_beside_a_formation(tmp_path):
 
 
 def test_rounding_is_no_result():
-    assert report_tables.number(-2.8e-15) == "0"
-    assert report_tables.number(2.0e-4) == "2.0e-04"
+    assert page.number(-2.8e-15) == "0"
+    assert page.number(2.0e-4) == "2.0e-04"

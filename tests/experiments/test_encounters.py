@@ -4,10 +4,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.lifecycle import RUNNING
-from experiments.encounters import ANGLES, Outcome, encounter, meet, random_pairs
-from experiments.experiment import Channel
-from experiments.virtual import simulate
+from agents.decision.lifecycle import RUNNING
+from experiments.definition.experiment import Channel
+from experiments.virtual_time.simulation import simulate
+from tools.bench.encounters import ANGLES, Outcome, encounter, meet, random_pairs
 
 pytestmark = pytest.mark.slow
 

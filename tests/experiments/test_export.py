@@ -8,11 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.graph import laplacian
-from experiments import export
-from experiments.export import KEYWORDS, UNITS, ExportError, matlab_names, structure
-from experiments.run import SOURCE, load, loads, simulate
-from experiments.signals import formation_errors, links_of
+from agents.formation.graph import laplacian
+from experiments.file.document import load, loads
+from experiments.metrics.signals import formation_errors, links_of
+from experiments.recording.run_folder import SOURCE
+from experiments.report import export
+from experiments.report.export import KEYWORDS, UNITS, ExportError, matlab_names, structure
+from experiments.run import simulate
 
 scipy_io = pytest.importorskip("scipy.io")
 

@@ -2,11 +2,10 @@ from collections import Counter
 
 import pytest
 
-from experiments import chaos_flight, injection
-from experiments.chaos import again
-from experiments.chaos_command import ALWAYS, AVOIDANCE, defaults
-from experiments.fault_script import KINDS, NATURES, script
-from experiments.run import load
+from experiments.file.document import load
+from tools.reliability import chaos_round, injection
+from tools.reliability.chaos import ALWAYS, AVOIDANCE, again, defaults
+from tools.reliability.fault_script import KINDS, NATURES, script
 
 ROBOTS = ("TB01", "KH01", "CF01", "CF02")
 
@@ -62,7 +61,7 @@ def test_every_kind_is_known_to_those_that_do_it_and_that_look_after_it():
     tables = {*injection.SIGNALS, *injection.CABLES, *injection.CLOCKS}
     assert tables <= set(KINDS)
     assert set(KINDS) - tables == {"double", "read-error", "disk", "corrupt"}, "done by functions of their own"
-    looked_after = {name.removeprefix("_after_").replace("_", "-") for name in vars(chaos_flight.Flight)}
+    looked_after = {name.removeprefix("_after_").replace("_", "-") for name in vars(chaos_round.Flight)}
     assert {kind for kind in KINDS if kind in looked_after} == {
         "kill", "bits", "clock", "read-error", "clock-behind", "double", "frozen-router", "mocap-clock"
     }  # fmt: skip

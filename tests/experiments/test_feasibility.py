@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.graph import Links, links
-from experiments import assign, document
-from experiments.feasibility import algebraic_connectivity, conflicts, link_errors, realise, stiffness, unfolded
+from agents.formation.graph import Links, links
+from experiments.check.realisation import algebraic_connectivity, conflicts, link_errors, realise, stiffness, unfolded
+from experiments.definition import assignment
+from experiments.file import document
 
 # where the reference formation may stand: TB01, KH01..03, CF01..03
 PUBLISHED = np.array(
@@ -29,7 +30,7 @@ PUBLISHED = np.array(
 
 @pytest.fixture(scope="module")
 def reference() -> Links:
-    return assign.all_links(document.read("robotic-park").experiment)
+    return assignment.all_links(document.read("robotic-park").experiment)
 
 
 def test_the_published_shape_meets_the_published_distances(reference):

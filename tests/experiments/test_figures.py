@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from experiments import figures
-from experiments.metrics import measure
-from experiments.signals import formation_errors
+from experiments.metrics.measure import measure
+from experiments.metrics.signals import formation_errors
+from experiments.report import figures
 from tests.experiments.traces import crowd, cut, experiment, park, trace
 
 pytestmark = pytest.mark.slow  # runs and reports, whole

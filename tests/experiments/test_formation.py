@@ -4,14 +4,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents import plugins
-from agents.lifecycle import DONE
-from experiments import check, document, virtual
-from experiments.experiment import Start
-from experiments.feasibility import contradictions
-from experiments.formation import Pattern, anchors_of, errors
-from experiments.links import one_way_links
-from experiments.signals import net_rotation
+from agents.decision.lifecycle import DONE
+from agents.plugins import registry
+from experiments.check import check
+from experiments.check.realisation import contradictions
+from experiments.definition.experiment import Start
+from experiments.definition.formation import Pattern, anchors_of, errors
+from experiments.definition.links import one_way_links
+from experiments.file import document
+from experiments.metrics.signals import net_rotation
+from experiments.virtual_time import simulation
 from tests.agents.swarm import Swarm
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
@@ -83,10 +85,10 @@ def written(tmp_path):
 
 def flown(experiment, seeds=(1,)):
     """The true positions (T, N, 3) from the common start on, their times, and the links' errors (T, E)."""
-    log = virtual.simulate(experiment, seeds)
+    log = simulation.simulate(experiment, seeds)
     running = (log.time >= 0.0) & (log.time < experiment.duration_s)
     time, position = log.time[running], log.true_position[running][:, : len(log.names)]
-    law = plugins.build(plugins.LAWS, experiment.formation.law)
+    law = registry.build(registry.LAWS, experiment.formation.law)
     return time, position, errors(law, Pattern.of(experiment, log.names), time, position)
 
 
@@ -220,7 +222,7 @@ def test_everything_that_changes_is_the_same_whoever_shares_a_process(written):
 def test_repetitions_side_by_side_are_as_they_are_alone(written):
     text = SQUARE + "[formation.anchors]\nA = { distance = 0.4 }\n[[formation.changes]]\nat_s = 1.0\nrotate = 0.5\n"
     experiment = msgspec.structs.replace(written(text, 4.0).experiment, start=Start(scatter=0.1))
-    both, alone = virtual.simulate(experiment, [3, 4]), virtual.simulate(experiment, [4])
+    both, alone = simulation.simulate(experiment, [3, 4]), simulation.simulate(experiment, [4])
     np.testing.assert_array_equal(both.true_position[:, 4:], alone.true_position)
 
 
@@ -237,7 +239,7 @@ def test_a_dead_zone_ends_the_rotation_of_an_event_triggered_ring():
     rates, sent = [], []
     for law in ({"kind": "distance"}, {"kind": "distance", "dead_zone": 0.01}):
         given["formation"]["law"] = law
-        log = virtual.simulate(msgspec.convert(given, document.Experiment), [200, 201, 202])
+        log = simulation.simulate(msgspec.convert(given, document.Experiment), [200, 201, 202])
         late = (log.time > 30.0) & (log.time < 60.0)
         turns = [net_rotation(log.true_position[late][:, 5 * k : 5 * k + 5], log.time[late]) for k in range(3)]
         rates.append(np.abs(turns).max())

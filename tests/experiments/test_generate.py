@@ -3,11 +3,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments import assign, document, virtual
-from experiments.check import check, figures
-from experiments.generate import Wanted, command, experiment_file, layout
-from experiments.layouts import LayoutError
-from experiments.problem import DocumentError
+from experiments.authoring.generate import Wanted, command, experiment_file, layout
+from experiments.authoring.layouts import LayoutError
+from experiments.check.check import check, figures
+from experiments.definition import assignment, bodies
+from experiments.file import document
+from experiments.file.problems import DocumentError
+from experiments.virtual_time import simulation
 
 
 def written(tmp_path, what, size, wanted=None, jumps=(1, 2)):
@@ -62,18 +64,18 @@ def test_starts_do_not_overlap_whatever_the_seed(tmp_path):
     experiment = written(tmp_path, "hemisphere", "40").experiment
     names = tuple(experiment.robots)
     for seed in range(5):
-        place, _ = assign.scattered(experiment, names, seed)
+        place, _ = bodies.scattered(experiment, names, seed)
         apart = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(40, 1)]
         assert apart.min() > 2 * 0.065
-        assert np.abs(place - assign.start(experiment, names)[0]).max() > 0.1
+        assert np.abs(place - bodies.start(experiment, names)[0]).max() > 0.1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.nightly)])
 def test_a_hundred_drones_form_their_hemisphere_from_random_starts(tmp_path, seed):
     experiment = written(tmp_path, "hemisphere", "100", Wanted(duration_s=25.0)).experiment
-    log = virtual.simulate(experiment, [seed])
-    net = assign.all_links(experiment)
+    log = simulation.simulate(experiment, [seed])
+    net = assignment.all_links(experiment)
     apart = np.linalg.norm(log.true_position[:, net.listener] - log.true_position[:, net.speaker], axis=2)
     worst = np.abs(apart - net.distance).max(axis=1)
     running = (log.time >= 0.0) & (log.time <= 25.0)
@@ -86,9 +88,9 @@ def test_by_offsets_they_come_from_anywhere(tmp_path):
     wanted = Wanted(law="displacement", scatter=3.0, duration_s=30.0)
     read = written(tmp_path, "hemisphere", "20", wanted)
     assert [found for found in check(read) if found.severity != "note"] == []
-    log = virtual.simulate(read.experiment, [1])
-    net = assign.all_links(read.experiment)
-    law = assign.assign(read.experiment, tuple(read.experiment.robots)).law
+    log = simulation.simulate(read.experiment, [1])
+    net = assignment.all_links(read.experiment)
+    law = assignment.assign(read.experiment, tuple(read.experiment.robots)).law
     begin, end = (log.true_position[np.searchsorted(log.time, at)] for at in (0.0, 29.9))
     assert law.error(begin, begin[net.speaker], net).max() > 3.0
     assert law.error(end, end[net.speaker], net).max() < 0.07  # three times the threshold at which robots speak

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from agents.lifecycle import DONE
-from experiments import document, playback
-from experiments.check import check
-from experiments.experiment import Formation, Robot, Safety
-from experiments.logbook import Logbook
-from experiments.virtual import simulate
+from agents.decision.lifecycle import DONE
+from experiments.check.check import check
+from experiments.definition.experiment import Formation, Robot, Safety
+from experiments.file import document
+from experiments.recording import playback
+from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.simulation import simulate
 from tests.agents.few import pair
 from tests.agents.swarm import changed
 

@@ -3,9 +3,9 @@
 import msgspec
 import pytest
 
-from experiments import document
-from experiments.hosts import absent
-from experiments.hosts import document as line
+from experiments.definition.standby import absent
+from experiments.file import document
+from experiments.file.document import case_document as line
 
 HEAD = """\
 title = "two"

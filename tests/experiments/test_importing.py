@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from experiments import assign, document, virtual
-from experiments.check import check, figures
-from experiments.importing import command, imported
-from experiments.problem import DocumentError
-from experiments.robotic_park_older import starts_from
+from experiments.authoring.robotic_park.convert import command, imported
+from experiments.authoring.robotic_park.older_formats import starts_from
+from experiments.check.check import check, figures
+from experiments.definition import assignment
+from experiments.file import document
+from experiments.file.problems import DocumentError
+from experiments.virtual_time import simulation
 from tests.experiments.robotic_park_files import column, dome, file, robot
 
 FILES = {
@@ -43,9 +45,9 @@ def test_they_convert_and_pass_the_check(tmp_path, count):
 @pytest.mark.parametrize("count", FILES)
 def test_they_run(tmp_path, count):
     experiment = converted(tmp_path, FILES[count]())[0].experiment
-    log = virtual.simulate(experiment, [1])
-    law = assign.assign(experiment, tuple(experiment.robots)).law
-    net = assign.all_links(experiment)
+    log = simulation.simulate(experiment, [1])
+    law = assignment.assign(experiment, tuple(experiment.robots)).law
+    net = assignment.all_links(experiment)
     last = log.true_position[np.searchsorted(log.time, 19.9)]
     allowed = experiment.tolerance if experiment.formation.update is None else 0.15  # what a chain of thresholds leaves
     assert law.error(last, last[net.speaker], net).max() < allowed

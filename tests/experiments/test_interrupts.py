@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from experiments.run import Interrupts
+from agents.runtime.command_line import Interrupts
 
 
 @pytest.fixture

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from agents.wire import Command
-from experiments.invariants import Invariants
-from experiments.run import load
+from agents.network.messages import Command
+from experiments.file.document import load
+from tools.reliability.observer import Invariants
 
 TRIANGLE = {"KH01": (-0.3, 0.0, 0.0), "KH02": (0.3, 0.0, 0.0), "CF01": (0.0, 0.4359, 0.6)}
 

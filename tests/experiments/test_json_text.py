@@ -2,9 +2,9 @@
 
 import pytest
 
-from experiments.json_text import OBJECT, table
-from experiments.problem import DocumentError
-from twins.device import Faults
+from experiments.file.problems import DocumentError
+from experiments.file.structure import OBJECT, table
+from twins.devices.device import Faults
 from twins.scene import Obstacle
 
 PLACE = ("arena", "obstacles", "box")

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.graph import rigidity
-from experiments import layouts
-from experiments.layouts import LayoutError
+from agents.formation.rigidity import rigidity
+from experiments.authoring import layouts
+from experiments.authoring.layouts import LayoutError
 
 
 def held(made):

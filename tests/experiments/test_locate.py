@@ -2,8 +2,8 @@ import tomllib
 
 import pytest
 
-from experiments import catalogue
-from experiments.locate import line_column, nearest, places
+from experiments.catalogue import index
+from experiments.file.problems import line_column, nearest, places
 
 FORMS = '''\
 # every form that TOML has
@@ -34,7 +34,7 @@ def paths_of(value, path=()):
         yield from paths_of(each, (*path, key))
 
 
-@pytest.mark.parametrize("text", [FORMS, *(f.read_text("utf-8") for f in sorted(catalogue.FOLDER.glob("*.toml")))])
+@pytest.mark.parametrize("text", [FORMS, *(f.read_text("utf-8") for f in sorted(index.FOLDER.glob("*.toml")))])
 def test_every_path_of_a_document_has_its_place_and_no_other_has(text):
     assert set(places(text)) == set(paths_of(tomllib.loads(text))) - {()}
 

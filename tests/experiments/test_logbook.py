@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.body import Disturbance
-from experiments import playback
-from experiments.experiment import Arena, Experiment, Formation, Leg, Rates, Robot, Shadow, World
-from experiments.logbook import Logbook
-from experiments.virtual import simulate
-from twins.engine import Touch
+from agents.body.interface import Disturbance
+from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Rates, Robot, Shadow, World
+from experiments.recording import playback
+from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.simulation import simulate
+from twins.engines.engine import Touch
 from twins.scene import Obstacle
 
 CART = Obstacle(box=(0.2, 0.2), at=(-0.8, 0.8), plan={"kind": "line", "move_by": [0.5, 0.0], "speed": 0.1})

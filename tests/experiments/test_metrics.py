@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import metrics, results, seeds, verdict
-from experiments.measured import INDICES, CaseMetrics, RobotMetrics
-from experiments.signals import formation_errors, net_rotation
-from experiments.trace import Trace
+from experiments.metrics import measure, statistics
+from experiments.metrics.results import INDICES, CaseMetrics, RobotMetrics
+from experiments.metrics.signals import formation_errors, net_rotation
+from experiments.recording.trace import Trace
+from experiments.report import metrics_files, verdict
 from tests.experiments.traces import STEP, cut, experiment, pair, park, trace
 
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
@@ -24,7 +25,7 @@ def follower(measured: CaseMetrics) -> RobotMetrics:
 
 
 def test_integrals_of_a_decaying_error():
-    measured = metrics.measure(pair(1.0 + np.exp(-T)))
+    measured = measure.measure(pair(1.0 + np.exp(-T)))
     end = math.exp(-20.0)
     for robot in measured.robots:  # the leader listens to nobody: it has the error of the link that listens to it
         assert robot.iae == pytest.approx(1.0 - end, rel=1e-4)
@@ -43,27 +44,27 @@ def test_error_is_the_sum_over_the_links_on_which_a_robot_listens():
 
 
 def test_acquired_when_the_one_second_mean_stays_inside():
-    measured = metrics.measure(pair(1.0 + np.maximum(1.0 - 0.0625 * T, 0.0)))
+    measured = measure.measure(pair(1.0 + np.maximum(1.0 - 0.0625 * T, 0.0)))
     # a window of 50 samples lags 24.5 of them: 1 − 0.0625 (t − 0.49) = 0.05
     assert follower(measured).acquired_s == pytest.approx(15.69, abs=STEP)
     assert measured.acquired_s == (follower(measured).acquired_s,)
 
 
 def test_never_acquired_is_none_also_in_the_mean():
-    measured = metrics.measure(pair(np.full_like(T, 1.06)))
+    measured = measure.measure(pair(np.full_like(T, 1.06)))
     assert follower(measured).acquired_s is None
     assert measured.mean["acquired_s"] is None
     assert follower(measured).residual == pytest.approx(0.06)
 
 
 def test_an_error_that_jitters_about_zero_does_not_hide_in_its_mean():
-    measured = metrics.measure(pair(1.0 + 0.08 * np.where(np.arange(len(T)) % 2, 1.0, -1.0)))
+    measured = measure.measure(pair(1.0 + 0.08 * np.where(np.arange(len(T)) % 2, 1.0, -1.0)))
     assert follower(measured).acquired_s is None
 
 
 def test_each_phase_is_measured_from_its_leg():
     off = np.where((T >= 10.0) & (T < 13.0), 0.5, 0.0) + np.where(T < 1e-9, 0.04, 0.0)
-    measured = metrics.measure(pair(1.0 + off, legs=[9.99, 10.0]))
+    measured = measure.measure(pair(1.0 + off, legs=[9.99, 10.0]))
     assert measured.starts_s == (0.0, 9.99)  # legs that begin within one sample are one phase
     robot = follower(measured)
     assert robot.acquired_s == 0.0
@@ -74,7 +75,7 @@ def test_each_phase_is_measured_from_its_leg():
 
 
 def test_legs_at_the_start_or_after_the_end_are_no_phases():
-    assert metrics.measure(pair(np.ones_like(T), legs=[0.0, 20.0, 30.0])).starts_s == (0.0,)
+    assert measure.measure(pair(np.ones_like(T), legs=[0.0, 20.0, 30.0])).starts_s == (0.0,)
 
 
 def test_residual_is_the_last_second_of_each_phase_on_the_worst_link():
@@ -82,7 +83,7 @@ def test_residual_is_the_last_second_of_each_phase_on_the_worst_link():
     place = np.zeros((len(T), 3, 3))
     place[:, 0, 0] = np.where(T < 9.0, -3.0, np.where(T < 10.0, -1.02, -1.3))
     place[:, 1, 0] = 1.1
-    robot = metrics.measure(trace(what, place)).robots[2]
+    robot = measure.measure(trace(what, place)).robots[2]
     assert (robot.residual, robot.worst) == (pytest.approx(0.1), "B")
     assert robot.by_the_end == (pytest.approx(0.3), "A")
 
@@ -104,9 +105,9 @@ def test_net_rotation_after_acquisition_counts_beyond_a_full_turn():
     place[:, 1:, 0], place[:, 1:, 1] = np.cos(angle), np.sin(angle)
     names = dict.fromkeys("LABC", "khepera4")
     what = experiment(names, {"L > A": 1.0, "L > B": 1.0, "L > C": 1.0, "A - B": math.sqrt(3.0)})
-    assert metrics.measure(trace(what, place)).rotation_rad_s == (pytest.approx(0.5),)
+    assert measure.measure(trace(what, place)).rotation_rad_s == (pytest.approx(0.5),)
     wrong = experiment(names, {"L > A": 2.0})
-    assert metrics.measure(trace(wrong, place)).rotation_rad_s == (None,)  # nothing was formed that could turn
+    assert measure.measure(trace(wrong, place)).rotation_rad_s == (None,)  # nothing was formed that could turn
 
 
 def moving(**rest: object) -> Trace:
@@ -118,7 +119,7 @@ def moving(**rest: object) -> Trace:
 
 
 def test_belief_error_of_a_pose_held_for_a_second():
-    belief = metrics.measure(moving()).belief[0]
+    belief = measure.measure(moving()).belief[0]
     assert (belief.listener, belief.speaker) == ("F", "L")
     assert belief.rms == pytest.approx(0.1 / math.sqrt(3.0), rel=0.03)
     assert belief.max == pytest.approx(0.1, abs=0.1 * STEP + 1e-9)
@@ -131,12 +132,12 @@ def test_an_overtaken_pose_is_not_believed():
     heard = dataclasses.replace(
         known.heard, seq=known.heard.seq[order], stamp=known.heard.stamp[order], position=known.heard.position[order]
     )
-    swapped = metrics.measure(dataclasses.replace(known, heard=heard)).belief[0]
+    swapped = measure.measure(dataclasses.replace(known, heard=heard)).belief[0]
     assert swapped.max == pytest.approx(0.1, abs=0.003)  # ahead by as much, and never two seconds old
 
 
 def test_transmissions_rates_and_gaps():
-    measured = metrics.measure(moving())
+    measured = measure.measure(moving())
     leader, other = measured.robots
     assert (leader.messages, leader.bytes, leader.listeners, leader.heard) == (20, 2000, 1, 20)
     assert leader.f_hz == pytest.approx(1.0)
@@ -148,7 +149,7 @@ def test_what_the_recorder_lost_is_counted_by_the_running_numbers():
     known = moving()
     keep = np.arange(20) % 3 == 0
     fields = {field.name: getattr(known.sent, field.name)[keep] for field in dataclasses.fields(known.sent)}
-    leader = metrics.measure(dataclasses.replace(known, sent=type(known.sent)(**fields))).robots[0]
+    leader = measure.measure(dataclasses.replace(known, sent=type(known.sent)(**fields))).robots[0]
     assert (leader.messages, leader.recorded) == (19, 7)
 
 
@@ -166,7 +167,7 @@ def test_transmissions_of_a_robot_that_began_anew_and_of_one_with_a_forged_numbe
     place = np.zeros((len(seq), 3))
     row = np.zeros(len(seq), dtype=np.intp)
     sent = type(known.sent)(time, row, np.array(seq), place, place, time, row)
-    leader = metrics.measure(dataclasses.replace(known, sent=sent)).robots[0]
+    leader = measure.measure(dataclasses.replace(known, sent=sent)).robots[0]
     assert (leader.messages, leader.recorded) == (messages, len(seq))
 
 
@@ -174,19 +175,19 @@ def test_benchmark_cost_by_hand():
     known = pair(1.0 + np.exp(-T), sent={"F": [0.0, 1.0, 2.0]})
     settle = round(math.log(50.0) / STEP + 0.5) * STEP
     robot = 0.3 * settle + 0.1 * 1.0 + 0.01 * 1.0 + 0.1 * (1001 // 5)
-    measured = metrics.measure(known)
+    measured = measure.measure(known)
     assert measured.robots[1].settle_s == pytest.approx(settle)
     assert measured.j2 == pytest.approx(2.0 * robot + 0.02 * 3, rel=1e-4)
 
 
 def test_closest_approach_and_excursion():
     gap = 1.0 + 0.5 * np.cos(0.5 * T)  # closest at 2 π, farthest at the start
-    measured = metrics.measure(pair(gap + 1.0))
+    measured = measure.measure(pair(gap + 1.0))
     assert measured.closest == pytest.approx(1.5, abs=1e-4)
     assert measured.closest_between == ("L", "F")
     assert measured.closest_at_s == pytest.approx(2.0 * math.pi, abs=STEP)
     assert (measured.excursion, measured.excursion_robot) == (pytest.approx(0.5), "F")
-    inside = metrics.measure(pair(gap))
+    inside = measure.measure(pair(gap))
     assert (inside.excursion, inside.excursion_robot) == (0.0, "")
 
 
@@ -194,7 +195,7 @@ def test_a_robot_that_died_does_not_poison_the_others():
     whole = park(duration=20.0)
     place = whole.true_position.copy()
     place[500:, whole.robots.index("CF03")] = np.nan
-    before, after = metrics.measure(whole), metrics.measure(dataclasses.replace(whole, true_position=place))
+    before, after = measure.measure(whole), measure.measure(dataclasses.replace(whole, true_position=place))
     dead = after.robots[whole.robots.index("CF03")]
     assert after.died == ("CF03",)
     assert dead.acquired_s is None
@@ -212,14 +213,14 @@ def test_a_robot_that_died_does_not_poison_the_others():
 
 def test_a_robot_that_was_never_seen_has_no_errors():
     known = pair(np.full_like(T, np.nan))
-    robot = follower(metrics.measure(known))
+    robot = follower(measure.measure(known))
     assert (robot.iae, robot.rmse, robot.coverage, robot.known) == (None, None, 0.0, 0.0)
-    assert metrics.measure(known).closest is None
+    assert measure.measure(known).closest is None
 
 
 def test_one_robot_without_links():
     known = trace(experiment({"A": "tello"}, {}), np.zeros((100, 1, 3)))
-    measured = metrics.measure(known)
+    measured = measure.measure(known)
     assert measured.leaders == ()  # nobody would be left
     assert (measured.closest, measured.belief_rms, measured.acquired_s) == (None, None, (None,))
     assert measured.robots[0].iae is None
@@ -227,17 +228,17 @@ def test_one_robot_without_links():
 
 def test_a_trace_without_time_is_refused():
     with pytest.raises(ValueError, match="fewer than two samples"):
-        metrics.measure(pair(np.ones(1)))
+        measure.measure(pair(np.ones(1)))
 
 
 def test_document_has_the_shape_for_scripts():
-    first, second = (metrics.measure(park("a", seed=4)), metrics.measure(park("b", 0.01, seed=4)))
-    found = results.document("runs/7", 4, [first, second])
+    first, second = (measure.measure(park("a", seed=4)), measure.measure(park("b", 0.01, seed=4)))
+    found = metrics_files.document("runs/7", 4, [first, second])
     assert (found["run"], found["seed"], list(found["cases"])) == ("runs/7", 4, ["a", "b"])
     b = found["cases"]["b"]
     assert set(b) == {"robots", "mean", "ratio", "collisions", "network", "near_m"}
     assert b["collisions"] == 0
-    short = results.document("runs/7", 4, [metrics.measure(cut(park("a", seed=4), 8.0))])["cases"]["a"]
+    short = metrics_files.document("runs/7", 4, [measure.measure(cut(park("a", seed=4), 8.0))])["cases"]["a"]
     assert (short["duration_s"], short["interrupted"]) == (8.0, True)
     assert set(b["robots"]["TB01"]) == set(b["mean"]) == set(b["ratio"]) == set(INDICES)
     followers = [b["robots"][name]["iae"] for name in b["robots"] if name != "TB01"]
@@ -249,8 +250,8 @@ def test_document_has_the_shape_for_scripts():
 
 
 def test_an_interrupted_run_is_measured_by_its_own_length():
-    measured = metrics.measure(cut(park(), 8.0))
-    whole = metrics.measure(park())
+    measured = measure.measure(cut(park(), 8.0))
+    whole = measure.measure(park())
     assert (measured.duration_s, measured.planned_s, measured.interrupted) == (8.0, 45.0, True)
     assert not whole.interrupted
     assert measured.died == ()
@@ -262,26 +263,26 @@ def test_an_interrupted_run_is_measured_by_its_own_length():
     assert robot.iae < whole.robots[1].iae
     assert [index for index, value in measured.mean.items() if value is None] == ["acquired_s"]
     assert measured.acquired_s == (None,)  # it came later
-    assert metrics.measure(cut(park(), 20.0)).acquired_s[0] == pytest.approx(whole.acquired_s[0])
+    assert measure.measure(cut(park(), 20.0)).acquired_s[0] == pytest.approx(whole.acquired_s[0])
 
 
 def test_who_died_before_the_interruption_died():
     place = park().true_position.copy()
     place[200:, 6] = np.nan
-    measured = metrics.measure(cut(dataclasses.replace(park(), true_position=place), 8.0))
+    measured = measure.measure(cut(dataclasses.replace(park(), true_position=place), 8.0))
     assert measured.died == ("CF03",)
 
 
 def test_what_grows_with_time_is_not_compared_with_an_interrupted_run():
-    whole, half = metrics.measure(park("a")), metrics.measure(cut(park("b"), 20.0))
-    assert seeds.ratios([half], [whole], "iae") == seeds.ratios([half], [whole], "messages") == [None]
-    assert seeds.ratios([half], [whole], "f_hz") == [pytest.approx(1.0)]
-    assert results.document("x", 1, [whole, half])["cases"]["b"]["ratio"]["itae"] is None
+    whole, half = measure.measure(park("a")), measure.measure(cut(park("b"), 20.0))
+    assert statistics.ratios([half], [whole], "iae") == statistics.ratios([half], [whole], "messages") == [None]
+    assert statistics.ratios([half], [whole], "f_hz") == [pytest.approx(1.0)]
+    assert metrics_files.document("x", 1, [whole, half])["cases"]["b"]["ratio"]["itae"] is None
 
 
 def test_a_whole_run_may_end_one_sample_before_its_time():
-    assert not metrics.measure(pair(np.ones(16), step=1.0, planned=15.5)).interrupted
-    assert metrics.measure(pair(np.ones(14), step=1.0, planned=15.5)).interrupted
+    assert not measure.measure(pair(np.ones(16), step=1.0, planned=15.5)).interrupted
+    assert measure.measure(pair(np.ones(14), step=1.0, planned=15.5)).interrupted
 
 
 def test_spread_over_seeds():
@@ -289,7 +290,7 @@ def test_spread_over_seeds():
         {"seed": k, "cases": {"a": {group: dict.fromkeys(INDICES, value) for group in ("mean", "ratio")}}}
         for k, value in enumerate([1.0, 2.0, None, 3.0])
     ]
-    found = seeds.across_seeds(documents)
+    found = statistics.across_seeds(documents)
     assert found["seeds"] == [0, 1, 2, 3]
     assert found["cases"]["a"]["mean"]["iae"] == {
         "mean": 2.0,
@@ -297,8 +298,8 @@ def test_spread_over_seeds():
         "ci95": pytest.approx(4.302653 / math.sqrt(3.0)),
         "n": 3,
     }
-    assert seeds.spread([None]) == seeds.Spread(None, None, None, 0)
-    assert seeds.spread([5.0]) == seeds.Spread(5.0, None, None, 1)
+    assert statistics.spread([None]) == statistics.Spread(None, None, None, 0)
+    assert statistics.spread([5.0]) == statistics.Spread(5.0, None, None, 1)
 
 
 @pytest.mark.parametrize(
@@ -306,19 +307,19 @@ def test_spread_over_seeds():
     [(1, 12.7062), (2, 4.30265), (3, 3.18245), (4, 2.77645), (5, 2.57058), (9, 2.26216), (19, 2.09302), (99, 1.98422)],
 )
 def test_student_quantiles_against_the_printed_table(freedom: int, quantile: float):
-    assert seeds.student_95(freedom) == pytest.approx(quantile, rel=1.5e-3)
+    assert statistics.student_95(freedom) == pytest.approx(quantile, rel=1.5e-3)
 
 
 def test_ratios_pair_seeds_or_divide_by_the_mean():
-    runs = [metrics.measure(park("a", seed=seed, duration=2.0)) for seed in (1, 2)]
-    assert seeds.ratios(runs, runs[::-1], "iae") == [1.0, 1.0]
+    runs = [measure.measure(park("a", seed=seed, duration=2.0)) for seed in (1, 2)]
+    assert statistics.ratios(runs, runs[::-1], "iae") == [1.0, 1.0]
     iae = [run.mean["iae"] for run in runs]
-    assert seeds.ratios(runs, runs[:1], "iae") == [1.0, pytest.approx(iae[1] / iae[0])]
+    assert statistics.ratios(runs, runs[:1], "iae") == [1.0, pytest.approx(iae[1] / iae[0])]
 
 
 def test_csv_has_a_row_per_robot_and_a_mean(tmp_path):
-    measured = metrics.measure(park())
-    results.write_csv(tmp_path / "metrics.csv", [measured])
+    measured = measure.measure(park())
+    metrics_files.write_csv(tmp_path / "metrics.csv", [measured])
     with (tmp_path / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["robot"] for row in rows] == [*(robot.robot for robot in measured.robots), "mean"]
@@ -329,8 +330,8 @@ def test_csv_has_a_row_per_robot_and_a_mean(tmp_path):
 
 
 def test_json_holds_everything(tmp_path):
-    measured = metrics.measure(park(duration=5.0))
-    results.write_json(tmp_path / "metrics.json", [measured])
+    measured = measure.measure(park(duration=5.0))
+    metrics_files.write_json(tmp_path / "metrics.json", [measured])
     assert msgspec.json.decode((tmp_path / "metrics.json").read_bytes(), type=list[CaseMetrics]) == [measured]
 
 
@@ -340,9 +341,9 @@ def test_errors_do_not_depend_on_where_the_formation_stands(turn: float, x: floa
     known = park(duration=3.0)
     c, s = math.cos(turn), math.sin(turn)
     place = known.true_position @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + [x, y, 0.0]
-    moved = metrics.measure(dataclasses.replace(known, true_position=place))
+    moved = measure.measure(dataclasses.replace(known, true_position=place))
     for index in ("iae", "itae", "rmse"):
-        assert moved.mean[index] == pytest.approx(metrics.measure(known).mean[index], rel=1e-9)
+        assert moved.mean[index] == pytest.approx(measure.measure(known).mean[index], rel=1e-9)
 
 
 def test_time_without_a_network_is_nobodys_death():
@@ -351,8 +352,8 @@ def test_time_without_a_network_is_nobodys_death():
     place = known.true_position.copy()
     place[(T > 4.0) & (T < 6.0)] = np.nan
     place[(T > 4.0) & (T < 6.4), 1] = np.nan
-    measured = metrics.measure(dataclasses.replace(known, true_position=place))
-    whole = metrics.measure(known)
+    measured = measure.measure(dataclasses.replace(known, true_position=place))
+    whole = measure.measure(known)
     assert measured.away_s == pytest.approx(2.0, abs=2 * STEP)
     assert measured.died == ()
     assert measured.acquired_s == whole.acquired_s
@@ -369,7 +370,7 @@ def test_who_does_not_come_back_has_died(gone: list[int]):
     place = known.true_position.copy()
     for row in gone:
         place[T > 4.0, row] = np.nan
-    measured = metrics.measure(dataclasses.replace(known, true_position=place))
+    measured = measure.measure(dataclasses.replace(known, true_position=place))
     assert measured.away_s == 0.0
     assert measured.robots[1].known < 0.5
     assert measured.robots[1].robot in measured.died

@@ -5,12 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.anchors import Anchors
-from agents.coordination import Displacement, Distance
-from agents.graph import BY_RELATIVE, Links, links
-from experiments import assign, document, layouts
-from experiments.feasibility import realise
-from experiments.modes import modes
+from agents.formation.anchors import Anchors
+from agents.formation.graph import BY_RELATIVE, Links, links
+from agents.plugins.laws import Displacement, Distance
+from experiments.authoring import layouts
+from experiments.check.realisation import realise
+from experiments.check.stability import modes
+from experiments.definition import assignment
+from experiments.file import document
 
 PUBLISHED = np.array(
     [
@@ -47,7 +49,7 @@ def by_hand(law, net, position, share, anchors=None):
 
 
 def test_stiffest_and_slowest_mode_of_the_reference():
-    reference = assign.all_links(document.read("robotic-park").experiment)
+    reference = assignment.all_links(document.read("robotic-park").experiment)
     shape = realise(reference, [PUBLISHED], np.arange(7) > 0)[0]
     hz = 1000.0  # u applied as a velocity: h = 1 / hz
     found = modes(Distance(), reference, shape.position, np.full(7, 1.0 / hz), hz)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from agents import wire
 from agents.agent import Agent
-from agents.goals import HeardGoals
-from agents.keys import Keys
-from experiments import assign
-from experiments.exchange import Exchange
-from experiments.experiment import Formation, Robot
-from experiments.population import Population
+from agents.network import messages
+from agents.network.keys import Keys
+from agents.runtime.goal_inbox import HeardGoals
+from experiments.definition import assignment
+from experiments.definition.experiment import Formation, Robot
+from experiments.real_time.processes.world_network import Exchange
+from experiments.real_time.processes.world_population import Population
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
@@ -33,7 +33,7 @@ def test_a_world_obeys_the_stop_of_a_process_whose_clock_is_behind_that_of_the_o
         def order(seq: int, action: str, **more: object) -> bool:
             """Whether it is carried out."""
             before = world._done.get("F", 0)
-            net.deliver(sent(KEYS.setpoint("F"), wire.Command("F", seq, UTC, action, **more))[0])
+            net.deliver(sent(KEYS.setpoint("F"), messages.Command("F", seq, UTC, action, **more))[0])
             world.listen(0.0)
             return world._done.get("F", 0) != before
 
@@ -49,13 +49,13 @@ def test_a_world_obeys_the_stop_of_a_process_whose_clock_is_behind_that_of_the_o
 
 def test_a_centre_whose_clock_is_behind_that_of_the_one_before_is_followed():
     experiment = pair(architecture="centralised")
-    agent = Agent(assign.assign(experiment, ("A",)))
+    agent = Agent(assignment.assign(experiment, ("A",)))
     with Net().worn() as net:
         goals = HeardGoals(net.session, KEYS, agent, agent.guidance, reach=(5.0, 5.0, 5.0))
 
         def tell(seq: int, t: float, x: float) -> float:
             """The goal that is pursued."""
-            goal = wire.Goal("A", seq, UTC + t, (x, 0.0, 0.0), None, UTC + t)
+            goal = messages.Goal("A", seq, UTC + t, (x, 0.0, 0.0), None, UTC + t)
             net.deliver(sent(KEYS.goal("A"), goal)[0])
             goals.take(t, UTC)
             return float(agent.guidance.goal[0, 0])
@@ -70,7 +70,7 @@ def test_a_centre_whose_clock_is_behind_that_of_the_one_before_is_followed():
 
 
 def test_a_late_goal_does_not_bring_a_dead_centre_back():
-    agent = Agent(assign.assign(pair(architecture="centralised"), ("A",)))
+    agent = Agent(assignment.assign(pair(architecture="centralised"), ("A",)))
     guidance, row, goal = agent.guidance, np.array([0]), np.zeros((1, 3))
     guidance.hear(row, goal, np.zeros(1), np.array([1.0]))
     guidance.lose(2.0)

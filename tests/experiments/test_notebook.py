@@ -4,10 +4,11 @@ from types import ModuleType
 import pytest
 from matplotlib.figure import Figure
 
-from experiments import check, document
-from experiments.notebook import CHECKOUT, folder, show
-from experiments.problem import DocumentError
-from experiments.run import loads, simulate
+from experiments.check import check
+from experiments.file import document
+from experiments.file.document import loads
+from experiments.file.problems import DocumentError
+from experiments.run import CHECKOUT, folder, show, simulate
 
 TEXT = """title = "Two"
 duration_s = 4.0

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agents.kinds import KINDS
-from agents.rows import norm
-from experiments import assign, outlines, virtual
-from experiments.document import read
-from experiments.feasibility import link_errors
+from agents.arrays import norm
+from agents.body.kinds import KINDS
+from experiments.check.realisation import link_errors
+from experiments.definition import assignment, bodies
+from experiments.file.document import read
+from experiments.virtual_time import simulation
+from twins import scene as outlines
 
 RADIUS = KINDS["turtlebot3"].radius
 
@@ -27,16 +29,16 @@ def test_the_gap_is_narrower_than_the_formation():
 @pytest.mark.parametrize("case", [pytest.param("periodic", marks=pytest.mark.nightly), "event"])
 def test_it_passes_without_contact_and_recovers(case):
     experiment = read("obstacle-course").cases()[case]
-    log = virtual.simulate(experiment, [experiment.seed])
+    log = simulation.simulate(experiment, [experiment.seed])
     run = (log.time >= 0.0) & (log.time <= experiment.duration_s)
     time, place = log.time[run], log.true_position[run]
-    scene = assign.scene(experiment)
+    scene = bodies.scene(experiment)
     assert log.touches == ()
     for k in range(len(scene.names)):
         assert (outlines.distance(scene, k, scene.pose[k], place[..., :2]) > RADIUS + 0.04).all()
     i, j = np.triu_indices(place.shape[1], 1)
     assert (norm(place[:, i, :2] - place[:, j, :2]) > 2.0 * RADIUS + 0.04).all()
     assert (place[-1, :, 0] > 0.5).all()  # all are through
-    error = link_errors(assign.all_links(experiment), place).max(axis=1)
+    error = link_errors(assignment.all_links(experiment), place).max(axis=1)
     assert error.max() > 0.3  # it had to fold
     assert error[time > 75.0].max() < 0.025

@@ -6,13 +6,12 @@ import threading
 
 import pytest
 
-from agents import session as network
-from agents import wire
 from agents.clock import Clock
-from agents.keys import Keys
-from experiments import orders
-from experiments.overview import Overview
-from experiments.seen import Progress, Seen
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from experiments.real_time.conductor import orders
+from experiments.real_time.conductor.run_view import Overview, Progress, Seen
 from tests.conftest import RouterProcess
 from tests.experiments.recordings import START, status
 
@@ -35,19 +34,19 @@ def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProc
             if len(waiting) == len(names):
                 for name, query in waiting.items():
                     with query:
-                        reply = wire.Reply(name, name != "B", "airborne", "" if name != "B" else "no")
-                        query.reply(KEYS.order(name), wire.encode(reply), encoding=wire.JSON)
+                        reply = messages.Reply(name, name != "B", "airborne", "" if name != "B" else "no")
+                        query.reply(KEYS.order(name), messages.encode(reply), encoding=messages.JSON)
                 waiting = {}
 
     with (
         network.open_session([router.endpoint], name="robots") as robots,
         network.open_session([router.endpoint], name="conductor") as conductor,
     ):
-        told = {name: network.orders(robots, KEYS.order(name)) for name in names}
+        told = {name: pubsub.orders(robots, KEYS.order(name)) for name in names}
         thread = threading.Thread(target=answer)
         thread.start()
         try:
-            replies = orders.give(conductor, KEYS, [*names, "D"], wire.Order("hold"), 20.0)
+            replies = orders.give(conductor, KEYS, [*names, "D"], messages.Order("hold"), 20.0)
         finally:
             over.set()
             thread.join()
@@ -64,7 +63,11 @@ def test_when_a_robot_began_is_its_first_status_of_the_experiment() -> None:
     view.say = lambda *_, **__: None  # type: ignore[method-assign]
     for phase, at in (("airborne", -0.1), ("running", 0.28), ("running", 1.28), ("landing", 2.0)):
         said = status(at=at)
-        view._heed(wire.decode(wire.encode(said).replace(b'"run"', f'"{phase}"'.encode()), wire.JSON, wire.Status))
+        view._heed(
+            messages.decode(
+                messages.encode(said).replace(b'"run"', f'"{phase}"'.encode()), messages.JSON, messages.Status
+            )
+        )
     assert view.robots["TB01"].began == START + 0.28
     view.robots["TB01"].forget()
     assert view.robots["TB01"].began is None

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.planning import Circle, Line
-from experiments import outlines
+from agents.plugins.planners import Circle, Line
+from twins import scene as outlines
 from twins.scene import Obstacle, Scene
 
 BOX = Obstacle(box=(0.4, 0.2), at=(1.0, 0.5), yaw=0.5)

@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import layouts
-from experiments.feasibility import ENOUGH
-from experiments.placing import Wanted, placed
+from experiments.authoring import layouts
+from experiments.authoring.robotic_park.heights import Wanted, placed
+from experiments.check.realisation import ENOUGH
 
 NOWHERE = np.zeros(0)
 

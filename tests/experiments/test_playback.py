@@ -9,11 +9,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from agents.wire import Event, Heard, HostClock
-from experiments.experiment import Formation, Rates
-from experiments.playback import NotStarted, read
-from experiments.records import RecordingError
-from experiments.recover import recover
+from agents.network.messages import Event, Heard, HostClock
+from experiments.definition.experiment import Formation, Rates
+from experiments.recording.playback import NotStarted, read
+from experiments.recording.reader import RecordingError
+from experiments.recording.recover import recover
 from tests.experiments.recordings import (
     PAIR,
     START,

@@ -6,8 +6,8 @@ import time
 
 import pytest
 
-from experiments.progress import Lines, Table
-from experiments.seen import Progress, Seen
+from experiments.real_time.conductor.run_view import Progress, Seen
+from tools.commands.progress import Lines, Table
 
 
 @pytest.mark.parametrize("kind", [Lines, Table])

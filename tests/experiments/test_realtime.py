@@ -5,10 +5,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from agents import registry
-from experiments.experiment import Formation, Host, Robot
-from experiments.problem import DocumentError
-from experiments.realtime import beside, hardware
+from agents.runtime import run_registry
+from experiments.definition.experiment import Formation, Host, Robot
+from experiments.file.problems import DocumentError
+from experiments.real_time.conductor.conduct import beside, hardware
 from tests.agents.few import pair
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
@@ -24,8 +24,8 @@ REAL = pair(
 )
 
 
-def run(robots: dict[str, str], title: str = "here", born: str | None = None) -> registry.Run:
-    made = registry.mine("run", title, ["tcp/127.0.0.1:7448"], folder=Path("/runs/other"), robots=robots)
+def run(robots: dict[str, str], title: str = "here", born: str | None = None) -> run_registry.Run:
+    made = run_registry.mine("run", title, ["tcp/127.0.0.1:7448"], folder=Path("/runs/other"), robots=robots)
     return made if born is None else msgspec.structs.replace(made, born=born)
 
 
@@ -55,7 +55,7 @@ def test_hardware_that_another_run_has_is_refused(
     monkeypatch: pytest.MonkeyPatch, mine: dict[str, str], theirs: dict[str, str], refused: bool
 ) -> None:
     me, other = run(mine), run(theirs, "there", born="another")
-    monkeypatch.setattr(registry, "born", lambda _pid: "another")
+    monkeypatch.setattr(run_registry, "born", lambda _pid: "another")
     if not refused:
         same = sorted(mine.keys() & theirs.keys())
         assert beside(me, [me, other], "x.toml") == [

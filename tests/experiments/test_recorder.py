@@ -8,10 +8,11 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from agents import farewell, runtime, wire
-from agents import session as network
-from agents.keys import Keys
-from experiments.recorder import AFTER_S, Recorder, with_truth
+from agents.network import messages, shutdown
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.runtime import loop
+from experiments.real_time.processes.recorder import AFTER_S, Recorder, with_truth
 from tests.conftest import RouterProcess
 from tests.experiments.recordings import START, state, touched, world
 
@@ -22,34 +23,34 @@ class Taken:
     """In the place of a recording: what would be in it."""
 
     def __init__(self) -> None:
-        self.contacts: list[wire.Contact] = []
-        self.worlds: list[wire.WorldState] = []
-        self.events: list[wire.Event] = []
+        self.contacts: list[messages.Contact] = []
+        self.worlds: list[messages.WorldState] = []
+        self.events: list[messages.Event] = []
 
-    def contact(self, contact: wire.Contact) -> None:
+    def contact(self, contact: messages.Contact) -> None:
         self.contacts.append(contact)
 
-    def event(self, event: wire.Event) -> None:
+    def event(self, event: messages.Event) -> None:
         self.events.append(event)
 
-    def world(self, said: wire.WorldState) -> None:
+    def world(self, said: messages.WorldState) -> None:
         self.worlds.append(said)
 
 
 def test_whoever_serves_robots_or_records_them_waits_for_the_longest_way_down() -> None:
-    assert farewell.AFTER_S == AFTER_S
-    assert AFTER_S > 2.0 * runtime.FAREWELL_S + runtime.STOPPED_S
+    assert shutdown.AFTER_S == AFTER_S
+    assert AFTER_S > 2.0 * loop.FAREWELL_S + loop.STOPPED_S
 
 
 @pytest.mark.system
 def test_what_the_world_says_is_taken_down_if_it_can_be_true(
     router: RouterProcess, eventually: Callable[[Callable[[], object]], None]
 ) -> None:
-    said: list[tuple[str, wire.Message]] = [
+    said: list[tuple[str, messages.Message]] = [
         (KEYS.contact, msgspec.structs.replace(touched(0.1), impulse=math.nan)),
         (KEYS.contact, msgspec.structs.replace(touched(0.1), stamp=math.inf)),
         (KEYS.contact, world(0.1)),
-        (KEYS.world, msgspec.structs.replace(world(0.1), obstacles=[wire.Standing("box", (0.0, math.nan, 0.0))])),
+        (KEYS.world, msgspec.structs.replace(world(0.1), obstacles=[messages.Standing("box", (0.0, math.nan, 0.0))])),
         (KEYS.world, touched(0.1)),
         (KEYS.world, world(0.2)),
         (KEYS.contact, touched(0.3)),
@@ -64,7 +65,7 @@ def test_what_the_world_says_is_taken_down_if_it_can_be_true(
         def heard() -> bool:
             for key, message in said:
                 # MessagePack keeps what is not finite; JSON would say null
-                other.put(key, wire.encode(message, "msgpack"), encoding=wire.MSGPACK)
+                other.put(key, messages.encode(message, "msgpack"), encoding=messages.MSGPACK)
             recorder.take()
             return bool(taken.contacts and taken.worlds)
 
@@ -85,7 +86,7 @@ def test_what_the_world_says_is_taken_down_if_it_can_be_true(
 def test_the_truth_of_a_state_is_on_the_line_between_those_beside_it() -> None:
     """At 0.5 m/s the newest of 50 truths a second is up to 1 cm away."""
     truths = [
-        wire.Position("TB01", START + 0.02 * k, (0.01 * k, 0.0, 0.0), wire.heading(math.pi - 0.05 + 0.02 * k))
+        messages.Position("TB01", START + 0.02 * k, (0.01 * k, 0.0, 0.0), messages.heading(math.pi - 0.05 + 0.02 * k))
         for k in range(10)
     ]
     for at in (0.0, 0.013, 0.0975, 0.18):

@@ -10,11 +10,11 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from experiments.experiment import Experiment
-from experiments.playback import read
-from experiments.recording import Recording
-from experiments.records import RecordingError
-from experiments.recover import recover
+from experiments.definition.experiment import Experiment
+from experiments.recording.playback import read
+from experiments.recording.reader import RecordingError
+from experiments.recording.recover import recover
+from experiments.recording.writer import Recording
 from tests.experiments.recordings import (
     DOCUMENT,
     PAIR,

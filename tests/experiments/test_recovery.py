@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from experiments.playback import read
-from experiments.records import RecordingError
-from experiments.recover import Recovered, recover, recover_command
+from experiments.recording.playback import read
+from experiments.recording.reader import RecordingError
+from experiments.recording.recover import Recovered, recover, recover_command
 from tests.experiments.recordings import DOCUMENT, begun, scattered, whole_run, write
 
 KILLED = """
 from pathlib import Path
-from experiments.recording import Recording
+from experiments.recording.writer import Recording
 from tests.experiments.recordings import *
 recording = Recording(Path({path!r}), PAIR, DOCUMENT, case="only", seed=4, clock="real")
 put(recording, whole_run())

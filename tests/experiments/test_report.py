@@ -9,15 +9,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.wire import Contact, Event, WorldState
-from experiments import report
-from experiments.experiment import Arena, Experiment, Shadow
-from experiments.metrics import measure
-from experiments.page import date_of, inline
-from experiments.report_tables import interval, number, proof_tables, robot_tables, summary_table
-from experiments.results import write_csv
-from experiments.seeds import spread
-from experiments.verdict import findings, left_out
+from agents.network.messages import Contact, Event, WorldState
+from experiments.definition.experiment import Arena, Experiment, Shadow
+from experiments.metrics.measure import measure
+from experiments.metrics.statistics import spread
+from experiments.report import report
+from experiments.report.metrics_files import write_csv
+from experiments.report.page import date_of, inline, interval, number
+from experiments.report.tables import proof_tables, robot_tables, summary_table
+from experiments.report.verdict import findings, left_out
 from tests.experiments.traces import crowd, cut, experiment, park, trace
 
 pytestmark = pytest.mark.slow  # runs and reports, whole

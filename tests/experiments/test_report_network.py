@@ -6,15 +6,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from experiments import playback, report
-from experiments.experiment import Channel, LinkChannel
-from experiments.logbook import Logbook
-from experiments.metrics import measure
-from experiments.report_network import network_tables
-from experiments.report_tables import proof_tables, summary_table
-from experiments.run import load
-from experiments.verdict import findings
-from experiments.virtual import simulate
+from experiments.definition.experiment import Channel, LinkChannel
+from experiments.file.document import load
+from experiments.metrics.measure import measure
+from experiments.recording import playback
+from experiments.report import report
+from experiments.report.feature_tables import network_tables
+from experiments.report.tables import proof_tables, summary_table
+from experiments.report.verdict import findings
+from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.simulation import simulate
 from tests.experiments.traces import pair
 
 pytestmark = pytest.mark.slow  # runs and reports, whole

@@ -9,12 +9,25 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents import wire
 from agents.agent import Agent
-from agents.body import BodyState
-from experiments import assign, checks, document, reserves, run
-from experiments.experiment import Channel, Experiment, Formation, Hybrid, Leg, Link, LinkChannel, Outage, Robot
-from experiments.succession import Refused, Spares
+from agents.body.interface import BodyState
+from agents.network import messages
+from experiments import run
+from experiments.definition import assignment
+from experiments.definition import standby as reserves
+from experiments.definition.experiment import (
+    Channel,
+    Experiment,
+    Formation,
+    Hybrid,
+    Leg,
+    Link,
+    LinkChannel,
+    Outage,
+    Robot,
+)
+from experiments.file import consistency, document
+from experiments.real_time.conductor.replacement import Refused, Spares
 
 BOT = Robot(kind="khepera4", start=[0.0, 0.0])
 FLY = Robot(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
@@ -46,12 +59,12 @@ def experiment(**more: Any) -> Experiment:
     ],
 )  # fmt: skip
 def test_reserves_that_nobody_could_call_upon(change: dict[str, object], path: tuple[str, ...], said: str) -> None:
-    found = [(fault.path, f"{fault.message}; {fault.hint}") for fault in checks.faults(experiment(**change))]
+    found = [(fault.path, f"{fault.message}; {fault.hint}") for fault in consistency.faults(experiment(**change))]
     assert any(where == path and said in what for where, what in found), found
 
 
 def test_what_is_right_is_not_complained_of() -> None:
-    assert not list(checks.faults(experiment(spares={"S": FLY, "T": BOT}, on_loss="replace")))
+    assert not list(consistency.faults(experiment(spares={"S": FLY, "T": BOT}, on_loss="replace")))
 
 
 def test_without_those_on_standby_nothing_names_them() -> None:
@@ -70,7 +83,7 @@ def test_without_those_on_standby_nothing_names_them() -> None:
     assert list(made.channel.links) == ["A > B"]
     assert [(outage.from_s, outage.robots) for outage in made.channel.outages] == [(2.0, ["B"]), (3.0, [])]
     assert made.architecture == Hybrid("hybrid", ["A"])
-    assert not list(checks.faults(made))
+    assert not list(consistency.faults(made))
     assert reserves.taking_part(made) is made
 
 
@@ -85,7 +98,7 @@ def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:
 def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     case = experiment()
     robots = {**case.robots, "C": msgspec.structs.replace(FLY, standby=standby)}
-    told = assign.assign(msgspec.structs.replace(case, robots=robots), ["A"])
+    told = assignment.assign(msgspec.structs.replace(case, robots=robots), ["A"])
     agent = Agent(told)
     assert agent.missing(0) == ["B", "C"]
     link = np.array([told.speakers[j] for j in told.links.speaker]) == "B"
@@ -102,8 +115,8 @@ def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     assert agent.missing(0) == ["C"]
 
 
-def order(**more: object) -> wire.RunOrder:
-    return wire.RunOrder("replace", ["A"], **more)  # type: ignore[arg-type]
+def order(**more: object) -> messages.RunOrder:
+    return messages.RunOrder("replace", ["A"], **more)  # type: ignore[arg-type]
 
 
 def test_a_spare_brings_its_body_and_keeps_the_rest() -> None:
@@ -135,6 +148,6 @@ def test_a_spare_brings_its_body_and_keeps_the_rest() -> None:
         (order(body="khepera4://192.0.2.1", at=(0.0, 0.0)), "only a twin"),
     ],
 )
-def test_what_cannot_take_over_a_name(asked: wire.RunOrder, said: str) -> None:
+def test_what_cannot_take_over_a_name(asked: messages.RunOrder, said: str) -> None:
     with pytest.raises(Refused, match=said):
         Spares(experiment(spares={"F": FLY, "S": BOT})).successor("A", BOT, asked)

@@ -8,11 +8,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from agents.body import Disturbance, Jitter
+from agents.body.interface import Disturbance, Jitter
 from experiments import run
-from experiments.assign import uses_chance
-from experiments.experiment import Channel, LinkChannel, Start
-from experiments.problem import DocumentError
+from experiments.definition.assignment import uses_chance
+from experiments.definition.experiment import Channel, LinkChannel, Start
+from experiments.file import document
+from experiments.file.problems import DocumentError
+from experiments.recording import run_folder
 from tests.agents.few import pair
 
 
@@ -20,23 +22,23 @@ def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    read = run.load("triangle")
+    read = document.load("triangle")
     with ThreadPoolExecutor(8) as pool:
-        folders = list(pool.map(lambda _: run.new_folder(read, None), range(24)))
+        folders = list(pool.map(lambda _: run_folder.new_folder(read, None), range(24)))
     assert len({*folders}) == 24
     assert all(folder.is_dir() for folder in folders)
 
 
 def test_a_folder_in_which_nothing_was_run_is_removed(tmp_path: Path) -> None:
-    read = run.load("triangle")
-    empty, failed, flown = (run.new_folder(read, str(tmp_path / name)) for name in ("empty", "failed", "flown"))
+    read = document.load("triangle")
+    empty, failed, flown = (run_folder.new_folder(read, str(tmp_path / name)) for name in ("empty", "failed", "flown"))
     for folder in (empty, failed, flown):
-        read.keep(folder / run.SOURCE)
+        read.keep(folder / run_folder.SOURCE)
     (failed / "logs").mkdir()
     (failed / "logs" / "router.log").write_text("no such port")
     (flown / "event.mcap").touch()
     for folder in (empty, failed, flown):
-        run.remove_unused(folder)
+        run_folder.remove_unused(folder)
     assert sorted(tmp_path.iterdir()) == [failed, flown]
 
 
@@ -53,12 +55,12 @@ def test_a_folder_in_which_nothing_was_run_is_removed(tmp_path: Path) -> None:
 )
 def test_numbers_that_no_run_can_have(change: str, says: str) -> None:
     with pytest.raises(DocumentError, match=says):
-        run.load("triangle", change)
+        document.load("triangle", change)
 
 
 def test_a_run_in_virtual_time_must_fit_into_memory() -> None:
     with pytest.raises(DocumentError, match="fit into memory"):
-        run.simulate_seeds(run.load("triangle"), range(100_000))
+        run.simulate_seeds(document.load("triangle"), range(100_000))
 
 
 def test_whether_seeds_change_anything() -> None:

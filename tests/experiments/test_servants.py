@@ -2,9 +2,9 @@
 
 from types import SimpleNamespace
 
-from experiments import document
-from experiments.launcher import ROUTER
-from experiments.servants import STARTS, Servants
+from experiments.file import document
+from experiments.real_time.conductor.support import STARTS, Servants
+from experiments.real_time.hosts.launcher import ROUTER
 
 
 class Starts:
@@ -26,7 +26,7 @@ def test_a_router_that_died_listens_again_where_other_machines_look_for_it(tmp_p
     )
     dead = SimpleNamespace(name=ROUTER, exit="killed by SIGKILL")
     said = [servants.again(dead, "only") for _ in range(STARTS)]
-    assert [words[:2] for words in launcher.told] == [(ROUTER, "agents.router")] * (STARTS - 1)
+    assert [words[:2] for words in launcher.told] == [(ROUTER, "agents.runtime.router")] * (STARTS - 1)
     assert all(words[2:4] == ("--listen", everywhere) for words in launcher.told)
     assert said[0] == (ROUTER, "the router ended (killed by SIGKILL); started again")
     assert said[-1] == (

@@ -7,9 +7,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from experiments import metrics, shadow_figures
-from experiments.experiment import Shadow
-from experiments.shadows import agreement
+from experiments.definition.experiment import Shadow
+from experiments.metrics import measure
+from experiments.metrics.shadow import agreement
+from experiments.report import figures
 from tests.experiments.traces import STEP, experiment, trace
 
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
@@ -104,13 +105,13 @@ def test_yaw_differs_the_short_way_round():
 def test_without_a_shadow_there_is_none():
     plain = trace(experiment({"A": "crazyflie"}, {}), winding(T)[:, None])
     assert agreement(plain) == [None]
-    assert metrics.measure(plain).robots[0].shadow is None
-    assert shadow_figures.every([plain]) == {}
+    assert measure.measure(plain).robots[0].shadow is None
+    assert figures.shadow_figures([plain]) == {}
 
 
 def test_the_figure_has_a_row_for_each_robot_with_a_twin():
     known = shadowed(winding(T), winding(T) + np.array([0.02, 0.0, 0.0]))
-    (figure,) = shadow_figures.every([known, dataclasses.replace(known, case="other")]).values()
+    (figure,) = figures.shadow_figures([known, dataclasses.replace(known, case="other")]).values()
     assert len(figure.axes) == 4
     above, beside = figure.axes[:2]
     np.testing.assert_allclose(above.lines[1].get_xdata() - above.lines[0].get_xdata(), 0.02)

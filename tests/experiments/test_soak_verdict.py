@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.soak_verdict import Row, Soaked, figure, judge, passed, table
+from tools.reliability.soak_verdict import Row, Soaked, figure, judge, passed, table
 
 ROBOTS = ("TB01", "CF02")
 SPAN = 3600.0

@@ -4,8 +4,8 @@ import shlex
 
 import pytest
 
-from agents.endpoint import Endpoint
-from experiments import ssh
+from agents.network.endpoints import Endpoint
+from experiments.real_time.hosts import ssh
 
 
 @pytest.mark.parametrize(

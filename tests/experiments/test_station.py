@@ -10,9 +10,9 @@ import msgspec
 import psutil
 import pytest
 
-from experiments import version
-from experiments.processes import RUN
-from experiments.station import Answer, Question, answer, devices
+from experiments.real_time.hosts.launcher import RUN
+from experiments.real_time.hosts.station import Answer, Question, answer, devices
+from experiments.recording import version
 from tests.system.lab import ENVIRONMENT, ROOT
 
 
@@ -55,7 +55,7 @@ class Started:
 
     def __init__(self, run):
         self.process = subprocess.Popen(
-            [sys.executable, "-c", "from experiments.station import serve; serve(patience_s=0.5)"],
+            [sys.executable, "-c", "from experiments.real_time.hosts.station import serve; serve(patience_s=0.5)"],
             cwd=ROOT,
             env={**ENVIRONMENT, RUN: run},
             stdin=subprocess.PIPE,

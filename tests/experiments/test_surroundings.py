@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from experiments.check import check, command, figures
-from experiments.document import read
+from experiments.check.check import check, command, figures
+from experiments.file.document import read
 
 pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
 

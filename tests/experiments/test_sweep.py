@@ -5,18 +5,20 @@ import json
 import numpy as np
 import pytest
 
-from experiments import sweep as sweeps
-from experiments import sweep_page, sweep_table
-from experiments.experiment import Experiment
-from experiments.metrics import measure
-from experiments.pareto import curves, front, pareto
-from experiments.problem import DocumentError
-from experiments.run import load, simulate
-from experiments.seeds import student_95
-from experiments.sweep import side_by_side, sweep
-from experiments.sweep_command import Request, command
-from experiments.sweep_runs import Stuck
-from experiments.sweep_workers import Processes, SweepError, Work, workers
+from experiments.definition.experiment import Experiment
+from experiments.file.document import load
+from experiments.file.problems import DocumentError
+from experiments.metrics.measure import measure
+from experiments.metrics.statistics import student_95
+from experiments.run import simulate
+from experiments.sweep import page as sweep_page
+from experiments.sweep import sweep as sweeps
+from experiments.sweep import table as sweep_table
+from experiments.sweep.pareto import curves, front, pareto
+from experiments.sweep.runs import Stuck
+from experiments.sweep.sweep import side_by_side, sweep
+from experiments.sweep.workers import Processes, SweepError, Work, workers
+from tools.commands.sweep import Request, command
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -127,16 +129,16 @@ def test_another_version_is_noticed(tmp_path, monkeypatch):
 
 
 def test_runs_that_fail_are_counted_and_named(tmp_path, monkeypatch):
-    from experiments import sweep_runs  # noqa: PLC0415
+    from experiments.sweep import runs  # noqa: PLC0415
 
-    real = sweep_runs.simulate
+    real = runs.simulate
 
     def stuck(experiment, seeds, *, lean):
         if isinstance(experiment.trigger, dict) and experiment.trigger.get("threshold") == 0.02 and 2 in seeds:
             raise Stuck("not airborne after 60 s: CF01")
         return real(experiment, seeds, lean=lean)
 
-    monkeypatch.setattr(sweep_runs, "simulate", stuck)
+    monkeypatch.setattr(runs, "simulate", stuck)
     found = swept(tmp_path)
     assert [(row.seeds, row.failed) for row in found.rows] == [(3, 0), (3, 0), (2, 1)]
     assert found.failures == ("event trigger.threshold=0.02, seed 2: not airborne after 60 s: CF01",)

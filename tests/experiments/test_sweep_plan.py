@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.problem import DocumentError
-from experiments.run import load
-from experiments.sweep_plan import Span, arguments, cells, seeds_of
+from experiments.file.document import load
+from experiments.file.problems import DocumentError
+from experiments.sweep.plan import Span, arguments, cells, seeds_of
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from experiments import metrics, sweep_runs
-from experiments.experiment import Channel, Start, World
-from experiments.logbook import Logbook
-from experiments.run import load
-from experiments.sweep_runs import Outcome, code_of, digest, figures_of, fly
-from experiments.virtual import simulate
+from experiments.definition.experiment import Channel, Start, World
+from experiments.file.document import load
+from experiments.metrics import measure
+from experiments.sweep import runs
+from experiments.sweep.runs import Outcome, code_of, digest, figures_of, fly
+from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.simulation import simulate
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def test_a_lean_log_gives_the_figures_of_the_report_to_the_bit(park):
     found = figures_of(lean, park)
     assert found == figures_of(whole, park)
     for copy, figures in enumerate(found):
-        measured = metrics.measure(Logbook(whole, park, "event", copy).trace())
+        measured = measure.measure(Logbook(whole, park, "event", copy).trace())
         assert figures.seed == seeds[copy]
         for index in ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s"):
             assert getattr(figures, index) == measured.mean[index], index
@@ -62,14 +63,14 @@ def test_a_run_comes_out_the_same_whoever_flies_beside_it(park):
 
 
 def test_a_run_that_is_stuck_does_not_take_the_others_with_it(park, monkeypatch):
-    real = sweep_runs.simulate
+    real = runs.simulate
 
     def fails_with_2(experiment, seeds, *, lean):
         if 2 in seeds:
-            raise sweep_runs.Stuck("not airborne after 60 s: CF01")
+            raise runs.Stuck("not airborne after 60 s: CF01")
         return real(experiment, seeds, lean=lean)
 
-    monkeypatch.setattr(sweep_runs, "simulate", fails_with_2)
+    monkeypatch.setattr(runs, "simulate", fails_with_2)
     short = msgspec.structs.replace(park, duration_s=1.0)
     outcome = flown(short, [1, 2, 3])
     assert [run.seed for run in outcome.runs] == [1, 3]
@@ -93,20 +94,20 @@ def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
     file = tmp_path / "my_triggers.py"
     file.write_text("one")
     before = code_of(park)
-    real = sweep_runs.getfile
-    monkeypatch.setattr(sweep_runs, "getfile", lambda of: str(file) if of.__name__ == "SendOnDelta" else real(of))
+    real = runs.getfile
+    monkeypatch.setattr(runs, "getfile", lambda of: str(file) if of.__name__ == "SendOnDelta" else real(of))
     foreign = code_of(park)
-    sweep_runs._file_digest.cache_clear()
+    runs._file_digest.cache_clear()
     file.write_text("two")
     assert len({before, foreign, code_of(park)}) == 3
-    sweep_runs._file_digest.cache_clear()
+    runs._file_digest.cache_clear()
 
 
 def test_the_version_of_the_engines_library_counts(park, monkeypatch):
     """Runs of another pymunk or mujoco are other runs; of one that is not used they are the same."""
-    real = sweep_runs.version
+    real = runs.version
     pymunk = msgspec.structs.replace(park, world=World(engine="pymunk"))
     before = code_of(park), code_of(pymunk)
-    monkeypatch.setattr(sweep_runs, "version", lambda name: "0.0" if name == "pymunk" else real(name))
+    monkeypatch.setattr(runs, "version", lambda name: "0.0" if name == "pymunk" else real(name))
     assert code_of(park) == before[0]
     assert code_of(pymunk) != before[1]

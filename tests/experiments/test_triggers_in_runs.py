@@ -7,10 +7,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.prediction import HOLD, ConstantVelocity
-from experiments import assign, checks, document, metrics, signals, virtual
-from experiments.experiment import Channel, Formation
-from experiments.logbook import Logbook
+from agents.plugins.predictors import HOLD, ConstantVelocity
+from experiments.definition import assignment
+from experiments.definition.experiment import Channel, Formation
+from experiments.file import consistency, document
+from experiments.metrics import measure, signals
+from experiments.virtual_time import simulation
+from experiments.virtual_time.log import Logbook
 from tests.agents.swarm import changed
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
@@ -24,8 +27,8 @@ def park():
 
 
 def measured(experiment, seeds):
-    log = virtual.simulate(experiment, seeds)
-    return [metrics.measure(Logbook(log, experiment, "", copy).trace()) for copy in range(len(seeds))]
+    log = simulation.simulate(experiment, seeds)
+    return [measure.measure(Logbook(log, experiment, "", copy).trace()) for copy in range(len(seeds))]
 
 
 def mean(cases, index):
@@ -36,13 +39,13 @@ def mean(cases, index):
 
 
 def test_prediction_is_what_the_trigger_needs_unless_it_is_said(park):
-    assert assign.predictor(park) is HOLD
-    assert assign.predictor(changed(park, trigger="predictive")) == ConstantVelocity()
-    assert assign.predictor(changed(park, trigger=CHOSEN)) == ConstantVelocity()
+    assert assignment.predictor(park) is HOLD
+    assert assignment.predictor(changed(park, trigger="predictive")) == ConstantVelocity()
+    assert assignment.predictor(changed(park, trigger=CHOSEN)) == ConstantVelocity()
     said = {"kind": "constant-velocity", "horizon_s": 0.5}
-    assert assign.predictor(changed(park, trigger=CHOSEN, prediction=said)) == ConstantVelocity(horizon_s=0.5)
-    assert assign.predictor(changed(park, prediction="constant-velocity")) == ConstantVelocity()
-    assert assign.predictor(changed(park, prediction="hold")) is HOLD
+    assert assignment.predictor(changed(park, trigger=CHOSEN, prediction=said)) == ConstantVelocity(horizon_s=0.5)
+    assert assignment.predictor(changed(park, prediction="constant-velocity")) == ConstantVelocity()
+    assert assignment.predictor(changed(park, prediction="hold")) is HOLD
 
 
 def updating(park, update):
@@ -66,7 +69,7 @@ def updating(park, update):
 def test_triggers_where_they_make_no_sense_are_refused(park, change, path, message, hint):
     rest = {key: value for key, value in change.items() if key != "update"}
     wrong = changed(updating(park, change.get("update")), **rest)
-    (fault,) = checks.faults(wrong)
+    (fault,) = consistency.faults(wrong)
     assert fault.path == path
     assert message in fault.message
     assert hint in fault.hint
@@ -84,7 +87,7 @@ def test_triggers_where_they_make_no_sense_are_refused(park, change, path, messa
 )
 def test_triggers_where_they_make_sense_are_not(park, change):
     rest = {key: value for key, value in change.items() if key != "update"}
-    assert not list(checks.faults(changed(updating(park, change.get("update")), **rest)))
+    assert not list(consistency.faults(changed(updating(park, change.get("update")), **rest)))
 
 
 # ---------------------------------------------------------------- what is sent, believed and counted
@@ -94,7 +97,7 @@ def test_triggers_where_they_make_sense_are_not(park, change):
 def flown(park):
     """A short run with the chosen trigger on a network with a delay, as a log and as a trace."""
     experiment = changed(park, trigger=CHOSEN, duration_s=8.0, timeline=[], channel=Channel(delay_s=0.05))
-    log = virtual.simulate(experiment, [4])
+    log = simulation.simulate(experiment, [4])
     return log, Logbook(log, experiment, "predictive").trace()
 
 
@@ -143,7 +146,7 @@ def test_belief_error_is_that_of_the_prediction(flown):
 
 def test_updates_are_counted_for_each_robot(park):
     experiment = changed(updating(park, {"kind": "send-on-delta", "threshold": 0.02}), duration_s=12.0, timeline=[])
-    log = virtual.simulate(experiment, [1, 2])
+    log = simulation.simulate(experiment, [1, 2])
     assert log.updates.reshape(2, 7)[:, 0].tolist() == [log.decisions] * 2 == [120] * 2
     for copy in range(2):
         logbook = Logbook(log, experiment, "", copy)
@@ -151,7 +154,7 @@ def test_updates_are_counted_for_each_robot(park):
         np.testing.assert_array_equal(trace.decisions, log.updates.reshape(2, 7)[copy])
         assert (trace.decisions[1:] < 120).all()
         assert (trace.decisions[1:] > 10).all()
-        case = metrics.measure(trace)
+        case = measure.measure(trace)
         assert [robot.updates for robot in case.robots] == trace.decisions.tolist()
         counted = {status.robot: status.decisions for status in logbook._statuses()}
         assert [counted[name] for name in trace.robots] == trace.decisions.tolist()
@@ -161,9 +164,9 @@ def test_updates_are_counted_for_each_robot(park):
 def test_repetitions_side_by_side_are_what_each_is_alone_with_all_of_it(park):
     noisy = Channel(delay_s=0.05, jitter_s=0.01, loss=0.1)
     experiment = changed(updating(park, "self-triggered"), trigger=CHOSEN, duration_s=4.0, timeline=[], channel=noisy)
-    both = virtual.simulate(experiment, [5, 6])
+    both = simulation.simulate(experiment, [5, 6])
     for copy, seed in enumerate((5, 6)):
-        alone = virtual.simulate(experiment, [seed])
+        alone = simulation.simulate(experiment, [seed])
         if len(alone.time) == len(both.time) and not both.waited.any():
             rows = slice(7 * copy, 7 * copy + 7)
             np.testing.assert_array_equal(both.true_position[:, rows], alone.true_position)
@@ -206,4 +209,4 @@ def test_a_formation_without_links_has_no_law_to_gate(park):
         timeline=[],
         duration_s=2.0,
     )
-    assert virtual.simulate(alone, [1]).updates.tolist() == [20]
+    assert simulation.simulate(alone, [1]).updates.tolist() == [20]

@@ -2,11 +2,11 @@
 
 import pytest
 
-from experiments.problem import DocumentError
-from experiments.seeds import Spread
-from experiments.sweep_command import Request, command
-from experiments.sweep_table import MEANS, RATIOS, Row
-from experiments.tuning import BROKEN, Limit, Wish, searched, tune, wish_of
+from experiments.file.problems import DocumentError
+from experiments.metrics.statistics import Spread
+from experiments.sweep.optimise import BROKEN, Limit, Wish, searched, tune, wish_of
+from experiments.sweep.table import MEANS, RATIOS, Row
+from tools.commands.sweep import Request, command
 
 SHORT = ["duration_s=4.0"]
 

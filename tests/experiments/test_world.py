@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.experiment import Arena, Experiment, Robot, World
-from experiments.population import Population, Refused
+from experiments.definition.experiment import Arena, Experiment, Robot, World
+from experiments.real_time.processes.world_population import Population, Refused
 from twins.scene import Obstacle
 
 POST = Obstacle(radius=0.1, at=(1.5, 1.5))

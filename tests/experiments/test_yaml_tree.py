@@ -1,7 +1,7 @@
 import pytest
 
-from experiments.problem import DocumentError
-from experiments.yaml_tree import Tree
+from experiments.authoring.robotic_park.yaml_reader import Tree
+from experiments.file.problems import DocumentError
 
 TEXT = """a:
   number: 1.5e-1

@@ -9,12 +9,12 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
-from agents.graph import links
-from agents.rows import Array, norm
-from agents.wire import Event
-from experiments.experiment import Arena, Experiment, Formation, Leg, Robot
-from experiments.links import parse_links
-from experiments.trace import HeardPoses, Sent, Trace
+from agents.arrays import Array, norm
+from agents.formation.graph import links
+from agents.network.messages import Event
+from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
+from experiments.definition.links import parse_links
+from experiments.recording.trace import HeardPoses, Sent, Trace
 
 Said = TypeVar("Said", Sent, HeardPoses)
 STEP = 0.02

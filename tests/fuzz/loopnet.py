@@ -1,4 +1,6 @@
-"""A Zenoh network without Zenoh: what `agents.session` hands out, fed by hand, so that no time is lost on a wire."""
+"""A Zenoh network without Zenoh: what `agents.network.session` hands out, fed by hand, so that no time is lost on a
+wire.
+"""
 
 from __future__ import annotations
 
@@ -198,7 +200,7 @@ class Net:
 
     @contextmanager
     def worn(self) -> Iterator[Net]:
-        """`agents.session` is this network."""
+        """`agents.network.session` is this network."""
 
         def heard(_session: object, key: str, *_: object, **__: object) -> Channel:
             return self.listen(key)
@@ -206,7 +208,7 @@ class Net:
         def mute(*_: object, **__: object) -> Mute:
             return Mute()
 
-        made: dict[str, Any] = {
+        declared: dict[str, Any] = {
             "pose_subscriber": heard,
             "subscriber": heard,
             "orders": lambda _session, key: self.listen(key, asked=True),
@@ -215,9 +217,14 @@ class Net:
             "urgent_publisher": mute,
             "last_value": mute,
             "alive_token": mute,
+        }
+        opened: dict[str, Any] = {
             "connected": lambda _session: True,
             "RouterWatch": Attentive,
             "open_session": lambda *_, **__: self.session,
         }
-        with mock.patch.multiple("agents.session", **made):
+        with (
+            mock.patch.multiple("agents.network.pubsub", **declared),
+            mock.patch.multiple("agents.network.session", **opened),
+        ):
             yield self

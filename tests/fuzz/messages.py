@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 
-from agents import wire
-from agents.keys import Keys
+from agents.network import messages
+from agents.network.keys import Keys
 
 KEYS = Keys()
 
@@ -14,79 +14,81 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
     """By the name of its key what a robot says, with stamps so far ahead of now [s]."""
     now = time.time() + ahead
     place, rest = (-0.5, -0.4, 0.0), (0.0, 0.0, 0.0)
-    heard = wire.Heard("KH02", seq, now, now, place, rest)
-    status = wire.Status(
+    heard = messages.Heard("KH02", seq, now, now, place, rest)
+    status = messages.Status(
         robot=robot, stamp=now, phase="running", reason="", body="", battery=0.5, sent=seq, heard=2,
         lost={"KH01": 1}, dropped={"KH02": 1}, malformed=0, refused=0, ticks=5, missed=1,
         decisions=2, interventions=0, avoided=0, late_s=0.001, started=now - 1.0, missing=["KH02"],
         pid=1, cpu_s=0.1, rss_mb=60.0, hazard="hold: ordered to hold",
-        incidents=[wire.Incident(seq, now, "hold: ordered to hold")],
+        incidents=[messages.Incident(seq, now, "hold: ordered to hold")],
     )  # fmt: skip
     commands = [
-        wire.Command(robot, seq + 10, now, "drive", (0.1, 0.2, 0.0, 0.0)),
-        wire.Command(robot, seq + 20, now, "takeoff", height=0.5),
-        wire.Command(robot, seq + 30, now, "land"),
-        wire.Command(robot, seq + 40, now, "stop"),
+        messages.Command(robot, seq + 10, now, "drive", (0.1, 0.2, 0.0, 0.0)),
+        messages.Command(robot, seq + 20, now, "takeoff", height=0.5),
+        messages.Command(robot, seq + 30, now, "land"),
+        messages.Command(robot, seq + 40, now, "stop"),
     ]
     return {
-        "pose": [wire.Pose(robot, seq + k, now + 0.01 * k, place, rest, 0.1) for k in range(2)],
+        "pose": [messages.Pose(robot, seq + k, now + 0.01 * k, place, rest, 0.1) for k in range(2)],
         "state": [
-            wire.State(robot, seq, now, "running", place, rest, 0.1, place, (0.1, 0.2, 0.0, 0.0), 0.1, place,
-            0.1, [heard], followed=[wire.Followed(seq, now, now, now)]),
-            wire.State(robot, seq, now, "idle", place, rest, 0.1, None, None, 0.1, attitude=(1.0, 0.0, 0.0, 0.0)),
+            messages.State(robot, seq, now, "running", place, rest, 0.1, place, (0.1, 0.2, 0.0, 0.0), 0.1, place,
+            0.1, [heard], followed=[messages.Followed(seq, now, now, now)]),
+            messages.State(robot, seq, now, "idle", place, rest, 0.1, None, None, 0.1, attitude=(1.0, 0.0, 0.0, 0.0)),
         ],
         "status": [status],
-        "position": [wire.Position(robot, now, place, 0.1), wire.Position(robot, now, place)],
-        "truth": [wire.Position(robot, now, place, 0.1)],
+        "position": [messages.Position(robot, now, place, 0.1), messages.Position(robot, now, place)],
+        "truth": [messages.Position(robot, now, place, 0.1)],
         "setpoint": list(commands),
-        "ranges": [wire.Ranges(robot, now, [0.0, 0.1], [0.0, 0.0], [1.0, None])],
+        "ranges": [messages.Ranges(robot, now, [0.0, 0.1], [0.0, 0.0], [1.0, None])],
         "order": [
-            wire.Order("takeoff"), wire.Order("start", at=now + 0.5), wire.Order("hold"), wire.Order("resume"),
-            wire.Order("leave"), wire.Order("land"),
-            wire.Order("stop"), wire.Order("get", name="clamp"), wire.Order("set", name="clamp", value=0.2),
-            wire.Order("set", name="trigger.period_s", value=0.05),
+            messages.Order("takeoff"), messages.Order("start", at=now + 0.5), messages.Order("hold"),
+            messages.Order("resume"),
+            messages.Order("leave"), messages.Order("land"),
+            messages.Order("stop"), messages.Order("get", name="clamp"), messages.Order("set", name="clamp", value=0.2),
+            messages.Order("set", name="trigger.period_s", value=0.05),
         ],
-        "goal": [wire.Goal(robot, seq + k, now, place, 0.1 if k else None, now - 0.01) for k in range(2)],
+        "goal": [messages.Goal(robot, seq + k, now, place, 0.1 if k else None, now - 0.01) for k in range(2)],
     }  # fmt: skip
 
 
 def of_all() -> dict[str, list[object]]:
     """By key what is nobody's."""
     now = time.time()
-    world = wire.WorldState(
+    world = messages.WorldState(
         now, "pymunk", 1.0, 1.0, 0.1, False, ["KH01"], ["CF01"],
-        [wire.Standing("box", (0.1, 0.2, 0.3))], 1, 0, 0, "",
+        [messages.Standing("box", (0.1, 0.2, 0.3))], 1, 0, 0, "",
     )  # fmt: skip
-    centre = wire.CentreState(
+    centre = messages.CentreState(
         stamp=now, robots=["KH01"], missing=["KH02"], load=0.1, late_s=0.001, decisions=5, missed=1, goals=5,
         heard={"KH01": 2}, lost={"KH01": 1}, dropped={"KH01": 0}, malformed=0, pid=1, cpu_s=0.1, rss_mb=60.0,
     )  # fmt: skip
     orders = [
-        wire.WorldOrder("pause"), wire.WorldOrder("resume"), wire.WorldOrder("step", steps=3),
-        wire.WorldOrder("reset"), wire.WorldOrder("reset", name="KH01"), wire.WorldOrder("remove", name="KH02"),
-        wire.WorldOrder("spawn", name="KH02", kind="khepera4", at=(0.5, 0.5), yaw=1.0),
-        wire.WorldOrder("spawn", name="CF02", kind="crazyflie", at=(0.2, -0.5)),
-        wire.WorldOrder("spawn", name="box", obstacle={"at": [0.1, 0.2], "radius": 0.1, "height": 0.5}),
-        wire.WorldOrder("spawn", name="moving", obstacle={
+        messages.WorldOrder("pause"), messages.WorldOrder("resume"), messages.WorldOrder("step", steps=3),
+        messages.WorldOrder("reset"), messages.WorldOrder("reset", name="KH01"),
+        messages.WorldOrder("remove", name="KH02"),
+        messages.WorldOrder("spawn", name="KH02", kind="khepera4", at=(0.5, 0.5), yaw=1.0),
+        messages.WorldOrder("spawn", name="CF02", kind="crazyflie", at=(0.2, -0.5)),
+        messages.WorldOrder("spawn", name="box", obstacle={"at": [0.1, 0.2], "radius": 0.1, "height": 0.5}),
+        messages.WorldOrder("spawn", name="moving", obstacle={
             "at": [0.1, 0.2], "box": [0.1, 0.2],
             "plan": {"kind": "circle", "radius": 0.1}}),
-        wire.WorldOrder("spawn", name="pushed", obstacle={"at": [-0.1, 0.6], "box": [0.1, 0.2], "mass": 1.0}),
+        messages.WorldOrder("spawn", name="pushed", obstacle={"at": [-0.1, 0.6], "box": [0.1, 0.2], "mass": 1.0}),
     ]  # fmt: skip
     return {
-        KEYS.estop: [wire.Stop("a test", "to see")],
-        KEYS.event: [wire.Event(now, "phase", "conductor", "landing")],
-        KEYS.contact: [wire.Contact(now, "KH01", "wall", 0.1, 0.001)],
+        KEYS.estop: [messages.Stop("a test", "to see")],
+        KEYS.event: [messages.Event(now, "phase", "conductor", "landing")],
+        KEYS.contact: [messages.Contact(now, "KH01", "wall", 0.1, 0.001)],
         KEYS.world: [world],
         KEYS.centre: [centre],
-        KEYS.clock: [wire.HostClock("lab1", now, 0.2, 0.001, ["KH01"], 0.2)],
+        KEYS.clock: [messages.HostClock("lab1", now, 0.2, 0.001, ["KH01"], 0.2)],
         KEYS.world_order: list(orders),
         KEYS.run_order: [
-            wire.RunOrder("pause", ["KH01"], who="ana"),
-            wire.RunOrder("remove", ["KH01", "KH02"]),
-            wire.RunOrder("restart", ["CF01"]),
-            wire.RunOrder("add", ["nobody"]),
-            wire.RunOrder("replace", ["KH01"], spare="S1"),
-            wire.RunOrder("replace", ["KH01"], body="twin", at=(0.1, 0.2), yaw=1.0),
+            messages.RunOrder("pause", ["KH01"], who="ana"),
+            messages.RunOrder("remove", ["KH01", "KH02"]),
+            messages.RunOrder("restart", ["CF01"]),
+            messages.RunOrder("add", ["nobody"]),
+            messages.RunOrder("replace", ["KH01"], spare="S1"),
+            messages.RunOrder("replace", ["KH01"], body="twin", at=(0.1, 0.2), yaw=1.0),
         ],
     }
 
@@ -94,7 +96,7 @@ def of_all() -> dict[str, list[object]]:
 def sent(key: str, message: object) -> list[bytes]:
     """A message as `loopnet.Net.deliver` takes it, in both encodings."""
     return [
-        b"\0".join([key.encode(), wire.MIME[encoding].encode(), wire.encode(message, encoding)])  # type: ignore[arg-type]
+        b"\0".join([key.encode(), messages.MIME[encoding].encode(), messages.encode(message, encoding)])  # type: ignore[arg-type]
         for encoding in ("json", "msgpack")
     ]
 

@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from agents.protocols import datastream
-from agents.protocols.datastream import Kind, Segment
+from agents.protocols import vicon_datastream
+from agents.protocols.vicon_datastream import Kind, Segment
 from tests.fuzz.sockets import Wire
 from tests.fuzz.target import Place, Renewed, Target
 from tests.twins.loopback import request as twin_request
-from twins.device import Device, DeviceRequest, Faults
+from twins.devices.device import Device, DeviceRequest, Faults
 
 # ---------------------------------------------------------------------- the Khepera IV
 
 
 def khepera_twin() -> Iterator[Target]:
     """Both protocols: the first byte says which."""
-    from twins import khepera4  # noqa: PLC0415
+    from twins.devices import khepera4  # noqa: PLC0415
 
     park = ["d 10.0 0.5", "stop", "p", "t", "get_data", "g 1.0 0.5", "i 0.1 0.2 0.3", "d -81.0 -7"]
     kteam = ["B", "D,100,-100", "R", "G", "N", "O", "V,5", "U,31", "I", "E", "S", "T", "M,1,2", "K", "H", "J"]
@@ -61,8 +61,8 @@ def khepera_twin() -> Iterator[Target]:
 def khepera_bridge() -> Iterator[Target]:
     """Answers of both servers to everything that the link asks, apart by zero bytes."""
     from agents.protocols.khepera4 import Settings  # noqa: PLC0415
-    from bridges.khepera4_link import KTeam, Park  # noqa: PLC0415
-    from bridges.odometry import Odometer  # noqa: PLC0415
+    from bridges.khepera4.link import KTeam, Park  # noqa: PLC0415
+    from bridges.khepera4.odometry import Odometer  # noqa: PLC0415
 
     class Line:
         def __init__(self, parts: list[bytes]) -> None:
@@ -108,26 +108,30 @@ def khepera_bridge() -> Iterator[Target]:
 
 
 def _vicon_stream() -> list[bytes]:
-    names = b"".join([datastream.pack_stream_info(100.0), datastream.pack_axes(), *(
-        datastream.pack_subject(k, name) for k, name in enumerate(("cf1", "kh1")))])  # fmt: skip
+    names = b"".join([vicon_datastream.pack_stream_info(100.0), vicon_datastream.pack_axes(), *(
+        vicon_datastream.pack_subject(k, name) for k, name in enumerate(("cf1", "kh1")))])  # fmt: skip
     eye = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     frames = []
     for number in range(3):
-        parts = [datastream.pack_frame_number(number), datastream.pack_latency([("a", 0.002), ("b", 0.001)])]
-        parts += [datastream.pack_segments(k, [Segment(0, (0.1 * number, 0.2, 0.3), eye)]) for k in range(2)]
+        parts = [
+            vicon_datastream.pack_frame_number(number),
+            vicon_datastream.pack_latency([("a", 0.002), ("b", 0.001)]),
+        ]
+        parts += [vicon_datastream.pack_segments(k, [Segment(0, (0.1 * number, 0.2, 0.3), eye)]) for k in range(2)]
         frames.append(b"".join(parts))
     return [
-        datastream.packet(names, frames[0]), datastream.packet(names, frames[0]) + datastream.packet(frames[1]),
-        datastream.packet(frames[1]), datastream.packet(names), datastream.packet(names,
-        datastream.pack_axes(1), frames[2]),
-        datastream.pack_kinds(datastream.POSES),
+        vicon_datastream.packet(names, frames[0]),
+        vicon_datastream.packet(names, frames[0]) + vicon_datastream.packet(frames[1]),
+        vicon_datastream.packet(frames[1]), vicon_datastream.packet(names), vicon_datastream.packet(names,
+        vicon_datastream.pack_axes(1), frames[2]),
+        vicon_datastream.pack_kinds(vicon_datastream.POSES),
     ]  # fmt: skip
 
 
 def vicon_bridge() -> Iterator[Target]:
     """What a DataStream server sends, in chunks."""
-    from bridges.datastream import Decoder  # noqa: PLC0415
-    from bridges.vicon import Sieve  # noqa: PLC0415
+    from bridges.vicon.client import Decoder  # noqa: PLC0415
+    from bridges.vicon.publisher import Sieve  # noqa: PLC0415
 
     def make():
         decoder, sieve, t = Decoder(), Sieve({"CF01": "cf1", "KH01": "kh1"}, lambda _: None), 0.0
@@ -135,12 +139,12 @@ def vicon_bridge() -> Iterator[Target]:
         def take(data: bytes) -> None:
             nonlocal t
             t += 0.01
-            framer = datastream.Framer()  # the connection is made anew after every error
+            framer = vicon_datastream.Framer()  # the connection is made anew after every error
             for begin in range(0, len(data), 4000):
                 for body in framer.feed(data[begin : begin + 4000]):
-                    for kind, payload in datastream.blocks(body):
+                    for kind, payload in vicon_datastream.blocks(body):
                         if kind == Kind.OBJECT_ENUMS:
-                            datastream.unpack_kinds(payload)
+                            vicon_datastream.unpack_kinds(payload)
                     frame = decoder.frame(body)
                     if frame is not None:
                         for _, measured, segment, yaw in sieve.sift(frame, t):
@@ -148,15 +152,15 @@ def vicon_bridge() -> Iterator[Target]:
 
         return take
 
-    yield Target(_vicon_stream(), Renewed(make, 300), (datastream.Malformed,))
+    yield Target(_vicon_stream(), Renewed(make, 300), (vicon_datastream.Malformed,))
 
 
 def vicon_twin() -> Iterator[Target]:
     """What a client sends to the server."""
-    from twins.vicon import ViconTwin, _Client  # noqa: PLC0415
+    from twins.devices.vicon import ViconTwin, _Client  # noqa: PLC0415
 
-    ask = datastream.packet(datastream.block(Kind.REQUEST_FRAME, b"\1"))
-    one = datastream.packet(datastream.block(Kind.REQUEST_NEXT_FRAME))
+    ask = vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_FRAME, b"\1"))
+    one = vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_NEXT_FRAME))
     vicon = ViconTwin(["cf1", "kh1"])
     t = 0.0
 
@@ -170,7 +174,10 @@ def vicon_twin() -> Iterator[Target]:
             vicon.serve(wire, t)
         vicon.advance(t)
 
-    yield Target([datastream.pack_kinds(datastream.POSES) + ask, ask, one, datastream.packet() + one + one], take)
+    yield Target(
+        [vicon_datastream.pack_kinds(vicon_datastream.POSES) + ask, ask, one, vicon_datastream.packet() + one + one],
+        take,
+    )
     vicon._clients.clear()
     vicon.close()
 

@@ -16,14 +16,14 @@ from agents.protocols.crtp import HighLevel, Log, Misc, Port, Safety, Setpoint
 from tests.fuzz.sockets import Wire
 from tests.fuzz.target import Place, Renewed, Target
 from tests.twins.loopback import request as twin_request
-from twins.device import DeviceRequest, Faults
+from twins.devices.device import DeviceRequest, Faults
 
 # ---------------------------------------------------------------------- the Crazyflie
 
 
 def crazyflie_twin() -> Iterator[Target]:
     """CRTP packets, one or more behind each other (length, bytes), in the air and on the ground."""
-    from twins.crazyflie import open_device  # noqa: PLC0415
+    from twins.devices.crazyflie.device import open_device  # noqa: PLC0415
 
     def packet(port: Port, channel: int, data: bytes) -> bytes:
         return bytes((1 + len(data), crtp.header(port, channel))) + data
@@ -97,7 +97,7 @@ def crazyflie_twin() -> Iterator[Target]:
 
 def tello_twin() -> Iterator[Target]:
     """Words over UDP, datagrams apart by zero bytes."""
-    from twins.tello import open_device  # noqa: PLC0415
+    from twins.devices.tello import open_device  # noqa: PLC0415
 
     words = [
         "command", "takeoff", "land", "emergency", "stop", "rc 10 -20 30 40", "rc 100 100 100 100", "up 50", "back 100",
@@ -158,12 +158,12 @@ class Drone:
 
 def tello_pilot() -> Iterator[Target]:
     """A drone's state lines and answers: state and answer with a zero byte between them."""
-    from agents.kinds import KINDS  # noqa: PLC0415
+    from agents.body.kinds import KINDS  # noqa: PLC0415
     from agents.protocols.tello import Settings  # noqa: PLC0415
-    from bridges.tello_pilot import Pilot  # noqa: PLC0415
+    from bridges.tello.pilot import Pilot  # noqa: PLC0415
 
     if "av" not in sys.modules and importlib.util.find_spec("av") is None:
-        sys.modules["av"] = types.ModuleType("av")  # only its video would need it, see `bridges.tello`
+        sys.modules["av"] = types.ModuleType("av")  # only its video would need it, see `bridges.tello.body`
     import djitellopy.tello  # noqa: PLC0415
 
     djitellopy.tello.Tello.LOGGER.setLevel("CRITICAL")  # it says every line that it cannot read

@@ -16,12 +16,14 @@ from typing import Any
 
 import msgspec
 
-from agents import plugins, wire
-from agents.body import BodyError
-from agents.endpoint import EndpointError
-from experiments import catalogue, document
-from experiments.document import DocumentError, write_json
-from experiments.records import RecordingError
+from agents.body.interface import BodyError
+from agents.network import messages as wire
+from agents.network.endpoints import EndpointError
+from agents.plugins import registry
+from experiments.catalogue import index
+from experiments.file import document
+from experiments.file.document import DocumentError, write_json
+from experiments.recording.reader import RecordingError
 from tests.fuzz.messages import KEYS, good, of_all
 from tests.fuzz.target import Place, Target
 
@@ -46,7 +48,7 @@ def refused_well(error: DocumentError) -> None:
 def experiment(suffix: str, examples: list[bytes]) -> Iterator[Target]:
     """An experiment file; what is read can be written and read again."""
     with place_for(f"some{suffix}") as file:
-        for arena in catalogue.FOLDER.glob("*.arena.toml"):
+        for arena in index.FOLDER.glob("*.arena.toml"):
             (file.parent / arena.name).write_bytes(arena.read_bytes())
 
         def take(data: bytes) -> None:
@@ -63,7 +65,7 @@ def experiment(suffix: str, examples: list[bytes]) -> Iterator[Target]:
 
 def toml() -> Iterator[Target]:
     """The catalogue, and every malformed file of the tests."""
-    files = [*sorted(catalogue.FOLDER.glob("*.toml")), *sorted(MALFORMED.glob("*.toml"))]
+    files = [*sorted(index.FOLDER.glob("*.toml")), *sorted(MALFORMED.glob("*.toml"))]
     small = (
         b'title = "x"\nduration_s = 1.0\n[robots.K]\nkind = "khepera4"\nstart = [0, 0]\n[formation.links]\n[cases.a]\n'
     )
@@ -90,7 +92,7 @@ def arena() -> Iterator[Target]:
                 refused_well(error)
                 raise
 
-        examples = [each.read_bytes() for each in sorted(catalogue.FOLDER.glob("*.arena.toml"))]
+        examples = [each.read_bytes() for each in sorted(index.FOLDER.glob("*.arena.toml"))]
         yield Target([*examples, b"[arena]\nsize = [4, 4, 2]\n"], take, (DocumentError,))
 
 
@@ -118,8 +120,8 @@ def overrides() -> Iterator[Target]:
 
 def park_yaml() -> Iterator[Target]:
     """Files of Robotic Park's authors; what becomes of them is read."""
-    from experiments.importing import imported  # noqa: PLC0415
-    from experiments.syntax import decoded  # noqa: PLC0415
+    from experiments.authoring.robotic_park.convert import imported  # noqa: PLC0415
+    from experiments.file.text import decoded  # noqa: PLC0415
     from tests.experiments import robotic_park_files as theirs  # noqa: PLC0415
 
     examples = [theirs.dome(4).encode(), theirs.column(3, 1).encode(), theirs.dome(5, origin=True, real=(0,)).encode()]
@@ -145,8 +147,8 @@ def recording_bytes(*, plain: bool) -> list[bytes]:
     """Recordings of a second: as they are made, or neither compressed nor guarded by checksums."""
     from mcap.writer import CompressionType, Writer  # noqa: PLC0415
 
-    from experiments import recording  # noqa: PLC0415
-    from experiments.records import Records  # noqa: PLC0415
+    from experiments.recording import writer as recording  # noqa: PLC0415
+    from experiments.recording.reader import Records  # noqa: PLC0415
 
     what = document.read("triangle", ["duration_s=1.0", "timeline=[]"]).experiment
     made = []
@@ -225,8 +227,8 @@ def resealed(data: bytes) -> bytes:
 
 def recording_of(*, plain: bool) -> Iterator[Target]:
     """A recording is read, analysed as `zenpark report` begins, and recovered."""
-    from experiments import playback  # noqa: PLC0415
-    from experiments.recover import recover  # noqa: PLC0415
+    from experiments.recording import playback  # noqa: PLC0415
+    from experiments.recording.recover import recover  # noqa: PLC0415
 
     with place_for("some.mcap") as file:
         target = file.with_name("other.mcap")
@@ -255,8 +257,8 @@ def forged() -> Iterator[Target]:
 
 def cdr() -> Iterator[Target]:
     """Every recorded struct: name and CDR with a zero byte between them; what is decoded can be encoded."""
-    from experiments.cdr import Undecodable, Unencodable, codec  # noqa: PLC0415
-    from experiments.recording import SentGoal, SentPose  # noqa: PLC0415
+    from experiments.recording.cdr import Undecodable, Unencodable, codec  # noqa: PLC0415
+    from experiments.recording.writer import SentGoal, SentPose  # noqa: PLC0415
 
     said = good("KH01")
     pose: Any = said["pose"][0]
@@ -283,8 +285,8 @@ def cdr() -> Iterator[Target]:
 
 def sweep_runs() -> Iterator[Target]:
     """`runs.jsonl` and `origin.json` of a sweep: lines that cannot be read are counted, not fatal."""
-    from experiments.sweep_runs import Figures  # noqa: PLC0415
-    from experiments.sweep_store import ORIGIN, RUNS, Origin, Store  # noqa: PLC0415
+    from experiments.sweep.runs import Figures  # noqa: PLC0415
+    from experiments.sweep.store import ORIGIN, RUNS, Origin, Store  # noqa: PLC0415
 
     kinds = {int: 1, float: 0.5, bool: True, str: "x"}
     blank = {
@@ -308,7 +310,7 @@ def sweep_runs() -> Iterator[Target]:
 
 def sweep_arguments() -> Iterator[Target]:
     """Axes and seeds, one a line."""
-    from experiments.sweep_plan import arguments, cells, seeds_of  # noqa: PLC0415
+    from experiments.sweep.plan import arguments, cells, seeds_of  # noqa: PLC0415
 
     read = document.read("triangle")
     lines = [
@@ -337,15 +339,15 @@ def sweep_arguments() -> Iterator[Target]:
 
 def words() -> Iterator[Target]:
     """Addresses, endpoints, settings of devices, faults, key expressions: kind and text with a zero byte between."""
-    from agents import settings as sessions  # noqa: PLC0415
+    from agents.body.interface import settings  # noqa: PLC0415
+    from agents.network import zenoh_config as sessions  # noqa: PLC0415
     from agents.protocols import crazyflie, khepera4, tello, turtlebot3  # noqa: PLC0415
-    from agents.protocols.settings import settings  # noqa: PLC0415
     from bridges.crazyflie.positioning import stations  # noqa: PLC0415
-    from bridges.khepera4_link import Address  # noqa: PLC0415
-    from bridges.vicon import split  # noqa: PLC0415
-    from experiments.links import pairs  # noqa: PLC0415
-    from tools.network import KeyExpressionError, key_expression  # noqa: PLC0415
-    from twins import vicon  # noqa: PLC0415
+    from bridges.khepera4.link import Address  # noqa: PLC0415
+    from bridges.vicon.publisher import split  # noqa: PLC0415
+    from experiments.definition.links import pairs  # noqa: PLC0415
+    from tools.commands.network import KeyExpressionError, key_expression  # noqa: PLC0415
+    from twins.devices import vicon  # noqa: PLC0415
 
     kinds = (crazyflie.Settings, khepera4.Settings, tello.Settings, turtlebot3.Settings)
 
@@ -372,7 +374,7 @@ def words() -> Iterator[Target]:
             "faults": vicon._faults,
             "device": device,
             "key": key_expression,
-            "plugin": lambda text: plugins.struct(plugins.TRIGGERS, text),
+            "plugin": lambda text: registry.struct(registry.TRIGGERS, text),
             "link": pairs,
             "park": lambda text: khepera4.scanned(text) + khepera4.numbers(text),
             "stations": lighthouse,
@@ -404,7 +406,7 @@ def words() -> Iterator[Target]:
             read[name if name in read else names[len(data) % len(names)]](text)
 
         refusals = (
-            BodyError, EndpointError, KeyExpressionError, plugins.PluginError, argparse.ArgumentTypeError,
+            BodyError, EndpointError, KeyExpressionError, registry.PluginError, argparse.ArgumentTypeError,
             msgspec.MsgspecError, ValueError,
         )  # fmt: skip
         yield Target(examples, take, refusals)

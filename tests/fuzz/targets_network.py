@@ -14,12 +14,14 @@ from typing import get_args
 import msgspec
 import numpy as np
 
-from agents import wire
-from agents.body import BodyRequest, Disturbance
-from agents.kinds import KINDS
-from agents.runtime import Runtime
-from agents.setup import Setup
-from experiments import assign, document, orders
+from agents.body.interface import BodyRequest, Disturbance
+from agents.body.kinds import KINDS
+from agents.network import messages as wire
+from agents.runtime.loop import Runtime
+from agents.runtime.setup import Setup
+from experiments.definition import assignment, bodies
+from experiments.file import document
+from experiments.real_time.conductor import orders
 from tests.fuzz.loopnet import Net, Reply, Sample
 from tests.fuzz.messages import KEYS, everything, good, of_all, sent
 from tests.fuzz.target import Place, Renewed, Target
@@ -52,15 +54,15 @@ def messages() -> Iterator[Target]:
 
 def robot() -> Iterator[Target]:
     """A robot's process: poses, tokens, orders, stops, positions, ranges; its body is never told nonsense."""
-    from agents.fleet import assemble  # noqa: PLC0415
+    from agents.body.fleet import assemble  # noqa: PLC0415
 
     experiment = document.read("triangle", ["robots.KH01.position=external", "avoidance=barrier"]).experiment
 
     def make():
         net.forget()
-        body = assemble(assign.request(experiment, ["KH01"], [1], ["tcp/127.0.0.1:1"]))
+        body = assemble(bodies.request(experiment, ["KH01"], [1], ["tcp/127.0.0.1:1"]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True], ranging=["world"])
-        runtime = Runtime(assign.assign(experiment, ["KH01"]), body, setup)
+        runtime = Runtime(assignment.assign(experiment, ["KH01"]), body, setup)
         body.open()
         runtime._join(net.session)
         runtime._utc = runtime._telemetry.utc = time.time()
@@ -105,8 +107,8 @@ def robot() -> Iterator[Target]:
 
 def world() -> Iterator[Target]:
     """The twin service: commands, states of those elsewhere, statuses, and orders to put things in and out."""
-    from experiments.population import Population  # noqa: PLC0415
-    from experiments.world import WorldProcess  # noqa: PLC0415
+    from experiments.real_time.processes.world import WorldProcess  # noqa: PLC0415
+    from experiments.real_time.processes.world_population import Population  # noqa: PLC0415
 
     changes = ["robots.KH01.body=world", "robots.KH02.body=world", "world.engine=pymunk"]
     experiment = document.read("triangle", changes).experiment
@@ -135,8 +137,8 @@ def world() -> Iterator[Target]:
 
 def recorder() -> Iterator[Target]:
     """The recorder writes what is honest and counts the rest; what it wrote can be read."""
-    from experiments.recorder import Recorder  # noqa: PLC0415
-    from experiments.recording import Recording  # noqa: PLC0415
+    from experiments.real_time.processes.recorder import Recorder  # noqa: PLC0415
+    from experiments.recording.writer import Recording  # noqa: PLC0415
 
     experiment = document.read("triangle").experiment
 
@@ -165,8 +167,8 @@ def recorder() -> Iterator[Target]:
 
 def conductor() -> Iterator[Target]:
     """The conductor follows the robots' statuses, states and tokens, and changes robots when it is asked."""
-    from experiments.conductor import Conductor  # noqa: PLC0415
-    from experiments.hosts import Hosts  # noqa: PLC0415
+    from experiments.real_time.conductor.conductor import Conductor  # noqa: PLC0415
+    from experiments.real_time.hosts.hosts import Hosts  # noqa: PLC0415
 
     experiment = document.read("triangle").experiment
 
@@ -243,7 +245,7 @@ def external_body() -> Iterator[Target]:
 
 def vicon_truths() -> Iterator[Target]:
     """The simulated Vicon hears where twins are."""
-    from twins.vicon import Truths, ViconTwin  # noqa: PLC0415
+    from twins.devices.vicon import Truths, ViconTwin  # noqa: PLC0415
 
     with Net().worn() as net:
         vicon = ViconTwin(["KH01", "KH02"])
@@ -265,7 +267,7 @@ def vicon_truths() -> Iterator[Target]:
 
 def answers() -> Iterator[Target]:
     """Whoever gives orders reads the answers; whoever looks at the network the admin space."""
-    from tools.network import members, readable  # noqa: PLC0415
+    from tools.commands.network import members, readable  # noqa: PLC0415
 
     examples = []
     for message in (wire.Reply("KH01", True, "ready", "", 0.1), wire.WorldReply(True, False, 1.0, "")):

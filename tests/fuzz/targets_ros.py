@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from agents.keys import Keys
+from agents.network.keys import Keys
 from agents.protocols import ros2
 from tests.fuzz.loopnet import Net, Sample
 from tests.fuzz.target import Place, Renewed, Target
 from tests.fuzz.targets_network import request
-from twins.device import DeviceRequest, Faults
+from twins.devices.device import DeviceRequest, Faults
 
 # ---------------------------------------------------------------------- ROS 2
 
@@ -80,7 +80,7 @@ def ros() -> Iterator[Target]:
 
 def turtlebot_bridge() -> Iterator[Target]:
     """Odometry, scans, batteries and tokens of a robot."""
-    from bridges.turtlebot3 import TurtleBot3  # noqa: PLC0415
+    from bridges.turtlebot3.body import TurtleBot3  # noqa: PLC0415
 
     good = ros_messages()
     topics = {"odom": ros2.ODOMETRY, "scan": ros2.LASER_SCAN, "battery_state": ros2.BATTERY_STATE}
@@ -110,7 +110,7 @@ def turtlebot_bridge() -> Iterator[Target]:
 
 def turtlebot_twin() -> Iterator[Target]:
     """Commands to the twin of a robot."""
-    from twins.turtlebot3 import open_device  # noqa: PLC0415
+    from twins.devices.turtlebot3 import open_device  # noqa: PLC0415
 
     good = ros_messages()
 
@@ -134,7 +134,7 @@ def turtlebot_twin() -> Iterator[Target]:
 
 def ros_graph() -> Iterator[Target]:
     """The bridge to ROS 2: states and statuses of robots, goals from ROS."""
-    from agents.rosnode import Participant  # noqa: PLC0415
+    from agents.protocols.ros2_node import Participant  # noqa: PLC0415
     from bridges.ros2 import Graph  # noqa: PLC0415
     from tests.fuzz.messages import everything  # noqa: PLC0415
 

@@ -19,10 +19,10 @@ import zenoh
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from agents import session as network
-from agents import wire
-from agents.keys import Keys
-from experiments import orders
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from experiments.real_time.conductor import orders
 from experiments.run import reopen
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -91,20 +91,20 @@ class Watcher(Looking):
     def __init__(self, *endpoints: str) -> None:
         self.keys = Keys()
         self.session = network.open_session(endpoints, name="test", identity="operator")
-        self._statuses = network.pose_subscriber(self.session, self.keys.status("*"), 4096)
-        self._states = network.subscriber(self.session, self.keys.state("*"), 8192)
-        self._alive = network.alive_watch(self.session, self.keys.alive("*"))
-        self.status: dict[str, wire.Status] = {}
-        self.state: dict[str, wire.State] = {}
+        self._statuses = pubsub.pose_subscriber(self.session, self.keys.status("*"), 4096)
+        self._states = pubsub.subscriber(self.session, self.keys.state("*"), 8192)
+        self._alive = pubsub.alive_watch(self.session, self.keys.alive("*"))
+        self.status: dict[str, messages.Status] = {}
+        self.state: dict[str, messages.State] = {}
         self.alive: set[str] = set()
 
     def look(self) -> None:
         for sample in network.received(self._statuses.handler):
-            status = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Status)
+            status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
             self.status[status.robot] = status
         for sample in network.received(self._states.handler):
-            with contextlib.suppress(wire.Malformed):  # a test may say nonsense on any key
-                state = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.State)
+            with contextlib.suppress(messages.Malformed):  # a test may say nonsense on any key
+                state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
                 self.state[state.robot] = state
         for sample in network.received(self._alive.handler):
             robot = self.keys.whose(str(sample.key_expr)) or ""  # a test may hold a token on any key
@@ -113,7 +113,7 @@ class Watcher(Looking):
     def phase(self, robot: str) -> str:
         return self.status[robot].phase if robot in self.status else ""
 
-    def order(self, robot: str, order: wire.Order) -> wire.Reply:
+    def order(self, robot: str, order: messages.Order) -> messages.Reply:
         return orders.give(self.session, self.keys, [robot], order)[robot]
 
     def close(self) -> None:
@@ -158,7 +158,7 @@ class RobotProcess(Started):
 
     def __init__(self, endpoint: str, file: str | Path, *names: str, lifeline: bool = False) -> None:
         more = ["--lifeline"] if lifeline else []
-        super().__init__("experiments.robot", str(file), *names, "--connect", endpoint, *more)
+        super().__init__("experiments.real_time.processes.robot", str(file), *names, "--connect", endpoint, *more)
 
 
 class WorldProcess(Started):
@@ -167,7 +167,7 @@ class WorldProcess(Started):
     patience_s = 25.0
 
     def __init__(self, endpoint: str, file: str | Path, *arguments: str) -> None:
-        super().__init__("experiments.world", str(file), "--connect", endpoint, *arguments)
+        super().__init__("experiments.real_time.processes.world", str(file), "--connect", endpoint, *arguments)
         assert self.process.stdout is not None
         self.ready = self.process.stdout.readline().strip()
 
@@ -197,20 +197,20 @@ class Flight:
                 line = child.cmdline()
             except (psutil.NoSuchProcess, psutil.ZombieProcess):
                 continue
-            if "experiments.robot" in line:
-                for name in line[line.index("experiments.robot") + 2 : line.index("--connect")]:
+            if "experiments.real_time.processes.robot" in line:
+                for name in line[line.index("experiments.real_time.processes.robot") + 2 : line.index("--connect")]:
                     found[name] = child
-            elif "agents.router" in line:
+            elif "agents.runtime.router" in line:
                 found["router"] = child
-            elif "experiments.recorder" in line:
+            elif "experiments.real_time.processes.recorder" in line:
                 found["recorder"] = child
-            elif "bridges.vicon" in line:
+            elif "bridges.vicon.publisher" in line:
                 found["vicon"] = child
-            elif "twins.vicon" in line:
+            elif "twins.devices.vicon" in line:
                 found["vicon-twin"] = child
-            elif "experiments.world" in line:
+            elif "experiments.real_time.processes.world" in line:
                 found["world"] = child
-            elif "experiments.centre" in line:
+            elif "experiments.real_time.processes.centre" in line:
                 found["centre"] = child
         return found
 

@@ -14,13 +14,13 @@ from pathlib import Path
 import msgspec
 import zenoh
 
-from agents import lab, wire
-from agents.endpoint import free_endpoint
-from agents.settings import config, settings
-from experiments import access
-from experiments.run import load
+from agents.network import lab, messages
+from agents.network.endpoints import free_endpoint
+from agents.network.zenoh_config import config, settings
+from experiments.definition import access_rights
+from experiments.file.document import load
 from tests.system.lab import ENVIRONMENT, ROOT, RobotProcess, Watcher, until
-from tools import authority
+from tools.commands import authority
 
 FILE = ROOT / "tests" / "system" / "secured.toml"
 FLOWN = ("KH01", "KH02", "CF01")
@@ -35,19 +35,19 @@ class Laboratory:
         robots = dict.fromkeys(next(iter(cases.values())).robots, "robot")
         authority.create(self.folder, {**{role: role for role in authority.SERVICES}, **robots})
         self.rights = folder / "rights.json"
-        rights = msgspec.structs.replace(access.rights(cases.values()), linked=linked)
+        rights = msgspec.structs.replace(access_rights.rights(cases.values()), linked=linked)
         self.rights.write_bytes(msgspec.json.encode(rights))
         self.plain = free_endpoint(preferred_port=0, protocol=protocol)
         (self.endpoint,) = lab.secured([self.plain], self.folder)
         self.robots: list[RobotProcess] = []
-        self.last: dict[str, wire.Status] = {}
+        self.last: dict[str, messages.Status] = {}
         self.process: subprocess.Popen[str]
         self.start()
 
     def start(self) -> None:
         """Starts the router."""
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "agents.router", "--listen", self.endpoint, "--rights", str(self.rights)],
+            [sys.executable, "-m", "agents.runtime.router", "--listen", self.endpoint, "--rights", str(self.rights)],
             cwd=ROOT,
             env=ENVIRONMENT,
             stdin=subprocess.DEVNULL,
@@ -63,17 +63,17 @@ class Laboratory:
         self.watcher = Watcher(self.endpoint)
         self.reach("ready")
         for name in FLOWN:
-            assert self.watcher.order(name, wire.Order("takeoff")).ok
+            assert self.watcher.order(name, messages.Order("takeoff")).ok
         self.reach("airborne")
         at = time.time() + 0.3
         for name in FLOWN:
-            assert self.watcher.order(name, wire.Order("start", at=at)).ok
+            assert self.watcher.order(name, messages.Order("start", at=at)).ok
         self.reach("running")
 
     def reach(self, phase: str) -> None:
         self.watcher.until(lambda: all(self.watcher.phase(name) == phase for name in FLOWN), f"all are {phase}")
 
-    def statuses(self) -> dict[str, wire.Status]:
+    def statuses(self) -> dict[str, messages.Status]:
         """Fresh ones, of every robot."""
         since = time.time()
         watcher = self.watcher

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from agents import wire
-from agents.endpoint import free_endpoint
-from agents.lab import Role
-from experiments import entries, playback
+from agents.network import messages
+from agents.network.endpoints import free_endpoint
+from agents.network.lab import Role
+from experiments.file import catalogue
+from experiments.recording import playback
 from tests.conftest import RouterProcess
 from tests.system.lab import Flight, RobotProcess, Started, Watcher
-from tools import authority
+from tools.commands import authority
 
 pytestmark = pytest.mark.system
 
@@ -24,7 +25,7 @@ SHORT = ("--json", "--set", "duration_s=2", "--no-report")
 
 def experiment(folder: Path, endpoint: str) -> str:
     file = folder / "x.toml"
-    text = entries.path("triangle").read_text("utf-8")
+    text = catalogue.path("triangle").read_text("utf-8")
     text += f'\n[network]\nconnect = ["{endpoint}"]\n[hosts.board]\nrobots = ["KH02"]\n'
     file.write_text(text)
     return str(file)
@@ -45,7 +46,7 @@ def test_who_is_there_is_adopted_and_who_has_flown_is_not(router: RouterProcess,
         watcher.until(lambda: watcher.phase("KH02") == "running", "it takes part")
         assert at_boot.wait() == 0, "with --once it ends when it is down, so that its service starts it anew"
         watcher.until(lambda: watcher.status["KH02"].reason == "finished", "it knew what --set had changed")
-        assert watcher.order("CF01", wire.Order("land")).ok, "its own file has twenty seconds"
+        assert watcher.order("CF01", messages.Order("land")).ok, "its own file has twenty seconds"
     finally:
         watcher.close()
     code, out = flight.finish()

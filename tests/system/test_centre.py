@@ -11,14 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents import session as network
-from agents import wire
-from agents.keys import Keys
-from experiments import playback
-from experiments.run import load, reopen
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from experiments.file.document import load
+from experiments.recording import playback
+from experiments.run import reopen
 from tests.conftest import RouterProcess
 from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher, gone, until
-from tools import authority
+from tools.commands import authority
 
 pytestmark = pytest.mark.system
 
@@ -102,7 +103,7 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
     watcher.until(lambda: len(watcher.status) == 3, "they are there")
     watcher.until(lambda: "never heard centre" in watcher.status["KH01"].reason, "they wait for the centre")
     assert watcher.status["KH01"].missing == ["centre"]
-    command = [sys.executable, "-m", "experiments.centre", str(file), "--connect", router.endpoint]
+    command = [sys.executable, "-m", "experiments.real_time.processes.centre", str(file), "--connect", router.endpoint]
     centre = subprocess.Popen(
         command, cwd=ROOT, env=ENVIRONMENT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
     )
@@ -114,11 +115,11 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
     assert "a centre guides the robots of the realm 'park' already" in second.stderr
 
     for name in watcher.status:
-        assert watcher.order(name, wire.Order("takeoff")).ok
+        assert watcher.order(name, messages.Order("takeoff")).ok
     watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in watcher.status), "airborne")
     at = time.time() + 0.3
     for name in watcher.status:
-        assert watcher.order(name, wire.Order("start", at=at)).ok
+        assert watcher.order(name, messages.Order("start", at=at)).ok
     watcher.until(lambda: watcher.state["KH01"].phase == "running" and watcher.state["KH01"].followed, "it is guided")
 
     refused = watcher.status["KH01"].malformed
@@ -127,23 +128,25 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
     now = time.time()
     nonsense = (
         b"no goal at all",
-        wire.encode(wire.Goal("KH02", 2**52, now, (0.0, 0.0, 0.0), None, now)),
-        wire.encode(wire.Goal("KH01", 2**52, now, (1e3, 0.0, 0.0), None, now)),
-        wire.encode(wire.Goal("KH01", 2**52, now - 5.0, (0.0, 0.0, 0.0), None, now - 5.0)),
-        wire.encode(wire.Goal("KH01", 1, now, (0.0, 0.0, 0.0), None, now)),  # of a centre that came before
+        messages.encode(messages.Goal("KH02", 2**52, now, (0.0, 0.0, 0.0), None, now)),
+        messages.encode(messages.Goal("KH01", 2**52, now, (1e3, 0.0, 0.0), None, now)),
+        messages.encode(messages.Goal("KH01", 2**52, now - 5.0, (0.0, 0.0, 0.0), None, now - 5.0)),
+        messages.encode(messages.Goal("KH01", 1, now, (0.0, 0.0, 0.0), None, now)),  # of a centre that came before
     )
     for payload in nonsense:
-        watcher.session.put(KEYS.goal("KH01"), payload, encoding=wire.JSON)
+        watcher.session.put(KEYS.goal("KH01"), payload, encoding=messages.JSON)
     watcher.until(lambda: watcher.status["KH01"].malformed >= refused + 5, "all are refused")
     assert watcher.state["KH01"].phase == "running"
     assert abs(watcher.state["KH01"].goal[0]) < 3.0
 
-    subscriber = network.pose_subscriber(watcher.session, KEYS.centre)
-    reports: list[wire.CentreState] = []
+    subscriber = pubsub.pose_subscriber(watcher.session, KEYS.centre)
+    reports: list[messages.CentreState] = []
 
     def reported() -> object:
         came = network.received(subscriber.handler)
-        reports.extend(wire.decode(each.payload.to_bytes(), str(each.encoding), wire.CentreState) for each in came)
+        reports.extend(
+            messages.decode(each.payload.to_bytes(), str(each.encoding), messages.CentreState) for each in came
+        )
         return bool(reports) and reports[-1].heard["KH01"] > 0  # the first may be from before the run
 
     watcher.until(reported, "the centre says how it is, and that it hears KH01")
@@ -170,7 +173,7 @@ def test_a_lab_lets_the_centre_decide_and_nobody_else(tmp_path: Path) -> None:
     flight.until_said(r"phase conductor: TB01 under way", 60.0)
     watcher = Watcher(flight.endpoint())
     watcher.until(lambda: {"TB01", "KH01", "KH02"} <= {*watcher.state}, "telemetry")
-    goal, own = (network.subscriber(watcher.session, key) for key in (KEYS.goal("KH01"), KEYS.ranges("KH02")))
+    goal, own = (pubsub.subscriber(watcher.session, key) for key in (KEYS.goal("KH01"), KEYS.ranges("KH02")))
     flight.children()["router"].kill()
     flight.until_said(r"router conductor: the router ended \(killed by SIGKILL\); started again")
     again = time.time()
@@ -179,15 +182,15 @@ def test_a_lab_lets_the_centre_decide_and_nobody_else(tmp_path: Path) -> None:
         before = watcher.status["KH01"].malformed
 
         def arrives() -> bool:
-            session.put(KEYS.goal("KH01"), b"of another robot", encoding=wire.JSON)
-            session.put(KEYS.ranges("KH02"), b"its own", encoding=wire.JSON)
+            session.put(KEYS.goal("KH01"), b"of another robot", encoding=messages.JSON)
+            session.put(KEYS.ranges("KH02"), b"its own", encoding=messages.JSON)
             return any(network.received(own.handler))
 
         watcher.until(arrives, "what it says on its own key is heard")
     watcher.until(lambda: watcher.state["TB01"].position[0] < -0.7, "the leader goes on")
     heard = [sample.payload.to_bytes() for sample in network.received(goal.handler)]
     assert b"of another robot" not in heard
-    assert max(wire.decode(each, wire.JSON, wire.Goal).stamp for each in heard) > again
+    assert max(messages.decode(each, messages.JSON, messages.Goal).stamp for each in heard) > again
     assert watcher.status["KH01"].malformed == before
     watcher.close()
     code, out = flight.finish(60.0)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-import tools.estop
-from agents import registry
-from experiments import playback
+from agents.runtime import run_registry
+from experiments.recording import playback
 from tests.system.lab import ENVIRONMENT, ROOT, Flight
+from tools.commands import estop as estop_command
 
 pytestmark = pytest.mark.system
 
@@ -51,11 +51,11 @@ def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
         f"another run is up with robots of these names (CF01, KH01): two that stay together, {folder}" in other.said()
     )
     up = [[flight.endpoint()], [other.endpoint()]]
-    assert [run.endpoints for run in registry.runs()] == up
-    monkeypatch.setattr(tools.estop, "DEFAULT_ENDPOINT", flight.endpoint())  # whoever else uses this machine
-    assert tools.estop.runs(as_json=True) == 0
+    assert [run.endpoints for run in run_registry.runs()] == up
+    monkeypatch.setattr(estop_command, "DEFAULT_ENDPOINT", flight.endpoint())  # whoever else uses this machine
+    assert estop_command.runs(as_json=True) == 0
     assert [run["robots"] for run in json.loads(capsys.readouterr().out)] == [{"CF01": "", "KH01": ""}] * 2
-    assert tools.estop.command(connect=[], realm=None, reason="person in arena", who=None) == 0
+    assert estop_command.command(connect=[], realm=None, reason="person in arena", who=None) == 0
     assert capsys.readouterr().out.splitlines() == [
         f"stopped: CF01, KH01 (two that stay together, {each.folder}, at {endpoint})"
         for each, (endpoint,) in zip((flight, other), up, strict=True)
@@ -64,7 +64,7 @@ def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
     assert other.finish()[0] == 1
     flight.until_said(r"stop conductor: emergency stop by operator: person in arena; the run ends here")
     code, _ = flight.finish()
-    assert registry.runs() == []
+    assert run_registry.runs() == []
     said = flight.said()
     assert code == 1
     assert "zenpark: emergency stop by operator: person in arena" in said

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from agents import session as network
-from agents import wire
-from agents.watchdog import HUNG
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.runtime.watchdog import HUNG
 from tests.conftest import RouterProcess
 from tests.system.lab import ENVIRONMENT, PATIENCE_S, ROOT, RobotProcess, Watcher, WorldProcess
 
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.system
 HANGS = """
 import threading
 from pathlib import Path
-from agents.triggers import Trigger
+from agents.plugins.triggers import Trigger
 
 class Hangs(Trigger, frozen=True):
     file: str = ""
@@ -40,13 +40,13 @@ class Truth(Watcher):
 
     def __init__(self, endpoint: str) -> None:
         super().__init__(endpoint)
-        self._truths = network.subscriber(self.session, self.keys.truth("*"), 4096)
-        self.place: dict[str, wire.Position] = {}
+        self._truths = pubsub.subscriber(self.session, self.keys.truth("*"), 4096)
+        self.place: dict[str, messages.Position] = {}
 
     def look(self) -> None:
         super().look()
         for sample in network.received(self._truths.handler):
-            truth = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
+            truth = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position)
             self.place[truth.robot] = truth
 
     def height(self, robot: str) -> float:
@@ -72,7 +72,7 @@ def lonely(folder: Path, trigger: str = "") -> Path:
 
 def fly(watcher: Truth) -> None:
     watcher.until(lambda: watcher.phase("TE01") == "ready", "it is ready")
-    assert watcher.order("TE01", wire.Order("takeoff")).ok
+    assert watcher.order("TE01", messages.Order("takeoff")).ok
     watcher.until(lambda: watcher.phase("TE01") == "airborne", "it is up")
 
 
@@ -89,14 +89,17 @@ def test_a_loop_that_hangs_is_landed_said_and_ended(router: RouterProcess, watch
     here = ["--connect", router.endpoint]
     started = []
     try:
-        for module, *more in (["experiments.world"], ["experiments.robot", "TE01"]):
+        for module, *more in (
+            ["experiments.real_time.processes.world"],
+            ["experiments.real_time.processes.robot", "TE01"],
+        ):
             command = [sys.executable, "-m", module, str(file), *more, *here]
             started.append(
                 subprocess.Popen(
                     command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
                 )
             )
-            if module == "experiments.world":
+            if module == "experiments.real_time.processes.world":
                 watcher.until(lambda: "TE01" in watcher.place, "the world goes")
         robot = started[1]
         fly(watcher)
@@ -127,7 +130,9 @@ def test_what_was_frozen_in_the_air_is_landed_and_knows_it(
         watcher.look()
         assert abs(watcher.height("TE01") - high) < 0.1  # the world holds it first,
         watcher.until(lambda: watcher.height("TE01") < 0.02, "the world lands it")
-        asked = watcher.session.get(watcher.keys.order("TE01"), payload=wire.encode(wire.Order("takeoff")), timeout=0.1)
+        asked = watcher.session.get(
+            watcher.keys.order("TE01"), payload=messages.encode(messages.Order("takeoff")), timeout=0.1
+        )
         assert not [reply for reply in asked if reply.ok is not None]
         robot.process.send_signal(signal.SIGCONT)
         watcher.until(lambda: watcher.status["TE01"].reason == "it came down by itself", "it knows")
@@ -181,9 +186,9 @@ def test_a_stop_behind_a_flood_of_what_is_none_is_obeyed(router: RouterProcess, 
         fly(watcher)
         for _ in range(2000):
             watcher.session.delete(watcher.keys.estop)
-        said = wire.encode(wire.Stop("a test", "now"))
+        said = messages.encode(messages.Stop("a test", "now"))
         block = zenoh.CongestionControl.BLOCK
-        watcher.session.put(watcher.keys.estop, said, encoding=wire.JSON, congestion_control=block)
+        watcher.session.put(watcher.keys.estop, said, encoding=messages.JSON, congestion_control=block)
         watcher.until(lambda: watcher.phase("TE01") == "done", "its motors are off")
         watcher.until(lambda: watcher.height("TE01") < 0.02, "it fell")
         assert watcher.status["TE01"].reason == "emergency stop by a test: now"

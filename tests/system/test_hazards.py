@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from agents import session as network
-from agents import wire
-from experiments import playback
+from agents.network import messages, pubsub
+from experiments.recording import playback
 from tests.conftest import RouterProcess
 from tests.system.lab import Flight, RobotProcess, Watcher, typed
 
@@ -75,7 +74,7 @@ def test_nobody_takes_off_without_charge_and_the_reason_is_shown(router: RouterP
     try:
         wanted = "its battery is at 100%, less than 100%"  # it uses some while it waits
         watcher.until(lambda: "A" in watcher.status and watcher.status["A"].reason == wanted, "it says why")
-        reply = watcher.order("A", wire.Order("takeoff"))
+        reply = watcher.order("A", messages.Order("takeoff"))
         assert (reply.ok, reply.reason) == (False, f"cannot take off while idle: {wanted}")
     finally:
         watcher.close()
@@ -85,13 +84,13 @@ def test_nobody_takes_off_without_charge_and_the_reason_is_shown(router: RouterP
 @pytest.mark.mechanism("hazard: conductor lost")
 def test_without_the_conductor_robots_end_if_the_file_says_so(router: RouterProcess, tmp_path: Path) -> None:
     watcher = Watcher(router.endpoint)
-    token = network.alive_token(watcher.session, watcher.keys.conductor)
+    token = pubsub.alive_token(watcher.session, watcher.keys.conductor)
     file = written(tmp_path, 'lost_conductor = "land"')
     robots = RobotProcess(router.endpoint, file, "A", "B")
     try:
         watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["ready"] * 2, "ready")
         for name in "AB":
-            assert watcher.order(name, wire.Order("takeoff")).ok
+            assert watcher.order(name, messages.Order("takeoff")).ok
         watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["airborne"] * 2, "waiting for the start")
         token.undeclare()  # type: ignore[no-untyped-call]
         watcher.until(lambda: [watcher.phase(name) for name in "AB"] == ["done"] * 2, "down")

@@ -11,8 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from agents import wire
-from experiments import entries, orders, playback, report
+from agents.network import messages
+from experiments.file import catalogue
+from experiments.real_time.conductor import orders
+from experiments.recording import playback
+from experiments.report import report
 from experiments.run import reopen
 from tests.conftest import RouterProcess
 from tests.system.lab import Flight, RobotProcess, Watcher, zenpark
@@ -41,7 +44,7 @@ class Lab:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.file, self.over = folder, folder / "x.toml", False
-        text = entries.path("triangle").read_text("utf-8")
+        text = catalogue.path("triangle").read_text("utf-8")
         text = text.replace("[formation]", f"{SPARES}\n[formation]", 1)
         text = text.replace('"KH01 - KH02"', '"KH01 > KH03" = 0.60\n"KH03 > KH01" = 0.60\n"KH01 - KH02"', 1)
         self.file.write_text(text)
@@ -57,8 +60,8 @@ class Lab:
     def running(self, *names: str) -> bool:
         return all(self.watcher.phase(name) == "running" for name in names)
 
-    def change(self, what: wire.ChangeKind, *names: str, **more: object) -> wire.RunReply:
-        order = wire.RunOrder(what, list(names), **more)  # type: ignore[arg-type]
+    def change(self, what: messages.ChangeKind, *names: str, **more: object) -> messages.RunReply:
+        order = messages.RunOrder(what, list(names), **more)  # type: ignore[arg-type]
         return orders.give_run(self.watcher.session, self.watcher.keys, order)
 
     def zenpark(self, *arguments: str) -> subprocess.CompletedProcess[str]:

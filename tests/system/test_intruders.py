@@ -14,19 +14,19 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from agents import lab, wire
-from agents import session as network
-from agents.endpoint import free_endpoint
-from agents.keys import Keys
-from agents.settings import config, settings
-from experiments import orders
+from agents.network import lab, messages, pubsub
+from agents.network import session as network
+from agents.network.endpoints import free_endpoint
+from agents.network.keys import Keys
+from agents.network.zenoh_config import config, settings
+from experiments.real_time.conductor import orders
 from tests.system.secured import FLOWN, Laboratory, copy, elsewhere, flying, steady
-from tools import authority
+from tools.commands import authority
 
 pytestmark = pytest.mark.system
 
 KEYS = Keys()
-STOP = wire.encode(wire.Stop("mallory", "because"))
+STOP = messages.encode(messages.Stop("mallory", "because"))
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Laboratory]
 class Flight:
     """The robots before a test, and whose key is used to say nonsense where that robot may speak."""
 
-    before: dict[str, wire.Status]
+    before: dict[str, messages.Status]
     mad: str = ""
 
 
@@ -61,12 +61,12 @@ def flight(laboratory: Laboratory) -> Iterator[Flight]:
 
 
 def say(session: zenoh.Session, key: str, payload: bytes) -> None:
-    session.put(key, payload, encoding=wire.JSON)
+    session.put(key, payload, encoding=messages.JSON)
 
 
 def forged(robot: str) -> bytes:
     """A pose that every check would believe."""
-    return wire.encode(wire.pose(robot, 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
+    return messages.encode(messages.pose(robot, 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
 
 
 def settled(laboratory: Laboratory, seconds: float = 0.5) -> None:
@@ -159,7 +159,7 @@ def test_a_router_elsewhere_than_its_certificate_says_is_refused(laboratory: Lab
     ],
 )
 def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory: Laboratory, who: str) -> None:
-    heard = network.subscriber(laboratory.watcher.session, "park/**", 20_000)
+    heard = pubsub.subscriber(laboratory.watcher.session, "park/**", 20_000)
     with laboratory.session(who) as session:
         threading.Event().wait(0.1)
         for key in ("park/KH01/pose", "park/*/pose", "park/**", "park/*/*", "**", "park/$*1/pose", "park/KH01/**"):
@@ -187,17 +187,23 @@ def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory: Laboratory, wh
 )
 def test_orders_are_the_operators(laboratory: Laboratory, who: str) -> None:
     with laboratory.session(who) as session:
-        reply = orders.give(session, KEYS, ["CF01"], wire.Order("land"))["CF01"]
+        reply = orders.give(session, KEYS, ["CF01"], messages.Order("land"))["CF01"]
         assert (reply.ok, reply.reason) == (False, "no answer")
         for key in ("park/*/order", "park/**", "park/CF01/*", "**"):
-            assert not list(session.get(key, payload=wire.encode(wire.Order("land")), encoding=wire.JSON, timeout=1.0))
-        say(session, KEYS.order("CF01"), wire.encode(wire.Order("land")))
-    assert laboratory.watcher.order("CF01", wire.Order("get", name="clamp")).ok, "the operator is heard"
+            assert not list(
+                session.get(key, payload=messages.encode(messages.Order("land")), encoding=messages.JSON, timeout=1.0)
+            )
+        say(session, KEYS.order("CF01"), messages.encode(messages.Order("land")))
+    assert laboratory.watcher.order("CF01", messages.Order("get", name="clamp")).ok, "the operator is heard"
 
 
 @pytest.mark.parametrize(("who", "part"), [("observer", "pose"), ("operator", "pose"), ("operator", "order")])
 def test_a_wildcard_that_may_be_asked_is_answered_by_all(laboratory: Laboratory, who: str, part: str) -> None:
-    order = {} if part == "pose" else {"payload": wire.encode(wire.Order("get", name="clamp")), "encoding": wire.JSON}
+    order = (
+        {}
+        if part == "pose"
+        else {"payload": messages.encode(messages.Order("get", name="clamp")), "encoding": messages.JSON}
+    )
     with laboratory.session(who) as session:
         replies = list(session.get(f"park/*/{part}", timeout=5.0, **order))
         assert {str(reply.ok.key_expr) for reply in replies if reply.ok} == {f"park/{name}/{part}" for name in FLOWN}
@@ -207,29 +213,29 @@ def test_a_wildcard_that_may_be_asked_is_answered_by_all(laboratory: Laboratory,
 @pytest.mark.parametrize("who", ["KH03", "observer", "recorder", "world"])
 def test_robots_are_changed_by_operators_only(laboratory: Laboratory, who: str) -> None:
     """Somebody else neither asks the conductor for a change, nor answers in its place."""
-    order = wire.RunOrder("remove", ["CF01"], who="operator")
+    order = messages.RunOrder("remove", ["CF01"], who="operator")
     with laboratory.session(who) as session:
-        false = network.orders(session, KEYS.run_order)
+        false = pubsub.orders(session, KEYS.run_order)
         reply = orders.give_run(laboratory.watcher.session, KEYS, order, 0.5)
         assert "no conductor answers" in reply.reason
         assert false.handler.try_recv() is None, "and it does not even hear of it"
         false.close()
-        asked = network.orders(laboratory.watcher.session, KEYS.run_order)
+        asked = pubsub.orders(laboratory.watcher.session, KEYS.run_order)
         settled(laboratory)
         for key in (KEYS.run_order, "park/run/*", "park/**"):
-            assert not list(session.get(key, payload=wire.encode(order), encoding=wire.JSON, timeout=0.5))
+            assert not list(session.get(key, payload=messages.encode(order), encoding=messages.JSON, timeout=0.5))
         assert asked.handler.try_recv() is None
         asked.close()
 
 
 def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory: Laboratory) -> None:
     with laboratory.session("KH03") as session:
-        neighbour = network.pose_subscriber(session, KEYS.pose("KH01"))
+        neighbour = pubsub.pose_subscriber(session, KEYS.pose("KH01"))
         others = [
-            network.pose_subscriber(session, key)
+            pubsub.pose_subscriber(session, key)
             for key in (KEYS.pose("KH02"), KEYS.state("KH01"), "park/*/pose", "park/**", "**", KEYS.event)
         ]
-        watches = [network.alive_watch(session, key) for key in ("park/KH02/alive", "park/*/alive", "park/**")]
+        watches = [pubsub.alive_watch(session, key) for key in ("park/KH02/alive", "park/*/alive", "park/**")]
         settled(laboratory)
         assert len(list(network.received(neighbour.handler))) > 10
         heard = {str(sample.key_expr) for other in others for sample in network.received(other.handler)}
@@ -242,17 +248,19 @@ def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory: Laboratory) ->
 def test_no_one_takes_anothers_place(laboratory: Laboratory) -> None:
     """Neither its orders, nor its token, nor the memory of its last value."""
     with laboratory.session("KH03") as session:
-        order = network.orders(session, KEYS.order("KH02"))
-        last = network.last_value(session, KEYS.pose("KH02"), wire.JSON)
+        order = pubsub.orders(session, KEYS.order("KH02"))
+        last = pubsub.last_value(session, KEYS.pose("KH02"), messages.JSON)
         last.hold(forged("KH02"))
-        token = network.alive_token(session, KEYS.alive("KH09"))
-        memory = network.pose_publisher(session, KEYS.pose("KH02"), wire.JSON)
+        token = pubsub.alive_token(session, KEYS.alive("KH09"))
+        memory = pubsub.pose_publisher(session, KEYS.pose("KH02"), messages.JSON)
         memory.put(forged("KH02"))
         settled(laboratory)
-        assert laboratory.watcher.order("KH02", wire.Order("get", name="clamp")).robot == "KH02"
-        late = network.pose_subscriber(laboratory.watcher.session, KEYS.pose("KH02"))
+        assert laboratory.watcher.order("KH02", messages.Order("get", name="clamp")).robot == "KH02"
+        late = pubsub.pose_subscriber(laboratory.watcher.session, KEYS.pose("KH02"))
         settled(laboratory, 0.2)
-        poses = [wire.decode(s.payload.to_bytes(), wire.JSON, wire.Pose) for s in network.received(late.handler)]
+        poses = [
+            messages.decode(s.payload.to_bytes(), messages.JSON, messages.Pose) for s in network.received(late.handler)
+        ]
         assert poses
         assert all(pose.seq < 10**8 for pose in poses)
         late.undeclare()  # type: ignore[no-untyped-call]
@@ -267,7 +275,7 @@ def test_no_one_takes_anothers_place(laboratory: Laboratory) -> None:
 
 def test_samples_that_are_said_again_are_not_believed_again(laboratory: Laboratory, flight: Flight) -> None:
     """With the very key of KH01, its own poses of a moment ago, twenty times each."""
-    with network.pose_subscriber(laboratory.watcher.session, KEYS.pose("KH01"), 500) as ear:
+    with pubsub.pose_subscriber(laboratory.watcher.session, KEYS.pose("KH01"), 500) as ear:
         settled(laboratory)
         taken = [sample.payload.to_bytes() for sample in network.received(ear.handler)]
     assert len(taken) > 10
@@ -288,7 +296,7 @@ def test_nonsense_at_ten_thousand_a_second_is_counted_and_forgotten(laboratory: 
     nonsense = [b"", b"{", b"[" * 1000, os.urandom(200), b'{"robot":"KH01","seq":NaN}', forged("KH02"), b"null"]
     sent = 0
     with laboratory.session("KH01") as thief:
-        mad = network.publisher(thief, KEYS.pose("KH01"), wire.JSON)
+        mad = pubsub.publisher(thief, KEYS.pose("KH01"), messages.JSON)
         for count in steady(10_000, 1.5):
             mad.put(nonsense[count % len(nonsense)])
             sent = count
@@ -327,7 +335,7 @@ def test_half_open_connections_are_dropped_and_disturb_nobody(laboratory: Labora
             one.sendall(b"\x16\x03\x01")  # the beginning of a ClientHello
             one.setblocking(False)
             half.append(one)
-        assert laboratory.watcher.order("CF01", wire.Order("get", name="clamp")).ok
+        assert laboratory.watcher.order("CF01", messages.Order("get", name="clamp")).ok
 
         def dropped() -> bool:
             laboratory.watcher.look()

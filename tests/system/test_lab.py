@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from agents import session as network
-from agents import wire
-from agents.keys import Keys
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
 from tests.system.lab import ENVIRONMENT, ROOT, Flight, until, zenpark
 from tests.system.secured import FILE, Laboratory, copy
-from tools import authority
+from tools.commands import authority
 
 pytestmark = pytest.mark.system
 
@@ -98,7 +98,7 @@ class Ear:
     """What the operator hears on a key."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
-        self._samples = network.subscriber(session, key)
+        self._samples = pubsub.subscriber(session, key)
         self._seen: set[str] = set()
 
     def heard(self, speaker: zenoh.Session, key: str, word: str) -> bool:
@@ -161,4 +161,4 @@ def test_robots_go_on_with_their_new_files_where_those_are_put(laboratory: Labor
     watcher.until(lambda: all(watcher.status[name].heard > before[name] + 100 for name in before), "all hear again")
     for name, status in laboratory.statuses().items():
         assert status.phase == "running", (name, status.reason)
-    assert watcher.order("CF01", wire.Order("land")).ok
+    assert watcher.order("CF01", messages.Order("land")).ok

@@ -13,9 +13,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from agents import session as network
-from agents.keys import Keys
-from agents.leaving import leave
+from agents.network import pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.network.shutdown import leave
 from tests.conftest import RouterProcess
 from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher, gone, until
 
@@ -58,7 +59,7 @@ def test_a_router_that_was_frozen_ends_when_it_is_told_to() -> None:
 
 def test_a_session_is_left_in_time_and_a_live_one_at_once(router: RouterProcess) -> None:
     sessions = [network.open_session([router.endpoint], name="test", lease_s=1.0) for _ in range(2)]
-    declared = [network.pose_subscriber(sessions[1], Keys().status("*"))]
+    declared = [pubsub.pose_subscriber(sessions[1], Keys().status("*"))]
     assert leave(sessions[0])
     router.process.send_signal(signal.SIGSTOP)
     try:

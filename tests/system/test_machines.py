@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import entries, playback
-from experiments.recording import CHUNK_BYTES
+from experiments.file import catalogue
+from experiments.recording import playback
+from experiments.recording.writer import CHUNK_BYTES
 from tests.system.lab import ROOT, typed, until
 from tests.system.machines import Machines, machines, why_not
 
@@ -35,14 +36,14 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
 
 def experiment(lab: Machines, folder: Path, duration_s: float) -> Path:
     """The reference experiment, its robots on the lab's machines."""
-    text = entries.path("robotic-park").read_text("utf-8")
+    text = catalogue.path("robotic-park").read_text("utf-8")
     text = text.replace("duration_s = 45.0", f"duration_s = {duration_s}").replace("at_s = 21.0", "at_s = 1.0")
     return on_hosts(lab, folder, text, ROBOTS)
 
 
 def triangle(lab: Machines, folder: Path, duration_s: float) -> Path:
     """The first experiment, one robot on each machine: enough for what does not depend on their number."""
-    text = entries.path("triangle").read_text("utf-8").replace("duration_s = 15.0", f"duration_s = {duration_s}")
+    text = catalogue.path("triangle").read_text("utf-8").replace("duration_s = 15.0", f"duration_s = {duration_s}")
     return on_hosts(lab, folder, text, dict(zip(ROBOTS, (["KH01"], ["KH02"], ["CF01"]), strict=True)))
 
 
@@ -182,7 +183,7 @@ def test_a_machine_that_is_cut_off_lands_its_robots_and_the_others_go_on(lab: Ma
 
 def test_a_robot_that_dies_on_a_machine_is_started_again_there(lab: Machines, tmp_path: Path) -> None:
     file, folder = tmp_path / "x.toml", tmp_path / "run"
-    text = entries.path("triangle").read_text("utf-8").replace("duration_s = 15.0", "duration_s = 12.0")
+    text = catalogue.path("triangle").read_text("utf-8").replace("duration_s = 15.0", "duration_s = 12.0")
     text = text.replace("seed = 1 ", 'on_loss = "restart"\nseed = 1 ')
     file.write_text(f'{text}\n[hosts.lab1]\naddress = "lab1"\nzenpark = "{lab["lab1"].zenpark()}"\nrobots = ["KH01"]\n')
     flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--no-report")

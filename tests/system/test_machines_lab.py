@@ -13,12 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from agents.lab import register
-from experiments import entries, playback
+from agents.network.lab import register
+from experiments.file import catalogue
+from experiments.recording import playback
 from tests.system.lab import typed, until
 from tests.system.machines import Machines, machines, why_not
 from tests.system.test_machines import busy, zenpark
-from tools import authority
+from tools.commands import authority
 
 LACKING = why_not()
 pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(LACKING), reason=LACKING)]
@@ -37,7 +38,7 @@ class Laboratory:
 
     def __init__(self, lab: Machines, folder: Path, network: str = "", *, drift: float = 0.0) -> None:
         self.lab, self.keys, self.file, self.out = lab, folder / "lab", folder / "triangle.toml", folder / "run"
-        text = entries.path("triangle").read_text("utf-8")
+        text = catalogue.path("triangle").read_text("utf-8")
         text += f'\n[network]\nlab = "lab"\n{network}\n'
         self.there = {host: folder / "there" / host for host in ROBOTS}
         for host, robots in ROBOTS.items():

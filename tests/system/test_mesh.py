@@ -10,16 +10,18 @@ import psutil
 import pytest
 import zenoh
 
-from agents import session as network
-from agents import topology, wire
-from agents.endpoint import free_endpoint
-from agents.lab import Role
-from agents.settings import config, settings
-from experiments import access, mesh
-from experiments.run import load, reopen
+from agents.network import endpoints as topology
+from agents.network import messages
+from agents.network import session as network
+from agents.network.endpoints import free_endpoint
+from agents.network.lab import Role
+from agents.network.zenoh_config import config, settings
+from experiments.definition import access_rights, mesh
+from experiments.file.document import load
+from experiments.run import reopen
 from tests.system.lab import Flight, Started, Watcher
-from tools import authority, estop
-from tools.network import members
+from tools.commands import authority, estop
+from tools.commands.network import members
 
 pytestmark = pytest.mark.system
 
@@ -43,7 +45,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
     children = flight.children()
     assert "router" not in children
 
-    hears = access.heard(load("robotic-park").experiment)
+    hears = access_rights.heard(load("robotic-park").experiment)
     robots = list(hears)
     linked: dict[str, set[str]] = {name: set() for name in robots}
     for name in robots:
@@ -120,14 +122,14 @@ def test_a_silent_missing_link_is_named() -> None:
     with ExitStack() as stack:
         for name in robots:
             connect = [part for each in (wrong if name == "KH02" else right) for part in ("--connect", each)]
-            robot = Started("experiments.robot", "triangle", name, *connect)
+            robot = Started("experiments.real_time.processes.robot", "triangle", name, *connect)
             stack.callback(robot.end)
         watcher = Watcher(*right)
         stack.callback(watcher.close)
         watcher.until(lambda: watcher.phase("CF01") == "ready", "it hears both")
         watcher.until(lambda: watcher.status["KH02"].reason == "never heard KH01", "and KH02 says whom it does not")
         assert watcher.phase("KH02") == watcher.phase("KH01") == "idle"
-        assert not watcher.order("KH02", wire.Order("takeoff")).ok
+        assert not watcher.order("KH02", messages.Order("takeoff")).ok
 
 
 def free(count: int) -> list[str]:
@@ -151,16 +153,16 @@ def test_members_of_a_lab_let_nobody_do_what_is_not_his(tmp_path: Path) -> None:
     flight = Flight(tmp_path / "run", str(file), "--case", "periodic", "--no-report", "--set", "duration_s=6")
     flight.until_said("phase conductor: formation")
     endpoints = (flight.folder / "network.txt").read_text().split()
-    stop = wire.encode(wire.Stop("mallory", "because"))
-    pose = wire.encode(wire.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
+    stop = messages.encode(messages.Stop("mallory", "because"))
+    pose = messages.encode(messages.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
     for who in ("KH09", "KH02", "observer", "recorder"):
         with network.open_session(endpoints, name="intruder", identity=who) as intruder:
             for _ in range(10):
                 for key in ("park/estop", "park/**"):
-                    intruder.put(key, stop, encoding=wire.JSON)
-                intruder.put("park/KH01/pose", pose, encoding=wire.JSON)
+                    intruder.put(key, stop, encoding=messages.JSON)
+                intruder.put("park/KH01/pose", pose, encoding=messages.JSON)
                 time.sleep(0.01)
-            order = wire.encode(wire.Order("land"))
+            order = messages.encode(messages.Order("land"))
             assert not [reply for reply in intruder.get("park/CF01/order", payload=order, timeout=0.5) if reply.ok]
     code, _ = flight.finish()
     assert code == 0, flight.logs()

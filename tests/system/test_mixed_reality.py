@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents import session as network
-from agents import wire
-from agents.keys import Keys
-from agents.kinds import CRAZYFLIE, KINDS, TURTLEBOT3
-from experiments import playback
+from agents.body.kinds import CRAZYFLIE, KINDS, TURTLEBOT3
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from experiments.recording import playback
 from tests.conftest import RouterProcess
 from tests.system.lab import Flight, until
 
@@ -68,7 +68,7 @@ RUNS = (
 )
 
 
-def ahead(scan: wire.Ranges) -> float:
+def ahead(scan: messages.Ranges) -> float:
     """What the rays along the nose say [m]; NaN: nothing."""
     along = np.abs(np.array(scan.bearing)) + np.abs(np.array(scan.elevation)) < 1e-6
     seen = [reading for reading, ray in zip(scan.distance, along, strict=True) if ray and reading is not None]
@@ -85,7 +85,7 @@ def test_real_robots_that_stand_in_the_way_of_twins_are_seen_and_avoided(tmp_pat
         connect = f'network.connect=["{router.endpoint}"]'
         flights.append(Flight(tmp_path / realm, str(file), "--json", "--no-report", "--set", connect))
     with network.open_session([router.endpoint], name="observer") as session:
-        listening = [network.subscriber(session, Keys(realm).ranges(twin), 4096) for realm, _, _, twin, *_ in RUNS]
+        listening = [pubsub.subscriber(session, Keys(realm).ranges(twin), 4096) for realm, _, _, twin, *_ in RUNS]
         for flight in flights:
             flight.until_said(r"phase conductor: formation", 60.0)
         for subscriber in listening:
@@ -95,7 +95,9 @@ def test_real_robots_that_stand_in_the_way_of_twins_are_seen_and_avoided(tmp_pat
         def enough() -> bool:
             for seen, subscriber in zip(readings, listening, strict=True):
                 for sample in network.received(subscriber.handler):
-                    seen.append(ahead(wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Ranges)))
+                    seen.append(
+                        ahead(messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Ranges))
+                    )
             return all(len(seen) >= 12 for seen in readings)
 
         until(enough, "range readings")

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.rows import Index
-from experiments import playback
-from experiments.experiment import Experiment
-from experiments.logbook import Logbook
-from experiments.run import load, reopen
-from experiments.trace import Trace
-from experiments.virtual import simulate
+from agents.arrays import Index
+from experiments.definition.experiment import Experiment
+from experiments.file.document import load
+from experiments.recording import playback
+from experiments.recording.trace import Trace
+from experiments.run import reopen
+from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.simulation import simulate
 from tests.system.lab import Flight
 
 pytestmark = pytest.mark.system

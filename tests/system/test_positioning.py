@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import playback
+from experiments.recording import playback
 from tests.system.lab import Flight, Watcher
 
 pytestmark = pytest.mark.system

@@ -10,8 +10,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from experiments import playback
-from experiments.launcher import LAND_S
+from experiments.real_time.hosts.launcher import LAND_S
+from experiments.recording import playback
 from tests.system.lab import NEAR, ROOT, Flight, gone, until
 
 pytestmark = pytest.mark.system

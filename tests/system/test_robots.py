@@ -11,9 +11,9 @@ from contextlib import ExitStack
 import pytest
 import zenoh
 
-from agents import wire
-from experiments import document
-from experiments.links import parse_links
+from agents.network import messages
+from experiments.definition.links import parse_links
+from experiments.file import document
 from tests.conftest import RouterProcess
 from tests.system.lab import RobotProcess, Watcher
 
@@ -100,18 +100,18 @@ def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, wa
     with ExitStack() as stack:
         fly(stack, router, "triangle", *TRIANGLE)
         watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
-        reply = watcher.order("CF01", wire.Order("start", at=time.time()))
+        reply = watcher.order("CF01", messages.Order("start", at=time.time()))
         assert (reply.ok, reply.reason) == (False, "cannot start while ready")
-        assert watcher.order("CF01", wire.Order("hold")).reason == "cannot hold while ready"
-        assert "needs `at`" in watcher.order("CF01", wire.Order("start")).reason
-        assert watcher.order("CF01", wire.Order("get", name="clamp")).value == pytest.approx(0.1)
-        assert watcher.order("CF01", wire.Order("set", name="clamp", value=0.05)).value == pytest.approx(0.05)
-        assert "known: clamp" in watcher.order("CF01", wire.Order("set", name="clmp", value=1.0)).reason
-        assert not watcher.order("CF01", wire.Order("set", name="trigger.period_s", value=0.0)).ok
-        assert watcher.order("nobody", wire.Order("land")).reason == "no answer"
+        assert watcher.order("CF01", messages.Order("hold")).reason == "cannot hold while ready"
+        assert "needs `at`" in watcher.order("CF01", messages.Order("start")).reason
+        assert watcher.order("CF01", messages.Order("get", name="clamp")).value == pytest.approx(0.1)
+        assert watcher.order("CF01", messages.Order("set", name="clamp", value=0.05)).value == pytest.approx(0.05)
+        assert "known: clamp" in watcher.order("CF01", messages.Order("set", name="clmp", value=1.0)).reason
+        assert not watcher.order("CF01", messages.Order("set", name="trigger.period_s", value=0.0)).ok
+        assert watcher.order("nobody", messages.Order("land")).reason == "no answer"
         bare = [b'{"order": "get", "name": "clamp"}', b'{"order": "hold"}']  # as z_get sends them: without an encoding
         answers = [
-            wire.decode(reply.ok.payload.to_bytes(), wire.JSON, wire.Reply)
+            messages.decode(reply.ok.payload.to_bytes(), messages.JSON, messages.Reply)
             for payload in bare
             for reply in watcher.session.get("park/*/order", payload=payload, timeout=2.0)
             if reply.ok is not None
@@ -121,14 +121,14 @@ def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, wa
         ]  # fmt: skip
         assert {answer.reason for answer in answers if not answer.ok} == {"cannot hold while ready"}
         for name in TRIANGLE:
-            assert watcher.order(name, wire.Order("takeoff")).ok
+            assert watcher.order(name, messages.Order("takeoff")).ok
         watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in TRIANGLE), "all are up")
         for name in TRIANGLE:
-            assert watcher.order(name, wire.Order("start", at=time.time() + 0.2)).ok
+            assert watcher.order(name, messages.Order("start", at=time.time() + 0.2)).ok
         watcher.until(lambda: all(watcher.phase(name) == "running" for name in TRIANGLE), "all run")
-        assert watcher.order("CF01", wire.Order("hold")).ok
+        assert watcher.order("CF01", messages.Order("hold")).ok
         for name in TRIANGLE:
-            assert watcher.order(name, wire.Order("land")).ok
+            assert watcher.order(name, messages.Order("land")).ok
         watcher.until(lambda: all(watcher.phase(name) == "done" for name in TRIANGLE), "all are down")
 
 
@@ -136,44 +136,44 @@ def test_an_emergency_stop_cuts_all_motors(router: RouterProcess, watcher: Watch
     with ExitStack() as stack:
         fly(stack, router, "triangle", *TRIANGLE)
         watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
-        watcher.order("CF01", wire.Order("takeoff"))
+        watcher.order("CF01", messages.Order("takeoff"))
         watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
-        stop = wire.Stop("a test", "to see it fall")
-        watcher.session.put(watcher.keys.estop, wire.encode(stop), encoding=wire.JSON)
+        stop = messages.Stop("a test", "to see it fall")
+        watcher.session.put(watcher.keys.estop, messages.encode(stop), encoding=messages.JSON)
         watcher.until(lambda: watcher.phase("CF01") == "done", "motors off")
         assert watcher.status["CF01"].reason == "emergency stop by a test: to see it fall"
         watcher.until(lambda: watcher.state["CF01"].position[2] < 0.03, "it fell")
 
 
 def nonsense() -> list[tuple[bytes, str]]:
-    honest = wire.Pose("KH02", 10**6, time.time(), (0.1, 0.1, 0.0), (0.0, 0.0, 0.0), 0.0)
+    honest = messages.Pose("KH02", 10**6, time.time(), (0.1, 0.1, 0.0), (0.0, 0.0, 0.0), 0.0)
 
     def changed(**fields: object) -> bytes:
-        return wire.encode(
-            wire.Pose(**{**{f: getattr(honest, f) for f in honest.__struct_fields__}, **fields}), "msgpack"
+        return messages.encode(
+            messages.Pose(**{**{f: getattr(honest, f) for f in honest.__struct_fields__}, **fields}), "msgpack"
         )  # type: ignore[arg-type]
 
     return [
-        (b"", wire.JSON),
-        (os.urandom(200), wire.JSON),
-        (os.urandom(200), wire.MSGPACK),
-        (b"[" * 50_000, wire.JSON),
-        (b'{"robot": 7}', wire.JSON),
-        (b'{"order": "dance"}', wire.JSON),
-        (b'"text"', wire.JSON),
-        (b"x" * 100_000, wire.JSON),
+        (b"", messages.JSON),
+        (os.urandom(200), messages.JSON),
+        (os.urandom(200), messages.MSGPACK),
+        (b"[" * 50_000, messages.JSON),
+        (b'{"robot": 7}', messages.JSON),
+        (b'{"order": "dance"}', messages.JSON),
+        (b'"text"', messages.JSON),
+        (b"x" * 100_000, messages.JSON),
         (b"\xff\xfe", "text/plain"),
-        (changed(position=(math.nan, 0.0, 0.0)), wire.MSGPACK),
-        (changed(position=(math.inf, 0.0, 0.0)), wire.MSGPACK),
-        (changed(position=(1e6, 0.0, 0.0)), wire.MSGPACK),
-        (changed(velocity=(math.nan, 0.0, 0.0)), wire.MSGPACK),
-        (changed(velocity=(1e9, 0.0, 0.0)), wire.MSGPACK),
-        (changed(yaw=math.nan), wire.MSGPACK),
-        (changed(stamp=math.nan), wire.MSGPACK),
-        (changed(stamp=1e300), wire.MSGPACK),
-        (changed(stamp=time.time() + 3600.0), wire.MSGPACK),
-        (changed(seq=-1), wire.MSGPACK),
-        (changed(robot="CF01"), wire.MSGPACK),
+        (changed(position=(math.nan, 0.0, 0.0)), messages.MSGPACK),
+        (changed(position=(math.inf, 0.0, 0.0)), messages.MSGPACK),
+        (changed(position=(1e6, 0.0, 0.0)), messages.MSGPACK),
+        (changed(velocity=(math.nan, 0.0, 0.0)), messages.MSGPACK),
+        (changed(velocity=(1e9, 0.0, 0.0)), messages.MSGPACK),
+        (changed(yaw=math.nan), messages.MSGPACK),
+        (changed(stamp=math.nan), messages.MSGPACK),
+        (changed(stamp=1e300), messages.MSGPACK),
+        (changed(stamp=time.time() + 3600.0), messages.MSGPACK),
+        (changed(seq=-1), messages.MSGPACK),
+        (changed(robot="CF01"), messages.MSGPACK),
     ]
 
 
@@ -183,7 +183,7 @@ def test_nonsense_on_every_key_is_counted_and_moves_nobody(router: RouterProcess
         fly(stack, router, "triangle", *TRIANGLE)
         watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
         for name in TRIANGLE:
-            watcher.order(name, wire.Order("takeoff"))
+            watcher.order(name, messages.Order("takeoff"))
         watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in TRIANGLE), "all are up")
         expected = 0
         for payload, mime in nonsense():
@@ -194,7 +194,7 @@ def test_nonsense_on_every_key_is_counted_and_moves_nobody(router: RouterProcess
             for reply in watcher.session.get(watcher.keys.order("CF01"), payload=payload, encoding=mime, timeout=2.0):
                 assert reply.err is not None
             expected += 1
-        watcher.session.put("park/*/pose", b"{}", encoding=wire.JSON)
+        watcher.session.put("park/*/pose", b"{}", encoding=messages.JSON)
         watcher.session.delete(watcher.keys.pose("KH02"))
         watcher.session.delete(watcher.keys.estop)
         watcher.until(lambda: watcher.status["CF01"].malformed >= expected, f"{expected} are counted")
@@ -218,7 +218,7 @@ def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher
             return all(watcher.phase(name) == "ready" for name in TRIANGLE)
 
         watcher.until(starter_is_heard_and_all_are_ready, "all are ready")
-        assert watcher.order("CF01", wire.Order("takeoff")).ok
+        assert watcher.order("CF01", messages.Order("takeoff")).ok
         watcher.until(
             lambda: watcher.status["CF01"].reason.startswith("nothing from the starter"), "silence is noticed"
         )

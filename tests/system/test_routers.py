@@ -13,11 +13,11 @@ import psutil
 import pytest
 import zenoh
 
-from agents import lab, wire
-from agents import session as network
-from agents.access import Rights
-from agents.endpoint import free_endpoint
-from agents.settings import config, settings
+from agents.network import lab, messages, pubsub
+from agents.network import session as network
+from agents.network.access_control import Rights
+from agents.network.endpoints import free_endpoint
+from agents.network.zenoh_config import config, settings
 from experiments.run import reopen
 from tests.conftest import RouterProcess
 from tests.system.lab import ENVIRONMENT, ROOT, Flight, Watcher, assert_held_in_time, until
@@ -31,7 +31,7 @@ def routers(flight: Flight) -> list[tuple[psutil.Process, str]]:
     found = []
     for child in psutil.Process(flight.process.pid).children():
         line = child.cmdline()
-        if "agents.router" in line:
+        if "agents.runtime.router" in line:
             found.append((child, line[line.index("--listen") + 1]))
     endpoints = (flight.folder / "network.txt").read_text().split()
     return sorted(found, key=lambda pair: endpoints.index(pair[1]))
@@ -74,7 +74,7 @@ def laboratory(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
     plain = free_endpoint(preferred_port=0, protocol="tls")
     (other,) = lab.secured([plain], made.folder)
     second = subprocess.Popen(
-        [sys.executable, "-m", "agents.router", "--listen", other, "--connect", made.endpoint,
+        [sys.executable, "-m", "agents.runtime.router", "--listen", other, "--connect", made.endpoint,
          "--rights", str(made.rights)],
         cwd=ROOT,
         env=ENVIRONMENT,
@@ -101,23 +101,23 @@ def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[L
     looker = Watcher(other)  # as operator: through the link everything is seen, and orders are carried
     try:
         looker.until(lambda: all(looker.phase(name) == "running" for name in FLOWN), "seen through the link")
-        assert looker.order("KH01", wire.Order("get", name="speed")).robot == "KH01"
+        assert looker.order("KH01", messages.Order("get", name="speed")).robot == "KH01"
     finally:
         looker.close()
     before = made.statuses()
-    forged = wire.encode(wire.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
-    stop = wire.encode(wire.Stop("mallory", "because"))
+    forged = messages.encode(messages.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
+    stop = messages.encode(messages.Stop("mallory", "because"))
     for mode in ("client", "router"):  # the latter would be a link, were it a router's certificate
         chosen = config(settings("client", connect=[other], name="intruder", identity="KH03"))
         chosen.insert_json5("mode", f'"{mode}"')
         with zenoh.open(chosen) as intruder:
-            states = network.subscriber(intruder, keys.state("*"))
+            states = pubsub.subscriber(intruder, keys.state("*"))
             for _ in range(20):
-                intruder.put(keys.pose("KH01"), forged, encoding=wire.JSON)
-                intruder.put(keys.estop, stop, encoding=wire.JSON)
-                intruder.put("park/**", stop, encoding=wire.JSON)
+                intruder.put(keys.pose("KH01"), forged, encoding=messages.JSON)
+                intruder.put(keys.estop, stop, encoding=messages.JSON)
+                intruder.put("park/**", stop, encoding=messages.JSON)
                 time.sleep(0.01)
-            order = wire.encode(wire.Order("land"))
+            order = messages.encode(messages.Order("land"))
             assert not [reply for reply in intruder.get(keys.order("KH01"), payload=order, timeout=1.0) if reply.ok]
             heard = {str(sample.key_expr) for sample in network.received(states.handler)}
             assert heard <= {"park/**"}, "its own words, and nobody else's"

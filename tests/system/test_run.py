@@ -12,8 +12,8 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from experiments import playback
-from experiments.recover import recover
+from experiments.recording import playback
+from experiments.recording.recover import recover
 from tests.system.lab import Flight, Watcher, gone, typed, until
 
 pytestmark = pytest.mark.system

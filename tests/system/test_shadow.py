@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import playback
-from experiments.metrics import measure
+from experiments.metrics.measure import measure
+from experiments.recording import playback
 from tests.system.lab import Flight
 
 pytestmark = pytest.mark.system

@@ -144,8 +144,8 @@ def test_a_cluster_of_which_a_worker_is_killed_half_way_gives_the_same_table(tmp
 
 
 SCRIPT = """
-from experiments.sweep import sweep
-from experiments.sweep_table import write_csv
+from experiments.sweep.sweep import sweep
+from experiments.sweep.table import write_csv
 
 if __name__ == "__main__":
     found = sweep("triangle", {given}, settings={settings}, out={folder!r}, processes=2)

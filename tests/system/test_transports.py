@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from agents.endpoint import free_endpoint
-from experiments.run import load, reopen
+from agents.network.endpoints import free_endpoint
+from experiments.file.document import load
+from experiments.run import reopen
 from tests.system import machines
 from tests.system.lab import PATIENCE_S, Flight, until
-from tools import authority
+from tools.commands import authority
 
 pytestmark = pytest.mark.system
 

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents import session as network
-from agents import wire
-from agents.keys import Keys
-from experiments import orders, playback
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from experiments.real_time.conductor import orders
+from experiments.recording import playback
 from tests.conftest import RouterProcess
 from tests.system.lab import NEAR, Flight, Looking, RobotProcess, Watcher, WorldProcess, gone, until
 
@@ -58,38 +59,38 @@ class Desk(Looking):
 
     def __init__(self, endpoint: str) -> None:
         self.session = network.open_session([endpoint], name="desk")
-        self._positions = network.subscriber(self.session, KEYS.position("*"), 4096)
-        self._worlds = network.pose_subscriber(self.session, KEYS.world)
-        self._events = network.subscriber(self.session, KEYS.event)
-        self._ranges = network.subscriber(self.session, KEYS.ranges("*"))
-        self.at: dict[str, wire.Position] = {}
-        self.ranges: dict[str, wire.Ranges] = {}
-        self.events: list[wire.Event] = []
-        self.world: wire.WorldState | None = None
+        self._positions = pubsub.subscriber(self.session, KEYS.position("*"), 4096)
+        self._worlds = pubsub.pose_subscriber(self.session, KEYS.world)
+        self._events = pubsub.subscriber(self.session, KEYS.event)
+        self._ranges = pubsub.subscriber(self.session, KEYS.ranges("*"))
+        self.at: dict[str, messages.Position] = {}
+        self.ranges: dict[str, messages.Ranges] = {}
+        self.events: list[messages.Event] = []
+        self.world: messages.WorldState | None = None
         self._seq = round(time.time() * 1e3)
 
     def look(self) -> None:
         for sample in network.received(self._positions.handler):
-            position = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Position)
+            position = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position)
             self.at[position.robot] = position
         for sample in network.received(self._worlds.handler):
-            self.world = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.WorldState)
+            self.world = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.WorldState)
         for sample in network.received(self._events.handler):
-            self.events.append(wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Event))
+            self.events.append(messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Event))
         for sample in network.received(self._ranges.handler):
-            ranges = wire.decode(sample.payload.to_bytes(), str(sample.encoding), wire.Ranges)
+            ranges = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Ranges)
             self.ranges[ranges.robot] = ranges
 
     def x(self, name: str) -> list[float]:
         return list(self.at[name].position)
 
-    def give(self, order: str, **fields: object) -> wire.WorldReply:
-        return orders.give_world(self.session, KEYS, wire.WorldOrder(order, **fields))  # type: ignore[arg-type]
+    def give(self, order: str, **fields: object) -> messages.WorldReply:
+        return orders.give_world(self.session, KEYS, messages.WorldOrder(order, **fields))  # type: ignore[arg-type]
 
     def tell(self, name: str, action: str, **fields: object) -> None:
         self._seq += 1
-        command = wire.Command(name, self._seq, time.time(), action, **fields)  # type: ignore[arg-type]
-        self.session.put(KEYS.setpoint(name), wire.encode(command), encoding=wire.JSON)
+        command = messages.Command(name, self._seq, time.time(), action, **fields)  # type: ignore[arg-type]
+        self.session.put(KEYS.setpoint(name), messages.encode(command), encoding=messages.JSON)
 
     def drive_until(self, name: str, setpoint: tuple[float, ...], true: Callable[[], object], what: str) -> None:
         due = [0.0]
@@ -201,13 +202,13 @@ def test_climbs_and_landings_go_on_in_the_next_world(router: RouterProcess, file
     try:
         watcher.until(lambda: all(watcher.phase(name) == "ready" for name in both), "they are ready")
         for name in both:
-            assert watcher.order(name, wire.Order("takeoff")).ok
+            assert watcher.order(name, messages.Order("takeoff")).ok
         watcher.until(lambda: min(map(height, both)) > 0.25, "they climb")
         world = again()
         watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in both), "they arrive")
         assert min(map(height, both)) > 0.54
         for name in both:
-            assert watcher.order(name, wire.Order("land")).ok
+            assert watcher.order(name, messages.Order("land")).ok
         watcher.until(lambda: max(map(height, both)) < 0.4, "they sink")
         world = again()
         watcher.until(lambda: all(watcher.phase(name) == "done" for name in both), "they are down")
@@ -222,7 +223,7 @@ def test_climbs_and_landings_go_on_in_the_next_world(router: RouterProcess, file
 
 
 def test_pause_step_and_resume(world: WorldProcess, desk: Desk) -> None:
-    assert desk.give("pause") == wire.WorldReply(True, True, pytest.approx(0.0, abs=60.0))  # type: ignore[arg-type]
+    assert desk.give("pause") == messages.WorldReply(True, True, pytest.approx(0.0, abs=60.0))  # type: ignore[arg-type]
     paused = desk.give("pause").time
     stamp = desk.at["KH01"].stamp
     desk.until(lambda: desk.world and desk.world.paused, "it says so")
@@ -232,7 +233,7 @@ def test_pause_step_and_resume(world: WorldProcess, desk: Desk) -> None:
     desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH01")[0] > 0.0, "it moves")
     desk.until(lambda: desk.world and desk.world.time == pytest.approx(paused + 0.2), "twenty ticks of 10 ms, no more")
     assert 0.02 < desk.x("KH01")[0] < 0.041
-    assert desk.give("resume") == wire.WorldReply(True, False, pytest.approx(paused + 0.2, abs=0.05))  # type: ignore[arg-type]
+    assert desk.give("resume") == messages.WorldReply(True, False, pytest.approx(paused + 0.2, abs=0.05))  # type: ignore[arg-type]
     desk.drive_until("KH01", (0.2, 0.0, 0.0, 0.0), lambda: desk.x("KH01")[0] > 0.1, "it goes on")
     refused = desk.give("step", steps=0)
     assert (refused.ok, refused.reason) == (False, "0 steps; step takes 1 to 1000000 ticks of 10 ms")
@@ -277,8 +278,8 @@ def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
     assert desk.world is not None
     assert desk.world.robots == ["KH01", "CF01", "TE01", "KH02"]
     assert desk.world.obstacles == [
-        wire.Standing("post", (1.5, 1.5, 0.0)),
-        wire.Standing("box", (-1.0, -1.0, 0.0)),
+        messages.Standing("post", (1.5, 1.5, 0.0)),
+        messages.Standing("box", (-1.0, -1.0, 0.0)),
     ]
 
     assert desk.give("remove", name="CF01").ok
@@ -296,8 +297,10 @@ def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
     desk.until(lambda: desk.world and "CF01" in desk.world.robots, "it is back")
     assert desk.world is not None
     assert desk.world.refused == 12
-    desk.session.put(KEYS.setpoint("KH01"), b"{", encoding=wire.JSON)
-    desk.session.put(KEYS.setpoint("KH01"), wire.encode(wire.Command("KH02", 1, 1.0, "stop")), encoding=wire.JSON)
+    desk.session.put(KEYS.setpoint("KH01"), b"{", encoding=messages.JSON)
+    desk.session.put(
+        KEYS.setpoint("KH01"), messages.encode(messages.Command("KH02", 1, 1.0, "stop")), encoding=messages.JSON
+    )
     desk.until(lambda: desk.world and desk.world.malformed == 2, "nonsense is counted")
 
 
@@ -339,7 +342,7 @@ def test_a_world_that_is_told_to_end_waits_for_its_robots(
     robot = RobotProcess(router.endpoint, file, "CF01", lifeline=False)
     try:
         watcher.until(lambda: watcher.phase("CF01") == "ready", "it is ready")
-        assert watcher.order("CF01", wire.Order("takeoff")).ok
+        assert watcher.order("CF01", messages.Order("takeoff")).ok
         watcher.until(lambda: watcher.phase("CF01") == "airborne", "it is up")
         world.process.terminate()
         assert robot.end() == 0

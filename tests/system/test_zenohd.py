@@ -19,15 +19,16 @@ from typing import Any
 import pytest
 import zenoh
 
-from agents import lab
-from agents.endpoint import free_endpoint
-from agents.settings import config, settings
-from experiments import access
-from experiments.run import load, reopen
+from agents.network import lab
+from agents.network.endpoints import free_endpoint
+from agents.network.zenoh_config import config, settings
+from experiments.definition import access_rights
+from experiments.file.document import load
+from experiments.run import reopen
 from tests.system import zenohd
 from tests.system.lab import Flight, assert_held_in_time, typed, until
 from tests.system.test_transports import SHORT, found
-from tools import router
+from tools.commands import router
 
 pytestmark = pytest.mark.system
 Router = Callable[[Path], AbstractContextManager[None]]
@@ -88,7 +89,7 @@ def test_an_experiment_at_a_router_of_somebody_else(tmp_path: Path, start: Route
     options: tuple[str, ...] = ()
     if secure:
         folder = found(tmp_path / "lab")
-        rights = access.rights(load("triangle").cases().values())
+        rights = access_rights.rights(load("triangle").cases().values())
         (endpoint,) = lab.secured([plain], folder)
         options = ("--lab", str(folder))
     file = tmp_path / "zenohd.json5"

@@ -7,9 +7,9 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from typer.testing import CliRunner
 
-from agents.lab import LabError, files, register
-from tools import authority
-from tools.cli import app
+from agents.network.lab import LabError, files, register
+from tools.cli.main import app
+from tools.commands import authority
 
 ROBOTS = {"router": "router", "operator": "operator", "CF01": "robot", "CF02": "robot"}
 

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 
-from tools.bench_process import Meter, Spent
+from tools.bench.process import Meter, Spent
 
 
 def test_what_another_process_spends_is_read_exactly() -> None:

@@ -8,8 +8,8 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from agents.endpoint import free_endpoint
-from tools.cli import EXPLAINED, app
+from agents.network.endpoints import free_endpoint
+from tools.cli.main import EXPLAINED, app
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = sorted(typer.main.get_command(app).commands)
@@ -99,7 +99,7 @@ def test_help_is_light():
 
 def test_an_emergency_stop_waits_for_no_numpy():
     _, modules = loaded("estop", "--connect", "tcp/127.0.0.1:9")
-    assert "tools.estop" in modules
+    assert "tools.commands.estop" in modules
     assert not {"numpy", "matplotlib", "mcap"} & modules
     said, modules = loaded("runs")
     assert said == "no run is up on this machine\n"

@@ -58,7 +58,7 @@ def test_imports_nothing_of_ours_and_nothing_heavy():
         check=True,
     )
     loaded = set(done.stdout.split())
-    assert not loaded & {"agents", "bridges", "twins", "experiments", "tools.cli", "typer", "numpy", "zenoh"}
+    assert not loaded & {"agents", "bridges", "twins", "experiments", "tools.cli.main", "typer", "numpy", "zenoh"}
 
 
 @pytest.mark.parametrize(
@@ -75,15 +75,15 @@ def test_what_a_run_starts_on_its_hosts_needs_no_typer(words, code):
     )
     assert done.returncode == code, done.stderr[-500:]
     loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
-    assert "experiments.station" in loaded or "experiments.robot" in loaded
-    assert not loaded & {"typer", "pydantic", "tools.cli"}
+    assert "experiments.real_time.hosts.station" in loaded or "experiments.real_time.processes.robot" in loaded
+    assert not loaded & {"typer", "pydantic", "tools.cli.main"}
 
 
 def test_a_robot_loads_no_openssl():
     program = (
         "import atexit, runpy, sys; sys.argv = ['robot', '--help'];"
         "atexit.register(lambda: print('openssl:', sys.modules['_hashlib'], 'hashlib' in sys.modules));"
-        "runpy.run_module('experiments.robot', run_name='__main__')"
+        "runpy.run_module('experiments.real_time.processes.robot', run_name='__main__')"
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.endswith("openssl: None True\n")

@@ -6,11 +6,11 @@ import sys
 
 import pytest
 
-from experiments.experiment import Host
-from experiments.hosts import HostError
+from experiments.definition.experiment import Host
+from experiments.real_time.hosts.hosts import HostError
 from tests.tools.test_hosts import FAKE
-from tools import authority
-from tools.host_keys import send
+from tools.commands import authority
+from tools.commands.host_files import send
 
 
 @pytest.fixture

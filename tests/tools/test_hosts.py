@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from experiments import entries, hosts, playback, version
-from experiments.problem import DocumentError
+from experiments.file import catalogue
+from experiments.file.problems import DocumentError
+from experiments.real_time.hosts import hosts
+from experiments.recording import playback, version
 from tests.system.lab import ROOT, Flight
-from tools import hosts as tool
-from tools.freight import packed
-from tools.hosts import HEADING, Row, choose, table
+from tools.commands import hosts as tool
+from tools.commands.host_files import packed
+from tools.commands.hosts import HEADING, Row, choose, table
 
 FAKE = """\
 #!{python}
@@ -53,7 +55,7 @@ def home(tmp_path, monkeypatch):
 
 def experiment(folder, **hosts):
     file = folder / "x.toml"
-    text = entries.path("triangle").read_text("utf-8")
+    text = catalogue.path("triangle").read_text("utf-8")
     for name, fields in hosts.items():
         text += f"\n[hosts.{name}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in fields.items())
     file.write_text(text)
@@ -107,7 +109,8 @@ def test_hosts_can_be_left_out(home, tmp_path):
 @pytest.mark.system
 def test_another_zenpark_is_refused_before_anything_moves(home, tmp_path, monkeypatch):
     command = home / "zenpark" / "zenpark"
-    old = "import experiments.version as v; v.digest = lambda: 'f' * 64; from experiments.station import serve; serve()"
+    serve = "from experiments.real_time.hosts.station import serve; serve()"
+    old = f"import experiments.recording.version as v; v.digest = lambda: 'f' * 64; {serve}"
     command.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -c "{old}"\n')
     flight = Flight(tmp_path / "run", experiment(tmp_path, lab1={"address": "lab1", "robots": ["CF01"]}))
     flight.until_said("another zenpark is there")
@@ -141,7 +144,7 @@ def test_a_package_holds_code_and_nothing_that_running_left():
     with tarfile.open(fileobj=io.BytesIO(packed(ROOT, ["agents", "zenpark"]))) as tar:
         names = tar.getnames()
         assert tar.getmember("zenpark").mode & 0o100
-    assert "agents/keys.py" in names
+    assert "agents/network/keys.py" in names
     assert not [name for name in names if "__pycache__" in name]
 
 

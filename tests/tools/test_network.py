@@ -8,8 +8,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from agents.session import alive_token, open_session, orders, pose_publisher, publisher, subscriber
-from tools.network import HEADING, Cadence, KeyExpressionError, echo, key_expression, members, readable
+from agents.network.pubsub import alive_token, orders, pose_publisher, publisher, subscriber
+from agents.network.session import open_session
+from tools.commands.network import HEADING, Cadence, KeyExpressionError, echo, key_expression, members, readable
 
 ROOT = Path(__file__).resolve().parents[2]
 JSON, MSGPACK = "application/json", "application/msgpack"

@@ -3,10 +3,10 @@
 import pytest
 from typer.testing import CliRunner
 
-from experiments import document
-from experiments.problem import DocumentError
+from experiments.file import document
+from experiments.file.problems import DocumentError
 from tests.experiments.robotic_park_files import dome
-from tools.cli import app
+from tools.cli.main import app
 
 
 def typed(tmp_path, monkeypatch, *words):

@@ -2,8 +2,8 @@
 
 import pytest
 
-from agents.wire import WorldOrder
-from tools.world import done
+from agents.network.messages import WorldOrder
+from tools.commands.orders import done
 
 
 @pytest.mark.parametrize(

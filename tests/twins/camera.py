@@ -6,8 +6,8 @@ import time
 
 import numpy as np
 
-from twins.device import Faults
-from twins.vicon import ViconTwin, upright
+from twins.devices.device import Faults
+from twins.devices.vicon import ViconTwin, upright
 
 
 class Camera:

@@ -6,10 +6,10 @@ import numpy as np
 
 from agents.protocols.crtp import HighLevel, Port, Safety, Setpoint
 from tests.twins.loopback import request
-from twins.crazyflie.drone import Drone
-from twins.crazyflie.flock import Flock
-from twins.crazyflie.supervisor import State
-from twins.device import Faults
+from twins.devices.crazyflie.drone import Drone
+from twins.devices.crazyflie.flock import Flock
+from twins.devices.crazyflie.supervisor import State
+from twins.devices.device import Faults
 
 DT = 0.01
 

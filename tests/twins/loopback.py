@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from agents.body import BodyRequest, Disturbance
-from agents.keys import Keys
-from agents.kinds import KINDS
-from twins.device import DeviceRequest, Faults
+from agents.body.interface import BodyRequest, Disturbance
+from agents.body.kinds import KINDS
+from agents.network.keys import Keys
+from twins.devices.device import DeviceRequest, Faults
 
 
 def request(kind, addresses, *, external=False, device=None, start=None, yaw=0.0, disturbance=None):

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from twins.engine import Stage
-from twins.planar import Planar
+from twins.engines.engine import Stage
+from twins.engines.pymunk_engine import Planar
 from twins.scene import Obstacle, Scene
 
 DT = 0.01

@@ -7,21 +7,22 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.body import BodyError, Disturbance, Jitter
-from agents.kinds import CRAZYFLIE, KHEPERA4, TELLO
-from experiments import assign, document
-from experiments.experiment import Experiment, Robot, World
-from experiments.virtual import simulate
+from agents.body.interface import BodyError, Disturbance, Jitter
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO
+from experiments.definition import assignment, bodies
+from experiments.definition.experiment import Experiment, Robot, World
+from experiments.file import document
+from experiments.virtual_time.simulation import simulate
 from tests.twins.runge_kutta import runge_kutta
-from twins.airframe import AIRFRAMES
 from twins.body import TwinBody
-from twins.engine import Stage
-from twins.quadrotor import GRAVITY, Quadrotor
+from twins.engines.engine import Stage
+from twins.engines.mujoco_model import AIRFRAMES
+from twins.models.quadrotor import GRAVITY, Quadrotor
 from twins.scene import Obstacle, Scene
 
 pytest.importorskip("mujoco", reason="the engine mujoco is the extra [mujoco]: ./zenpark install mujoco-core")
 
-from twins.attitude import FOLLOWED, Drones, RigidBody
+from twins.engines.mujoco_engine import FOLLOWED, Drones, RigidBody
 
 DT = 0.01
 
@@ -337,7 +338,7 @@ def twin(robots, nature=None):
     experiment = Experiment(
         title="Drones", robots=robots, duration_s=1.0, disturbance=nature or {}, world=World(engine="mujoco")
     )
-    return TwinBody(assign.request(experiment, names, (3,)), assign.world(experiment, names))
+    return TwinBody(bodies.request(experiment, names, (3,)), bodies.world(experiment, names))
 
 
 @pytest.mark.slow
@@ -362,7 +363,7 @@ def test_ground_robots_drive_as_in_the_point_mass_engine():
         {"K": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.5)}
     )
     experiment = Experiment(title="K", robots={"K": Robot(kind="khepera4", start=[0.0, 0.0])}, duration_s=1.0)
-    plain = TwinBody(assign.request(experiment, ("K",), (3,)))
+    plain = TwinBody(bodies.request(experiment, ("K",), (3,)))
     for tick in range(100):
         state, other = body.read(tick * DT), plain.read(tick * DT)
         body.command(np.array([[0.2, 0.5, 0.0, 0.0], [np.nan] * 4]))
@@ -387,7 +388,7 @@ def test_the_drones_are_what_the_engine_flies():
 def test_the_reference_formation_needs_half_the_gain():
     """With the attitude's lag in the loop the file's gain of 3 hunts; see docs/mujoco.md."""
     park = document.read("robotic-park").cases()["periodic"]
-    links = assign.all_links(park)
+    links = assignment.all_links(park)
     error = {}
     for gain in (1.5, 3.0):
         formation = msgspec.structs.replace(park.formation, gain=gain)

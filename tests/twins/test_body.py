@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.body import BodyError, Disturbance, Jitter
-from agents.kinds import KINDS
-from agents.plugins import load
-from agents.positioning import SMOOTHING_S, External
-from experiments import assign
-from experiments.experiment import Experiment, Rates, Robot
+from agents.body.external_pose import SMOOTHING_S, External
+from agents.body.interface import BodyError, Disturbance, Jitter
+from agents.body.kinds import KINDS
+from agents.plugins.registry import load
+from experiments.definition import bodies
+from experiments.definition.experiment import Experiment, Rates, Robot
 from twins.body import CATCH_UP_S, ENDURANCE_S, TwinBody
 
 DT = 0.01
@@ -37,7 +37,7 @@ def request(robots, nature=None, seeds=(3,), hz=100.0):
     experiment = Experiment(
         title="Bodies", robots=robots, duration_s=1.0, disturbance=nature or {}, rates=Rates(body_hz=hz)
     )
-    return assign.request(experiment, tuple(robots), seeds)
+    return bodies.request(experiment, tuple(robots), seeds)
 
 
 def body(kind, **parts):

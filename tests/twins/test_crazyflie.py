@@ -11,8 +11,8 @@ from numpy.polynomial import Polynomial
 
 from agents.protocols.crtp import HighLevel, Info, Location, Port, Safety, Setpoint, Status, yaw_of
 from tests.twins.crazyflie_wire import Wire
-from twins.crazyflie.planner import Planner, evaluate, polynomial
-from twins.crazyflie.supervisor import State
+from twins.devices.crazyflie.planner import Planner, evaluate, polynomial
+from twins.devices.crazyflie.supervisor import State
 
 numbers = st.floats(-3.0, 3.0)
 axis = st.tuples(numbers, numbers, numbers)

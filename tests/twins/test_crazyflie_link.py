@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.body import BodyError, Disturbance, Jitter
+from agents.body.interface import BodyError, Disturbance, Jitter
 from agents.protocols import crtp
 from agents.protocols.crtp import Log, Memory, Misc, Port, Safety, Status, Toc, header
 from tests.twins.crazyflie_wire import Wire
 from tests.twins.loopback import request
 from twins.body import TwinBody
-from twins.crazyflie import open_device
-from twins.crazyflie.flock import Flock
-from twins.crazyflie.memory import ANCHOR_PAGES, CALIBRATION, Memories
-from twins.crazyflie.tables import LOG_TABLE, LOGS, PARAMETER_TABLE, PARAMETERS
-from twins.device import DeviceRequest, Faults
+from twins.devices.crazyflie.device import open_device
+from twins.devices.crazyflie.flock import Flock
+from twins.devices.crazyflie.memory import ANCHOR_PAGES, CALIBRATION, Memories
+from twins.devices.crazyflie.tables import LOG_TABLE, LOGS, PARAMETER_TABLE, PARAMETERS
+from twins.devices.device import DeviceRequest, Faults
 
 
 def number(name):

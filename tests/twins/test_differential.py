@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from agents.body import FRESH_S
-from agents.kinds import KHEPERA4, TURTLEBOT3
-from twins.differential import DRIVES, Differential
+from agents.body.interface import FRESH_S
+from agents.body.kinds import KHEPERA4, TURTLEBOT3
+from twins.models.differential import DRIVES, Differential
 
 DT = 0.01
 

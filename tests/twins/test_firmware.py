@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twins.firmware import BASE, FULL, LEAST, MIX, OUTER, RATE_HZ, SPEED, TILT, Firmware, Gains, Pid
+from twins.engines.crazyflie_cascade import BASE, FULL, LEAST, MIX, OUTER, RATE_HZ, SPEED, TILT, Firmware, Gains, Pid
 
 DT = 1.0 / RATE_HZ
 NONE = np.zeros((1, 3))

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.body import BodyError, Disturbance
+from agents.body.interface import BodyError, Disturbance
 from agents.protocols import khepera4 as protocol
 from tests.twins.loopback import request
-from twins import khepera4
-from twins.device import DeviceRequest, Faults
+from twins.devices import khepera4
+from twins.devices.device import DeviceRequest, Faults
 
 DT = 0.01
 

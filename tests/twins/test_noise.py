@@ -6,9 +6,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from agents.body import Disturbance, Jitter
-from twins.disturbance import Drift, HoverJitter, Latency, Measurement
-from twins.noise import BLOCK, Noise
+from agents.body.interface import Disturbance, Jitter
+from twins.models.disturbance import Drift, HoverJitter, Latency, Measurement
+from twins.models.noise import BLOCK, Noise
 
 
 def noise(rows, width, purpose="test", seed=1):

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import plugins
-from agents.body import BodyError
-from agents.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
-from experiments import virtual
-from experiments.run import chosen, load
+from agents.body.interface import BodyError
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
+from agents.plugins import registry
+from experiments.file.document import chosen, load
+from experiments.virtual_time import simulation
 from tests.twins.planar_drive import DT, Drive, furnished, stage, still
-from twins.place import MASSES
-from twins.planar import Planar
-from twins.pointmass import PointMass
+from twins.engines.point_mass import PointMass
+from twins.engines.pymunk_engine import Planar
+from twins.engines.pymunk_space import MASSES
 
 # without contact
 
@@ -66,7 +66,7 @@ def test_an_experiment_runs_the_same_on_it_as_on_point_masses():
     logs = []
     for engine in ("point-mass", "pymunk"):
         read = load("robotic-park", f"world.engine={engine}", "duration_s=25")
-        logs.append(virtual.simulate(chosen(read, ["event"])["event"], [7]))
+        logs.append(simulation.simulate(chosen(read, ["event"])["event"], [7]))
     one, other = logs
     np.testing.assert_allclose(other.true_position, one.true_position, atol=1e-9)
     np.testing.assert_allclose(other.error, one.error, atol=1e-9)
@@ -262,8 +262,8 @@ def test_a_kind_without_a_twin_is_an_error():
 
 
 def test_it_is_found_by_name_and_its_parameters_are_checked():
-    assert plugins.build(plugins.ENGINES, "pymunk") == Planar()
+    assert registry.build(registry.ENGINES, "pymunk") == Planar()
     with pytest.raises(msgspec.ValidationError, match=r"restitution"):
-        plugins.build(plugins.ENGINES, {"kind": "pymunk", "restitution": 2.0})
+        registry.build(registry.ENGINES, {"kind": "pymunk", "restitution": 2.0})
     with pytest.raises(msgspec.ValidationError, match=r"step_s"):
-        plugins.build(plugins.ENGINES, {"kind": "pymunk", "step_s": 0.0})
+        registry.build(registry.ENGINES, {"kind": "pymunk", "step_s": 0.0})

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from agents.kinds import CRAZYFLIE, KHEPERA4, TURTLEBOT3
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TURTLEBOT3
 from tests.twins.planar_drive import DT, furnished, stage
-from twins.planar import Planar
+from twins.engines.pymunk_engine import Planar
 
 # copies
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from agents.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
-from agents.planning import Line
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
+from agents.plugins.planners import Line
 from tests.twins.planar_drive import DT, Drive, furnished, stage, still
 
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from agents.kinds import CRAZYFLIE, TELLO
+from agents.body.kinds import CRAZYFLIE, TELLO
 from tests.twins.runge_kutta import runge_kutta
-from twins.pilot import CLIMB, TOUCHDOWN
-from twins.quadrotor import RESPONSES, Quadrotor
+from twins.models.onboard_flight import CLIMB, TOUCHDOWN
+from twins.models.quadrotor import RESPONSES, Quadrotor
 
 
 def flying(kinds=(CRAZYFLIE,), height=0.8, dt=0.01, yaw=0.0):

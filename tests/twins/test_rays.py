@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
-from twins import rays
-from twins.rays import Beams, Caster, Fan
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from twins.scene import Obstacle, Scene
+from twins.sensing import ray_casting
+from twins.sensing.ray_casting import Beams, Caster, Fan
 
 LOW = 0.01  # [m] everything that stands on the floor spans this height
 
@@ -85,9 +85,9 @@ def by_pymunk(position, angles, reach, scene, pose):
     return seen
 
 
-@pytest.mark.parametrize("budget", [rays.BUDGET, 300])
+@pytest.mark.parametrize("budget", [ray_casting.BUDGET, 300])
 def test_random_scenes_are_seen_as_pymunk_sees_them(budget, monkeypatch):
-    monkeypatch.setattr(rays, "BUDGET", budget)  # however memory is portioned
+    monkeypatch.setattr(ray_casting, "BUDGET", budget)  # however memory is portioned
     rng = np.random.default_rng(4)
     scene = furnished(THINGS, walled=True, size=(4.0, 3.0, 2.5))
     copies, n, reach = 12, len(CROWD), 2.2

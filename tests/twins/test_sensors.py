@@ -7,16 +7,15 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from agents.body import BodyError, BodyRequest, Disturbance
-from agents.keys import Keys
-from agents.kinds import CRAZYFLIE, KHEPERA4, KINDS, TURTLEBOT3
-from twins import sensors
+from agents.body.interface import BodyError, BodyRequest, Disturbance
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TURTLEBOT3
+from agents.network.keys import Keys
 from twins.body import TwinBody
-from twins.engine import Stage
-from twins.pointmass import PointMass
-from twins.scene import Obstacle, Scene
-from twins.sensors import OF_KIND, SENSORS, RangeSensors
-from twins.world import World
+from twins.engines.engine import Stage
+from twins.engines.point_mass import PointMass
+from twins.scene import Obstacle, Scene, World
+from twins.sensing import range_sensors
+from twins.sensing.range_sensors import OF_KIND, SENSORS, RangeSensors
 
 
 def asked(kinds, start, *, yaw=None, names=None, seeds=None):
@@ -310,7 +309,7 @@ def test_a_twin_s_state_carries_its_rays():
 
 def test_a_sensor_of_one_s_own(monkeypatch):
     """As a user adds one: an entry of the table, here a height sensor that looks down."""
-    floor = sensors.Sensor(
+    floor = range_sensors.Sensor(
         bearing=np.zeros(1), elevation=np.array([-0.5 * np.pi]), height=0.0, farthest=2.0, rate_hz=25.0, sigma=0.0
     )
     monkeypatch.setitem(SENSORS, "floor", floor)

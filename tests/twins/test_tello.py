@@ -6,10 +6,10 @@ import socket
 import numpy as np
 import pytest
 
-from agents.body import BodyError, Disturbance, Jitter
+from agents.body.interface import BodyError, Disturbance, Jitter
 from tests.twins.loopback import request
-from twins import tello
-from twins.device import DeviceRequest, Faults
+from twins.devices import tello
+from twins.devices.device import DeviceRequest, Faults
 
 DT = 0.01
 

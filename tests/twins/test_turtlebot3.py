@@ -10,12 +10,12 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 from zenoh.handlers import RingChannel
 
-from agents.body import BodyError, Disturbance
-from agents.session import open_session
+from agents.body.interface import BodyError, Disturbance
+from agents.network.session import open_session
 from tests.bridges.turtlebots import request
 from tests.conftest import RouterProcess
-from twins.device import DeviceRequest, Faults
-from twins.turtlebot3 import open_device
+from twins.devices.device import DeviceRequest, Faults
+from twins.devices.turtlebot3 import open_device
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 KINDS = {

@@ -17,17 +17,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents import session as network
-from agents import wire
-from agents.endpoint import free_endpoint
-from agents.keys import Keys
-from agents.protocols import datastream
-from agents.protocols.datastream import Framer, Kind, Malformed, Segment
-from bridges.datastream import Decoder, Frame, Reader
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.endpoints import free_endpoint
+from agents.network.keys import Keys
+from agents.protocols import vicon_datastream
+from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment
+from bridges.vicon.client import Decoder, Frame, Reader
 from tests.conftest import ROOT, RouterProcess
 from tests.twins.camera import Camera
-from twins.device import Faults
-from twins.vicon import ViconTwin, upright
+from twins.devices.device import Faults
+from twins.devices.vicon import ViconTwin, upright
 
 # the vendor's client, in a process of its own: it holds the interpreter, and never returns from a dead server
 VENDOR = """
@@ -77,12 +77,12 @@ def test_what_is_packed_is_unpacked_however_it_is_cut(
     bodies: list[tuple[float, float, float, list[float]]], number: int, cut: int
 ) -> None:
     sent = [Segment(0, (x, y, z), tuple(turn)) for x, y, z, turn in bodies]
-    stream = datastream.packet(
-        datastream.pack_axes(),
-        *(datastream.pack_subject(row, f"körper {row}") for row in range(len(sent))),
-        datastream.pack_frame_number(number),
-        datastream.pack_latency([("a", 0.25), ("b", 0.125)]),
-        *(datastream.pack_segments(row, [segment]) for row, segment in enumerate(sent)),
+    stream = vicon_datastream.packet(
+        vicon_datastream.pack_axes(),
+        *(vicon_datastream.pack_subject(row, f"körper {row}") for row in range(len(sent))),
+        vicon_datastream.pack_frame_number(number),
+        vicon_datastream.pack_latency([("a", 0.25), ("b", 0.125)]),
+        *(vicon_datastream.pack_segments(row, [segment]) for row, segment in enumerate(sent)),
     )
     framer, decoder = Framer(), Decoder()
     packets = [body for at in range(0, 2 * len(stream), cut) for body in framer.feed((stream * 2)[at : at + cut])]
@@ -100,21 +100,26 @@ def test_what_is_packed_is_unpacked_however_it_is_cut(
 
 @given(st.binary(max_size=200), st.integers(0, 400), st.integers(0, 255))
 def test_damage_is_malformed_and_nothing_else(noise: bytes, at: int, value: int) -> None:
-    honest = datastream.packet(
-        datastream.pack_subject(0, "CF01"),
-        datastream.pack_frame_number(1),
-        datastream.pack_latency([("all", 0.002)]),
-        datastream.pack_segments(0, [Segment(0, (1.0, 2.0, 3.0), (1.0,) * 9)]),
+    honest = vicon_datastream.packet(
+        vicon_datastream.pack_subject(0, "CF01"),
+        vicon_datastream.pack_frame_number(1),
+        vicon_datastream.pack_latency([("all", 0.002)]),
+        vicon_datastream.pack_segments(0, [Segment(0, (1.0, 2.0, 3.0), (1.0,) * 9)]),
     )
     damaged = bytearray(honest)
     damaged[at % len(honest)] = value
-    for stream in (noise, bytes(damaged), datastream.block(datastream.MAGIC, noise), honest[: at % len(honest)]):
+    for stream in (
+        noise,
+        bytes(damaged),
+        vicon_datastream.block(vicon_datastream.MAGIC, noise),
+        honest[: at % len(honest)],
+    ):
         decoder = Decoder()
         try:
             for body in Framer().feed(stream):
                 decoder.frame(body)
-                for _, payload in datastream.blocks(body):
-                    datastream.unpack_kinds(payload)
+                for _, payload in vicon_datastream.blocks(body):
+                    vicon_datastream.unpack_kinds(payload)
         except Malformed:
             pass  # anything else would fail the test
 
@@ -129,12 +134,12 @@ def test_the_root_segment_is_the_pose_of_a_subject_and_new_names_replace_the_old
             for parent, segment in segments
         ]
         payload = number.to_bytes(4, "little") + text(name) + len(parts).to_bytes(4, "little") + b"".join(parts)
-        return datastream.block(Kind.SUBJECT_INFO, payload + bytes(8))
+        return vicon_datastream.block(Kind.SUBJECT_INFO, payload + bytes(8))
 
     near, far = Segment(7, (1.0, 0.0, 0.0), (0.0,) * 9), Segment(3, (2.0, 0.0, 0.0), (0.0,) * 9)
-    moved = datastream.pack_frame_number(5) + datastream.pack_segments(1, [near, far])
+    moved = vicon_datastream.pack_frame_number(5) + vicon_datastream.pack_segments(1, [near, far])
     decoder = Decoder()
-    root = datastream.NO_PARENT
+    root = vicon_datastream.NO_PARENT
     assert decoder.frame(subject(1, "arm", [(root, 3), (3, 7)]) + subject(2, "leg", [(root, 0)])) is None
     first = decoder.frame(moved)
     assert first is not None
@@ -182,7 +187,7 @@ def test_clients_come_and_go_and_a_slow_one_holds_nobody_up() -> None:
     with Camera(["CF01"], rate_hz=250.0) as camera:
         camera.place("CF01", [0.1, 0.2, 0.3], 0.5)
         slow = socket.create_connection(("127.0.0.1", camera.port))
-        slow.sendall(datastream.packet(datastream.block(Kind.REQUEST_FRAME, b"\x01")))
+        slow.sendall(vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_FRAME, b"\x01")))
         rude = socket.create_connection(("127.0.0.1", camera.port))
         rude.sendall(b"GET / HTTP/1.1\r\n\r\n")
         for _ in range(3):
@@ -193,7 +198,7 @@ def test_clients_come_and_go_and_a_slow_one_holds_nobody_up() -> None:
         heard = b""
         while part := rude.recv(4096):  # it is told what there is, and then left
             heard += part
-        assert heard == datastream.pack_kinds(datastream.POSES)
+        assert heard == vicon_datastream.pack_kinds(vicon_datastream.POSES)
         slow.close()
         rude.close()
 
@@ -203,7 +208,7 @@ def test_a_client_may_ask_for_single_frames() -> None:
     with Camera(["CF01"]) as camera, socket.create_connection(("127.0.0.1", camera.port), 2.0) as client:
         camera.place("CF01", [1.0, 2.0, 3.0])
         framer, decoder, frames = Framer(), Decoder(), []
-        ask = datastream.packet(datastream.block(Kind.REQUEST_NEXT_FRAME))
+        ask = vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_NEXT_FRAME))
         for wanted in (1, 2):
             client.sendall(ask)
             while len(frames) < wanted:
@@ -222,10 +227,10 @@ def test_a_delayed_frame_comes_late_and_as_it_was() -> None:
         listener = twin.sockets()[0]
         select.select([listener], [], [], 2.0)
         twin.serve(listener, 0.0)
-        client.sendall(datastream.packet(datastream.block(Kind.REQUEST_FRAME, b"\x01")))
+        client.sendall(vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_FRAME, b"\x01")))
         select.select(twin.sockets(), [], [], 2.0)
         twin.serve(twin.sockets()[1], 0.0)
-        offer = datastream.pack_kinds(datastream.POSES)
+        offer = vicon_datastream.pack_kinds(vicon_datastream.POSES)
         assert client.recv(65536) == offer
         for t, height in ((0.01, 1.0), (0.02, 2.0), (0.055, 3.0)):
             twin.place(0, np.array([0.0, 0.0, height]), upright(0.0))
@@ -281,7 +286,7 @@ def test_noise_has_the_size_that_was_asked_for() -> None:
 
 @pytest.fixture
 def process(router: RouterProcess) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "twins.vicon", "--robots", "CF01", "KH01", "--connect", router.endpoint]
+    command = [sys.executable, "-m", "twins.devices.vicon", "--robots", "CF01", "KH01", "--connect", router.endpoint]
     made = subprocess.Popen(
         [*command, "--sigma", "0", "--rate", "200", "--lifeline"],
         cwd=ROOT,
@@ -306,13 +311,13 @@ def test_the_process_shows_the_truth_that_it_hears(process: subprocess.Popen[str
     assert said.startswith("vicon ready on 127.0.0.1:")
     keys = Keys()
     with network.open_session([router.endpoint], name="test") as session:
-        truth = network.publisher(session, keys.truth("CF01"), wire.JSON)
+        truth = pubsub.publisher(session, keys.truth("CF01"), messages.JSON)
         reader = Reader("127.0.0.1", int(said.rpartition(":")[2]))
         deadline = time.monotonic() + 5.0
         seen = None
         while seen is None and time.monotonic() < deadline:
-            truth.put(wire.encode(wire.Position("CF01", time.time() - 0.02, (0.4, -0.2, 0.9), 0.7)))
-            session.put(keys.truth("KH01"), b"{}", encoding=wire.JSON)
+            truth.put(messages.encode(messages.Position("CF01", time.time() - 0.02, (0.4, -0.2, 0.9), 0.7)))
+            session.put(keys.truth("KH01"), b"{}", encoding=messages.JSON)
             frame = reader.newest(1.0)
             assert frame is not None
             assert frame.poses["KH01"] is None
@@ -341,7 +346,7 @@ def test_the_process_ends_with_its_starter_but_not_before_the_robots(
     said = process.stdout.readline()
     reader = Reader("127.0.0.1", int(said.rpartition(":")[2]))
     with network.open_session([router.endpoint], name="robot") as session:
-        token = network.alive_token(session, Keys().alive("KH01"))
+        token = pubsub.alive_token(session, Keys().alive("KH01"))
         process.stdin.close()
         for _ in range(40):
             assert reader.newest(1.0) is not None
@@ -359,7 +364,7 @@ def test_what_a_user_can_mend_is_said_without_a_traceback() -> None:
         (["--faults", '{"occluded": 1}'], "occluded"),
         (["--rate", "0"], "--rate is 1 to 1000 Hz"),
     ):
-        command = [sys.executable, "-m", "twins.vicon", "--robots", "CF01", "--connect", endpoint, *arguments]
+        command = [sys.executable, "-m", "twins.devices.vicon", "--robots", "CF01", "--connect", endpoint, *arguments]
         ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20, check=False)
         assert ended.returncode == 2
         assert words in ended.stderr

@@ -1,0 +1,101 @@
+"""Exclusive use of a device on this machine: a lock on the device's address, held as long as a body is open.
+
+The locks are files of the user's runtime folder (`agents.runtime.run_registry`) and end with their process. Other
+machines and other users are not seen.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import socket
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from agents.body.interface import BodyError
+from agents.user_folder import runtime_folder
+
+LONGEST: Final = 200  # [bytes] of what a holder says of itself
+
+
+def numeric(host: str) -> str:
+    """The IPv4 address of a host, so that two names of it are one; the name itself if it cannot be resolved."""
+    try:
+        return socket.gethostbyname(host)
+    except (OSError, UnicodeError):
+        return host.lower()
+
+
+class Claims:
+    """The devices of a body, of which this process is the only driver between `take` and `release`."""
+
+    def __init__(self, names: Sequence[str], addresses: Sequence[str]) -> None:
+        """`addresses` are spelled in one way for each device: what is equal is the same device."""
+        self._wanted = list(zip(names, addresses, strict=True))
+        self._locks: dict[Path, int] = {}  # open files
+
+    def take(self) -> None:
+        """Takes all of them, or none; before the first byte goes to a device.
+
+        Raises:
+            BodyError: If a process has one of them, with the address and that process; or if the folder cannot be had.
+        """
+        try:
+            for name, address in self._wanted:
+                path = runtime_folder() / f"device-{hashlib.sha256(address.encode()).hexdigest()[:32]}.lock"
+                self._locks[path] = _lock(path, name, address)
+        except OSError as error:
+            self.release()
+            raise BodyError(
+                f"no lock on {address}, which keeps other processes off {name}: {error}; "
+                "set ZENPARK_RUNS to a folder that is yours alone (mode 0700)"
+            ) from error
+        except BodyError:
+            self.release()
+            raise
+
+    def release(self) -> None:
+        """Lets go of all."""
+        while self._locks:
+            path, lock = self._locks.popitem()
+            with suppress(OSError):
+                path.unlink()  # while it is locked: whoever waits at this file finds that it is no longer there
+            os.close(lock)
+
+
+def _lock(path: Path, name: str, address: str) -> int:
+    """The open and locked file.
+
+    Raises:
+        BodyError: If another open file has the lock.
+        OSError: If there can be no such file.
+    """
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is(path, file):
+                os.ftruncate(file, 0)
+                os.write(file, f"{os.getpid()} {name}".encode())
+                return file
+        except BlockingIOError:
+            holder, _, other = os.read(file, LONGEST).decode(errors="replace").partition(" ")
+            os.close(file)
+            who = "this process" if holder == str(os.getpid()) else f"process {holder or '(not known yet)'}"
+            of = f" for {other}" if other else ""
+            raise BodyError(f"{name}: {address} is in use: {who} drives it{of}; end that first") from None
+        except BaseException:
+            os.close(file)
+            raise
+        os.close(file)
+
+
+def _is(path: Path, file: int) -> bool:
+    """Whether that is still the file of this path; its last holder may have removed it meanwhile."""
+    try:
+        return os.path.samestat(path.lstat(), os.fstat(file))
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,294 @@
+"""The one seam between a robot and what it is made of: hardware or a twin, chosen by one word.
+
+A body has rows as everything has: a bridge that serves three Crazyflies on one radio is one body of three rows.
+The runtime finds bodies by the entry-point group `zenpark.bodies`: the word before `://` (or the whole word) names one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Final, Protocol, TypeVar
+
+import msgspec
+import numpy as np
+
+from agents.arrays import Array, Index, Mask
+from agents.body.kinds import Kind
+from agents.clock import Clock
+from agents.network.keys import Keys
+
+
+class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Wobble about the place that a flying robot holds: an Ornstein-Uhlenbeck process on each horizontal axis."""
+
+    sigma: float  # [m] standard deviation
+    correlation_s: float = 0.5  # [s] correlation time
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.sigma < 1.0 and 0.0 < self.correlation_s < 1e3):
+            raise ValueError("hover_jitter needs 0 <= sigma < 1 m and correlation_s > 0")
+
+
+class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What nature adds to a simulated body; a field left out means: nothing of it."""
+
+    hover_jitter: Jitter | None = None
+    position_sigma: float | None = None  # [m] white noise of the measured position, per axis (planar for ground robots)
+    yaw_sigma: float | None = None  # [rad] white noise of the measured yaw
+    latency_s: Annotated[float, msgspec.Meta(ge=0, le=10)] | None = None  # [s] from command to effect
+    odometry_drift: float | None = None  # [m per square root of m] random walk of the measured position with the way
+
+
+@dataclass(frozen=True)
+class BodyRequest:
+    """What a body is opened with; every sequence has one entry per row.
+
+    `external` rows get their position from outside, through `Body.locate`. `device` holds each row's settings for its
+    hardware, as they stand in the experiment file; the body checks them. `endpoints` and `keys` are for bodies that
+    live on the network, and so is `clock`, which makes the stamps there.
+    """
+
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+    addresses: tuple[str, ...]  # the `body` of the experiment file: "twin", "radio://0/80/2M/E7E7E7E701", ...
+    start: Array  # (n, 3) [m]
+    yaw: Array  # (n,) [rad]
+    rate_hz: float  # how often it will be read and commanded
+    seeds: tuple[int, ...]
+    disturbance: tuple[Disturbance, ...]
+    external: tuple[bool, ...]
+    device: tuple[Mapping[str, Any], ...]
+    endpoints: tuple[str, ...]
+    keys: Keys
+    clock: Clock = field(default_factory=Clock)
+
+    def of(self, rows: Index) -> BodyRequest:
+        """The same for some of the rows."""
+        return BodyRequest(
+            tuple(self.names[row] for row in rows),
+            tuple(self.kinds[row] for row in rows),
+            tuple(self.addresses[row] for row in rows),
+            self.start[rows],
+            self.yaw[rows],
+            self.rate_hz,
+            tuple(self.seeds[row] for row in rows),
+            tuple(self.disturbance[row] for row in rows),
+            tuple(self.external[row] for row in rows),
+            tuple(self.device[row] for row in rows),
+            self.endpoints,
+            self.keys,
+            self.clock,
+        )
+
+
+@dataclass(frozen=True)
+class RangeScan:
+    """One sweep of a robot's range sensors.
+
+    Attributes:
+        time: When, on the clock of `Body.read` [s]; a newer scan has a newer time.
+        bearing: (m,) from the robot's nose, to the left [rad].
+        elevation: (m,) up [rad].
+        distance: (m,) from the robot's centre [m]; NaN where nothing is in reach.
+    """
+
+    time: float
+    bearing: Array
+    elevation: Array
+    distance: Array
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The newest readings of the range sensors of any rows, one entry per ray (R).
+
+    Attributes:
+        row: (R,) whose ray it is; rays of one row follow one another.
+        time: (R,) when it was measured, on the clock of `Body.read` [s].
+        bearing: (R,) from the robot's nose, to the left [rad].
+        elevation: (R,) up [rad].
+        distance: (R,) from the robot's centre [m]; NaN where nothing is in reach.
+    """
+
+    row: Index
+    time: Array
+    bearing: Array
+    elevation: Array
+    distance: Array
+
+    @classmethod
+    def gather(cls, scans: Sequence[RangeScan | None]) -> Rays | None:
+        """The scans of all rows; None if no row has one."""
+        seen = [(row, scan) for row, scan in enumerate(scans) if scan is not None]
+        if not seen:
+            return None
+        counts = [len(scan.distance) for _, scan in seen]
+        return cls(
+            np.repeat(np.array([row for row, _ in seen], dtype=np.intp), counts),
+            np.repeat(np.array([scan.time for _, scan in seen]), counts),
+            np.concatenate([scan.bearing for _, scan in seen]),
+            np.concatenate([scan.elevation for _, scan in seen]),
+            np.concatenate([scan.distance for _, scan in seen]),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[tuple[Index, Rays | None]]) -> Rays | None:
+        """Those of several bodies, whose rows are rows `group` of the whole; None if none has any."""
+        there = [(group, rays) for group, rays in parts if rays is not None]
+        if not there:
+            return None
+        columns = ("time", "bearing", "elevation", "distance")
+        return cls(
+            np.concatenate([group[rays.row] for group, rays in there]),
+            *(np.concatenate([getattr(rays, column) for _, rays in there]) for column in columns),
+        )
+
+    def of(self, row: int) -> RangeScan | None:
+        """What one row sees; None if it has no rays."""
+        mine = self.row == row
+        if not mine.any():
+            return None
+        time = float(self.time[mine].max())
+        return RangeScan(time, self.bearing[mine], self.elevation[mine], self.distance[mine])
+
+
+@dataclass
+class BodyState:
+    """What a body knows of its rows. Unknown numbers are NaN.
+
+    Attributes:
+        time: (n,) when the pose was measured, on the clock of `read` [s].
+        position: (n, 3) measured [m].
+        velocity: (n, 3) measured or estimated [m/s].
+        yaw: (n,) measured [rad].
+        true_position: (n, 3) the truth of a twin [m].
+        true_yaw: (n,) the truth of a twin [rad].
+        battery: (n,) charge, 0 to 1.
+        flying: (n,) motors on, off the ground or about to be.
+        notes: What each row's hardware says of itself (supervisor, link), for people; empty if nothing.
+        rays: What the rows' range sensors see; None if they have none.
+        attitude: (n, 4) unit quaternion w, x, y, z from the robot to the room, where a body knows more than yaw.
+        shadow_position: (n, 3) of the twin that runs beside each row [m], NaN for rows without one; None if there is
+            none at all (see `agents.body.shadow_twin`).
+        shadow_yaw: (n,) of that twin [rad].
+        ahead: (n,) how far ahead of its arrival the last position was stamped that something outside measured [s],
+            negative where behind; None if there is none.
+    """
+
+    time: Array
+    position: Array
+    velocity: Array
+    yaw: Array
+    true_position: Array
+    true_yaw: Array
+    battery: Array
+    flying: Mask
+    notes: tuple[str, ...] = ()
+    rays: Rays | None = None
+    attitude: Array | None = None
+    shadow_position: Array | None = None
+    shadow_yaw: Array | None = None
+    ahead: Array | None = None
+
+
+class Body(Protocol):
+    """What the runtime drives. `takes` of each row's kind says how a row of `command` is read.
+
+    Calls come from one thread, but for `land` and `stop`: these come from others too, more than once, and while another
+    call runs or hangs (`agents.runtime.watchdog`, emergency stops). They must neither block nor need the loop to go on.
+    A body of several rows tells all of them, even if one of them fails (`call_all`).
+    """
+
+    def open(self) -> None:
+        """Connects; returns when poses arrive.
+
+        Raises:
+            BodyError: If it cannot, saying what to plug in or to change.
+        """
+        ...
+
+    def read(self, t: float) -> BodyState:
+        """The newest state at time `t` [s] of the process's clock. Never blocks; a twin advances itself to `t`."""
+        ...
+
+    def command(self, setpoint: Array) -> None:
+        """One setpoint (n, 4) per row: x y z yaw, v_x v_y v_z yaw-rate, or v ω 0 0; rows of NaN are left alone."""
+        ...
+
+    def takeoff(self, rows: Index, height: Array) -> None:
+        """Flying rows climb to `height` (len(rows),) [m] by themselves."""
+        ...
+
+    def land(self, rows: Index) -> None:
+        """Flying rows descend and switch their motors off, ground robots halt, by themselves."""
+        ...
+
+    def stop(self, rows: Index) -> None:
+        """Motors off, at once, wherever the rows are: the emergency stop.
+
+        A device that may not have heard it is told again until it says that its motors stand, or must be taken for
+        gone; `flying` says until then that a flying row flies, and its note that the stop is not answered.
+        """
+        ...
+
+    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
+        """An externally measured pose of a row: (3,) [m], yaw [rad] or NaN, taken at `t` on the clock of `read`."""
+        ...
+
+    def close(self) -> None:
+        """Lets go of the device. Rows still in the air must have been landed before."""
+        ...
+
+
+class BodyError(RuntimeError):
+    """A body that cannot be opened or driven, with the remedy."""
+
+
+FRESH_S: Final = 0.5  # a setpoint that is older is none: wheels stop, sticks are at rest
+
+UNANSWERED: Final = "the emergency stop is not answered"  # in the notes of a robot that was stopped and goes on
+
+# what a body that fails may raise, a plug-in too
+TROUBLE: Final = (
+    AttributeError,
+    TypeError,
+    ValueError,
+    NameError,
+    LookupError,
+    ArithmeticError,
+    RuntimeError,
+    OSError,
+)
+
+
+def call_all(calls: Iterable[Callable[[], object]]) -> None:
+    """Makes every call in the given order, whatever the others raise; the last error is raised afterwards.
+
+    For everything that stops robots: a body that fails must not keep the next one from being stopped.
+    """
+    left = iter(calls)
+    for call in left:
+        try:
+            call()
+        finally:
+            call_all(left)
+
+
+BodyFactory = Callable[[BodyRequest], Body]
+
+
+SettingsT = TypeVar("SettingsT", bound=msgspec.Struct)
+
+
+def settings(kind: type[SettingsT], robot: str, device: Mapping[str, Any]) -> SettingsT:
+    """The settings of a robot's device.
+
+    Raises:
+        BodyError: If a field is unknown or wrong, naming the robot, the field and the fields that there are.
+    """
+    try:
+        return msgspec.convert(dict(device), kind)
+    except msgspec.ValidationError as error:
+        known = ", ".join(kind.__struct_fields__)
+        raise BodyError(f"{robot}: device: {error}; its fields are {known}") from error

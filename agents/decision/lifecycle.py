@@ -1,0 +1,178 @@
+"""The life of a robot in an experiment: idle, ready, airborne, running, landing, done. Pure and row-wise.
+
+Orders and facts go in, phases come out; what a body must do because of a change is collected in `Duties`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask
+
+
+class Phase(IntEnum):
+    """Where in its life a robot is; the numbers grow with time."""
+
+    IDLE = 0  # process alive, something missing: position or a neighbour
+    READY = (
+        1  # body open, own position fresh, every neighbour heard, and whatever else `agents.safety.preflight` asks for
+    )
+    AIRBORNE = 2  # at its hover height (a ground robot: at once), waiting for the common start
+    RUNNING = 3  # the experiment
+    LANDING = 4  # going down, or rolling out
+    DONE = 5  # on the ground, motors off
+
+    @property
+    def word(self) -> str:
+        """As it stands on the wire."""
+        return self.name.lower()
+
+
+# the members of an enumeration are slow to look up, and every tick asks for them
+IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
+
+AT_HEIGHT = 0.05  # [m] nearer than this to the hover height a robot has arrived there
+SETTLED = 0.1  # [m/s] slower than this it has stopped climbing, or rolling
+
+
+@dataclass(frozen=True)
+class Duties:
+    """What the body must do now: rows that take off, land, and cut their motors."""
+
+    takeoff: Index
+    land: Index
+    stop: Index
+
+
+class Lifecycle:
+    """Phases of N rows; `moved` says whether any changed on the last tick, or by an order since the one before."""
+
+    def __init__(self, flies: Mask, hover: Array, duration: float) -> None:
+        """Rows that fly (N,), the heights that they hold (N,) [m], and how long the experiment is [s]."""
+        rows = len(flies)
+        self.phase = np.full(rows, IDLE)
+        self.start_at = np.full(rows, np.inf)
+        self.reason, self._waits = [""] * rows, [""] * rows
+        self.moved = False
+        self._before = self.phase.tobytes()
+        self._flies, self._hover, self._duration = flies, hover, duration
+        self._climbing = np.zeros(rows, dtype=bool)
+        self._due: dict[str, list[int]] = {"takeoff": [], "land": [], "stop": []}
+        self._settled_until = -np.inf  # until then nothing changes by itself
+
+    def takeoff(self, row: int) -> str:
+        """Order to climb; an empty answer means yes, else why not."""
+        phase = Phase(self.phase[row])
+        if self._climbing[row] or phase in (AIRBORNE, RUNNING):
+            return ""  # done already: an order may be repeated when its reply was lost
+        if phase != READY:
+            return f"cannot take off while {phase.word}" + (f": {self.reason[row]}" if self.reason[row] else "")
+        self._climbing[row] = True
+        self._due["takeoff"].append(row)
+        return ""
+
+    def start(self, row: int, at: float) -> str:
+        """Order to begin the experiment at `at` on the process's clock [s]."""
+        phase = Phase(self.phase[row])
+        if phase == RUNNING:
+            return ""
+        if phase != AIRBORNE:
+            return f"cannot start while {phase.word}"
+        self.start_at[row] = at
+        return ""
+
+    def land(self, row: int, reason: str) -> None:
+        """Go down, or roll out, whatever it was doing."""
+        if self.phase[row] < LANDING:
+            self.phase[row], self._climbing[row], self.reason[row] = LANDING, False, reason
+            self._forget("takeoff", row)
+            self._due["land"].append(row)
+            self._settled_until = -np.inf
+
+    def stop(self, row: int, reason: str) -> None:
+        """Motors off."""
+        self.phase[row], self._climbing[row], self.reason[row] = DONE, False, reason
+        self._forget("takeoff", row)
+        self._due["stop"].append(row)
+        self._settled_until = -np.inf
+
+    def _forget(self, what: str, row: int) -> None:
+        """A duty that the body has not been told yet and must not be told any more."""
+        if row in self._due[what]:
+            self._due[what].remove(row)
+
+    def wait(self, row: int, reason: str) -> None:
+        """Says why an idle row is not ready, or why a ready one will not be any more on this tick."""
+        self._waits[row] = reason
+        if self.phase[row] == IDLE:
+            self.reason[row] = reason
+
+    @property
+    def active(self) -> Mask:
+        """Rows (N,) that climb, wait in the air, or run."""
+        return np.asarray(self._climbing | (self.phase == AIRBORNE) | (self.phase == RUNNING))
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a row has yet to take off."""
+        return self._settled_until == -np.inf and bool(self.phase.min() <= READY)
+
+    @property
+    def all_running(self) -> bool:
+        """Whether every row runs the experiment."""
+        return self._settled_until > -np.inf or bool((self.phase == RUNNING).all())
+
+    def advance(self, t: float, ready: Mask, position: Array, velocity: Array, flying: Mask) -> Duties | None:
+        """Moves every row on as far as the facts allow.
+
+        Args:
+            t: Now, on the process's clock [s].
+            ready: (N,) nothing is missing; who was ready and is not is idle again, unless it climbs already.
+            position: (N, 3) [m].
+            velocity: (N, 3) [m/s].
+            flying: (N,) motors on.
+        """
+        if t < self._settled_until:
+            self.moved = False
+            return None
+        phase = self.phase
+        lowest, highest = phase.min(), phase.max()
+        if lowest <= READY:
+            for row in np.flatnonzero((phase == IDLE) & ready):
+                phase[row], self.reason[row] = READY, ""
+            for row in np.flatnonzero((phase == READY) & ~ready & ~self._climbing):
+                phase[row], self.reason[row] = IDLE, self._waits[row]
+        if self._climbing.any():
+            there = ~self._flies | (
+                (np.abs(position[:, 2] - self._hover) < AT_HEIGHT) & (np.abs(velocity[:, 2]) < SETTLED)
+            )
+            arrived = self._climbing & there & ~np.isin(np.arange(len(phase)), self._due["takeoff"])
+            phase[arrived] = AIRBORNE
+            self._climbing &= ~arrived
+        if lowest <= AIRBORNE:
+            phase[(phase == AIRBORNE) & (t >= self.start_at - 1e-6)] = RUNNING
+        if highest >= RUNNING:
+            over = (phase == RUNNING) & (t - self.start_at >= self._duration - 1e-6)
+            for row in np.flatnonzero(over) if over.any() else ():
+                self.land(int(row), "finished")
+        if highest >= LANDING:
+            slow = ~((velocity * velocity).sum(axis=1) >= SETTLED**2)  # what is not known cannot be waited for
+            down = (phase == LANDING) & np.where(self._flies, ~flying, slow)
+            down[self._due["land"]] = False  # the body has not been told yet
+            phase[down] = DONE
+        now = phase.tobytes()
+        self.moved, self._before = now != self._before, now  # orders between ticks count as well
+        if (phase == RUNNING).all():
+            self._settled_until = float(self.start_at.min()) + self._duration - 1e-6
+        return self._duties()
+
+    def _duties(self) -> Duties | None:
+        if not any(self._due.values()):
+            return None
+        duties = Duties(*(np.array(self._due[what], dtype=np.intp) for what in ("takeoff", "land", "stop")))
+        for rows in self._due.values():
+            rows.clear()
+        return duties

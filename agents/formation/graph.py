@@ -1,0 +1,168 @@
+"""Who listens to whom, as arrays, and what the theory of graphs and of rigid frameworks says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask
+
+BY_DISTANCE, BY_RELATIVE, BY_BEARING = range(3)  # what a link wants
+
+
+@dataclass(frozen=True)
+class Links:
+    """Directed links sorted by listener: `listener`, `speaker` (E,) rows, target `distance` [m] and `gain` (E,).
+
+    What a link wants is a distance, a relative position or a direction; it is told in each way that follows from it.
+    In a robot's own process the listeners are its rows, renumbered from 0; the speakers keep the numbers that they
+    have in the experiment.
+
+    Attributes:
+        listener: (E,) rows i.
+        speaker: (E,) rows j.
+        distance: (E,) d_ij [m]; NaN where only a direction is wanted.
+        gain: (E,) of the law.
+        relative: (E, 3) wanted p_i − p_j [m], NaN where only a distance or a direction is; None: nowhere any.
+        bearing: (E, 3) unit vector along the wanted p_i − p_j, NaN where none is; its z alone is NaN where the
+            direction is one seen from above. None: nowhere any.
+        wants: (E,) BY_DISTANCE, BY_RELATIVE or BY_BEARING, as the file has it; None, as both before: all by distance.
+    """
+
+    listener: Index
+    speaker: Index
+    distance: Array
+    gain: Array
+    relative: Array | None = None
+    bearing: Array | None = None
+    wants: Index | None = None
+
+    def __len__(self) -> int:
+        return len(self.listener)
+
+    @cached_property
+    def _starts(self) -> Index:
+        """Where each listener that has links begins; the links are sorted by listener."""
+        return np.flatnonzero(np.diff(self.listener, prepend=-1))
+
+    @cached_property
+    def _heads(self) -> Index:
+        return self.listener[self._starts]
+
+    def onto_listeners(self, per_link: Array, rows: int) -> Array:
+        """Sum of a quantity (E, ...) over each listener's links -> (rows, ...)."""
+        if len(self._heads) == rows > 0:
+            return np.asarray(np.add.reduceat(per_link, self._starts, axis=0))
+        total = np.zeros((rows, *per_link.shape[1:]))
+        if len(self):
+            total[self._heads] = np.add.reduceat(per_link, self._starts, axis=0)
+        return total
+
+    def take(self, which: Index | Mask) -> Links:
+        """Some of them, or the same in another order."""
+        return Links(*(None if column is None else column[which] for column in self._columns()))  # type: ignore[arg-type]
+
+    def most_of_listeners(self, per_link: Array, rows: int) -> Array:
+        """Largest of a quantity (E,) over each listener's links -> (rows,), 0 without links."""
+        most = np.zeros(rows)
+        if len(self):
+            most[self._heads] = np.maximum.reduceat(per_link, self._starts)
+        return most
+
+    def of(self, rows: Index) -> Links:
+        """The links on which these rows listen; listeners renumbered 0..len(rows)-1, speakers keep their numbers."""
+        at, listener = self.heard_by(rows)
+        return replace(self.take(at), listener=listener)
+
+    def heard_by(self, rows: Index) -> tuple[Index, Index]:
+        """Which links these rows listen on, in the order of `of`, and the new number of each one's listener."""
+        mine = np.flatnonzero(np.isin(self.listener, rows))
+        order = np.argsort(rows)
+        listener = order[np.searchsorted(rows, self.listener[mine], sorter=order)]
+        by_listener = np.argsort(listener, kind="stable")
+        return mine[by_listener], listener[by_listener]
+
+    def repeated(self, times: int, rows: int) -> Links:
+        """The same links in `times` copies of an experiment of `rows` robots, one copy behind the other."""
+        shift = np.repeat(np.arange(times) * rows, len(self))
+        many = self.take(np.tile(np.arange(len(self)), times))
+        return replace(many, listener=many.listener + shift, speaker=many.speaker + shift)
+
+    def and_then(self, others: Links) -> Links:
+        """These and others behind them: no longer sorted, so only a sorted part of it may be summed."""
+        if others.wants is None and self.wants is None:
+            ours, theirs = self, others
+        else:
+            ours, theirs = self._told_in_full(), others._told_in_full()
+        both = zip(ours._columns(), theirs._columns(), strict=True)
+        return Links(*(None if a is None or b is None else np.concatenate([a, b]) for a, b in both))  # type: ignore[arg-type]
+
+    def _told_in_full(self) -> Links:
+        """With every column."""
+        if self.wants is not None:
+            return self
+        blank = np.full((len(self), 3), np.nan)
+        return replace(self, relative=blank, bearing=blank, wants=np.full(len(self), BY_DISTANCE))
+
+    def _columns(self) -> tuple[Array | Index | None, ...]:
+        return self.listener, self.speaker, self.distance, self.gain, self.relative, self.bearing, self.wants
+
+
+def links(
+    pairs: Sequence[tuple[int, int]], distance: Sequence[float] | float = np.nan, gain: Sequence[float] | float = 1.0
+) -> Links:
+    """Links by distance from (listener, speaker) pairs in any order; one number is for all of them.
+
+    For a graph of which only the matrices are wanted the pairs are enough: `laplacian(links(pairs), rows)`.
+    """
+    both = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+    order = np.lexsort((both[:, 1], both[:, 0]))
+    wanted, gains = (np.broadcast_to(np.asarray(each, dtype=float), len(both))[order] for each in (distance, gain))
+    return Links(both[order, 0], both[order, 1], wanted, gains)
+
+
+def adjacency(net: Links, rows: int) -> Array:
+    """A (N, N): a_ij = 1 if i listens to j (paper, eq. (11))."""
+    matrix = np.zeros((rows, rows))
+    matrix[net.listener, net.speaker] = 1.0
+    return matrix
+
+
+def degree(net: Links, rows: int) -> Array:
+    """D (N, N): how many neighbours each robot listens to, on the diagonal."""
+    return np.diag(adjacency(net, rows).sum(axis=1))
+
+
+def laplacian(net: Links, rows: int) -> Array:
+    """L = D − A (N, N) (paper, eq. (5))."""
+    return degree(net, rows) - adjacency(net, rows)
+
+
+def edges(net: Links) -> Index:
+    """The undirected edges (M, 2), smaller row first, each once."""
+    pairs = np.sort(np.stack([net.listener, net.speaker], axis=1), axis=1)
+    return np.unique(pairs, axis=0).astype(np.intp).reshape(-1, 2)
+
+
+def reached(net: Links, rows: int, sources: Index) -> Mask:
+    """Which rows (N,) hear of the sources, directly or through others."""
+    hears = adjacency(net, rows) > 0
+    known = np.zeros(rows, dtype=bool)
+    known[sources] = True
+    for _ in range(rows):
+        wider = known | (hears @ known)
+        if (wider == known).all():
+            break
+        known = wider
+    return known
+
+
+def components(net: Links, rows: int) -> int:
+    """How many parts the network has when directions are ignored."""
+    label = np.arange(rows)
+    for i, j in edges(net):
+        label[label == label[j]] = label[i]
+    return len(np.unique(label))

@@ -1,0 +1,324 @@
+"""A modelled network: delay, jitter, loss in bursts or alone, limited bandwidth and outages, on each link by itself.
+
+The virtual clock sends through it, and so does the listener of a real network: what has arrived waits here until the
+model lets it through. What becomes of a sample follows from the seed, the names at the two ends of its link and its
+running number (see `agents.network.channel_model`), so that both lose the same samples. docs/networks.md has the
+formulas.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.arrays import Array, Index, Mask, every, some
+
+Words = NDArray[np.uint64]
+Counter = NDArray[np.integer] | int
+
+# SplitMix64 (Steele, Lea and Flood, Fast splittable pseudorandom number generators, OOPSLA 2014) is a counter with an
+# odd step, and a mixer behind it: here the counter is given, not kept.
+_STEP: Final = np.uint64(0x9E3779B97F4A7C15)
+_MIXERS: Final = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
+_SHIFTS: Final = (np.uint64(30), np.uint64(27), np.uint64(31))
+_SPARE: Final = np.uint64(11)  # bits that a float has no place for
+
+
+def key(seed: int, *names: str) -> int:
+    """A key of 64 bits: another one for another seed, or other names, or the same ones in another order."""
+    text = "\0".join([str(seed), *names])
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
+
+
+def uniform(keys: Words, counter: Counter) -> Array:
+    """Numbers in [0, 1), multiples of 2⁻⁵³: one for each key and counter, whose shapes are broadcast.
+
+    Args:
+        keys: (M, ...) see `key`.
+        counter: Which number of each.
+    """
+    first, second, last = _SHIFTS
+    word = keys + _STEP * np.asarray(counter, dtype=np.int64).astype(np.uint64)  # wraps, as it must
+    word = (word ^ (word >> first)) * _MIXERS[0]
+    word = (word ^ (word >> second)) * _MIXERS[1]
+    word ^= word >> last
+    return np.asarray((word >> _SPARE) * 2.0**-53)
+
+
+ROUNDING_S: Final = 2e-6  # stamps on the wire are whole microseconds, and sums of binary fractions miss the ticks
+LOSS, JITTER, USES = 0, 1, 2  # each sample has so many numbers of its own
+SPAN: Final = 64  # so many samples before one are looked at together for what state it found its link in
+
+
+@dataclass(frozen=True)
+class Outage:
+    """From `begin` to `end` [s] after the common start nothing passes on the `links` (E,)."""
+
+    begin: float
+    end: float
+    links: Mask
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Of links (E).
+
+    Attributes:
+        delay: From speaker to listener [s].
+        jitter: Mean of an exponential addition [s].
+        loss: Share of the samples that are lost, in the long run.
+        burst: Mean number of samples that are lost one after the other, at least 1 / (1 − loss); NaN: each sample is
+            lost or not by itself.
+        bandwidth: [bit/s], infinity for no limit.
+        queue: A sample that would wait for longer than this until it is sent is dropped [s].
+        key: See `agents.network.channel_model.key`; from the seed, the speaker's and the listener's name.
+        outages: When nothing passes.
+        duration: From the common start [s]; only for so long is anything lost or too slow.
+    """
+
+    delay: Array
+    jitter: Array
+    loss: Array
+    burst: Array
+    bandwidth: Array
+    queue: Array
+    key: Words
+    outages: tuple[Outage, ...] = ()
+    duration: float = np.inf
+
+    def __len__(self) -> int:
+        return len(self.delay)
+
+    @classmethod
+    def ideal(cls, links: int) -> Conditions:
+        """Nothing is lost, nothing takes time."""
+        zero, never = np.zeros(links), np.full(links, np.inf)
+        return cls(zero, zero, zero, np.full(links, np.nan), never, never, np.zeros(links, dtype=np.uint64))
+
+    @classmethod
+    def side_by_side(cls, parts: Sequence[Conditions]) -> Conditions:
+        """Those of several repetitions, which have the same outages each on its own links."""
+        names = [field.name for field in fields(cls) if field.name not in {"outages", "duration"}]
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        outages = [
+            Outage(first.begin, first.end, np.concatenate([first.links, *(each.links for each in others)]))
+            for first, *others in zip(*(part.outages for part in parts), strict=True)
+        ]
+        return cls(**columns, outages=tuple(outages), duration=parts[0].duration)
+
+
+class Samples(msgspec.Struct, frozen=True):
+    """Poses on their way (M): link, arrival time, sample time [s], number, position and velocity (M, 3).
+
+    `extra` (M, k) is what else is told with them, for those who need it: with all that go over a channel, or with none.
+    """
+
+    link: Index
+    arrival: Array
+    stamp: Array
+    seq: Index
+    position: Array
+    velocity: Array
+    extra: Array | None = None
+
+    def take(self, which: Index | Mask) -> Samples:
+        """Some of them."""
+        return Samples(
+            self.link[which],
+            self.arrival[which],
+            self.stamp[which],
+            self.seq[which],
+            self.position[which],
+            self.velocity[which],
+            None if self.extra is None else self.extra[which],
+        )
+
+
+COLUMNS: Final = tuple(name for name in Samples.__struct_fields__ if name != "extra")
+
+
+class Channel:
+    """Carries samples over links (E).
+
+    Attributes:
+        dropped: (E,) samples that were lost.
+        limited: Some link has a bandwidth: sizes must be given.
+        instant: Nothing takes time on any link: what is said is known at once, or lost.
+        ideal: Nothing is lost or takes time on any link: whoever wants to save time need not send.
+    """
+
+    def __init__(self, conditions: Conditions) -> None:
+        self._conditions = conditions
+        self.dropped: Index = np.zeros(len(conditions), dtype=np.intp)
+        delay = conditions.delay
+        self._delay: Array | float = delay
+        if len(delay) and (delay == delay[0]).all():
+            self._delay = float(delay[0])  # one number for all costs nothing to look up
+        self._jitters = bool(conditions.jitter.any())
+        self._loses = bool(conditions.loss.any())
+        self.limited = bool(np.isfinite(conditions.bandwidth).any())
+        self._plain = not (self._jitters or self._loses or self.limited or conditions.outages)
+        self.instant = not (conditions.delay.any() or self._jitters or self.limited)
+        self.ideal = self._plain and self.instant
+        self._in_order = isinstance(self._delay, float) and not (self._jitters or self.limited)
+        self._enter, self._leave = _thresholds(conditions)
+        self._free = np.full(len(conditions), -np.inf)  # when each link has sent all that it has taken
+        self._flying: list[Samples] = []
+
+    def send(
+        self,
+        link: Index,
+        seq: Index,
+        stamp: Array,
+        position: Array,
+        velocity: Array,
+        *,
+        start: Array | float = np.inf,
+        size: Index | None = None,
+        now: float = -np.inf,
+        extra: Array | None = None,
+    ) -> None:
+        """Samples set out, on each link at most one.
+
+        Before the common start nothing is lost and no link is too slow: no run begins before everybody has heard his
+        neighbours, and the real network repeats a first pose until it arrives. Nor is anything after the end.
+
+        Args:
+            link: (M,) on which.
+            seq: (M,) their running numbers.
+            stamp: (M,) when they were said [s], on a clock on which `start` is the common start; infinity or NaN while
+                that is not known.
+            position: (M, 3) what they say [m].
+            velocity: (M, 3) and [m/s].
+            start: See `stamp`; (M,), or for all of them.
+            size: (M,) of their payloads [bytes]; needed on links of limited bandwidth.
+            now: At the listener of a real network, where they have arrived by now [s]: the time that it took counts
+                towards the delay.
+            extra: (M, k) that goes along.
+        """
+        delay = self._delay if isinstance(self._delay, float) else self._delay[link]
+        if self._plain:
+            arrival = stamp + delay
+        else:
+            passes, took = self._fates(link, seq, stamp, stamp - start, size)
+            arrival = stamp + (delay + took)
+            if not every(passes):
+                self.dropped[link[~passes]] += 1
+                link, seq, stamp, arrival = link[passes], seq[passes], stamp[passes], arrival[passes]
+                position, velocity = position[passes], velocity[passes]
+                extra = None if extra is None else extra[passes]
+        if now > -np.inf:
+            arrival, self._in_order = np.maximum(arrival, now), False  # speakers are asked one after the other
+        if len(link):
+            self._flying.append(Samples(link, arrival, stamp, seq, position, velocity, extra))
+
+    def due(self, t: float) -> Samples | None:
+        """What gets through by `t` [s], in order of arrival."""
+        if not self._flying:
+            return None
+        pool = self._pool()
+        here = pool.arrival <= t + ROUNDING_S
+        if every(here):
+            self._flying = []
+            return pool if self._in_order else pool.take(np.argsort(pool.arrival, kind="stable"))
+        self._flying = [pool.take(~here)]
+        if not some(here):
+            return None
+        arrived = pool.take(here)
+        return arrived.take(np.argsort(arrived.arrival, kind="stable"))
+
+    def forget(self, link: Index) -> None:
+        """What is under way on links whose speaker is gone never arrives: that would sound as if it were back."""
+        if not self._flying:
+            return
+        pool = self._pool()
+        gone = np.isin(pool.link, link)
+        self._flying = [] if every(gone) else [pool.take(~gone)]
+
+    def lost(self, link: Index, seq: Index) -> Mask:
+        """Which samples (M,) the links lose, by their numbers alone.
+
+        A link is good or bad, and loses a sample that finds it bad (Gilbert, Capacity of a burst-noise channel, Bell
+        System Technical Journal 39, 1960). One number u of each sample moves it: below the probability of becoming bad
+        it is bad then, above one less that of becoming good it is good, whatever it was; in between it stays as it was,
+        so that the last sample with another number decides. That one is looked for, and no state is kept.
+        """
+        key = self._conditions.key[link]
+        enter, leave = self._enter[link], self._leave[link]
+        u = uniform(key, seq * USES + LOSS)
+        bad: Mask = u < enter
+        asked = np.flatnonzero(~bad & (u < leave))
+        back = np.arange(1, SPAN + 1)
+        while len(asked):
+            number = seq[asked][:, None] - back
+            u = uniform(key[asked][:, None], number * USES + LOSS)
+            first = number == 0  # before the first sample: as often bad as in the long run
+            loss = self._conditions.loss[link[asked]][:, None]
+            found = u < np.where(first, loss, enter[asked][:, None])
+            decides = found | (u >= np.where(first, loss, leave[asked][:, None]))
+            one = decides.argmax(axis=1)
+            row = np.arange(len(asked))
+            bad[asked] = found[row, one]
+            asked, back = asked[~decides[row, one]], back + SPAN
+        return bad
+
+    def _fates(self, link: Index, seq: Index, stamp: Array, since: Array, size: Index | None) -> tuple[Mask, Array]:
+        """Which samples pass (M,), and what their way takes beyond the delay if they do (M,) [s]."""
+        conditions = self._conditions
+        begun: Mask = (since >= -ROUNDING_S) & (since < conditions.duration - ROUNDING_S)
+        passes, took = np.ones(len(link), dtype=bool), np.zeros(len(link))
+        if self.limited:
+            took, passes = self._queued(link, stamp, size, begun)
+        if self._jitters:
+            took = took - conditions.jitter[link] * np.log1p(-uniform(conditions.key[link], seq * USES + JITTER))
+        if self._loses:
+            passes &= ~(begun & self.lost(link, seq))
+        if conditions.outages:
+            there = since + (conditions.delay[link] + took)
+            for outage in conditions.outages:
+                inside = (since < outage.end - ROUNDING_S) & (there > outage.begin - ROUNDING_S)
+                passes &= ~(begun & inside & outage.links[link])
+        return passes, took
+
+    def _queued(self, link: Index, stamp: Array, size: Index | None, begun: Mask) -> tuple[Array, Mask]:
+        """How long samples wait for those before them and are being sent (M,) [s]; which of them are taken (M,).
+
+        Raises:
+            ValueError: If their sizes are not given.
+        """
+        if size is None:
+            raise ValueError("links of limited bandwidth need the sizes of their samples")
+        conditions = self._conditions
+        waits = np.where(begun, np.maximum(self._free[link] - stamp, 0.0), 0.0)
+        taken: Mask = waits <= conditions.queue[link] + ROUNDING_S
+        waits = waits + np.where(begun, 8.0 * size / conditions.bandwidth[link], 0.0)
+        occupies = begun & taken
+        self._free[link[occupies]] = (stamp + waits)[occupies]
+        return waits, taken
+
+    def _pool(self) -> Samples:
+        if len(self._flying) == 1:
+            return self._flying[0]
+        pool = Samples(*(np.concatenate([getattr(each, column) for each in self._flying]) for column in COLUMNS))
+        extra = [each.extra for each in self._flying if each.extra is not None]
+        return msgspec.structs.replace(pool, extra=np.concatenate(extra)) if extra else pool
+
+
+def _thresholds(conditions: Conditions) -> tuple[Array, Array]:
+    """Below the first a link is bad, from the second on good, in between as it was (E,): see `Channel.lost`.
+
+    The chain is bad for `burst` samples on average and for a share `loss` of all. Where each sample is lost by itself
+    nothing lies between.
+    """
+    loss, burst = conditions.loss, conditions.burst
+    alone = np.isnan(burst) | (loss >= 1.0)
+    kept = np.where(alone, 1.0, 1.0 - loss)
+    length = np.where(alone, 1.0, burst)
+    enter = np.where(alone, loss, loss / (length * kept))
+    return enter, np.where(alone, loss, np.maximum(1.0 - 1.0 / length, enter))

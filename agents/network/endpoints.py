@@ -1,0 +1,210 @@
+"""Zenoh endpoints, `protocol/host:port`, and behind `?` or `#` settings that only Zenoh reads; and which are free."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal, Self
+
+from agents.network import lab
+
+DEFAULT_PORT: Final = 7447
+DEFAULT_ENDPOINT: Final = f"tcp/127.0.0.1:{DEFAULT_PORT}"
+UNIX: Final = "unixsock-stream"
+PROTOCOLS: Final = ("tcp", "tls", "quic", UNIX)
+_WHY_NOT: Final = {
+    "udp": "what it loses nobody says again, and who was killed is noticed late",
+    "ws": "it shows no certificates",
+    "wss": "its certificates are not checked by name",
+    "serial": "two ends of a wire are no network",
+}
+
+
+class EndpointError(ValueError):
+    """An endpoint that cannot or must not be used, with the remedy."""
+
+
+def refusal(endpoint: str) -> str:
+    """Why the protocol of an endpoint is not used, and what is; empty if it is."""
+    protocol = endpoint.partition("/")[0]
+    if protocol in PROTOCOLS:
+        return ""
+    why = _WHY_NOT.get(protocol, "there is no such protocol here")
+    return f"'{endpoint}' cannot be used: {why}; write it like {DEFAULT_ENDPOINT}, or with tls, quic or {UNIX}/PATH"
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """An endpoint in its parts.
+
+    Attributes:
+        protocol: tcp, tls, quic, ...
+        host: Name or address, without brackets; the path of a Unix socket.
+        port: 0 for a Unix socket.
+        rest: Settings, with the `?` or `#` before them.
+    """
+
+    protocol: str
+    host: str
+    port: int
+    rest: str = ""
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Takes an endpoint apart.
+
+        Raises:
+            ValueError: If it is none; says how one is written.
+        """
+        protocol, _, whole = text.partition("/")
+        if protocol and whole and (why := refusal(text)):
+            raise ValueError(why)
+        end = min((at for mark in "?#" if (at := whole.find(mark)) >= 0), default=len(whole))
+        address, rest = whole[:end], whole[end:]
+        if protocol == UNIX and address:
+            return cls(protocol, address, 0, rest)
+        host, _, port = address.rpartition(":")
+        if not (protocol and host and port.isdecimal() and 0 < int(port) < 65536):
+            raise ValueError(f"'{text}' is not an endpoint; write it like {DEFAULT_ENDPOINT}")
+        return cls(protocol, host.removeprefix("[").removesuffix("]"), int(port), rest)
+
+    def __str__(self) -> str:
+        if self.protocol == UNIX:
+            return f"{self.protocol}/{self.host}{self.rest}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.protocol}/{host}:{self.port}{self.rest}"
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine reaches it."""
+        address = self._address
+        return self.protocol == UNIX or self.host == "localhost" or (address is not None and address.is_loopback)
+
+    @property
+    def is_wildcard(self) -> bool:
+        """Whether it means every address of a machine, so that one can listen there but not connect."""
+        address = self._address
+        return address is not None and address.is_unspecified
+
+    def at(self, host: str, port: int | None = None) -> Endpoint:
+        """The same under another name of its machine, or at another port."""
+        return replace(self, host=host, port=self.port if port is None else port)
+
+    @property
+    def _address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+        try:
+            return ipaddress.ip_address(self.host)
+        except ValueError:
+            return None
+
+
+def free_endpoint(preferred_port: int = DEFAULT_PORT, protocol: str = "tcp") -> str:
+    """A loopback endpoint to listen on: of the preferred port, or of any free one when that is taken."""
+    for port in (preferred_port, 0):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port in TIME_WAIT is free
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+    raise EndpointError("no free TCP port on 127.0.0.1: end some of the processes that listen there")
+
+
+def free_endpoints(count: int, protocol: str = "tcp") -> list[str]:
+    """So many different ones, of the usual port and those after it where they are free."""
+    made: dict[str, None] = {}
+    while len(made) < count:
+        made[free_endpoint(DEFAULT_PORT + len(made), protocol)] = None
+    return list(made)
+
+
+Mode = Literal["client", "peer", "router"]
+
+OWNER: Final = "#of="
+TOGETHER: Final = "+"  # between the names of robots that share a process
+
+
+@dataclass(frozen=True)
+class Ends:
+    """What a session does about endpoints.
+
+    Attributes:
+        mode: What it is to Zenoh.
+        connect: Where it connects: a client at the first that answers, all others everywhere.
+        listen: Where it listens.
+    """
+
+    mode: Mode
+    connect: list[str]
+    listen: list[str]
+
+    @property
+    def visits(self) -> bool:
+        """Whether it comes into a mesh to which it does not belong."""
+        return self.mode == "peer" and not self.listen
+
+
+def ends(endpoints: Sequence[str], name: str) -> Ends:
+    """What the session of this name does about the endpoints that it was given."""
+    if not is_mesh(endpoints):
+        return Ends("client", list(endpoints), [])
+    own = next((number for number, each in enumerate(endpoints) if name in (owner(each), *owners(each))), None)
+    if own is None:
+        return Ends("peer", [unowned(each) for each in endpoints], [])
+    return Ends("peer", [unowned(each) for each in endpoints[:own]], [unowned(endpoints[own])])
+
+
+def is_mesh(endpoints: Sequence[str]) -> bool:
+    """Whether endpoints are those of a mesh."""
+    return any(map(owner, endpoints))
+
+
+def owned(endpoint: str, name: str) -> str:
+    """The endpoint of a member, which may carry its lab already."""
+    plain, mark, folder = endpoint.partition(lab.MARK)
+    return f"{plain}{OWNER}{name}{mark}{folder}"
+
+
+def owner(endpoint: str) -> str:
+    """Whose endpoint it is, several names with + between; empty for a router's."""
+    return endpoint.partition(lab.MARK)[0].partition(OWNER)[2]
+
+
+def owners(endpoint: str) -> list[str]:
+    """The same, name by name."""
+    return owner(endpoint).split(TOGETHER)
+
+
+def unowned(endpoint: str) -> str:
+    """The endpoint without its owner."""
+    plain, mark, folder = endpoint.partition(lab.MARK)
+    return f"{plain.partition(OWNER)[0]}{mark}{folder}"
+
+
+def bare(endpoints: Sequence[str]) -> list[str]:
+    """The endpoints as Zenoh takes them."""
+    return [endpoint.partition(OWNER)[0] for endpoint in lab.bare(endpoints)]
+
+
+def near(endpoints: Sequence[str], hears: Mapping[str, set[str]], names: Sequence[str]) -> list[str]:
+    """What of a mesh concerns robots that share a process: their own endpoint, their neighbours', and the services'.
+
+    Args:
+        endpoints: Of all members.
+        hears: Whom each robot of the experiment hears.
+        names: The robots of the process.
+    """
+    if not is_mesh(endpoints):
+        return list(endpoints)
+    wanted = {*names, *(speaker for name in names for speaker in hears[name])}
+    wanted |= {other for other, heard in hears.items() if heard & set(names)}
+    return [each for each in endpoints if not hears.keys() & set(owners(each)) or wanted & set(owners(each))]
+
+
+def from_here(endpoint: str) -> str:
+    """How this machine reaches what listens at an endpoint of it."""
+    parsed = Endpoint.parse(endpoint)
+    return str(parsed.at("127.0.0.1")) if parsed.is_wildcard else endpoint

@@ -1,0 +1,195 @@
+"""Ownership of a name on the network: a process touches the body of a robot only while it owns the robot's name.
+
+A process claims a name with a token that carries the time of its start. Of several claims the earliest wins; a name
+that is owned already stays with its owner, whatever clocks say. Tokens end with their session, so a name is free again
+as soon as its owner is dead, or cut off, or stands still for longer than its lease. In the latter cases its tokens come
+back, maybe after another process has taken the name: a process that was cut off or stood still must ask (`Doubt`), and
+gives way to any other owner.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from math import inf
+from typing import Final
+
+import zenoh
+
+from agents.network import pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+
+GHOST_S: Final = 2.5  # limit for the tokens of a killed owner to vanish
+ANSWER_S: Final = 10.0  # limit for the routers to answer
+SETTLE_S: Final = 0.2  # limit for a token to travel from one router to the next, and for a lost link to be noticed
+
+
+class NameTaken(RuntimeError):
+    """A process of the same name is on the network already."""
+
+
+def claim(
+    session: zenoh.Session,
+    alive: Sequence[str],
+    *,
+    began: float,
+    endpoints: Sequence[str] = (),
+    stop: threading.Event | None = None,
+) -> list[zenoh.LivelinessToken]:
+    """Takes the ownership of names; returns the tokens that keep it, as long as they are referenced.
+
+    The decision has two rounds, before and after the token of the owner is declared. Of two processes, the one whose
+    token a router got later sees the other one's in its round, so that exactly one passes both.
+
+    Args:
+        session: Of the process.
+        alive: Liveliness key of each name.
+        began: Start of the process, UTC [s].
+        endpoints: Routers; if there are several, tokens get `SETTLE_S` to travel between them.
+        stop: Ends the wait when it is set.
+
+    Raises:
+        NameTaken: If another process owns one of the names, or claimed it earlier; the tokens of a killed process are
+            given `GHOST_S` to vanish.
+        network.Unreachable: If no router answers within `ANSWER_S`, or `stop` was set.
+    """
+    pause = stop or threading.Event()
+    mine = str(session.zid())
+    rank = Keys.rank(began, mine)
+    settle_s = SETTLE_S if len(endpoints) > 1 else 0.0
+    tokens = [pubsub.alive_token(session, Keys.claim(key, rank)) for key in alive]
+    try:
+        pause.wait(settle_s)
+        _first_round(session, alive, mine, rank, pause)
+        tokens += [pubsub.alive_token(session, Keys.life(key, mine)) for key in alive]
+        pause.wait(settle_s)
+        others = _others(session, alive, mine, rank, pause, owners=False)
+        if others:
+            raise NameTaken(", ".join(others))
+    except BaseException:
+        for token in tokens:
+            token.undeclare()  # type: ignore[no-untyped-call]
+        raise
+    return tokens
+
+
+def _first_round(session: zenoh.Session, alive: Sequence[str], mine: str, rank: str, pause: threading.Event) -> None:
+    """Waits until no other process owns a name or has an earlier claim."""
+    deadline = time.monotonic() + GHOST_S
+    while others := _others(session, alive, mine, rank, pause, owners=True):
+        if time.monotonic() > deadline:
+            raise NameTaken(", ".join(others))
+        pause.wait(network.RETRY_S)
+
+
+def _others(
+    session: zenoh.Session, alive: Sequence[str], mine: str, rank: str, pause: threading.Event, *, owners: bool
+) -> list[str]:
+    """Names (their liveliness keys) with an earlier claim than `rank`, or with another owner if `owners` count."""
+    deadline = time.monotonic() + ANSWER_S
+    while True:
+        found = {key: network.here(session, Keys.lives(key)) for key in alive}
+        if pause.is_set():
+            raise network.Unreachable("told to end before the name was taken")
+        if None not in found.values() and network.connected(session):
+            break
+        if time.monotonic() > deadline:
+            raise network.Unreachable(f"no router answers who owns the name, for {ANSWER_S:g} s: is it overloaded?")
+        pause.wait(network.RETRY_S)
+    return [
+        key for key, tokens in found.items() if any(_rival(key, token, mine, rank, owners) for token in tokens or ())
+    ]
+
+
+def _rival(alive: str, token: str, mine: str, rank: str, owners: bool) -> bool:
+    """Whether a token stands in the way of the claim `rank` of the session `mine`."""
+    if (other := Keys.rank_of(alive, token)) is not None:
+        return other < rank
+    return owners and token != Keys.life(alive, mine)
+
+
+def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -> None:
+    """Returns when it is known that names that were owned once still are, because no other process has taken them.
+
+    One answer is not enough: a link that is lost ends its questions as an answer does, and a process that takes the
+    name may be between its two rounds. No other owner must be seen for `SETTLE_S`. One that is seen may still give way
+    to the claim of this process, for `GHOST_S`.
+
+    Args:
+        session: Of the process, whose tokens are declared, and declared anew by Zenoh when it was cut off.
+        alive: Liveliness key of each name.
+        pause: Ends the wait when it is set.
+
+    Raises:
+        NameTaken: If another process owns one of the names.
+        network.Unreachable: If `pause` was set before that was known; without a router the wait has no limit.
+    """
+    mine = str(session.zid())
+    free = taken = inf
+    while not pause.is_set():
+        linked = network.connected(session)
+        found = [network.here(session, Keys.lives(key)) for key in alive]
+        now = time.monotonic()
+        if not linked or None in found or not network.connected(session):
+            free = inf
+        elif others := [
+            key
+            for key, tokens in zip(alive, found, strict=True)
+            if any(Keys.life_of(token) not in (None, mine) for token in tokens or ())
+        ]:
+            free, taken = inf, min(taken, now)
+            if now - taken > GHOST_S:
+                raise NameTaken(", ".join(others))
+        else:
+            free, taken = min(free, now), inf
+            if now - free > SETTLE_S:
+                return
+        pause.wait(network.RETRY_S)
+    raise network.Unreachable("told to end before it was known whether the name has another owner")
+
+
+class Doubt:
+    """Whether a process still owns its names, asked in a thread of its own: the control loop polls the answer."""
+
+    def __init__(self, alive: Sequence[str]) -> None:
+        """There is none yet. `alive` has the liveliness key of each name."""
+        self._alive = alive
+        self._taken = ""
+        self._asking: threading.Thread | None = None
+        self._anew = False
+        self._over = threading.Event()
+
+    def begin(self, session: zenoh.Session) -> None:
+        """Asks from now on; what is being asked already is asked anew afterwards."""
+        self._session, self._anew = session, self._asking is not None
+        if self._asking is None:
+            self._asking = threading.Thread(target=self._ask, name="owner of the name", daemon=True)
+            self._asking.start()
+
+    def over(self) -> bool:
+        """Whether there is none, or none any more; costs 0.1 µs when there is none.
+
+        Raises:
+            NameTaken: If another process owns one of the names, each time.
+        """
+        if self._asking is not None and not self._asking.is_alive():
+            self._asking = None
+            if self._anew and not self._taken:
+                self.begin(self._session)
+        if self._taken:
+            raise NameTaken(self._taken)
+        return self._asking is None
+
+    def end(self) -> None:
+        """Asks no longer."""
+        self._over.set()
+
+    def _ask(self) -> None:
+        try:
+            keep(self._session, self._alive, self._over)
+        except NameTaken as taken:
+            self._taken = str(taken)
+        except network.Unreachable:
+            pass  # nobody asks any more

@@ -1,0 +1,403 @@
+"""Sessions on the Zenoh network, and what a robot declares on them.
+
+Everything that is received waits to be polled from the control loop: frequent samples in a ring channel, which keeps
+the newest ones and never blocks; rare ones in an `Inbox`. A callback of the usual kind would cost a thread each, a slow
+one stops all reception of its session, and one that is left open keeps the interpreter from exiting. The emergency stop
+alone cannot wait for the next tick (`Alarm`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import socket
+import struct
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from itertools import chain
+from math import inf
+from pathlib import Path
+from typing import Final, Generic, Protocol, Self, TypeVar
+
+import zenoh
+from zenoh.handlers import Callback, RingChannel
+
+from agents.network import access_control, lab
+from agents.network import endpoints as topology
+from agents.network.endpoints import EndpointError
+from agents.network.zenoh_config import ASK_S, LEASE_S, config, reason, settings
+
+_OPEN: Final = Path("/proc/self/fd")  # Linux
+_INET: Final = (socket.AF_INET, socket.AF_INET6)
+
+
+def hang_up(session: zenoh.Session) -> int:
+    """Ends the connections of this process, those of its other sessions too, to where a session is linked.
+
+    Blocks nothing: the network is not waited for. Only TCP and TLS have connections that can be ended so; other links
+    stay.
+
+    Returns:
+        How many connections were ended.
+    """
+    own = {str(link.src).partition("/")[2] for link in session.info.links()}
+    ended = 0
+    with ExitStack() as seen:
+        found = [seen.enter_context(each) for each in _connections()]
+        peers = {each.getpeername() for each in found if _address(each) in own}
+        for each in found:
+            if each.getpeername() in peers:
+                each.shutdown(socket.SHUT_RDWR)
+                ended += 1
+    return ended
+
+
+def _connections() -> Iterator[socket.socket]:
+    """The TCP connections of this process, by descriptors of our own: theirs may be closed at any moment."""
+    for name in list(_OPEN.iterdir()) if _OPEN.is_dir() else ():
+        try:
+            own = os.dup(int(name.name))
+        except OSError:  # closed meanwhile
+            continue
+        try:
+            one = socket.socket(fileno=own)
+        except OSError:  # no socket
+            os.close(own)
+            continue
+        try:
+            one.getpeername()
+            good = one.family in _INET and one.type == socket.SOCK_STREAM
+        except OSError:  # it listens, or is not connected any more
+            good = False
+        if good:
+            yield one
+        else:
+            one.close()
+
+
+def _address(connection: socket.socket) -> str:
+    """The near end, as Zenoh writes it."""
+    host, port = connection.getsockname()[:2]
+    return f"[{host}]:{port}" if connection.family == socket.AF_INET6 else f"{host}:{port}"
+
+
+SLICE_NS: Final = 100_000  # the shortest that is granted
+_CALL: Final = {"x86_64": 314, "aarch64": 274}  # sched_setattr, which glibc has only since 2.41
+
+
+@contextmanager
+def prompt_threads() -> Iterator[None]:
+    """Threads that are started inside, and by them, ask for short slices; the caller gets its own back."""
+    asked = _ask(SLICE_NS)
+    try:
+        yield
+    finally:
+        if asked:
+            _ask(0)
+
+
+def _ask(slice_ns: int) -> bool:
+    """Asks for slices of a length for the calling thread, 0 for the usual; whether that was possible."""
+    number = _CALL.get(platform.machine())
+    if sys.platform != "linux" or number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
+        return False
+    nice = os.getpriority(os.PRIO_PROCESS, 0)
+    # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
+    attributes = struct.pack("=IIQiIQQQ", 48, os.SCHED_OTHER, 0, nice, 0, slice_ns, 0, 0)
+    return bool(ctypes.CDLL(None).syscall(number, 0, attributes, 0) == 0)
+
+
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+
+RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
+GATHER_S: Final = 1.0
+LINK_S: Final = 0.01
+FREED_S: Final = 3.0  # so long may an endpoint of a mesh stay taken by a robot that is started again
+ROBOT_LEASE_S: Final = 1.2  # of robots: neighbours of one that hangs must know within 1.5 s
+ASK_EVERY_S: Final = 0.4  # between two questions whether the router still answers
+ANSWER_S: Final = 0.3  # a question without an answer for so long begins a silence
+ASKED: Final = 8  # questions that are waited for at once
+LOOK_S: Final = 0.1  # between two looks for an answer no more than this is held against the router
+NO_ORDER: Final = 'an order is a query with a payload, such as {"order": "land"}'
+ORDERS: Final = 8  # that wait to be answered
+EVENTS_OF_LIFE: Final = 256  # comings and goings that wait to be polled
+
+
+class Unreachable(ConnectionError):
+    """No router answers at the endpoints that were tried."""
+
+
+class Polled(Protocol[T_co]):
+    """Anything that hands out what arrived, one by one, and None when nothing waits."""
+
+    def try_recv(self) -> T_co | None: ...
+
+
+def open_session(
+    endpoints: Sequence[str],
+    *,
+    name: str,
+    wait_s: float = 10.0,
+    stop: threading.Event | None = None,
+    lease_s: float = LEASE_S,
+    identity: str | None = None,
+    rights: access_control.Rights | None = None,
+    gather_s: float = GATHER_S,
+) -> zenoh.Session:
+    """A session on the network that some endpoints make; use it in a `with`.
+
+    It is a client of the first router that answers. In a mesh (`agents.network.endpoints`) it is linked with all, some
+    of whom may come later.
+
+    Args:
+        endpoints: Routers, best first; or members of a mesh.
+        name: Who this is, as `zenpark keys` shows it.
+        wait_s: How long to try [s].
+        stop: Ends the wait when it is set.
+        lease_s: See `agents.network.zenoh_config`.
+        identity: Whose certificate is shown, where the endpoints are of a lab; `name` if left out.
+        gather_s: How long members of a mesh that do not answer are waited for when others do [s].
+        rights: Who may do what; a member of a mesh needs them in a lab, for nobody else enforces them.
+
+    Raises:
+        EndpointError: If an endpoint is malformed, or its lab has no such identity, or it cannot listen there.
+        Unreachable: If nobody answered in time, or `stop` was set before anybody did.
+    """
+    ends = topology.ends(endpoints, name)
+    chosen = config(
+        settings(
+            ends.mode,
+            connect=ends.connect,
+            listen=ends.listen,
+            name=name,
+            lease_s=lease_s,
+            identity=identity,
+            rights=rights if ends.listen else None,
+        )
+    )
+    gone = stop or threading.Event()
+    deadline = time.monotonic() + (min(wait_s, FREED_S) if ends.listen else wait_s)
+    while True:
+        try:
+            with prompt_threads():
+                session = zenoh.open(chosen)
+        except zenoh.ZError as error:
+            if time.monotonic() < deadline and not gone.wait(RETRY_S):
+                continue
+            if ends.listen:
+                raise EndpointError(
+                    f"{name} cannot listen on {', '.join(topology.bare(ends.listen))}: {reason(error)}. If it is on "
+                    "the network already, end it first; or give it another endpoint in network.addresses"
+                ) from None
+        else:
+            if not ends.visits or _gathered(session, len(ends.connect), gather_s, gone, deadline):
+                return session
+            session.close()  # type: ignore[no-untyped-call]
+        raise Unreachable(_silence(endpoints, identity or name)) from None
+
+
+def _gathered(session: zenoh.Session, members: int, gather_s: float, gone: threading.Event, deadline: float) -> bool:
+    """Waits until a visitor is linked with all members of a mesh, or after a while with those that are there."""
+    begun = time.monotonic()
+    while (linked := len(session.info.transports())) < members:
+        now = time.monotonic()
+        if linked and now - begun > gather_s:
+            return True
+        if now > deadline or gone.wait(LINK_S):
+            return linked > 0
+    return True
+
+
+def _silence(endpoints: Sequence[str], identity: str) -> str:
+    folder = lab.of(endpoints)
+    refused = (
+        ""
+        if folder is None
+        else f", or it refuses the certificate of {identity} (`zenpark keys show {folder}` says until when it is valid)"
+    )
+    remedy = "`zenpark router` starts one, --connect names another"
+    if topology.is_mesh(endpoints):
+        remedy = "a mesh lasts as long as its run, --connect names another"
+    elif folder is None:
+        remedy += "; in a lab it needs --lab"
+    return (
+        f"{'nobody' if topology.is_mesh(endpoints) else 'no router'} answers at "
+        f"{', '.join(topology.bare(endpoints)) or 'no endpoint'}{refused}: {remedy}"
+    )
+
+
+def connected(session: zenoh.Session) -> bool:
+    """Whether the session has a router now, or a neighbour in a mesh. Costs 0.6 µs: poll it in the control loop."""
+    return bool(session.info.routers_zid() or session.info.peers_zid())
+
+
+class RouterWatch:
+    """Detection of a router that is silent, by questions of our own.
+
+    Zenoh closes a link after the lease that the *other* end announces: 2 s with our router, 10 s with a plain zenohd,
+    60 s with rmw_zenohd. Until then a frozen router, or a pulled cable, looks like a quiet one. A router answers a
+    liveliness query from its own tables, so the end of its answer is a sign of life. Nothing waits for it: an answer
+    is polled. A member of a mesh is not asked, for its lease is ours.
+
+    Where there are several routers, one that is silent for `LEASE_S` is left for the next one, as one of ours would be
+    by its lease (`agents.network.session`).
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, endpoints: Sequence[str] = ()) -> None:
+        """Begins with the first `silent_since`.
+
+        Args:
+            session: Whose router is watched.
+            key: What is asked for; in a lab, a liveliness key that this session may watch.
+            endpoints: Of the session.
+        """
+        self._session, self._key, self._others = session, key, len(endpoints) > 1
+        self._waiting: deque[tuple[float, Polled[zenoh.Reply]]] = deque(maxlen=ASKED)
+        # Times of a clock that stands while nobody looks: a process that gets no processor cannot blame the router.
+        self._now, self._asked, self._unanswered = 0.0, -inf, inf  # the latter: when the oldest question was asked
+        self._looked = inf
+        self._silent_since = inf
+        self._left = 0.0  # when a silent router was left last, or the silence or the time without any link began
+        self._arrived = 0
+        self._answers = 0  # since the silence began
+
+    def silent_since(self, t: float, arrived: int = 0) -> float:
+        """When the silence of the router began, or when the last link was lost; infinity while it answers.
+
+        Args:
+            t: Now, on any clock that does not go back [s]. Call it in each round of a loop, at 10 Hz or more.
+            arrived: Samples that came by the router, ever. While more come it need not be asked.
+        """
+        self._now += max(0.0, min(t - self._looked, LOOK_S))
+        self._looked = t
+        info = self._session.info
+        if not info.routers_zid():
+            self._waiting.clear()
+            self._asked, self._unanswered, self._answers, self._left = -inf, inf, 0, self._now
+            self._silent_since = inf if info.peers_zid() else min(self._silent_since, t)
+            return self._silent_since
+        if self._answered():
+            self._answers += 1
+            # A link that is closed ends its questions as an answer does: after a silence the second one counts.
+            if self._answers > 1:
+                self._silent_since = inf
+            else:
+                self._asked = -inf
+        if arrived != self._arrived:
+            self._arrived = arrived
+            if self._silent_since == inf:
+                self._waiting.clear()
+                self._asked, self._unanswered = self._now, inf
+        if self._now - self._unanswered > ANSWER_S and self._silent_since == inf:
+            self._silent_since, self._answers = t - (self._now - self._unanswered), 0
+            self._left = self._unanswered
+        if self._others and self._silent_since < inf and self._now - self._left > LEASE_S:
+            self._left = self._now
+            hang_up(self._session)
+        if self._now - self._asked >= ASK_EVERY_S:
+            handler = self._session.liveliness().get(self._key, RingChannel(1), timeout=10.0 * ASKED * ASK_EVERY_S)
+            self._waiting.append((self._now, handler))
+            self._asked = self._now
+            self._unanswered = min(self._unanswered, self._now)
+        return self._silent_since
+
+    def _answered(self) -> bool:
+        """Whether an answer has come since the last look."""
+        for number in reversed(range(len(self._waiting))):
+            _, handler = self._waiting[number]
+            try:
+                while handler.try_recv() is not None:
+                    pass
+            except zenoh.ZError:  # the answer is complete
+                for _ in range(number + 1):
+                    self._waiting.popleft()
+                self._unanswered = self._waiting[0][0] if self._waiting else inf
+                return True
+        return False
+
+
+def links(session: zenoh.Session) -> int:
+    """With how many others it is linked."""
+    return len(session.info.transports())
+
+
+def deserted(session: zenoh.Session) -> bool:
+    """Whether nobody but other routers is connected to a router."""
+    return all(transport.whatami == zenoh.WhatAmI.ROUTER for transport in session.info.transports())
+
+
+class Inbox(Generic[T]):
+    """Rare items, put in by the thread that receives, until they are polled.
+
+    An empty one costs a tenth of an empty ring channel to poll. Items that come often belong into a ring channel: each
+    item here costs the receiving thread a wait for the interpreter's lock.
+    """
+
+    def __init__(self, depth: int, wanted: Callable[[T], bool] = lambda _: True) -> None:
+        """Keeps the newest `depth` items that are `wanted`. `filled` is the callback to declare."""
+        self._items: deque[T] = deque(maxlen=depth)
+        self._wanted = wanted
+        self.filled = Callback(self._take, indirect=False)
+
+    def try_recv(self) -> T | None:
+        """See `Polled`."""
+        return self._items.popleft() if self._items else None
+
+    def _take(self, item: T) -> None:
+        if self._wanted(item):
+            self._items.append(item)
+
+
+class Orders:
+    """Queries that carry an order, as they wait in `handler`.
+
+    Reply inside `with query:` and on the key, or the asker waits.
+
+    A query without payload is no order. Tools that read all keys (`get park/**`) send such: they get no answer. One
+    on the key itself is told what an order is.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._queries = Inbox[zenoh.Query](ORDERS)
+        self._queryable = session.declare_queryable(key, self._queries.filled, complete=True)
+
+    @property
+    def handler(self) -> Self:
+        """See `Polled`."""
+        return self
+
+    def try_recv(self) -> zenoh.Query | None:
+        """See `Polled`."""
+        for query in received(self._queries):
+            if query.payload is not None and query.payload.to_bytes():
+                return query
+            with query:
+                if "*" not in str(query.key_expr):
+                    query.reply_err(NO_ORDER, encoding="text/plain")
+        return None
+
+    def close(self) -> None:
+        """Takes no more orders."""
+        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+
+
+def here(session: zenoh.Session, keyexpr: str, wait_s: float = ASK_S) -> set[str] | None:
+    """Liveliness tokens that match; None if the question was not answered within `wait_s`."""
+    found = set()
+    for reply in session.liveliness().get(keyexpr, timeout=wait_s):
+        if reply.ok is None:
+            return None
+        found.add(str(reply.ok.key_expr))
+    return found
+
+
+def received(handler: Polled[T_co]) -> Iterable[T_co]:
+    """Items that wait in a handler, oldest first, without blocking. Nearly always there are none."""
+    first = handler.try_recv()
+    return () if first is None else chain((first,), iter(handler.try_recv, None))

@@ -1,0 +1,202 @@
+"""The checks of what arrived and is well formed: numbers that no robot, clock or sensor can have are refused.
+
+`agents.network.messages` decodes; what it lets through may still be NaN, of another robot, or from the future. NaN
+fails each comparison here, because they all ask whether a number lies inside.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array
+from agents.network.messages import Command, Goal, Malformed, Pose, Position, Ranges, State, Vector
+
+FUTURE_S: Final = 5.0  # a stamp further ahead is a broken clock or a forgery, and would silence honest samples
+MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
+ABSURD: Final = 1e6  # [m, m/s, rad, rad/s] no setpoint is that large
+MAX_RAYS: Final = 720  # of one sweep; the finest scanner here has 360
+MAX_RANGE: Final = 100.0  # [m]; no range sensor here sees farther
+REACH_M: Final = 1.0  # a neighbour said to be farther outside the arena than this is not believed
+MAX_YAW: Final = 1e3  # [rad]; ours is within ±π, other programs may count on over full turns
+
+
+def reach_of(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Vector:
+    """Largest |x|, |y|, |z| [m] that a robot may say it has, and that anybody may tell it to go to.
+
+    Args:
+        low: Smallest x, y, z of the arena [m].
+        high: Largest.
+    """
+    x, y, z = np.maximum(np.abs(low), np.abs(high)) + REACH_M
+    return float(x), float(y), float(z)
+
+
+def taken(stamp: float, now: float) -> float:
+    """When something was measured, by its `stamp` [s]: not after `now` [s], at which it has arrived.
+
+    A clock that is ahead must not make anything look fresh for longer than it is.
+    """
+    return min(stamp, now)
+
+
+def check_pose(pose: Pose, *, robot: str, now: float, reach: Vector) -> None:
+    """Refuses a pose that cannot be true.
+
+    Args:
+        pose: What arrived.
+        robot: Whose key it arrived on.
+        now: UTC time of arrival [s].
+        reach: Largest |x|, |y|, |z| [m] that a robot of this experiment can have.
+
+    Raises:
+        Malformed: If the name is another's, a number is not finite, the stamp lies in the future, the position is out
+            of reach, or the velocity is no robot's.
+    """
+    if pose.robot != robot:
+        raise Malformed(f"pose of '{pose.robot}' on the key of '{robot}'")
+    if not (_counted(pose.seq) and _past(pose.stamp, now)):
+        raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
+    _refuse_place(pose.position, reach)
+    _refuse_motion(pose.velocity, pose.yaw)
+
+
+def check_state(state: State, *, robot: str, now: float, reach: Vector) -> None:
+    """Refuses telemetry whose pose cannot be true; it may have none.
+
+    Raises:
+        Malformed: As `check_pose`.
+    """
+    if state.robot != robot:
+        raise Malformed(f"state of '{state.robot}' on the key of '{robot}'")
+    _refuse_stamp(state.stamp, now)
+    if state.position is not None:
+        _refuse_place(state.position, reach)
+    _refuse_motion(state.velocity, state.yaw)
+
+
+def check_position(measured: Position, *, robot: str, now: float, reach: Vector) -> None:
+    """Refuses a measured position that cannot be true.
+
+    Raises:
+        Malformed: As `check_pose`.
+    """
+    if measured.robot != robot:
+        raise Malformed(f"position of '{measured.robot}' on the key of '{robot}'")
+    _refuse_stamp(measured.stamp, now)
+    _refuse_place(measured.position, reach)
+    if measured.yaw is not None and not abs(measured.yaw) <= MAX_YAW:
+        raise Malformed(f"yaw {measured.yaw} is impossible")
+
+
+def check_goal(goal: Goal, *, robot: str, now: float, reach: Vector, oldest_s: float) -> None:
+    """Refuses a goal that no robot can follow, or that is too old to be followed.
+
+    Args:
+        goal: What arrived.
+        robot: Whose key it arrived on.
+        now: UTC time of arrival [s].
+        reach: See `check_pose`.
+        oldest_s: A goal that was decided longer ago is none [s].
+
+    Raises:
+        Malformed: If the name is another's, a number is not finite, the stamp is old or lies in the future, the pose is
+            younger than the goal that rests on it, or the position is out of reach.
+    """
+    if goal.robot != robot:
+        raise Malformed(f"goal of '{goal.robot}' on the key of '{robot}'")
+    if not (_counted(goal.seq) and now - oldest_s <= goal.stamp and _past(goal.stamp, now)):
+        raise Malformed(f"sequence number {goal.seq} or stamp {goal.stamp} is impossible, or the goal is old")
+    if not 0.0 < goal.pose <= goal.stamp + FUTURE_S:  # the robot's clock may be ahead
+        raise Malformed(f"a goal of {goal.stamp} cannot rest on a pose of {goal.pose}")
+    _refuse_place(goal.position, reach)
+    if goal.yaw is not None and not abs(goal.yaw) <= MAX_YAW:
+        raise Malformed(f"yaw {goal.yaw} is impossible")
+
+
+def check_ranges(ranges: Ranges, *, robot: str, now: float) -> None:
+    """Refuses a sweep of range sensors that cannot be true.
+
+    Raises:
+        Malformed: If the name is another's, the stamp is not finite or lies in the future, there is no ray or too many,
+            the lists differ in length, an angle or a distance is not finite, or a distance is no sensor's.
+    """
+    if ranges.robot != robot:
+        raise Malformed(f"ranges of '{ranges.robot}' on the key of '{robot}'")
+    _refuse_stamp(ranges.stamp, now)
+    if not 1 <= len(ranges.distance) <= MAX_RAYS:
+        raise Malformed(f"{len(ranges.distance)} rays; a sweep has 1 to {MAX_RAYS}")
+    if not len(ranges.bearing) == len(ranges.elevation) == len(ranges.distance):
+        raise Malformed("bearings, elevations and distances differ in number")
+    if not _within((*ranges.bearing, *ranges.elevation), 2.0 * math.pi):
+        raise Malformed("a bearing or an elevation is no angle in radians")
+    if not all(value is None or 0.0 <= value <= MAX_RANGE for value in ranges.distance):
+        raise Malformed(f"a distance is not between 0 and {MAX_RANGE:g} m")
+
+
+def check_command(command: Command, *, robot: str) -> None:
+    """Refuses a command that no body can carry out.
+
+    Raises:
+        Malformed: If the name is another's, the sequence number is impossible, `drive` has no finite setpoint, or
+            `takeoff` no height.
+    """
+    if command.robot != robot:
+        raise Malformed(f"command of '{command.robot}' on the key of '{robot}'")
+    if not _counted(command.seq):
+        raise Malformed(f"sequence number {command.seq} is impossible")
+    if command.action == "drive":
+        x, y, z, w = command.setpoint or (math.nan,) * 4
+        # a world checks twenty thousand of these in a second: a generator would cost it three times as much
+        if not (abs(x) <= ABSURD and abs(y) <= ABSURD and abs(z) <= ABSURD and abs(w) <= ABSURD):
+            raise Malformed(f"drive with the setpoint {command.setpoint}")
+    elif command.action == "takeoff" and not (command.height is not None and 0.0 < command.height <= MAX_RANGE):
+        raise Malformed(f"takeoff with the height {command.height}")
+
+
+def missed(last: int, seq: int, since: float, rate: float) -> int:
+    """Poses of a robot that never came between two that did, by their running numbers.
+
+    Args:
+        last: Number of the former. One that does not grow is of a process that began anew at 1.
+        seq: Number of the latter.
+        since: Time between their stamps [s].
+        rate: Poses that a robot says in a second at most [1/s]. A gap counts only as far as that allows: one forged
+            number must not become a hundred million lost poses.
+    """
+    return min(seq - last - 1 if seq > last else seq - 1, said_within(since, rate))
+
+
+def said_within(since: float, rate: float) -> int:
+    """Poses that a robot can have said in `since` [s] at `rate` [1/s]; UTC stamps are exact to a microsecond."""
+    return math.ceil(since * rate - 1e-3)
+
+
+def _counted(seq: int) -> bool:
+    return 0 < seq < 2**53  # what JSON carries exactly
+
+
+def _past(stamp: float, now: float) -> bool:
+    return 0.0 < stamp < now + FUTURE_S
+
+
+def _within(values: Sequence[float], limit: float) -> bool:
+    return all(abs(value) <= limit for value in values)
+
+
+def _refuse_stamp(stamp: float, now: float) -> None:
+    if not _past(stamp, now):
+        raise Malformed(f"stamp {stamp} is impossible")
+
+
+def _refuse_place(position: Vector, reach: Vector) -> None:
+    if not all(abs(value) <= limit for value, limit in zip(position, reach, strict=True)):
+        raise Malformed(f"position {position} is outside the arena")
+
+
+def _refuse_motion(velocity: Vector | None, yaw: float | None) -> None:
+    if not _within(velocity or (), MAX_SPEED) or not abs(yaw or 0.0) <= MAX_YAW:
+        raise Malformed(f"velocity {velocity} or yaw {yaw} is impossible")

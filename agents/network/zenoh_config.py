@@ -1,0 +1,169 @@
+"""Every setting of a Zenoh session, in one place: what is on, what is off, who is shown which certificate."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import zenoh
+
+from agents.network import access_control, lab
+from agents.network import endpoints as topology
+from agents.network.endpoints import DEFAULT_ENDPOINT, UNIX, EndpointError, Mode, refusal
+
+LEASE_S: Final = 2.0  # whoever is silent for so long is held for dead
+ASK_S: Final = 2.0  # whoever asks waits no longer for an answer
+OPEN_S: Final = 3.0  # a handshake that takes longer has failed,
+NEXT_S: Final = 1.0  # or longer than this where there is another router to go to
+MOST_BYTES: Final = 4 * 1024 * 1024  # of a message that a router of a lab puts together; the largest is an experiment
+
+# 4 threads instead of 7 in each client and a sixth less CPU at 50 Hz. Zenoh reads it once, at the first open.
+_RUNTIME: Final = (
+    "(acc:(handover:app),tx:(handover:app),net:(handover:app),rx:(worker_threads:1),app:(worker_threads:1))"
+)
+
+
+def config(settings: Mapping[str, object]) -> zenoh.Config:
+    """The configuration of a session that has these settings.
+
+    Raises:
+        EndpointError: If Zenoh understands an endpoint in another way or not at all.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
+    made = zenoh.Config()
+    for key, value in settings.items():
+        try:
+            made.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            what = ", ".join(value) if isinstance(value, list) else f"{key} {value}"
+            raise EndpointError(f"{what}: {reason(error)}; write endpoints like {DEFAULT_ENDPOINT}") from None
+    return made
+
+
+def settings(
+    mode: Mode,
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    name: str | None = None,
+    lease_s: float = LEASE_S,
+    identity: str | None = None,
+    rights: access_control.Rights | None = None,
+) -> dict[str, object]:
+    """What every session sets of Zenoh: no multicast, no gossip, no shared memory, listening on loopback only.
+
+    With a lab (`agents.network.lab`) both ends show certificates, and listening beyond loopback is allowed.
+
+    Args:
+        mode: Robots are clients: a router forwards between clients, but not between two peers.
+        connect: Endpoints of the routers; a client uses the first that answers and fails over to the others, and a
+            router is linked with every one.
+        listen: Loopback endpoints to listen on; a client needs none.
+        name: Shown by `zenpark keys`.
+        lease_s: After this silence [s] the others hold this session for dead. A killed process is noticed at once.
+        identity: Whose certificate is shown, in a lab; `name` if left out.
+        rights: Who may do what; a router of a lab needs them.
+
+    Raises:
+        EndpointError: If an endpoint is malformed, or one to listen on can be reached from outside this machine
+            although there is no lab, or the lab has no such identity, or its router no rights to enforce.
+    """
+    for endpoint in (*connect, *listen):
+        _check_form(endpoint)
+    try:
+        of_lab, folder = _of_lab([*connect, *listen], identity or name or "", bool(listen), rights)
+    except lab.LabError as error:
+        raise EndpointError(str(error)) from None
+    connect, listen = topology.bare(connect), topology.bare(listen)
+    if folder is None:
+        for endpoint in listen:
+            check_loopback(endpoint)
+    elif listen and rights is None:
+        raise EndpointError(f"who listens in the lab {folder} must know who may do what: name the experiment")
+    made: dict[str, object] = {
+        "mode": mode,
+        "connect/endpoints": list(connect),
+        # A client's open that waits inside Zenoh does not hear Ctrl-C: fail at once and try again in Python. Others
+        # open without waiting, and seek whom they miss for as long as they live.
+        "connect/timeout_ms": 0 if mode == "client" else -1,
+        "connect/exit_on_failure": mode == "client",
+        "open/return_conditions/connect_scouted": mode == "client",
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+        "listen/endpoints": list(listen),
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/link/tx/lease": round(lease_s * 1000),
+        # A client that has lost its router seeks them in the order of the list: one that is frozen holds it up so long.
+        "transport/unicast/open_timeout": round((NEXT_S if mode == "client" and len(connect) > 1 else OPEN_S) * 1000),
+        "transport/unicast/accept_timeout": round(OPEN_S * 1000),
+        "transport/shared_memory/enabled": False,
+        "queries_default_timeout": round(ASK_S * 1000),
+        "adminspace/enabled": True,  # read-only; how `zenpark keys` learns who is there
+    }
+    if name is not None:
+        made["metadata"] = {"name": name}
+    return made | of_lab
+
+
+def _of_lab(
+    endpoints: Sequence[str], identity: str, listens: bool, rights: access_control.Rights | None
+) -> tuple[dict[str, object], Path | None]:
+    """What the lab of some endpoints adds to a configuration, and its folder; nothing and None without one.
+
+    Raises:
+        LabError: If the lab has no such identity, or its register does not go with the rights.
+    """
+    folder = lab.of(endpoints)
+    if folder is None:
+        return {}, None
+    settings = lab.settings(folder, identity, listens=listens)
+    if rights is not None:
+        known = lab.register(folder)
+        if identity in known.identities and not known.identities[identity].hosts:
+            raise lab.LabError(
+                f"{identity} has a certificate with which one cannot listen, as in a mesh all do: `zenpark keys init` "
+                f"with the file of the mesh gives such, or `zenpark keys issue {folder} NAME --host ADDRESS`"
+            )
+        settings["access_control"] = access_control.rules(rights, known)
+        settings["low_pass_filter"] = access_control.sizes(rights)
+        settings["transport/link/rx/max_message_size"] = MOST_BYTES
+    return settings, folder
+
+
+def _check_form(endpoint: str) -> None:
+    protocol, slash, address = endpoint.partition("/")
+    if not (protocol and slash and address and endpoint.isprintable()):
+        raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
+    if why := refusal(lab.bare([endpoint])[0]):
+        raise EndpointError(why)
+
+
+def check_loopback(endpoint: str) -> None:
+    """Refuses to listen where others could connect: without a lab there is no authentication.
+
+    Raises:
+        EndpointError: If the endpoint is not of this machine alone.
+    """
+    protocol, _, address = endpoint.partition("/")
+    if protocol == UNIX:
+        return
+    host = address.partition("#")[0].partition("?")[0].rpartition(":")[0].strip("[]")
+    try:
+        loopback = host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        loopback = False
+    if not loopback:
+        raise EndpointError(
+            f"will not listen on {endpoint}: whoever reaches it could command the robots. Make certificates with "
+            "`zenpark keys init LAB FILE`, then listen on tls/... with --lab LAB; or listen on "
+            f"{DEFAULT_ENDPOINT} and let other machines in through an SSH tunnel (ssh -R 7447:127.0.0.1:7447 HOST)"
+        )
+
+
+def reason(error: zenoh.ZError) -> str:
+    """The innermost reason in a message of Zenoh, without the place in its source."""
+    return str(error).partition(" at /")[0].rpartition(": ")[2]

@@ -1,0 +1,187 @@
+"""Avoidance: how robots keep clear of what their range sensors see and of whom they hear.
+
+An avoidance is a frozen struct of its parameters, found by the entry-point group `zenpark.avoidances`. It may act at
+two levels: `deviate` shifts a goal (individual level; the potential of the paper), `restrain` has a say in the last
+word before the body (safety level; the barrier).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from agents.arrays import Array, Index, Mask, every, norm
+
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+
+COINCIDENT = 1e-6  # [m] axes nearer than this have no direction
+TOUCHING = 1e-3  # [m] no gap counts as smaller: forces stay finite
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """What rows know of the things around them, one entry per thing and row that knows it (K).
+
+    Things are upright cylinders: a robot that was heard, or the point (radius 0) where a ray of a range sensor ended.
+
+    Attributes:
+        row: (K,) who knows it.
+        position: (K, 2) where it is believed to be now [m].
+        velocity: (K, 2) as believed [m/s]; 0 for what a ray saw.
+        radius: (K,) [m]
+        low: (K,) lower end [m].
+        high: (K,) upper end [m].
+        heard: (K,) a robot of this experiment that was heard, which may avoid as well; else what a ray saw.
+        lag: (K,) time constant with which its velocity follows its commands [s]; 0 for what a ray saw.
+    """
+
+    row: Index
+    position: Array
+    velocity: Array
+    radius: Array
+    low: Array
+    high: Array
+    heard: Mask
+    lag: Array
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def of(self, which: Mask) -> Nearby:
+        """Some of the things (K,)."""
+        return Nearby(*(getattr(self, field.name)[which] for field in fields(Nearby)))
+
+    def and_then(self, others: Nearby) -> Nearby:
+        """These things and others."""
+        if not len(others):
+            return self
+        if not len(self):
+            return others
+        both = (np.concatenate([getattr(self, field.name), getattr(others, field.name)]) for field in fields(Nearby))
+        return Nearby(*both)
+
+    def bearing(self, own: Self) -> tuple[Array, Array]:
+        """Unit vectors (K, 2) from each thing to who knows it, and the distances (K,) of their axes [m].
+
+        Two axes in one place, which only wrong measurements can give, are told apart along x.
+        """
+        away = own.position[self.row, :2] - self.position
+        distance = norm(away)
+        some_way = distance > COINCIDENT
+        if not every(some_way):
+            away[~some_way], distance = (COINCIDENT, 0.0), np.maximum(distance, COINCIDENT)
+        return away / distance[:, None], distance
+
+
+@dataclass(frozen=True)
+class Self:
+    """What rows know of themselves (N).
+
+    Attributes:
+        position: (N, 3) measured [m].
+        velocity: (N, 3) measured or estimated, 0 where unknown [m/s].
+        yaw: (N,) measured [rad].
+        radius: (N,) [m]
+        height: (N,) vertical size, from the position up [m].
+        speed: (N,) limit [m/s].
+        turn_rate: (N,) limit [rad/s].
+        response: (N,) rate at which a body that takes positions closes a position error [1/s].
+        lag: (N,) time constant with which the velocity follows what is commanded [s].
+        takes: (N,) "position", "velocity" or "twist".
+        by_position: (N,) takes a position.
+        by_twist: (N,) takes a twist.
+        flies: (N,)
+    """
+
+    position: Array
+    velocity: Array
+    yaw: Array
+    radius: Array
+    height: Array
+    speed: Array
+    turn_rate: Array
+    response: Array
+    lag: Array
+    takes: tuple[str, ...]
+    by_position: Mask
+    by_twist: Mask
+    flies: Mask
+
+
+class Avoidance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Parameters that every avoidance has."""
+
+    hears: Annotated[
+        Literal["neighbours", "all"], Meta(description="whom it hears: the neighbours of the formation, or every robot")
+    ] = "neighbours"
+    clearance: Annotated[
+        NotNegative,
+        Meta(description="things farther above or below than this are in nobody's way [m]; more against downwash"),
+    ] = 0.1
+
+    def deviate(self, goal: Array, own: Self, near: Nearby, period: float) -> Array:
+        """The goals (N, 3) [m] that are pursued in place of `goal` (N, 3); asked every `period` [s]."""
+        return goal
+
+    def restrain(self, setpoint: Array, own: Self, near: Nearby) -> Array:
+        """The setpoints (N, 4) that may be sent in place of `setpoint` (N, 4), in the meaning of each row's kind.
+
+        What is changed is held to the limits of speed and arena; rows that do not know where they are keep theirs.
+        """
+        return setpoint
+
+
+class Potential(Avoidance, frozen=True):
+    """The repulsive potential of the paper, eqs. (2) to (4): a shift of the goal away from what is near.
+
+    Each thing k within d0 pushes with F_k = η (1/d_k − 1/d0) / d_k² along the horizontal unit vector from it to the
+    robot, and the goal is shifted by u = h v F/‖F‖, F = Σ F_k. The paper leaves open:
+
+    - d is measured from surface to surface, so that robots of any radii keep the same gap (a range reading of a Khepera
+      is counted from its edge as well). F points away from the thing's axis.
+    - h, "the period of the controller", is the time in which the body closes an error of position, 1/response: that is
+      the shift that makes the body move at v along F. (A shift of a tick of 10 ms times v would be millimetres.)
+    - v is the robot's own limit of speed unless given, and the goal is first brought as near as that limit lets the
+      robot go anyway: so no goal, however far behind the thing it lies, pulls harder than the thing pushes.
+    - η has no influence after the normalisation of (4); it is kept for whoever compares forces.
+
+    There is no guarantee: a robot can be caught between two pushes, and what is behind it may be nearer than what it is
+    pushed from. It halts where pull and push are opposite (no way around is sought).
+    """
+
+    reach: Annotated[Positive, Meta(description="d0, from surface to surface [m]")] = 0.30
+    strength: Annotated[Positive, Meta(description="η [N m³], of all forces alike")] = 1.5e-4
+    velocity: Annotated[Positive | None, Meta(description="v [m/s]; left out: the robot's limit of speed")] = None
+    period_s: Annotated[Positive | None, Meta(description="h [s]; left out: 1/response of the robot's kind")] = None
+
+    def force(self, own: Self, near: Nearby) -> Array:
+        """F (N, 2) of eq. (3), summed over what is near; zero where nothing is."""
+        away, distance = near.bearing(own)
+        gap = np.maximum(distance - own.radius[near.row] - near.radius, TOUCHING)
+        push = self.strength * np.maximum(1.0 / gap - 1.0 / self.reach, 0.0) / gap**2
+        total = np.zeros((len(own.yaw), 2))
+        np.add.at(total, near.row, push[:, None] * away)
+        return total
+
+    def deviate(self, goal: Array, own: Self, near: Nearby, period: float) -> Array:
+        """See `Avoidance.deviate`; eq. (4)."""
+        if not len(near):
+            return goal
+        force = self.force(own, near)
+        strength = norm(force)
+        rows = np.flatnonzero((strength > 0.0) & np.isfinite(goal[:, :2]).all(axis=1))
+        if not len(rows):
+            return goal
+        here, limit, response = own.position[rows, :2], own.speed[rows], own.response[rows]
+        way = goal[rows, :2] - here
+        way *= np.minimum(1.0, limit / response / np.maximum(norm(way), TOUCHING))[:, None]
+        v = limit if self.velocity is None else self.velocity
+        h = 1.0 / response if self.period_s is None else self.period_s
+        shifted = goal.copy()
+        shifted[rows, :2] = here + way + (h * v / strength[rows])[:, None] * force[rows]
+        return shifted

@@ -1,0 +1,148 @@
+"""Plug-ins by name: bodies, triggers, laws, planners, avoidances and engines, found through entry points.
+
+A trigger, law, planner, avoidance or engine is a frozen `msgspec.Struct` of its parameters; a body is a function, a
+`agents.body.interface.BodyFactory`. Anybody's distribution may add one, for example under
+`[project.entry-points."zenpark.triggers"]` in its pyproject.toml.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from typing import Any, Final, Protocol
+
+import msgspec
+
+BODIES: Final = "zenpark.bodies"
+TRIGGERS: Final = "zenpark.triggers"
+LAWS: Final = "zenpark.laws"
+PREDICTORS: Final = "zenpark.predictors"
+PLANNERS: Final = "zenpark.planners"
+AVOIDANCES: Final = "zenpark.avoidances"
+ENGINES: Final = "zenpark.engines"  # what moves the twins of a world
+DEVICES: Final = "zenpark.devices"  # protocol twins: what stands in for hardware at the far end of a body's wire
+
+
+class _Groups(Protocol):
+    """What `entry_points()` gives, which Python 3.12 has changed."""
+
+    def select(self, *, group: str) -> EntryPoints: ...
+
+
+class PluginError(ValueError):
+    """A plug-in that is registered but cannot be used."""
+
+
+class UnknownPlugin(PluginError):
+    """No plug-in has this name."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The nearest known word as a question, or the list of all when none is near; empty when nothing is known."""
+    words = list(known)
+    lower = {each.lower(): each for each in words}
+    near = difflib.get_close_matches(word.lower()[:80], lower, n=1)
+    if near:
+        return f"did you mean '{lower[near[0]]}'?"
+    return f"known: {', '.join(words)}" if words else ""
+
+
+def names(group: str) -> list[str]:
+    """Names registered in an entry-point group, sorted."""
+    return sorted(_registered(group))
+
+
+def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on the group
+    """The object registered under a name.
+
+    Raises:
+        UnknownPlugin: If there is none, with the nearest name or all of them.
+        PluginError: If its module fails to import, with the distribution it came from and why.
+    """
+    known = _registered(group)
+    if name not in known:
+        what = group.rpartition(".")[2]
+        raise UnknownPlugin(f"no {name!r} among the {what}; {did_you_mean(name, sorted(known)) or 'none is installed'}")
+    entry = known[name]
+    try:
+        return entry.load()
+    except _IMPORT_FAILURES as error:
+        raise PluginError(f"{_origin(entry)} fails to import: {type(error).__name__}: {error}") from error
+
+
+def struct(group: str, name: str) -> type[msgspec.Struct]:
+    """The struct of parameters registered under a name.
+
+    Raises:
+        UnknownPlugin: If there is none.
+        PluginError: If it fails to import or is no `msgspec.Struct`.
+    """
+    plugin = load(group, name)
+    if not (isinstance(plugin, type) and issubclass(plugin, msgspec.Struct)):
+        raise PluginError(
+            f"{_origin(_registered(group)[name])} is no msgspec.Struct; its parameters must be its fields"
+        )
+    return plugin
+
+
+def build(group: str, choice: str | Mapping[str, Any]) -> Any:  # noqa: ANN401 - likewise
+    """The plug-in that a choice names, with its parameters.
+
+    Args:
+        group: Entry-point group.
+        choice: `"periodic"`, or `{"kind": "send-on-delta", "threshold": 0.01}`.
+
+    Raises:
+        UnknownPlugin: If there is none of that name.
+        PluginError: If it cannot be imported or is no `msgspec.Struct`.
+        msgspec.ValidationError: If a parameter is unknown, missing or out of range, with its path `$.parameter`.
+    """
+    name, parameters = split(choice)
+    return msgspec.convert(parameters, struct(group, name))
+
+
+def split(choice: str | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """A choice as its name and its parameters.
+
+    Raises:
+        msgspec.ValidationError: If a table has no `kind`, or one that is no text.
+    """
+    if isinstance(choice, str):
+        return choice, {}
+    if "kind" not in choice:
+        raise msgspec.ValidationError("Object missing required field `kind`")
+    kind = choice["kind"]
+    if not isinstance(kind, str):
+        raise msgspec.ValidationError(f"Expected `str`, got `{type(kind).__name__}` - at `$.kind`")
+    return kind, {key: value for key, value in choice.items() if key != "kind"}
+
+
+def body_name(address: str) -> str:
+    """The body that an address asks for: `"radio"` of `"radio://0/80/2M"`, `"twin"` of `"twin"`."""
+    return address.partition("://")[0]
+
+
+@cache
+def _installed() -> _Groups:
+    """Cached, and all groups at once: reading the metadata of all installed distributions takes milliseconds."""
+    return entry_points()
+
+
+@cache
+def _registered(group: str) -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in _installed().select(group=group)}
+
+
+def _origin(entry: EntryPoint) -> str:
+    distribution = entry.dist.name if entry.dist is not None else "an unnamed distribution"
+    return f"plug-in {entry.name!r} ({entry.value}) of {distribution}"
+
+
+# What a mistake in a plug-in raises.
+FAILURES: Final = (AttributeError, TypeError, ValueError, NameError, LookupError, ArithmeticError)
+# What a stranger's module may raise while it is imported.
+_IMPORT_FAILURES: Final = (
+    ImportError, AttributeError, SyntaxError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError
+)  # fmt: skip

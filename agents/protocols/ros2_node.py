@@ -1,0 +1,164 @@
+"""A ROS 2 node made of a Zenoh session: publishers and subscribers of either style, polled, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import zenoh
+from zenoh.handlers import Handler
+
+from agents.clock import Clock
+from agents.network import pubsub
+from agents.network import session as network
+from agents.protocols import ros2
+from agents.protocols.ros2 import Message, Role, Style, Types
+
+
+class Participant:
+    """The ROS 2 side of one session; numbers its entities, as rmw_zenoh does.
+
+    With "ros2dds", tokens belong to what plays the bridge between DDS and Zenoh (`announces`): it makes routes of them.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, types: Types, *, style: Style, domain: int = 0, announces: bool = False
+    ) -> None:
+        self.session: Final = session
+        self.announces: Final = announces or style == "rmw"
+        self.types: Final = types
+        self.style: Final[Style] = style
+        self.domain: Final = domain
+        self.zid: Final = str(session.zid())
+        self.clock: Final = Clock()
+        self._entities = 0
+
+    def number(self) -> int:
+        """The next entity's."""
+        self._entities += 1
+        return self._entities - 1
+
+    def node(self, name: str, namespace: str = "") -> Node:
+        """A node; namespace as in "tb3_0", without the leading slash."""
+        return Node(self, name, namespace)
+
+
+class Node:
+    """A node and what it announces. Style "ros2dds" knows no nodes, only topics."""
+
+    def __init__(self, participant: Participant, name: str, namespace: str) -> None:
+        self.participant: Final = participant
+        self.name, self.namespace = name, namespace
+        self._number = participant.number()
+        self._token: zenoh.LivelinessToken | None = None
+        if participant.style == "rmw":
+            key = ros2.node_token(participant.domain, participant.zid, self._number, namespace, name)
+            self._token = pubsub.alive_token(participant.session, key)
+
+    def publisher(self, topic: str, kind: str, quality: str = ros2.RELIABLE) -> Publisher:
+        """Publishes messages of a type on a topic of the node's namespace, or on one that begins with a slash."""
+        token, key = self.announce("MP", topic, kind, quality)
+        return Publisher(self, kind, key, token)
+
+    def subscriber(self, topic: str, kind: str, quality: str = ros2.RELIABLE, depth: int = 16) -> Subscriber:
+        """Hears a topic likewise; the newest `depth` samples wait."""
+        token, key = self.announce("MS", topic, kind, quality)
+        return Subscriber(self, kind, key, token, depth)
+
+    def announce(self, role: Role, topic: str, kind: str, quality: str) -> tuple[str, str]:
+        """The token and the key of a new endpoint."""
+        it = self.participant
+        full = ros2.absolute(self.namespace, topic)
+        key = ros2.topic_key(it.style, full, kind, domain=it.domain, types=it.types)
+        if it.style == "ros2dds":
+            return ros2.dds_token(it.zid, role, full, kind), key
+        rest = ros2.endpoint_topic(full, kind, quality, it.types)
+        entity = it.number()
+        return ros2.endpoint_token(it.domain, it.zid, self._number, entity, role, self.namespace, self.name, rest), key
+
+    def close(self) -> None:
+        """Takes the node's token back; its endpoints are closed by themselves."""
+        if self._token is not None:
+            self._token.undeclare()  # type: ignore[no-untyped-call]
+
+
+class Publisher:
+    """One end of a topic."""
+
+    def __init__(self, node: Node, kind: str, key: str, token: str) -> None:
+        participant = node.participant
+        self._node = node  # a token that nobody holds is taken back: the node lives as long as what it has
+        self.kind: Final = kind
+        self.key: Final = key
+        self._types = participant.types
+        self._gid = ros2.gid(token) if participant.style == "rmw" else None
+        self._sequence = 0
+        self._publisher = participant.session.declare_publisher(
+            key, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.DATA_HIGH
+        )
+        self._token = _announce(participant, token)
+
+    def put(self, message: Message) -> None:
+        """Publishes a message."""
+        self.send(self._types.encode(message, self.kind))
+
+    def send(self, payload: bytes) -> None:
+        """Publishes a message that is CDR already."""
+        if self._gid is None:
+            self._publisher.put(payload)
+            return
+        self._sequence += 1
+        now = round(self._node.participant.clock.utc() * 1e9)
+        self._publisher.put(
+            payload,
+            attachment=ros2.attachment(self._sequence, now, self._gid),
+        )
+
+    def close(self) -> None:
+        """Leaves the graph."""
+        if self._token is not None:
+            self._token.undeclare()  # type: ignore[no-untyped-call]
+        self._publisher.undeclare()  # type: ignore[no-untyped-call]
+
+
+class Subscriber:
+    """The other end of a topic.
+
+    Attributes:
+        malformed: Samples that were no message of the topic's type; they were left out.
+    """
+
+    def __init__(self, node: Node, kind: str, key: str, token: str, depth: int) -> None:
+        participant = node.participant
+        self._node = node  # as above
+        self.kind: Final = kind
+        self.key: Final = key
+        self.malformed = 0
+        self._types = participant.types
+        self._subscriber: zenoh.Subscriber[Handler[zenoh.Sample]] = pubsub.subscriber(participant.session, key, depth)
+        self._token = _announce(participant, token)
+
+    def received(self) -> Iterator[Message]:
+        """The messages that wait, oldest first."""
+        for sample in network.received(self._subscriber.handler):
+            try:
+                yield self._types.decode(sample.payload.to_bytes(), self.kind)
+            except ros2.UnknownMessage:
+                self.malformed += 1
+
+    def newest(self) -> Message | None:
+        """The last of them, or None."""
+        last = None
+        for last in self.received():  # noqa: B007
+            pass
+        return last
+
+    def close(self) -> None:
+        """Leaves the graph."""
+        if self._token is not None:
+            self._token.undeclare()  # type: ignore[no-untyped-call]
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _announce(participant: Participant, token: str) -> zenoh.LivelinessToken | None:
+    return pubsub.alive_token(participant.session, token) if participant.announces else None

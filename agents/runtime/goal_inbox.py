@@ -1,0 +1,109 @@
+"""Goals as they come over the network to robots that are guided, and whether the centre is there."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from math import nan
+
+import numpy as np
+import zenoh
+
+from agents.agent import Agent
+from agents.decision.centralised import Guidance
+from agents.network import messages, pubsub, validation
+from agents.network import session as network
+from agents.network.channel_model import Channel, Conditions
+from agents.network.keys import Keys
+from agents.runtime.pose_inbox import NEWS
+
+
+class HeardGoals:
+    """The goals of the rows of one process; polled.
+
+    Attributes:
+        malformed: Goals that were refused.
+        news: Per row, goals that it got since somebody emptied this; for telemetry.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        agent: Agent,
+        guidance: Guidance,
+        *,
+        reach: messages.Vector,
+        conditions: Conditions | None = None,
+    ) -> None:
+        """Listens for the guided rows of `agent`; no goal beyond `reach` [m] is believed.
+
+        `conditions` are what is done to the goals of each guided row on their way; None: nothing.
+        """
+        self._session, self._agent, self._guidance, self._reach = session, agent, guidance, reach
+        self._names: Sequence[str] = agent.assignment.names
+        rows = np.flatnonzero(guidance.guided).tolist()
+        self._goals = [(row, pubsub.subscriber(session, keys.goal(self._names[row]), 8)) for row in rows]
+        self._watch = pubsub.alive_watch(session, keys.lives(keys.centre_alive))
+        self._centre, self._life = keys.centre_alive, ""
+        self._seq = dict.fromkeys(rows, 0)
+        self._rows = np.array(rows, dtype=np.intp)
+        self._channel = Channel(conditions or Conditions.ideal(len(rows)))
+        self.malformed = 0
+        self.news = [deque[messages.Followed](maxlen=NEWS) for _ in self._names]
+
+    def take(self, t: float, utc: float) -> None:
+        """Takes in what has come by `t` [s] of a clock that was 0 at `utc`."""
+        for sample in network.received(self._watch.handler):
+            token = str(sample.key_expr)
+            if token != self._centre:
+                self._begin(Keys.life_of(token), there=sample.kind == zenoh.SampleKind.PUT)
+            elif sample.kind == zenoh.SampleKind.PUT:
+                self._guidance.find()
+            elif network.connected(self._session):  # without a router every token is gone, and that is another matter
+                self._guidance.lose(t)
+        for link, (row, goals) in enumerate(self._goals):
+            for sample in network.received(goals.handler):
+                self._hear(link, row, sample, t, utc)
+        if (got := self._channel.due(t)) is not None and got.extra is not None:
+            said = (got.link.tolist(), got.seq.tolist(), got.stamp.tolist(), got.position, got.extra.tolist())
+            for link, seq, stamp, position, (toward, sent, pose) in zip(*said, strict=True):
+                which = self._rows[[link]]
+                news = self._agent.hear_goal(which, position[None], np.array([toward]), np.array([stamp]))
+                if news.any():
+                    self.news[which[0]].append(messages.Followed(seq, utc + sent, utc + pose, utc + t))
+
+    def _begin(self, life: str | None, *, there: bool) -> None:
+        """A centre of another session counts its goals anew; its clock may be behind that of the last one."""
+        if life is None or not there or life == self._life:
+            return
+        if self._life:
+            self._seq = dict.fromkeys(self._seq, 0)
+            self._guidance.stamp[self._rows] = -np.inf
+        self._life = life
+
+    def _hear(self, link: int, row: int, sample: zenoh.Sample, t: float, utc: float) -> None:
+        oldest_s = self._agent.assignment.limits.link_silence_s
+        payload = sample.payload.to_bytes()
+        try:
+            goal = messages.decode(payload, str(sample.encoding), messages.Goal)
+            validation.check_goal(goal, robot=self._names[row], now=utc + t, reach=self._reach, oldest_s=oldest_s)
+            if goal.seq <= self._seq[row]:
+                raise messages.Malformed(f"goal {goal.seq} after {self._seq[row]}")
+        except messages.Malformed:
+            self.malformed += 1
+            return
+        self._seq[row] = goal.seq
+        stamp, sent = validation.taken(goal.stamp - utc, t), goal.stamp - utc
+        start = self._agent.life.start_at[[row]]
+        self._channel.send(
+            np.array([link]),
+            np.array([goal.seq]),
+            np.array([stamp]),
+            np.array([goal.position]),
+            np.zeros((1, 3)),
+            start=start,
+            size=np.array([len(payload)]),
+            now=t,
+            extra=np.array([[nan if goal.yaw is None else goal.yaw, sent, goal.pose - utc]]),
+        )

@@ -1,0 +1,536 @@
+"""The robot process: a deadline loop around the decision. Everything here is I/O; everything decided is `agents.agent`.
+
+One plain loop on the monotonic clock, no asyncio, no callbacks: what arrives waits in ring channels and is polled.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
+from math import ceil, floor
+from typing import Final
+
+import numpy as np
+import zenoh
+
+from agents.agent import Actions, Agent
+from agents.arrays import Index, some
+from agents.body.interface import Body, call_all
+from agents.body.measured_positions import MeasuredPositions
+from agents.decision.assignment import Assignment
+from agents.decision.lifecycle import Phase
+from agents.decision.transmission import Said
+from agents.network import messages, pubsub, validation
+from agents.network import session as network
+from agents.network.name_ownership import ANSWER_S, Doubt, NameTaken, claim
+from agents.network.shutdown import FAREWELL_S, STOPPED_S, leave
+from agents.network.zenoh_config import ASK_S
+from agents.runtime.command_line import told_to_end
+from agents.runtime.goal_inbox import HeardGoals
+from agents.runtime.lifeline import Lifeline
+from agents.runtime.orders import LAND, STOP, carry_out
+from agents.runtime.pose_inbox import Neighbours
+from agents.runtime.range_inbox import HeardRanges, instead
+from agents.runtime.setup import Setup
+from agents.runtime.telemetry import Counts, Telemetry
+from agents.runtime.watchdog import AGAIN_S, Watchdog
+
+HUSH_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
+ROUTER_S: Final = 0.045  # between two looks at the router
+STOOD_S: Final = 0.5 * network.ROBOT_LEASE_S  # a process that stood still for longer may have lost its name
+_CLOCK: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # goes on while the machine sleeps
+
+
+class Runtime:
+    """Drives the robots of one process through an experiment."""
+
+    def __init__(self, assignment: Assignment, body: Body, setup: Setup) -> None:
+        self.agent = Agent(assignment)
+        self._assignment, self._body, self._setup = assignment, body, setup
+        self._names = assignment.names
+        self._mime = messages.MIME[setup.encoding]
+        self._dt = 1.0 / assignment.body_hz
+        self._state_every = round(assignment.body_hz / setup.state_hz)
+        self._counts = Counts.nothing(len(self._names))
+        self._state_slot = 0
+        self._stopping: str | None = None
+        self._leaving: set[int] = set()  # rows that were told to go while the run goes on
+        self._retired: set[int] = set()  # rows that come down, or are down, while the run goes on
+        self._cut_off = False  # motors were cut by a stop that the loop has not seen yet
+        self._airborne = False  # a row was in the air when its body said so last, or took off since
+        self._joined = False
+        self._utc = self._now = self._next = 0.0
+        self._looked = np.inf  # when the process ran last, on `_CLOCK` [s]
+        self._doubt = Doubt([setup.keys.alive(name) for name in assignment.names])
+        self._hands_off = False  # another process may drive the bodies, or does
+        self._told: Callable[[], str | None] = lambda: None
+        self._reach = validation.reach_of(assignment.limits.low, assignment.limits.high)
+        self._everyone = np.arange(len(self._names))
+        self._began = setup.clock.utc()
+        self._owned: list[zenoh.LivelinessToken] = []
+        self._tokens: dict[int, zenoh.LivelinessToken] = {}  # of rows on which neighbours count
+        self._tokens_lock = threading.Lock()  # the watchdog's alarm takes them back from another thread
+        self._coming_down = False  # for good: the loop is over
+        self._watchdog = Watchdog(body, self._everyone, alarm=self._call_for_help, silence_s=setup.loop_silence_s)
+
+    def run(self) -> int:
+        """Opens the body, joins the network, drives until all is done; returns the exit code of the process.
+
+        Raises:
+            BodyError: If the body cannot be opened.
+            NameTaken: If another process owns the name of a robot, or took it while this one stood still or was cut
+                off: then the body is left as it is, for it is the other one's.
+            network.Unreachable: If no router answers.
+        """
+        lost = threading.Event()
+        rope = Lifeline(lost, told=self._setup.clock.heed)
+        if self._setup.lifeline:
+            rope.start()
+        asked = threading.Event()
+
+        # on the way out everything is tried, the last entry first, whatever the others raise
+        with told_to_end(asked.set), ExitStack() as out:
+            session = network.open_session(
+                self._setup.endpoints,
+                name="+".join(self._names),
+                stop=asked,
+                lease_s=network.ROBOT_LEASE_S,
+                identity=self._names[0],
+                rights=self._setup.rights,
+            )
+            out.callback(leave, session, self)
+            self._take_names(session, asked)
+            out.callback(self._doubt.end)
+            self._body.open()
+            out.callback(self._let_go)
+            out.callback(self._watchdog.end)
+            out.callback(self._order_down, self._body.stop, STOPPED_S)
+            out.callback(self._come_down)
+            self._join(session)
+            self._loop(lambda: rope.reason if lost.is_set() else self._told_to_end(asked.is_set()))
+        return 0
+
+    def _let_go(self) -> None:
+        if not self._hands_off:
+            self._body.close()
+
+    def _told_to_end(self, asked: bool) -> str | None:
+        if asked:
+            return "told to end"
+        return "told to leave" if len(self._leaving) == len(self._names) else None
+
+    def _come_down(self) -> None:
+        """Lands what is still in the air, because something broke on the way, before the motors are switched off."""
+        if self._hands_off:
+            return
+        self._coming_down = True
+        self._watchdog.start()
+        failures: list[Exception] = []
+        if self._in_the_air(failures) and (self.agent.life.phase < Phase.DONE).any():  # else it was stopped
+            error = sys.exception()
+            why = "it did not land in time" if error is None else f"its control loop broke: {_what(error)}"
+            self._watchdog.call_for_help(why)
+            self._order_down(self._body.land, FAREWELL_S)
+        if failures:
+            raise failures[0]
+
+    def _order_down(self, order: Callable[[Index], object], limit_s: float) -> None:
+        """Gives an order, and again until it is taken and no row is in the air any more, or for so long [s].
+
+        A body that does not say how it is gets all of that time if it was in the air before. The first error is raised
+        at the end.
+        """
+        if self._hands_off:
+            return
+        failures: list[Exception] = []
+        zero, begin, again = time.monotonic(), self._now, -np.inf
+        obeyed = False
+        while True:
+            self._watchdog.beat()
+            self._make_sure()
+            if self._now >= again:
+                again = self._now + AGAIN_S
+                obeyed = False
+                with _noted(failures):
+                    order(self._everyone)
+                    obeyed = True
+            if (obeyed and not self._in_the_air(failures)) or self._now > begin + limit_s:
+                break
+            time.sleep(self._dt)
+            self._now = begin + time.monotonic() - zero
+        if failures:
+            raise failures[0]
+
+    def _in_the_air(self, failures: list[Exception]) -> bool:
+        """Whether a row flies, as its body says, or said last: what it raises is noted."""
+        with _noted(failures):
+            self._airborne = some(self._body.read(self._now).flying)
+        return self._airborne
+
+    # ------------------------------------------------------------------ the network
+
+    def _take_names(self, session: zenoh.Session, stop: threading.Event) -> None:
+        """Takes the ownership of the robots' names, before any body is touched.
+
+        Raises:
+            NameTaken: If another process owns one of them.
+            network.Unreachable: If no router answers who does.
+        """
+        keys, setup = self._setup.keys, self._setup
+        tokens = [keys.alive(name) for name in self._names]
+        try:
+            self._owned = claim(session, tokens, began=self._began, endpoints=setup.endpoints, stop=stop)
+        except NameTaken as taken:
+            raise NameTaken(
+                f"{self._whose(taken)}: a robot of this name is on the network already; end it first "
+                "(`zenpark keys` shows who is there), or choose another router with --connect"
+            ) from None
+
+    def _whose(self, taken: NameTaken) -> str:
+        return ", ".join(self._setup.keys.whose(token) or token for token in str(taken).split(", "))
+
+    def _mine(self) -> bool:
+        """Whether the names are this process's, as far as is known.
+
+        Raises:
+            NameTaken: If another process has taken one of them.
+        """
+        try:
+            return self._doubt.over()
+        except NameTaken as taken:
+            self._hands_off = True
+            raise NameTaken(
+                f"{self._whose(taken)}: another process has taken this name while this one stood still or was cut off; "
+                "it leaves, and its body to the other one"
+            ) from None
+
+    def _make_sure(self) -> bool:
+        """Whether the process stood still since the last call: then it has waited until it knew that its names are its
+        own. Until then it must not tell its bodies anything, for another process may drive them.
+
+        Raises:
+            NameTaken: If another process has taken one of them.
+            network.Unreachable: If the process was told to end, and no router has said so within `ANSWER_S`.
+        """
+        last, self._looked = self._looked, time.clock_gettime(_CLOCK)
+        if self._looked - last < STOOD_S or self._watchdog.tripped:  # one that is watched over does not stand still
+            return False
+        woke, self._hands_off = self._looked, True
+        self._doubt.begin(self._session)
+        while not self._mine():
+            if self._looked - woke > ANSWER_S and self._told() is not None:
+                names = ", ".join(self._names)
+                raise network.Unreachable(
+                    f"{names}: told to end after it stood still, and no router says who owns the name now; its body is "
+                    "left as it is"
+                )
+            self._watchdog.beat()
+            time.sleep(self._dt)
+            self._looked = time.clock_gettime(_CLOCK)
+        self._hands_off = False
+        return True
+
+    def _join(self, session: zenoh.Session) -> None:
+        keys, names = self._setup.keys, self._names
+        self._session = session
+        self._router_due, self._silent_since = -np.inf, np.inf
+        self._router = network.RouterWatch(session, keys.alive(names[0]), self._setup.endpoints)
+        self._poses = [pubsub.pose_publisher(session, keys.pose(name), self._mime) for name in names]
+        self._last = [pubsub.last_value(session, keys.pose(name), self._mime) for name in names]
+        self._orders = [pubsub.orders(session, keys.order(name)) for name in names]
+        self._estop = pubsub.Alarm(session, keys.estop, self._cut)
+        self._conductor = pubsub.alive_watch(session, keys.conductor)
+        located = np.flatnonzero(self._setup.located).tolist()
+        self._located = MeasuredPositions(session, keys, names, located, self._reach) if located else None
+        ranging = tuple(self._setup.ranging) or ("body",) * len(names)
+        seen_by_world = [row for row, source in enumerate(ranging) if source == "world"]
+        self._from_world = np.array(seen_by_world, dtype=np.intp)
+        self._ranges = HeardRanges(session, keys, names, seen_by_world) if seen_by_world else None
+        self._neighbours = neighbours = Neighbours(
+            session, keys, self.agent, reach=self._reach, conditions=self._setup.conditions
+        )
+        guidance = self.agent.guidance
+        self._goals = None
+        if guidance is not None:
+            of_goals = self._setup.goal_conditions
+            self._goals = HeardGoals(session, keys, self.agent, guidance, reach=self._reach, conditions=of_goals)
+        self._telemetry = Telemetry(
+            session,
+            keys,
+            self._setup.encoding,
+            agent=self.agent,
+            neighbours=neighbours,
+            counts=self._counts,
+            ranged=[source == "body" for source in ranging],
+            followed=None if self._goals is None else self._goals.news,
+        )
+        self._be_there()
+
+    def _be_there(self) -> None:
+        """Neighbours count on these robots from now on."""
+        with self._tokens_lock:
+            for row, name in enumerate(self._names):
+                if row not in self._retired and row not in self._tokens:
+                    self._tokens[row] = pubsub.alive_token(self._session, self._setup.keys.alive(name))
+
+    def _call_for_help(self, why: str) -> None:
+        """From a thread of the watchdog's: neighbours must not count on robots whose loop hangs, or is over."""
+        print(f"{', '.join(self._names)}: {why}; landing it", flush=True)
+        if self._joined:
+            self._telemetry.alarm(why, self._setup.clock.utc())
+            with self._tokens_lock:
+                # tokens of a loop that has recovered meanwhile stay
+                hangs = self._coming_down or bool(self._watchdog.tripped)
+                tokens = [self._tokens.pop(row) for row in list(self._tokens)] if hangs else []
+            for token in tokens:
+                token.undeclare()  # type: ignore[no-untyped-call]
+
+    def _recover(self, why: str) -> None:
+        """The loop runs again after the watchdog had its robots land: they do, whatever was decided before."""
+        for row in np.flatnonzero(self.agent.life.active).tolist():
+            self.agent.life.land(row, why)
+        self.agent.land_here()
+        self._be_there()
+
+    def _wake(self, slept: float) -> None:
+        """The process stood still for so long [s]: until it has heard the others again, it holds."""
+        self.agent.outside.wake(self._next, slept)
+        print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
+
+    def _listen(self, t: float) -> None:
+        """Takes in what has arrived since the last tick."""
+        agent = self.agent
+        outside = agent.outside
+        outside.offline_since = self._cut_off_since(t)
+        for sample in network.received(self._conductor.handler):
+            gone = sample.kind == zenoh.SampleKind.DELETE
+            outside.unattended_since = min(outside.unattended_since, t) if gone else np.inf
+        self._neighbours.listen(t, self._utc)
+        if self._goals is not None:
+            refused = self._goals.malformed
+            self._goals.take(t, self._utc)
+            self._counts.malformed += self._goals.malformed - refused
+        self._heed_stops()
+        if (located := self._located) is not None:
+            refused = sum(located.malformed)
+            for row, taken, position, yaw in located.take(self._utc, t):
+                self._body.locate(row, taken, position, yaw)
+            self._counts.malformed += sum(located.malformed) - refused
+        for row, queryable in enumerate(self._orders):
+            for query in network.received(queryable.handler):
+                self._obey(row, query, t)
+        for last in self._last:
+            last.answer()
+
+    def _cut_off_since(self, t: float) -> float:
+        """Since when the routers are gone [s]; infinity while one is there."""
+        if t >= self._router_due:  # a look at the router costs as much as a law
+            self._router_due = t + ROUTER_S
+            before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
+            if before < np.inf and self._silent_since == np.inf:
+                self._doubt.begin(self._session)  # it was cut off
+            self._mine()
+        return self._silent_since
+
+    def _cut(self, _stop: messages.Stop) -> None:
+        """Motors off as soon as an emergency stop is heard, in the thread that receives; the loop does the rest."""
+        self._cut_off = True
+        self._body.stop(self._everyone)
+
+    def _heed_stops(self) -> None:
+        """Emergency stops of everybody, after `_cut`."""
+        for stop in network.received(self._estop):
+            self._cut_off = False  # the phases say it from now on
+            for row in range(len(self._names)):
+                self.agent.life.stop(row, stop.words)
+
+    def _obey(self, row: int, query: zenoh.Query, t: float) -> None:
+        """One order to one row; it always gets a reply."""
+        key = self._setup.keys.order(self._names[row])
+        with query:
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            try:
+                order = messages.decode(payload, str(query.encoding or messages.JSON), messages.Order)
+            except messages.Malformed as error:
+                self._counts.malformed += 1
+                query.reply_err(str(error).encode(), encoding="text/plain")
+                return
+            waits = self.agent.life.phase[row] == Phase.AIRBORNE
+            slept = self.agent.outside.slept
+            if order.order == "takeoff" and slept > ASK_S and self.agent.outside.just_woke(t):  # he left long ago
+                refusal, value = f"the process stood still for {slept:.1f} s; ask again", None
+            else:
+                refusal, value = carry_out(self.agent, row, order, t, self._utc)
+            self._counts.refused += bool(refusal)
+            if order.order == "leave":
+                self._leaving.add(row)
+            if (
+                order.order == "start" and order.at is not None and not refusal and waits
+            ):  # one that runs keeps its grid
+                self._align(order.at - self._utc)
+                self._telemetry.due = t  # whoever decides for it must know in time when it begins
+            phase = Phase(self.agent.life.phase[row]).word
+            reply = messages.Reply(self._names[row], not refusal, phase, refusal, value)
+            query.reply(key, messages.encode(reply, self._setup.encoding), encoding=self._mime)
+
+    # ------------------------------------------------------------------ the loop
+
+    def _align(self, at: float) -> None:
+        """Moves the grid of ticks so that one falls on `at`: robots that start together then decide together."""
+        self._next = at - floor((at - self._now) / self._dt - 1e-6) * self._dt
+
+    def _loop(self, stopping: Callable[[], str | None]) -> None:
+        gc.collect()
+        gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
+        zero = time.monotonic()
+        # one reading: a step of the wall clock in mid-run does not move the experiment
+        self._utc = self._telemetry.utc = self._setup.clock.utc()
+        self._joined, self._told = True, stopping
+        self._looked = time.clock_gettime(_CLOCK)
+        self._watchdog.start()
+        self._go_round(zero, stopping)
+
+    def _go_round(self, zero: float, stopping: Callable[[], str | None]) -> None:
+        farewell = np.inf
+        while True:
+            self._watchdog.beat()
+            if self._watchdog.tripped:
+                self._recover(self._watchdog.forgive())
+            if self._cut_off:
+                self._rest()
+            wait = zero + self._next - time.monotonic()
+            behind = max(0, int(-wait / self._dt))
+            if wait > 0.0:
+                time.sleep(wait)
+            if self._make_sure():
+                continue
+            self._counts.missed += behind
+            self._next += behind * self._dt
+            self.agent.skip(behind)
+            if behind * self._dt > self._setup.loop_silence_s:
+                self._wake(behind * self._dt)
+            t = self._now = self._next
+            self._counts.late_s = max(self._counts.late_s, time.monotonic() - zero - t)
+            self._next = t + self._dt
+            zero -= self._setup.clock.slew(self._dt)
+            self._tick(t)
+            if farewell == np.inf and (reason := stopping()) is not None:
+                farewell = t + FAREWELL_S
+                self._stopping = reason
+                for row in range(len(self._names)):
+                    self.agent.life.land(row, reason)
+            if (self._stopping is not None or self._setup.once) and (
+                t > farewell or (self.agent.life.phase == Phase.DONE).all()
+            ):
+                self._telemetry.report(t, everything=True)
+                return
+
+    def _rest(self) -> None:
+        """Leaves the processor to those whose motors still run."""
+        ticks = ceil(HUSH_S / self._dt)
+        self._next += ticks * self._dt
+        self.agent.tick += ticks
+        time.sleep(HUSH_S)
+
+    def _tick(self, t: float) -> None:
+        begun = self.agent.decisions > 0
+        self._listen(t)
+        state = self._body.read(t)
+        self._airborne = some(state.flying)
+        if (located := self._located) is not None:
+            known = np.isfinite(located.ahead)
+            state.ahead = located.ahead if state.ahead is None else np.where(known, located.ahead, state.ahead)
+        if self._ranges is not None:
+            refused = self._ranges.malformed
+            state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))
+            self._counts.malformed += self._ranges.malformed - refused
+        said = self.agent.speak(t, state)
+        for row in said.rows if not self._retired else [row for row in said.rows if row not in self._retired]:
+            self._say(int(row), said, float(state.yaw[row]), t)
+        actions = self.agent.act(t, state, said)
+        self._act(actions)
+        if self._retired or not self.agent.life.all_running:
+            self._retire(t)
+        counts, telemetry = self._counts, self._telemetry
+        if not begun and self.agent.decisions:
+            counts.begin()
+        counts.ticks += 1
+        counts.interventions += actions.changed
+        counts.avoided += actions.avoided
+        slot = (self.agent.tick - 1) // self._state_every
+        if slot != self._state_slot:
+            self._state_slot = slot
+            telemetry.tell(state, actions, t)
+            telemetry.scan(state)
+        telemetry.report(t, everything=t >= telemetry.due, state=state, changed=self._neighbours.changed)
+        self._neighbours.changed = False
+
+    def _retire(self, t: float) -> None:
+        """Who is told to leave, or comes down unasked, takes its token back and is silent: none must follow it down.
+
+        When the experiment is over the latter says again that it is there; whoever was ordered down is told about
+        elsewhere.
+        """
+        life = self.agent.life
+        during = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
+        # those who serve robots whose launcher is gone go when the tokens do (`agents.network.shutdown`)
+        down = self.agent.sinking if self._stopping is None else life.phase == Phase.DONE
+        for row in np.flatnonzero(down).tolist():
+            unasked = during[row] and not life.reason[row].startswith((messages.EMERGENCY, LAND, STOP))
+            if (unasked or row in self._leaving) and row not in self._retired:
+                self._retired.add(row)
+                with self._tokens_lock:
+                    token = self._tokens.pop(row, None)
+                if token is not None:  # else the watchdog has taken it back
+                    token.undeclare()  # type: ignore[no-untyped-call]
+        if back := [row for row in self._retired if not (during[row] or row in self._leaving)]:
+            self._retired.difference_update(back)
+            self._be_there()
+
+    def _act(self, actions: Actions) -> None:
+        """What the body must do, the motors-off first."""
+        duties = actions.duties
+        stale = self._make_sure()
+        overruled = self._cut_off or self._watchdog.tripped  # another thread has told the body to stop or to land
+        if duties is not None:
+            told = ((self._body.stop, duties.stop), (self._body.land, duties.land))
+            call_all(partial(order, rows) for order, rows in told if len(rows))
+            if len(duties.takeoff) and not overruled:
+                self._airborne = True
+                self._body.takeoff(duties.takeoff, self._assignment.hover[duties.takeoff])
+        if not overruled and not stale:
+            self._body.command(actions.setpoint)
+
+    def _say(self, row: int, said: Said, yaw: float, t: float) -> None:
+        """Sends a row's pose to its neighbours."""
+        self._counts.sent[row] += 1
+        pose = messages.pose(
+            self._names[row],
+            self._counts.sent[row],
+            self._utc + t,
+            said.position[row].tolist(),
+            said.velocity[row].tolist(),
+            yaw,
+        )
+        payload = messages.encode(pose, self._setup.encoding)
+        self._last[row].hold(payload)
+        self._poses[row].put(payload)
+
+
+@contextmanager
+def _noted(failures: list[Exception]) -> Iterator[None]:
+    """The first error inside is kept, to be raised when everything has been tried."""
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001
+        failures[:] = failures or [error]
+
+
+def _what(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"

@@ -1,0 +1,108 @@
+"""What a robot does with an order: obeys, or says why not. Pure; the process around it only carries the words."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Final
+
+import msgspec
+
+from agents.agent import Agent
+from agents.network.messages import Order
+
+SOON_S: Final = 3600.0  # a common start further ahead than this is a mistake of somebody's clock
+LAND: Final = "ordered to land"
+STOP: Final = "ordered to stop"
+OWN: Final = ("clamp", "tracking_gain")
+PAUSED: Final = "told to hold"
+
+Answer = tuple[str, float | None]  # why it is refused (empty: it is not), and the value of a parameter
+
+
+def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Answer:
+    """Carries out an order to one row.
+
+    Args:
+        agent: The decision that the row belongs to.
+        row: Of the robot.
+        order: What it is told.
+        t: Now, on the process's clock [s].
+        utc: UTC time at which that clock stood at 0 [s].
+
+    Returns:
+        Why it is refused (empty: it is not), and the value of a parameter that was asked for or set.
+    """
+    match order.order:
+        case "takeoff":
+            return agent.life.takeoff(row), None
+        case "start":
+            return _start(agent, row, order, t, utc), None
+        case "hold":
+            return _hold(agent, row), None
+        case "resume":
+            return _resume(agent, row), None
+        case "leave":
+            agent.life.land(row, "told to leave")
+        case "land":
+            agent.life.land(row, LAND)
+        case "stop":
+            agent.life.stop(row, STOP)
+        case "get" | "set":
+            return _parameter(agent, order)
+    return "", None
+
+
+def _hold(agent: Agent, row: int) -> str:
+    refusal = agent.hold(row)
+    if not refusal:
+        agent.life.reason[row] = PAUSED
+    return refusal
+
+
+def _resume(agent: Agent, row: int) -> str:
+    agent.resume(row)
+    if agent.life.reason[row] == PAUSED:
+        agent.life.reason[row] = ""
+    return ""
+
+
+def _start(agent: Agent, row: int, order: Order, t: float, utc: float) -> str:
+    at, origin = order.at, order.origin
+    if at is None or not isfinite(at):
+        return "a start needs `at`, a UTC time in seconds"
+    if not t - agent.assignment.duration < at - utc < t + SOON_S:
+        return f"start at {at} is not within this experiment; are the clocks set?"
+    if origin is not None and not all(map(isfinite, origin)):
+        return "the `origin` of a start is x, y, z, yaw, all of them known"
+    refusal = agent.start(row, at - utc, t, origin)
+    return refusal or _resume(agent, row)
+
+
+def _parameter(agent: Agent, order: Order) -> Answer:
+    """Reads or changes the clamp, the tracking gain or a number of the trigger, for all robots of this process."""
+    of_trigger = {f"trigger.{field}": field for field in agent.trigger.__struct_fields__}
+    name = order.name or ""
+    if name not in of_trigger and name not in OWN:
+        return f"no parameter '{name}'; known: {', '.join(sorted([*of_trigger, *OWN]))}", None
+    if name in OWN and agent.all_guided:
+        return f"'{name}' is the centre's: change the experiment file, and start the centre again", None
+    if order.order == "set":
+        refusal = _set(agent, name, of_trigger.get(name), order.value)
+        if refusal:
+            return refusal, None
+    value = getattr(agent.trigger, of_trigger[name]) if name in of_trigger else getattr(agent.deciding, name)
+    return ("", float(value)) if isinstance(value, int | float) else (f"'{name}' is not set", None)
+
+
+def _set(agent: Agent, name: str, of_trigger: str | None, value: float | None) -> str:
+    if value is None or not isfinite(value) or value < 0.0:
+        return f"'{name}' needs a `value`, a number that is not negative"
+    if of_trigger is None:
+        setattr(agent.deciding, name, value)
+        return ""
+    try:
+        changed = {**msgspec.structs.asdict(agent.trigger), of_trigger: value}
+        agent.trigger = msgspec.convert(changed, type(agent.trigger))
+    except msgspec.ValidationError as error:
+        return f"'{name}' cannot be {value:g}: {error}"
+    return ""

@@ -1,0 +1,301 @@
+"""What comes from the neighbours of a process's rows: their poses, through the modelled network, and who is there."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from enum import Enum
+from math import inf
+from typing import Final, NamedTuple
+
+import numpy as np
+import zenoh
+
+from agents.agent import Agent, links_by_speaker
+from agents.arrays import Index
+from agents.network import messages, pubsub, validation
+from agents.network import session as network
+from agents.network.channel_model import Channel, Conditions, Samples
+from agents.network.keys import Keys
+
+LATE_S: Final = 3.0  # a network delays no pose longer: Zenoh holds one back for 2 s where another is missing
+PROOFS: Final = 3  # so many late poses in succession: one may be the last value of a robot that is silent
+
+
+class Coming(Enum):
+    """A change of the liveliness of a robot."""
+
+    CAME = 1
+    WENT = 2
+    ANEW = 3  # its process is another one than before
+
+
+class Said(NamedTuple):
+    """A pose that is news.
+
+    Attributes:
+        pose: Checked.
+        size: Of its payload [bytes].
+        missed: Poses before it that never came.
+        measured: When the pose was measured (UTC [s]), as far as its stamp can be true: not after its arrival; of a
+            clock that is behind, not earlier before it than a network delays poses.
+        anew: Whether it is the first of a new life: what was known of the robot is of the past.
+    """
+
+    pose: messages.Pose
+    size: int
+    missed: int
+    measured: float
+    anew: bool
+
+
+class Speaker:
+    """Listens to one robot.
+
+    Attributes:
+        name: Of the robot.
+        links: (K,) on which it is heard.
+        lost: Poses that never came; whoever listens counts them, because it knows since when they matter.
+        stale: Poses that were left out because a newer one was known, or because they are of a life that is over.
+        malformed: Samples that were refused.
+        behind: Age [s] of the last pose on arrival if the clock of the robot is behind: the last poses were older than
+            a network delays them. 0 if not.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        name: str,
+        links: Index,
+        *,
+        reach: messages.Vector,
+        rate: float,
+        depth: int = pubsub.POSES,
+    ) -> None:
+        """Listens.
+
+        Args:
+            session: To the network.
+            keys: Of the realm.
+            name: Of the robot.
+            links: (K,) on which it is heard.
+            reach: Largest |x|, |y|, |z| that is believed [m].
+            rate: Poses that it says in a second at most [1/s].
+            depth: Newest poses that may wait.
+        """
+        self.name, self.links, self._reach, self._rate = name, links, reach, rate
+        self._poses = pubsub.pose_subscriber(session, keys.pose(name), depth)
+        self._token = keys.alive(name)
+        self._alive = pubsub.alive_watch(session, keys.lives(self._token))
+        self._seq, self._stamp = 0, 0.0
+        self._life: str | None = None  # session of the robot's process, as far as it is known
+        self._past: set[str] = set()
+        self._owned = False  # the token of that session is there: no other one speaks for the robot
+        self._gone = False
+        self._heard_at = -inf  # when news came last (UTC [s])
+        self._old, self._old_at = 0, 0.0  # how often in succession poses were old on arrival, and when last
+        self.lost = self.stale = self.malformed = 0
+        self.behind = 0.0
+
+    def news(self, now: float) -> Iterator[Said]:
+        """Poses that have come until `now` (UTC [s]), oldest first: what cannot be true is refused, what is known left
+        out.
+
+        A new session of the robot, or a clock that was set back in one session, begins anew.
+        """
+        before = self._heard_at  # what waited with others while this process stood still was not heard then
+        for sample in network.received(self._poses.handler):
+            payload = sample.payload.to_bytes()
+            try:
+                pose = messages.decode(payload, str(sample.encoding), messages.Pose)
+                validation.check_pose(pose, robot=self.name, now=now, reach=self._reach)
+            except messages.Malformed:
+                self.malformed += 1
+                continue
+            life = _session_of(sample)
+            if life in self._past or (self._owned and life not in (None, self._life)):
+                self.stale += 1
+                continue
+            anew = life is not None and self._live(life)
+            if pose.stamp <= self._stamp and pose.seq > self._seq:  # its clock was set back
+                self._seq, self._stamp, anew = 0, 0.0, True
+            if pose.stamp <= self._stamp:  # equal: told again after a reconnection
+                self.stale += pose.stamp < self._stamp
+                continue
+            self._weigh(now, now - pose.stamp)
+            since = pose.stamp - self._stamp
+            missed = validation.missed(self._seq, pose.seq, since, self._rate) if self._seq else 0
+            self._seq, self._stamp = pose.seq, pose.stamp
+            # A clock that is behind: a predictor must not carry the pose on over that time. News from before the last
+            # news came, too late for a network, tell it at once; the first pose ever may be one of a silent robot.
+            slow = self.behind or (pose.stamp < before and now - pose.stamp > LATE_S)
+            measured = now - LATE_S if slow else validation.taken(pose.stamp, now)
+            self._heard_at = now
+            yield Said(pose, len(payload), missed, measured, anew)
+
+    def comings(self) -> Iterator[Coming]:
+        """Changes of its liveliness, oldest first."""
+        for sample in network.received(self._alive.handler):
+            token, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+            if token == self._token:
+                if there and self._gone and self._life is None and self._stamp:  # no token tells which life it is
+                    self._seq, self._stamp = 0, 0.0
+                    yield Coming.ANEW
+                self._gone = not there
+                yield Coming.CAME if there else Coming.WENT
+            elif (life := Keys.life_of(token)) is not None and life not in self._past:
+                if there and self._live(life):
+                    yield Coming.ANEW
+                self._owned = there if life == self._life else self._owned
+
+    def _live(self, life: str) -> bool:
+        """Takes in the session of the robot's process; whether that is a new life, after another one."""
+        if life == self._life:
+            return False
+        before, self._life = self._life, life
+        if before is not None:
+            self._past.add(before)
+            self._seq, self._stamp = 0, 0.0
+        return before is not None
+
+    def _weigh(self, now: float, age: float) -> None:
+        """Counts how often, at different times, a pose was `age` [s] old when it arrived."""
+        if age <= LATE_S:
+            self._old, self.behind = 0, 0.0
+        elif now > self._old_at:  # what waited while this process stood still came at once, and counts once
+            self._old, self._old_at = self._old + 1, now
+            self.behind = age if self._old >= PROOFS else 0.0
+
+
+def _session_of(sample: zenoh.Sample) -> str | None:
+    """Session that published a sample, if its publisher says so."""
+    source = sample.source_info
+    return None if source is None else str(source.source_id.zid)
+
+
+NEWS: Final = 20_000  # newest poses that wait for telemetry, which takes them several times a second: 10 MB
+
+
+class Neighbours:
+    """Those whom the rows of a process listen to.
+
+    Attributes:
+        speakers: One for each name that is heard.
+        news: (n) the newest poses that got through to each row, which telemetry empties.
+        heard: (n) how many that were, ever.
+        dropped: (E,) samples that the modelled network dropped.
+        arrived: Poses of other processes that the network brought, ever, each once, before the modelled channel.
+        changed: Somebody came or went since whoever looks last said so.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        agent: Agent,
+        *,
+        reach: messages.Vector,
+        conditions: Conditions | None = None,
+    ) -> None:
+        """Listens.
+
+        Args:
+            session: To the network.
+            keys: Of the realm.
+            agent: Hears what gets through, and who is gone.
+            reach: Largest |x|, |y|, |z| that is believed [m].
+            conditions: What is done to poses on each link; None: nothing.
+        """
+        assignment = agent.assignment
+        self._agent = agent
+        self._links = assignment.links
+        names = [assignment.speakers[speaker] for speaker in assignment.links.speaker.tolist()]
+        self._ends = list(zip(assignment.links.listener.tolist(), names, strict=True))
+        self._channel = Channel(conditions or Conditions.ideal(len(assignment.links)))
+        by_speaker = links_by_speaker(assignment.links, assignment.speakers)
+        rate = assignment.body_hz / assignment.pose_every
+        self.speakers = [
+            Speaker(session, keys, name, links, reach=reach, rate=rate) for name, links in by_speaker.items()
+        ]
+        self.news = [deque[messages.Heard](maxlen=NEWS) for _ in assignment.names]
+        self.heard = [0] * len(assignment.names)
+        self.arrived = 0
+        self.dropped = self._channel.dropped
+        self.changed = False
+
+    @property
+    def malformed(self) -> int:
+        """Samples that were refused."""
+        return sum(speaker.malformed for speaker in self.speakers)
+
+    def listen(self, t: float, utc: float) -> None:
+        """Takes in what has arrived at `t` [s] of the process's clock, which stood at 0 at `utc` [s]."""
+        for speaker in self.speakers:
+            for coming in speaker.comings():
+                self.changed = True
+                if coming is Coming.CAME:
+                    self._agent.find(speaker.links)
+                elif coming is Coming.ANEW:
+                    self._begin(speaker)
+                else:
+                    self._channel.forget(speaker.links)
+                    self._agent.lose(speaker.links, t)
+        arrived: list[tuple[int, Said]] = []
+        for speaker in self.speakers:
+            behind = speaker.behind
+            for said in speaker.news(utc + t):
+                speaker.lost += said.missed
+                self.arrived += speaker.name not in self._agent.assignment.names
+                if said.anew:
+                    self._begin(speaker)
+                    arrived = [(link, before) for link, before in arrived if link not in speaker.links]
+                arrived += [(link, said) for link in speaker.links.tolist()]
+            if speaker.behind != behind:
+                self._agent.hearing.distrust(speaker.links, speaker.behind)
+        if arrived:
+            self._send(arrived, t, utc)
+        if (got := self._channel.due(t)) is not None:
+            self._believe(got, utc)
+
+    def _begin(self, speaker: Speaker) -> None:
+        """A neighbour begins a new life."""
+        self._channel.forget(speaker.links)
+        self._agent.forget(speaker.links)
+
+    def _send(self, arrived: list[tuple[int, Said]], t: float, utc: float) -> None:
+        """Gives poses, each with the link on which it arrived, to the modelled network, all of a tick at once."""
+        poses = [heard.pose for _, heard in arrived]
+        measured = np.array([[heard.measured - utc] for _, heard in arrived])
+        got = Samples(
+            np.array([link for link, _ in arrived]),
+            np.array([t] * len(arrived)),
+            np.array([pose.stamp - utc for pose in poses]),
+            np.array([pose.seq for pose in poses]),
+            np.array([pose.position for pose in poses]),
+            np.array([pose.velocity or messages.STILL for pose in poses]),
+            measured,
+        )
+        if self._channel.ideal:
+            self._believe(got, utc)
+            return
+        start = self._agent.life.start_at[self._links.listener[got.link]]
+        sizes = np.array([heard.size for _, heard in arrived])
+        for at in range(len(arrived)):  # the queue of a link counts one sample after the other
+            one = slice(at, at + 1)
+            self._channel.send(
+                got.link[one], got.seq[one], got.stamp[one], got.position[one], got.velocity[one],
+                start=start[one], size=sizes[one], now=t, extra=measured[one],
+            )  # fmt: skip
+
+    def _believe(self, got: Samples, utc: float) -> None:
+        """Poses have got through."""
+        assert got.extra is not None  # all bring along when they were measured; what is recorded keeps its own stamp
+        self._agent.hear(got.link, got.position, got.velocity, got.extra[:, 0], got.arrival)
+        columns = (got.link, got.seq, got.stamp, got.arrival, got.position, got.velocity)
+        for link, seq, stamp, arrival, position, velocity in zip(*(c.tolist() for c in columns), strict=True):
+            row, who = self._ends[link]
+            self.news[row].append(
+                messages.Heard(who, seq, utc + stamp, utc + arrival, tuple(position), tuple(velocity))
+            )
+            self.heard[row] += 1

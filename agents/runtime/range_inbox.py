@@ -1,0 +1,86 @@
+"""Range readings on the network: a sweep as a message, and what somebody else says that some robots see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import zenoh
+
+from agents.arrays import Index
+from agents.body.interface import RangeScan, Rays
+from agents.network import messages, pubsub, validation
+from agents.network import session as network
+from agents.network.keys import Keys
+
+OLD_S = 1.0  # readings older than this say nothing of where things are now
+
+
+def message(robot: str, utc: float, scan: RangeScan) -> messages.Ranges:
+    """A sweep to send, rounded to micrometres and microradians; `utc` is when the scan's clock was 0 [s]."""
+    distance = [value if value == value else None for value in scan.distance.round(6).tolist()]  # noqa: PLR0124 - NaN
+    return messages.Ranges(
+        robot, round(utc + scan.time, 6), scan.bearing.round(6).tolist(), scan.elevation.round(6).tolist(), distance
+    )
+
+
+def instead(own: Rays | None, heard: Rays | None, rows: Index) -> Rays | None:
+    """What bodies see by themselves, but for `rows`, which see what was heard, or nothing."""
+    if own is None:
+        return heard
+    kept = ~np.isin(own.row, rows)
+    parts = [Rays(own.row[kept], own.time[kept], own.bearing[kept], own.elevation[kept], own.distance[kept])]
+    parts += [heard] if heard is not None else []
+    columns = ("row", "time", "bearing", "elevation", "distance")
+    row, time, bearing, elevation, distance = (np.concatenate([getattr(rays, c) for rays in parts]) for c in columns)
+    if not len(row):
+        return None
+    order = np.argsort(row, kind="stable")  # rays of one row follow one another
+    return Rays(row[order], time[order], bearing[order], elevation[order], distance[order])
+
+
+class HeardRanges:
+    """The newest sweep of each of some rows, as it came on their keys `ranges`.
+
+    Attributes:
+        malformed: Payloads that were refused, and `trouble` why the last of them was.
+        trouble: See `malformed`.
+    """
+
+    def __init__(self, session: zenoh.Session, keys: Keys, names: Sequence[str], rows: Sequence[int]) -> None:
+        """Listens for `rows` of those called `names`."""
+        self._names = tuple(names)
+        self._scans: list[RangeScan | None] = [None] * len(self._names)
+        self._subscribers = [(row, pubsub.subscriber(session, keys.ranges(self._names[row]), 4)) for row in rows]
+        self._rays: Rays | None = None
+        self.malformed = 0
+        self.trouble = ""
+
+    def read(self, utc: float, now: float) -> Rays | None:
+        """What is known at `now` [s] of a clock that was 0 at `utc`; sweeps older than `OLD_S` are forgotten."""
+        changed = False
+        for row, subscriber in self._subscribers:
+            for sample in network.received(subscriber.handler):
+                changed |= self._take(row, sample, utc, now)
+            scan = self._scans[row]
+            if scan is not None and now - scan.time > OLD_S:
+                self._scans[row], changed = None, True
+        if changed:
+            self._rays = Rays.gather(self._scans)
+        return self._rays
+
+    def _take(self, row: int, sample: zenoh.Sample, utc: float, now: float) -> bool:
+        try:
+            said = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Ranges)
+            validation.check_ranges(said, robot=self._names[row], now=utc + now)
+        except messages.Malformed as error:
+            self.malformed += 1
+            self.trouble = str(error)
+            return False
+        time = validation.taken(said.stamp - utc, now)
+        known = self._scans[row]
+        if known is not None and time <= known.time:
+            return False
+        distance = np.array([np.nan if value is None else value for value in said.distance])
+        self._scans[row] = RangeScan(time, np.array(said.bearing), np.array(said.elevation), distance)
+        return True

@@ -1,0 +1,188 @@
+"""The router process: `python -m agents.runtime.router`.
+
+Light to start, for every experiment on one machine starts one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import zenoh
+
+from agents.network import lab
+from agents.network.access_control import Rights
+from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.session import deserted, prompt_threads
+from agents.network.shutdown import end, held
+from agents.network.zenoh_config import config, reason, settings
+from agents.runtime.command_line import told_to_end
+from agents.runtime.lifeline import Lifeline
+
+EMPTY_S: Final = 1.0  # nobody connected for this long: whoever lost its connection would have it again
+LOOK_S: Final = 0.1
+FREED_S: Final = 10.0  # so long may the port of a router that begins anew stay taken by what it was before
+AGAIN_S: Final = 0.1
+# How often it looks whether somebody's certificate has been revoked, and whether it was told to end: a signal that the
+# kernel gives to another thread, as after a SIGCONT, does not wake the one that waits.
+LOOK_AGAIN_S: Final = 0.5
+
+
+def serve(
+    endpoints: Sequence[str],
+    *,
+    link: Sequence[str] = (),
+    lifeline: bool = False,
+    linger_s: float = 0.0,
+    rights: Rights | None = None,
+) -> int:
+    """Runs a router until SIGINT, SIGTERM or the loss of its lifeline; returns the exit code of the process.
+
+    Prints one line when clients can connect.
+
+    Args:
+        endpoints: Where to listen: on loopback, or anywhere with a lab.
+        link: Other routers: who is there is seen here, and the other way round.
+        lifeline: Whether standard input is a lifeline.
+        linger_s: How long it stays after its lifeline was lost, so that landing robots can still be seen [s]; less when
+            nobody is connected any more.
+        rights: Who may do what, in a lab.
+
+    Raises:
+        EndpointError: If it cannot listen there, or the lab cannot be used.
+    """
+    stop, lost = threading.Event(), threading.Event()
+    rope = Lifeline(lost)
+
+    def leave(sessions: Sequence[zenoh.Session]) -> None:
+        lost.wait()
+        over = time.monotonic() + linger_s
+        empty = time.monotonic()
+        while (now := time.monotonic()) < over and not stop.wait(LOOK_S):
+            if not deserted(sessions[0]):
+                empty = now
+            elif now - empty > EMPTY_S:
+                break
+        stop.set()
+
+    open_now: list[zenoh.Session] = []
+
+    def ready(session: zenoh.Session) -> None:
+        begun = bool(open_now)
+        open_now[:] = [session]
+        if begun:
+            return
+        print(f"router ready on {', '.join(endpoints)}", flush=True)
+        if lifeline:
+            rope.start()
+            threading.Thread(target=leave, args=(open_now,), name="linger", daemon=True).start()
+
+    with told_to_end(stop.set):
+        serve_router(endpoints, stop, link=link, ready=ready, rights=rights)
+    if rope.reason is not None:
+        print(f"router: {rope.reason}", file=sys.stderr)
+    return 0
+
+
+def serve_router(
+    endpoints: Sequence[str],
+    stop: threading.Event,
+    *,
+    link: Sequence[str] = (),
+    ready: Callable[[zenoh.Session], None] = lambda _: None,
+    rights: Rights | None = None,
+) -> None:
+    """Runs a router on loopback endpoints, or on those of a lab, until `stop` is set.
+
+    When the register of its lab changes, the router begins anew with the rules that follow from it: certificates that
+    were revoked have no rights from then on. Its clients connect again by themselves.
+
+    Args:
+        endpoints: Where it listens.
+        stop: Ends it.
+        link: Other routers, sought until they answer.
+        ready: Gets the router as soon as clients can connect, and again when it has begun anew.
+        rights: Who may do what, in a lab.
+
+    Raises:
+        EndpointError: If an endpoint is malformed, not on loopback though there is no lab, or taken, or if the lab
+            cannot be used.
+    """
+    register = _register(endpoints)
+    patience_s = 0.0
+    seen = _stamp(register)  # before it is read: what changes in between is seen then
+    chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
+    while True:
+        with held(_routing(chosen, endpoints, patience_s, stop)) as (session, _):
+            ready(session)
+            patience_s = FREED_S
+            while not stop.wait(LOOK_AGAIN_S):
+                if (now := _stamp(register)) == seen:
+                    continue
+                seen = now
+                try:
+                    chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
+                except EndpointError as error:  # what stood there before still holds
+                    print(f"router: {error}", file=sys.stderr, flush=True)
+                    continue
+                print("router: the lab has changed; its rules are enforced from now on", flush=True)
+                break
+            else:
+                return
+
+
+def _routing(chosen: zenoh.Config, endpoints: Sequence[str], wait_s: float, stop: threading.Event) -> zenoh.Session:
+    deadline = time.monotonic() + wait_s
+    while True:
+        try:
+            with prompt_threads():
+                return zenoh.open(chosen)
+        except zenoh.ZError as error:
+            if time.monotonic() < deadline and not stop.wait(AGAIN_S):
+                continue
+            raise EndpointError(
+                f"cannot listen on {', '.join(lab.bare(endpoints))}: {reason(error)}. If a router runs there already, "
+                "use it; else choose another port with --listen"
+            ) from None
+
+
+def _register(endpoints: Sequence[str]) -> Path | None:
+    """The register of the lab that endpoints belong to."""
+    folder = lab.of(endpoints)
+    return None if folder is None else folder / lab.REGISTER
+
+
+def _stamp(file: Path | None) -> int:
+    """Changes when a file does."""
+    try:
+        return 0 if file is None else file.stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line of the router process."""
+    parser = argparse.ArgumentParser(prog="zenpark router", description="A Zenoh router on this machine.")
+    parser.add_argument("--listen", action="append", metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="another router")
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent for 3 s")
+    parser.add_argument("--linger", type=float, default=0.0, metavar="SECONDS", help="and then stay for so long")
+    parser.add_argument("--rights", type=Path, metavar="FILE", help="who may do what, in a lab")
+    chosen = parser.parse_args(arguments)
+    try:
+        rights = None if chosen.rights is None else msgspec.json.decode(chosen.rights.read_bytes(), type=Rights)
+        listen = chosen.listen or [DEFAULT_ENDPOINT]
+        return serve(listen, link=chosen.connect, lifeline=chosen.lifeline, linger_s=chosen.linger, rights=rights)
+    except (EndpointError, OSError, msgspec.MsgspecError) as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    end(main())

@@ -1,0 +1,172 @@
+"""The runs that are up on this machine: a small file for each, so that an emergency stop finds all of them.
+
+The files lie in a folder that belongs to the user alone: `$ZENPARK_RUNS`, else `$XDG_RUNTIME_DIR/zenpark`, else
+`zenpark-UID` in the folder for temporary files. Other users' runs are not seen.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final, Literal
+
+import msgspec
+
+from agents.clock import Clock
+from agents.network import endpoints as topology
+from agents.network import lab
+from agents.network.endpoints import UNIX, Endpoint
+from agents.user_folder import runtime_folder
+
+LARGEST: Final = 1 << 20  # [bytes] of a file
+KNOCK_S: Final = 0.3  # a router on this machine takes a connection sooner
+
+
+class Run(msgspec.Struct, frozen=True):
+    """A run, or a router that was started by hand.
+
+    Attributes:
+        what: Which of both.
+        pid: Its process.
+        born: When that process was started, as the operating system counts it; empty where that is not known.
+        since: The same, UTC [s].
+        title: Of the experiment.
+        folder: Of the results, absolute.
+        endpoints: Routers, or members of a mesh, each with its lab.
+        realm: First chunk of the keys.
+        identity: Whose certificate stops it, in a lab.
+        robots: Name and address of hardware of each robot; the address is empty for a twin.
+    """
+
+    what: Literal["run", "router"]
+    pid: int
+    born: str
+    since: float
+    title: str
+    folder: str
+    endpoints: list[str]
+    realm: str = "park"
+    identity: str = "operator"
+    robots: dict[str, str] = {}
+
+    @property
+    def alive(self) -> bool:
+        """Whether its process is up; what it started may be, for a while, when it is not."""
+        return born(self.pid) == self.born
+
+    @property
+    def where(self) -> str:
+        """Its routers, as people read them."""
+        return "a mesh" if topology.is_mesh(self.endpoints) else ", ".join(topology.bare(self.endpoints))
+
+    @property
+    def words(self) -> str:
+        """Which one it is."""
+        return f"{self.title}, {self.folder}, at {self.where}" if self.folder else f"{self.title}, at {self.where}"
+
+
+def born(pid: int) -> str | None:
+    """When a process was started, in ticks since the machine was; empty where that is not known, None: it is gone."""
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text("ascii", "replace").rpartition(")")[2].split()
+        return None if status[0] in "ZX" else status[19]
+    except (OSError, IndexError):
+        if Path("/proc/self/stat").exists():
+            return None
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return None
+    except (OSError, OverflowError):
+        pass  # another user's
+    return ""
+
+
+def mine(
+    what: Literal["run", "router"],
+    title: str,
+    endpoints: Sequence[str],
+    *,
+    folder: Path | None = None,
+    realm: str = "park",
+    identity: str = "operator",
+    robots: dict[str, str] | None = None,
+) -> Run:
+    """An entry of this process."""
+    pid = os.getpid()
+    place = "" if folder is None else str(folder.absolute())
+    return Run(
+        what, pid, born(pid) or "", Clock().utc(), title, place, list(endpoints), realm, identity, robots or {}
+    )  # fmt: skip
+
+
+@contextmanager
+def registered(run: Run) -> Iterator[str]:
+    """Inside, a run is found by others; gives why it is not, empty if it is."""
+    file, why = None, ""
+    try:
+        file = runtime_folder() / f"{run.pid}-{run.born or 'x'}-{time.monotonic_ns()}.json"
+        draft = file.with_suffix(".draft")
+        draft.write_bytes(msgspec.json.encode(run))
+        draft.replace(file)
+    except OSError as error:
+        why = f"not listed among the runs of this machine ({error}): stop it with --connect"
+    try:
+        yield why
+    finally:
+        if file is not None:
+            with suppress(OSError):
+                file.unlink()
+
+
+def runs() -> list[Run]:
+    """All runs that are up, oldest first; and those that died while a router of theirs, or their robots, may be up.
+
+    Files of runs that are gone are removed; what is none of ours, or cannot be read, is left alone.
+    """
+    found: list[Run] = []
+    try:
+        files = sorted(runtime_folder().glob("*.json"))
+    except OSError:
+        return found
+    for file in files:
+        run = _read(file)
+        if run is None:
+            continue
+        if run.alive or any(map(_answers, topology.bare(run.endpoints))):
+            found.append(run)
+        else:
+            with suppress(OSError):
+                file.unlink()
+    return sorted(found, key=lambda run: run.since)
+
+
+def _read(file: Path) -> Run | None:
+    """A run's file, if it is one of this user's."""
+    try:
+        about = file.lstat()
+        if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid() or about.st_size > LARGEST:
+            return None
+        run = msgspec.json.decode(file.read_bytes(), type=Run)
+        for endpoint in topology.bare(run.endpoints):
+            Endpoint.parse(endpoint)
+        lab.of(run.endpoints)
+    except (OSError, ValueError, msgspec.MsgspecError, RecursionError):
+        return None
+    return run if run.pid > 0 and run.endpoints and run.realm else None
+
+
+def _answers(endpoint: str) -> bool:
+    """Whether something takes connections there; nobody knows of QUIC before it is spoken."""
+    where = Endpoint.parse(endpoint)
+    with suppress(OSError):
+        if where.protocol == UNIX:
+            return stat.S_ISSOCK(Path(where.host).stat().st_mode)
+        with socket.create_connection((where.host, where.port), KNOCK_S):
+            return True
+    return False

@@ -1,0 +1,272 @@
+"""What a robot process says of itself for people and recorders: telemetry, range readings, statuses.
+
+Nothing here is needed by another robot; poses for the neighbours are the runtime's.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+import zenoh
+
+from agents.agent import Actions, Agent
+from agents.arrays import Array, Index
+from agents.body.interface import BodyState
+from agents.decision.lifecycle import Phase
+from agents.network import messages, pubsub
+from agents.network.keys import Keys
+from agents.runtime import range_inbox
+from agents.runtime.pose_inbox import Neighbours
+
+STATUS_S: Final = 1.0
+INCIDENTS: Final = 16  # so many are told again
+WORDS: Final = tuple(phase.word for phase in Phase)
+UNDER_WAY: Final = ("airborne", "running")
+
+
+@dataclass
+class Counts:
+    """What is counted in a process of n rows; ticks and interventions from the common start.
+
+    Attributes:
+        sent: (n) poses said.
+        interventions: (n,) ticks on which safety changed what had been decided.
+        avoided: (n,) ticks on which avoidance did.
+        malformed: Payloads that were refused, other than poses.
+        refused: Orders that were.
+        ticks: Since the start, and `missed` ones.
+        missed: See `ticks`.
+        late_s: Largest lateness of a tick since the last status.
+    """
+
+    sent: list[int]
+    interventions: Index
+    avoided: Index
+    malformed: int = 0
+    refused: int = 0
+    ticks: int = 0
+    missed: int = 0
+    late_s: float = 0.0
+
+    @classmethod
+    def nothing(cls, rows: int) -> Counts:
+        """Before anything was counted."""
+        return cls([0] * rows, *np.zeros((2, rows), dtype=np.intp))
+
+    def begin(self) -> None:
+        """At the common start."""
+        self.ticks = self.missed = 0
+        self.interventions[:] = self.avoided[:] = 0
+
+
+class Telemetry:
+    """Says how the rows of a process are.
+
+    Attributes:
+        utc: UTC time at which the process's clock was 0 [s].
+        due: When all rows' statuses are sent next, on the process's clock [s].
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        encoding: messages.Encoding,
+        *,
+        agent: Agent,
+        neighbours: Neighbours,
+        counts: Counts,
+        ranged: Sequence[bool],
+        followed: Sequence[deque[messages.Followed]] | None = None,
+    ) -> None:
+        """Declares the publishers.
+
+        Args:
+            session: Of the process.
+            keys: Of the realm.
+            encoding: Of payloads.
+            agent: Whose rows they are.
+            neighbours: Whom the rows listen to; what they said since the last telemetry is sent along and emptied.
+            counts: Kept by the runtime.
+            ranged: (n) rows whose range readings are their own: the others' come from the network, where they need
+                not be said again.
+            followed: Goals that reached each row since the last telemetry; emptied here. None: nobody is guided.
+        """
+        self._agent, self._neighbours, self._counts = agent, neighbours, counts
+        self._encoding = encoding
+        names = self._names = agent.assignment.names
+        mime = messages.MIME[encoding]
+        self._states = [pubsub.publisher(session, keys.state(name), mime) for name in names]
+        self._statuses = [pubsub.pose_publisher(session, keys.status(name), mime) for name in names]
+        self._ranges = [
+            pubsub.publisher(session, keys.ranges(name), mime) if own else None
+            for name, own in zip(names, ranged, strict=True)
+        ]
+        self.utc = self.due = 0.0
+        self._followed = [deque[messages.Followed]() for _ in names] if followed is None else followed
+        self._told = 0
+        self._scanned = [-inf] * len(names)
+        self._origin: list[messages.Setpoint | None] = [None] * len(names)
+        self._said: list[messages.Status | None] = [None] * len(names)
+        self._reported: list[tuple[object, ...]] = [()] * len(names)
+        self._incidents: list[deque[messages.Incident]] = [deque(maxlen=INCIDENTS) for _ in names]
+        self._numbers = [0] * len(names)
+
+    def tell(self, state: BodyState, actions: Actions, t: float) -> None:
+        """Sends the telemetry of every row; one that does not know where it is tells what it heard all the same."""
+        self._told += 1
+        agent = self._agent
+        position, velocity, truth = state.position.tolist(), state.velocity.tolist(), state.true_position.tolist()
+        goal, setpoint, error = agent.goal.tolist(), actions.setpoint.tolist(), agent.error.tolist()
+        yaw, true_yaw, phase = state.yaw.tolist(), state.true_yaw.tolist(), agent.life.phase.tolist()
+        for row, name in enumerate(self._names):
+            message = messages.State(
+                name,
+                self._told,
+                self.utc + t,
+                WORDS[phase[row]],
+                messages.vector(position[row]),
+                messages.vector(velocity[row]),
+                messages.heading(yaw[row]),
+                messages.vector(goal[row]),
+                tuple(setpoint[row]) if all(map(isfinite, setpoint[row])) else None,
+                messages.number(error[row]),
+                messages.vector(truth[row]),
+                messages.heading(true_yaw[row]),
+                list(self._neighbours.news[row]),
+                _known_row(state.attitude, row),
+                _known_row(state.shadow_position, row),
+                _known_row(state.shadow_yaw, row),
+                list(self._followed[row]),
+            )
+            for payload in messages.payloads(message, self._encoding):
+                self._states[row].put(payload)
+            self._neighbours.news[row].clear()
+            self._followed[row].clear()
+
+    def scan(self, state: BodyState) -> None:
+        """Sends the range readings that are new and the rows' own."""
+        if state.rays is None:
+            return
+        for row in np.unique(state.rays.row).tolist():
+            publisher = self._ranges[row]
+            scan = state.rays.of(row) if publisher is not None else None
+            if publisher is not None and scan is not None and scan.time > self._scanned[row]:
+                self._scanned[row] = scan.time
+                ranges = range_inbox.message(self._names[row], self.utc, scan)
+                publisher.put(messages.encode(ranges, self._encoding))
+
+    def report(self, t: float, *, everything: bool, state: BodyState | None = None, changed: bool = False) -> None:
+        """Sends statuses: of all rows when asked for everything, else of those of which something has changed.
+
+        `changed` says that neighbours came or went: what the phases alone would not tell.
+        """
+        agent, counts = self._agent, self._counts
+        if not (everything or changed or agent.life.moved or agent.hazards.incidents):
+            return
+        self._note_incidents()
+        if everything:
+            self.due = t + STATUS_S
+        life = agent.life
+        listener = agent.assignment.links.listener
+        for row, name in enumerate(self._names):
+            missing = agent.missing(row)
+            news = (life.phase[row], life.reason[row], tuple(missing), self._numbers[row])
+            if not everything and news == self._reported[row]:
+                continue
+            if news[:2] != self._reported[row][:2]:
+                print(f"{name}: {Phase(life.phase[row]).word}" + (f" ({news[1]})" if news[1] else ""), flush=True)
+            self._reported[row] = news
+            mine = [speaker for speaker in self._neighbours.speakers if (listener[speaker.links] == row).any()]
+            battery = float(state.battery[row]) if state is not None else float("nan")
+            if self._origin[row] is None and state is not None and life.phase[row] == Phase.RUNNING:
+                x, y, z = state.position[row].tolist()
+                self._origin[row] = (x, y, z, float(state.yaw[row])) if isfinite(x + y + z) else None
+            start = float(life.start_at[row])  # a plain float: msgspec does not encode those of numpy
+            status = messages.Status(
+                robot=name,
+                stamp=self.utc + t,
+                phase=Phase(life.phase[row]).word,
+                reason=life.reason[row],
+                body=state.notes[row] if state is not None and state.notes else "",
+                battery=battery if isfinite(battery) else None,
+                sent=counts.sent[row],
+                heard=self._neighbours.heard[row],
+                lost={speaker.name: speaker.lost for speaker in mine},
+                dropped=self._dropped_of(row),
+                stale={speaker.name: speaker.stale for speaker in mine if speaker.stale},
+                malformed=counts.malformed + self._neighbours.malformed,
+                refused=counts.refused,
+                ticks=counts.ticks,
+                missed=counts.missed,
+                decisions=int(agent.updates[row]),
+                interventions=int(counts.interventions[row]),
+                avoided=int(counts.avoided[row]),
+                late_s=counts.late_s,
+                started=self.utc + start if isfinite(start) else 0.0,
+                missing=missing,
+                pid=os.getpid(),
+                cpu_s=time.process_time(),
+                rss_mb=resident_mb(),
+                origin=agent.origin(row) or self._origin[row],
+                hazard=agent.hazards.worst(row),
+                incidents=list(self._incidents[row]),
+            )
+            self._said[row] = status
+            self._statuses[row].put(messages.encode(status, self._encoding))
+        if everything:
+            counts.late_s = 0.0
+
+    def _note_incidents(self) -> None:
+        """Takes what happened out of the decision, and prints it: the log of a process outlives the network."""
+        happened = self._agent.hazards.incidents
+        for incident in happened:
+            row = incident.row
+            self._numbers[row] += 1
+            self._incidents[row].append(
+                messages.Incident(self._numbers[row], round(self.utc + incident.time, 6), incident.text)
+            )
+            print(f"{self._names[row]}: {incident.text}", flush=True)
+        happened.clear()
+
+    def alarm(self, why: str, stamp: float) -> None:
+        """Says the last statuses again, with what has happened since; from any thread, while the loop hangs."""
+        for publisher, status in zip(self._statuses, self._said, strict=True):
+            if status is not None:
+                phase = "landing" if status.phase in UNDER_WAY else status.phase
+                said = msgspec.structs.replace(status, stamp=stamp, phase=phase, reason=why)
+                publisher.put(messages.encode(said, self._encoding))
+
+    def _dropped_of(self, row: int) -> dict[str, int]:
+        """How many samples of whom a row did not get because the modelled network dropped them."""
+        assignment = self._agent.assignment
+        dropped = self._neighbours.dropped
+        at = np.flatnonzero((dropped > 0) & (assignment.links.listener == row))
+        speakers = assignment.links.speaker[at].tolist()
+        return {assignment.speakers[j]: int(n) for j, n in zip(speakers, dropped[at].tolist(), strict=True)}
+
+
+def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it
+    """A row of what a body may know or not, for the wire; None if it does not."""
+    if column is None or not np.isfinite(column[row]).all():
+        return None
+    value = column[row].tolist()
+    return tuple(value) if isinstance(value, list) else value
+
+
+def resident_mb() -> float:
+    """Memory of this process [MB]."""
+    try:
+        with open("/proc/self/statm", "rb") as pages:  # noqa: PTH123 - a Path costs more than the read
+            return int(pages.read().split()[1]) * resource.getpagesize() / 1e6
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

@@ -1,0 +1,1 @@
+"""What overrules a decision: the setpoint filter, hazards and their detection, preflight, landing. Imports decision."""

@@ -1,0 +1,122 @@
+"""What must be true of a robot before it takes off. Pure and row-wise; a row that fails says why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
+from math import degrees
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask, some
+from agents.body.interface import BodyState
+from agents.decision.assignment import Assignment
+from agents.decision.neighbours import Hearing
+from agents.safety.detection import Outside, Separation, lean, leaning, misstamped, stamped
+from agents.safety.setpoint_filter import Whereabouts
+
+LOST_S: Final = 0.5  # a robot that was ready is so no more when a check has failed for this long
+FLOOR_M: Final = 0.5  # a drone that stands has at most this height: positioning systems differ about the floor
+REST_M_S: Final = 0.3  # and at most this speed
+LEVEL: Final = 0.35  # [rad] and leans at most so much
+WALL_M: Final = 0.05  # a place measured this far outside of the arena may still be in it
+
+Failing = tuple[Mask, Callable[[int], str]]  # rows (N,), and what to say of one of them
+
+
+class Preflight:
+    """The checks of N rows, and for how long each has failed one."""
+
+    def __init__(self, assignment: Assignment) -> None:
+        """Of the rows of an assignment."""
+        self._limits, self._assignment = assignment.limits, assignment
+        self._flies = np.array([kind.flies for kind in assignment.kinds])
+        self._separation = Separation(assignment)
+        self._since = np.full(len(self._flies), np.inf)
+
+    def check(  # noqa: PLR0917 - what there is to look at
+        self,
+        t: float,
+        state: BodyState,
+        where: Whereabouts,
+        hearing: Hearing,
+        outside: Outside,
+        lacking: tuple[Mask, Callable[[int], Sequence[str]]],
+    ) -> dict[int, str]:
+        """Rows that must not take off at `t` [s], each with the first thing that is wrong with it.
+
+        Args:
+            t: Now [s].
+            state: Of the bodies.
+            where: What their poses are worth.
+            hearing: Of the rows.
+            outside: What the process knows.
+            lacking: (N,) rows that still wait for somebody, and for whom a row does.
+        """
+        failing: dict[int, str] = {}
+        checks = [self._knows(t, state, where, outside, lacking), self._rests(state)]
+        if self._limits.separation is not None:
+            checks.append(self._near(t, state.position, hearing, self._limits.separation))
+        for rows, say in chain.from_iterable(checks):
+            for row in np.flatnonzero(rows).tolist():
+                failing.setdefault(row, say(row))
+        return failing
+
+    def lost(self, t: float, failing: dict[int, str]) -> Index:
+        """Of the rows that fail, those (K,) that have failed for so long that they are not ready any more."""
+        rows = np.array(list(failing), dtype=np.intp)
+        since = np.full(len(self._flies), np.inf)
+        since[rows] = np.minimum(self._since[rows], t)
+        self._since = since
+        return rows[t - since[rows] >= LOST_S]
+
+    def _knows(
+        self,
+        t: float,
+        state: BodyState,
+        where: Whereabouts,
+        outside: Outside,
+        lacking: tuple[Mask, Callable[[int], Sequence[str]]],
+    ) -> Iterator[Failing]:
+        """Where it is, and who else is there."""
+        known = np.isfinite(state.position).all(axis=1) & (t - state.time <= self._limits.own_silence_s)
+        ahead = np.zeros(len(known)) if state.ahead is None else state.ahead
+
+        def nowhere(row: int) -> str:
+            if np.isnan(state.yaw[row]) and known[row]:
+                return "it does not know which way it looks"
+            off = misstamped(ahead, self._limits.own_silence_s)[row]
+            return "no position of its own" + (f": {stamped(self._assignment.names, ahead, row)}" if off else "")
+
+        yield where.blind, nowhere
+        waits, whom = lacking
+        yield waits, lambda row: "never heard " + ", ".join(whom(row))
+        if outside.offline_since < np.inf:
+            yield np.ones(len(self._flies), dtype=bool), lambda _: "no connection to a router"
+        if not where.sure:
+            yield where.outside > WALL_M, lambda row: f"it is {where.outside[row]:.2f} m outside the arena"
+
+    def _rests(self, state: BodyState) -> Iterator[Failing]:
+        """Its body on the floor."""
+        flies, height, least = self._flies, state.position[:, 2], self._limits.battery_min
+        yield flies & (height > FLOOR_M), lambda row: f"it does not stand on the floor, but at z = {height[row]:.2f} m"
+        fast = flies & (np.vecdot(state.velocity, state.velocity) > REST_M_S**2)
+        yield fast, lambda row: f"it is not at rest: {np.linalg.norm(state.velocity[row]):.2f} m/s"
+        if state.attitude is not None:
+            attitude = state.attitude
+            leans = flies & leaning(attitude, LEVEL)
+            yield leans, lambda row: f"it is not level: it leans {degrees(lean(attitude, row)):.0f}°"
+        low = state.battery < least
+        yield low, lambda row: f"its battery is at {state.battery[row]:.0%}, less than {least:.0%}"
+
+    def _near(self, t: float, position: Array, hearing: Hearing, limit: float) -> Iterator[Failing]:
+        apart = self._separation.distances(t, position, hearing)
+        near = apart < limit
+        if some(near):
+
+            def say(row: int) -> str:
+                distance, other = self._separation.nearest(row, apart)
+                return f"it is {distance:.2f} m from {other}, nearer than {limit:g} m"
+
+            yield self._separation.rows(near), say

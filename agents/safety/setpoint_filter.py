@@ -1,0 +1,228 @@
+"""Safety, the last word before a body: whatever was decided, this is what may be sent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from agents.arrays import Array, Mask, Rows, clamp, every, norm, some, span
+from agents.body.kinds import Kind
+from agents.body.limits import Limits
+from agents.plugins.avoidance import Avoidance, Nearby, Self
+from agents.plugins.registry import FAILURES, PluginError
+
+ESCAPED = 0.25  # [m] this far outside the arena a robot is no longer under control
+ABSURD = 1e6  # [m, m/s, rad, rad/s] no place, speed or angle is that large; NaN is not smaller either
+ROUNDING = 1e-9  # smaller differences are arithmetic, not interventions
+
+
+@dataclass(frozen=True)
+class Whereabouts:
+    """What the measured poses of N rows are worth.
+
+    Attributes:
+        sure: Every row knows where it is, and is inside the arena.
+        blind: (N,) own position missing, stale or not finite: no closed loop is possible.
+        beyond: (N,) outside a wall, or above the ceiling.
+        escaped: (N,) outside the arena beyond any doubt.
+        flown: (N,) so far outside that a flying row must be stopped there.
+        outside: (N,) how far from the arena [m], along the worst axis; 0 inside.
+    """
+
+    sure: bool
+    blind: Mask
+    beyond: Mask
+    escaped: Mask
+    flown: Mask
+    outside: Array
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """What may be sent, and what else must happen.
+
+    Attributes:
+        setpoint: (N, 4) safe.
+        changed: (N,) the setpoint was not what had been decided.
+        blind: (N,) own position missing, stale or not finite: no closed loop is possible.
+        wild: (N,) it was not made of finite numbers although the row is not blind; what is sent instead keeps it there.
+        avoided: (N,) avoidance changed the setpoint.
+    """
+
+    setpoint: Array
+    changed: Mask
+    blind: Mask
+    wild: Mask
+    avoided: Mask
+
+
+class Safety:
+    """Checks setpoints of rows of any kinds."""
+
+    def __init__(self, kinds: Sequence[Kind], limits: Limits) -> None:
+        takes = np.array([kind.takes for kind in kinds])
+        self.limits = limits
+        position, velocity, twist = (np.flatnonzero(takes == what) for what in ("position", "velocity", "twist"))
+        self._position, self._velocity, self._twist = span(position), span(velocity), span(twist)
+        self._any_position, self._any_velocity, self._any_twist = len(position), len(velocity), len(twist)
+        self._takes_position = takes == "position"
+        self._speed = np.minimum(np.array([kind.speed for kind in kinds]), limits.speed)
+        # a body that closes position errors by itself goes as fast as its goal is far
+        self._closes_s = 1.0 / np.array([kind.response for kind in kinds])
+        self._step = np.minimum(limits.goal_step, self._speed * self._closes_s)
+        self._turn_rate = np.array([kind.turn_rate for kind in kinds])
+        flies = np.array([kind.flies for kind in kinds])[:, None]
+        inside = np.array([limits.margin, limits.margin, 0.0])
+        floor, ceiling = np.array([0.0, 0.0, np.inf]), np.array([0.0, 0.0, limits.margin])
+        self._low = limits.low + inside - np.where(flies, 0.0, floor)  # ground robots have no business with heights
+        self._high = limits.high - inside - np.where(flies, ceiling, -floor)
+        self._centre = 0.5 * (limits.low + limits.high)
+        self._half = 0.5 * (limits.high - limits.low)
+        self._nobody: Mask = np.zeros(len(kinds), dtype=bool)
+        self._sure = Whereabouts(True, *(self._nobody,) * 4, np.zeros(len(kinds)))
+
+    def where(self, position: Array, yaw: Array, age: Array) -> Whereabouts:
+        """What poses are worth: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s]."""
+        off = np.abs(position - self._centre)
+        known = (np.abs(yaw) < ABSURD) & (age <= self.limits.own_silence_s)
+        if every(off <= self._half) and every(known):
+            return self._sure
+        blind = ~np.asarray(known & (np.abs(position) < ABSURD).all(axis=1))
+        off = np.where(blind[:, None], 0.0, off)  # what is not known is not outside
+        outside = np.maximum((off - self._half).max(axis=1), 0.0)
+        walls = (off[:, :2] > self._half[:2]).any(axis=1) | (~blind & (position[:, 2] > self.limits.high[2]))
+        escaped = np.asarray((off > self._half + ESCAPED).any(axis=1))
+        return Whereabouts(False, blind, np.asarray(walls), escaped, outside > self.limits.cut_outside, outside)
+
+    def check(  # noqa: PLR0917 - the four that always are, and those of avoidance
+        self,
+        setpoint: Array,
+        position: Array,
+        yaw: Array,
+        age: Array,
+        avoidance: Avoidance | None = None,
+        own: Self | None = None,
+        nearby: Nearby | None = None,
+        where: Whereabouts | None = None,
+    ) -> Verdict:
+        """The last word.
+
+        Args:
+            setpoint: (N, 4) as decided, in the meaning of each row's kind.
+            position: (N, 3) measured [m].
+            yaw: (N,) measured [rad].
+            age: (N,) of that measurement [s].
+            avoidance: Has its say after all limits.
+            own: For it.
+            nearby: For it.
+            where: What the pose is worth, if it has been asked already.
+        """
+        where = self.where(position, yaw, age) if where is None else where
+        sane = np.abs(setpoint) < ABSURD
+        nobody = self._nobody
+        blind, wild = where.blind, nobody
+        safe, here = setpoint.copy(), position
+        troubled = not (where.sure and every(sane))
+        if troubled:
+            wild = ~np.asarray(sane.all(axis=1) | blind)
+            here, yaw = np.where(blind[:, None], self._centre, position), np.where(blind, 0.0, yaw)
+            safe[blind | wild] = 0.0
+            stay = wild & self._takes_position
+            safe[stay, :3] = here[stay]
+        late = np.where(blind, 0.0, np.maximum(age, 0.0)) if troubled else np.maximum(age, 0.0)
+        self._limit(safe, here, yaw, late)
+        avoided = nobody
+        if avoidance is not None and own is not None and nearby is not None:
+            limited = safe
+            wished = _wished(avoidance, limited, own, nearby)
+            safe = self._restrained(limited, wished, here, yaw, late, blind | wild)
+            if safe is not limited:
+                avoided = np.asarray((np.abs(safe - limited) > ROUNDING).any(axis=1))
+        other = np.abs(safe - setpoint) > ROUNDING
+        changed = np.asarray(other.any(axis=1)) if some(other) else nobody
+        if troubled:
+            changed = (changed | wild) & ~blind
+            # a body that controls its position on board keeps its last setpoint while the position is not known here
+            safe[blind & self._takes_position] = np.nan
+        return Verdict(safe, changed, blind, wild, avoided)
+
+    def _limit(self, setpoint: Array, here: Array, yaw: Array, age: Array) -> None:
+        """Brings setpoints (N, 4) within all limits, in place; rows were `here` (N, 3) [m] `age` (N,) [s] ago."""
+        if self._any_position:
+            rows = self._position
+            setpoint[rows, :3] = self._near(setpoint[rows, :3], here[rows], rows)
+        if self._any_velocity:
+            rows = self._velocity
+            setpoint[rows] = self._slow(setpoint[rows], here[rows], age[rows], rows)
+        if self._any_twist:
+            rows = self._twist
+            setpoint[rows, :2] = self._drive(setpoint[rows, :2], here[rows, :2], yaw[rows], age[rows], rows)
+
+    def _restrained(  # noqa: PLR0917 - what limits take
+        self, setpoint: Array, wished: Array, here: Array, yaw: Array, age: Array, unknown: Mask
+    ) -> Array:
+        """Setpoints (N, 4) that avoidance wishes instead of those that are within the limits, within the limits again.
+
+        A row that is not made of numbers is not taken, and `unknown` rows (N,), which do not know where they are or
+        what they want, stay as they are.
+        """
+        other = np.asarray((wished != setpoint).any(axis=1) & np.isfinite(wished).all(axis=1))
+        other &= ~unknown
+        if not some(other):
+            return setpoint
+        again = np.where(other[:, None], wished, setpoint)
+        self._limit(again, here, yaw, age)
+        return np.where(other[:, None], again, setpoint)  # limits twice over may differ in the last bit
+
+    def _near(self, target: Array, here: Array, rows: Rows) -> Array:
+        """Goals inside the arena and not too far ahead of the robot."""
+        target = clamp(target, self._low[rows], self._high[rows])
+        step = target - here
+        length, longest = norm(step), self._step[rows]
+        far = length > longest
+        if some(far):
+            target[far] = here[far] + step[far] * (longest[far] / length[far])[:, None]
+        return target
+
+    def _slow(self, velocity: Array, here: Array, age: Array, rows: Rows) -> Array:
+        """Velocities within the limits, and not out of the arena.
+
+        Toward a wall as fast as a goal on it would be closed in on, less what was flown since `here` was measured; from
+        beyond a wall, back.
+        """
+        speed, turn = self._speed[rows, None], self._turn_rate[rows]
+        seconds = (self._closes_s[rows] + age)[:, None]
+        inside = clamp(velocity[:, :3], (self._low[rows] - here) / seconds, (self._high[rows] - here) / seconds)
+        velocity[:, :3] = clamp(inside, -speed, speed)
+        velocity[:, 3] = clamp(velocity[:, 3], -turn, turn)
+        return velocity
+
+    def _drive(self, twist: Array, here: Array, yaw: Array, age: Array, rows: Rows) -> Array:
+        """Twists within the limits, and not out of the arena, as `_slow`: turning on the spot is always allowed."""
+        speed, turn = self._speed[rows], self._turn_rate[rows]
+        v = clamp(twist[:, 0], -speed, speed)
+        below, above = here - self._low[rows, :2], self._high[rows, :2] - here
+        seconds = self._closes_s[rows] + age
+        if some(np.minimum(below, above) < (speed * seconds)[:, None]):
+            moves = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * v[:, None]
+            most = np.maximum(np.where(moves > 0.0, above, below), 0.0) / seconds[:, None]
+            amount = np.abs(moves)
+            v = v * np.where(amount > most, most / np.maximum(amount, ROUNDING), 1.0).min(axis=1)
+        twist[:, 0], twist[:, 1] = v, clamp(twist[:, 1], -turn, turn)
+        return twist
+
+
+def _wished(avoidance: Avoidance, setpoint: Array, own: Self, nearby: Nearby) -> Array:
+    """What avoidance makes of setpoints (N, 4). It may be somebody's first: one that fails is named."""
+    name = type(avoidance).__name__
+    try:
+        wished = np.asarray(avoidance.restrain(setpoint.copy(), own, nearby), dtype=float)
+    except FAILURES as error:
+        raise PluginError(f"the avoidance {name} failed: {type(error).__name__}: {error}") from error
+    if wished.shape != setpoint.shape:
+        raise PluginError(
+            f"`restrain` of the avoidance {name} must give a setpoint per row, {setpoint.shape}, not {wished.shape}"
+        )
+    return wished

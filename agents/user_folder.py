@@ -1,0 +1,33 @@
+"""The folder for files of running processes: private to the user, emptied by the system at a restart."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+OWN: Final = stat.S_IRWXU
+
+
+def runtime_folder() -> Path:
+    """The user's folder, made if need be.
+
+    Raises:
+        OSError: If it cannot be made, or others could write there.
+    """
+    chosen, runtime = os.environ.get("ZENPARK_RUNS"), os.environ.get("XDG_RUNTIME_DIR")
+    if chosen:
+        folder = Path(chosen)
+    elif runtime and os.access(runtime, os.W_OK):
+        folder = Path(runtime) / "zenpark"
+    else:
+        folder = Path(tempfile.gettempdir()) / f"zenpark-{os.getuid()}"
+    with suppress(FileExistsError):
+        folder.mkdir(OWN)
+    about = folder.lstat()
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or stat.S_IMODE(about.st_mode) & ~OWN:
+        raise PermissionError(f"{folder} is no folder of yours alone (mode 0700)")
+    return folder

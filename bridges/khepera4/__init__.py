@@ -1,0 +1,1 @@
+"""Khepera IV over TCP: the body, one link per robot, odometry."""

@@ -1,0 +1,1 @@
+"""DJI Tello through djitellopy: the body, one pilot per drone."""

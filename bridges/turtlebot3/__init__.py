@@ -1,0 +1,1 @@
+"""TurtleBot3 over Zenoh (zenoh-bridge-ros2dds or rmw_zenoh)."""

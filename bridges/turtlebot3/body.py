@@ -1,0 +1,208 @@
+"""TurtleBot3 over Zenoh: through zenoh-bridge-ros2dds (`ros2dds://`) or rmw_zenoh (`rmw://`)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from math import nan
+from typing import Final
+
+import numpy as np
+import zenoh
+
+from agents.arrays import Array, Index
+from agents.body.device_locks import Claims
+from agents.body.external_pose import External
+from agents.body.interface import Body, BodyError, BodyRequest, BodyState, Rays, call_all
+from agents.network import session as network
+from agents.network.endpoints import EndpointError
+from agents.network.shutdown import leave
+from agents.protocols import ros2, turtlebot3
+from agents.protocols.ros2_node import Participant
+from bridges.turtlebot3.robot import SILENCE_S, Robot
+
+OPEN_S: Final = 4.5  # from the first attempt to reach the router to odometry of every robot
+DIAGNOSIS_S: Final = 0.3  # how long `open` asks who else is there before it gives up
+POLL_S: Final = 0.01
+FAREWELL_S: Final = 3.0  # how long `close` waits for the robots to stand
+
+Clock = Callable[[], float]
+
+
+class TurtleBot3:
+    """Rows of TurtleBot3; implements `agents.body.interface.Body`. Everything is polled: no threads.
+
+    Args:
+        request: What to open.
+        clock: Monotonic [s].
+
+    Raises:
+        BodyError: If an address or a setting is wrong.
+    """
+
+    def __init__(self, request: BodyRequest, clock: Clock = time.monotonic) -> None:
+        self._clock = clock
+        self._robots = [Robot(request, row) for row in range(len(request.names))]
+        self._claims = Claims([robot.name for robot in self._robots], [robot.device for robot in self._robots])
+        self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
+        self._outside = np.flatnonzero(request.external)
+        self._external = External(len(self._robots))
+
+    def open(self) -> None:
+        """See `Body.open`: returns when every robot's odometry was heard."""
+        self._claims.take()
+        deadline = self._clock() + OPEN_S
+        try:
+            participants: dict[tuple[object, ...], Participant] = {}
+            for robot in self._robots:
+                where = robot.where
+                session = self._session(robot, deadline)
+                which = (robot.endpoints, where.style, where.distro, where.domain)
+                if which not in participants:
+                    participants[which] = Participant(
+                        session, ros2.types(where.distro), style=where.style, domain=where.domain
+                    )
+                robot.join(participants[which])
+            while missing := [robot for robot in self._robots if robot.heard == -np.inf]:
+                if self._clock() > deadline:
+                    raise BodyError("; ".join(self._absent(robot) for robot in missing))
+                time.sleep(POLL_S)
+                for robot in self._robots:
+                    robot.hear(-np.inf, self._clock())
+        except BaseException:
+            self._close()
+            raise
+
+    def _session(self, robot: Robot, deadline: float) -> zenoh.Session:
+        if robot.endpoints not in self._sessions:
+            wait = max(0.0, deadline - self._clock())
+            try:
+                session = network.open_session(
+                    robot.endpoints, name=f"{robot.name} ROS 2", wait_s=wait, identity=robot.name
+                )
+            except (network.Unreachable, EndpointError) as error:
+                raise BodyError(f"{robot.name}: {error}; or set device.endpoint to the router of the robot") from None
+            self._sessions[robot.endpoints] = session
+        return self._sessions[robot.endpoints]
+
+    def _absent(self, robot: Robot) -> str:
+        """Why a robot's odometry may not have come, and what to do."""
+        where = robot.where
+        session = self._sessions[robot.endpoints]
+        topic = ros2.absolute(where.namespace, turtlebot3.ODOMETRY)
+        hint = (
+            "is the robot on, and zenoh-bridge-ros2dds on it connected to this router?"
+            if where.style == "ros2dds"
+            else "is the robot on, and its ROS 2 (RMW_IMPLEMENTATION=rmw_zenoh_cpp) connected to this router?"
+        )
+        others = set()
+        tokens = session.liveliness().get(ros2.endpoints(where.style, "MP", "*"), timeout=DIAGNOSIS_S)
+        for token in (str(reply.ok.key_expr) for reply in tokens if reply.ok is not None):
+            try:
+                found = ros2.announced(where.style, token)
+            except ValueError:
+                continue
+            if found.kind == ros2.ODOMETRY and found.topic != topic:
+                others.add(found.topic.rpartition("/")[0].removeprefix("/") or "(none)")
+            elif found.topic == topic and found.domain != where.domain:
+                hint = f"it is published in domain {found.domain}: write rmw://{where.namespace}?domain={found.domain}."
+            elif found.topic == topic and where.style == "rmw":
+                hint = f"it is published with type hash {found.hash}: set another distro than {where.distro}."
+        if others:
+            hint += f" Namespaces with odometry there: {', '.join(sorted(others))}"
+        return f"{robot.name}: no odometry on '{robot.odometry_key}': {hint}"
+
+    def read(self, t: float) -> BodyState:
+        """See `Body.read`."""
+        now = self._clock()
+        robots = self._robots
+        for robot in robots:
+            robot.hear(t, now)
+            if robot.time == -np.inf and robot.heard > -np.inf:
+                robot.time = t - (now - robot.heard)  # heard while it was opened
+            robot.speak(now)
+        rows = len(robots)
+        pose = np.array([robot.pose for robot in robots])
+        speed = np.array([robot.speed[0] for robot in robots])
+        position = np.zeros((rows, 3))
+        position[:, :2] = pose[:, :2]
+        position[np.isnan(pose[:, 0])] = nan
+        linked = {endpoints: network.connected(session) for endpoints, session in self._sessions.items()}
+        state = BodyState(
+            time=np.array([robot.time for robot in robots]),
+            position=position,
+            velocity=np.zeros((rows, 3)),
+            yaw=pose[:, 2].copy(),
+            true_position=np.full((rows, 3), nan),
+            true_yaw=np.full(rows, nan),
+            battery=np.array([robot.battery for robot in robots]),
+            flying=np.zeros(rows, dtype=bool),
+            notes=tuple(robot.note(now, linked[robot.endpoints]) for robot in robots),
+            rays=Rays.gather([robot.scan for robot in robots]),
+        )
+        if len(self._outside):
+            odometry = state.time.copy()
+            self._external.fill(state, self._outside)
+            # a robot that is seen from outside and does not answer is still out of reach
+            state.time = np.where(t - odometry > SILENCE_S, np.minimum(state.time, odometry), state.time)
+        state.velocity[:, 0], state.velocity[:, 1] = speed * np.cos(state.yaw), speed * np.sin(state.yaw)
+        state.velocity[:, 2] = 0.0
+        return state
+
+    def command(self, setpoint: Array) -> None:
+        """See `Body.command`: v [m/s] and ω [rad/s]."""
+        now = self._clock()
+        for robot, (v, w, _, _) in zip(self._robots, setpoint.tolist(), strict=True):
+            if np.isfinite(v) and np.isfinite(w):
+                robot.drive(v, w, now)
+            robot.speak(now)
+
+    def takeoff(self, rows: Index, height: Array) -> None:
+        """See `Body.takeoff`: does nothing, a ground robot is where it should be."""
+
+    def land(self, rows: Index) -> None:
+        """See `Body.land`."""
+        now = self._clock()
+        if self._sessions:
+            call_all(partial(self._robots[row].halt, now) for row in rows.tolist())
+
+    def stop(self, rows: Index) -> None:
+        """See `Body.stop`."""
+        self.land(rows)
+
+    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
+        """See `Body.locate`."""
+        self._external.update(row, t, position, yaw)
+
+    def close(self) -> None:
+        """Stops every robot, waits a moment until they stand, and leaves the network."""
+        if not self._sessions:
+            return
+        until = self._clock() + FAREWELL_S
+        try:
+            self.stop(np.arange(len(self._robots)))
+            while (now := self._clock()) < until:
+                for robot in self._robots:
+                    robot.hear(robot.time, now)
+                call_all(partial(robot.speak, now) for robot in self._robots)
+                if all(robot.settled for robot in self._robots):
+                    break
+                time.sleep(POLL_S)
+        finally:
+            self._close()
+
+    def _close(self) -> None:
+        for session in self._sessions.values():
+            leave(session, self)
+        self._sessions.clear()
+        self._claims.release()
+
+
+def open_turtlebot3(request: BodyRequest) -> Body:
+    """The entry points `ros2dds` and `rmw` of the group `zenpark.bodies`.
+
+    Raises:
+        BodyError: As `TurtleBot3`.
+    """
+    return TurtleBot3(request)

@@ -1,0 +1,1 @@
+"""Motion capture: a DataStream client, and the process that publishes poses."""

@@ -1,0 +1,153 @@
+"""A client of the Vicon DataStream in plain Python: one socket, one caller, no vendor library.
+
+The vendor's own client holds the interpreter while it connects and never returns once its server has died.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+from agents.protocols import vicon_datastream
+from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment, Subject
+
+CHUNK: Final = 1 << 18  # [bytes] read at once: some ten frames of twenty bodies
+OLDEST_S: Final = 1.0  # a frame that claims to be older has a broken latency
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What motion capture saw at one moment.
+
+    Attributes:
+        number: As the server counts.
+        latency_s: How old it was when it was sent [s].
+        poses: The root segment of each subject that the server knows; None while it is occluded.
+        z_up: Whether the z axis points up.
+    """
+
+    number: int
+    latency_s: float
+    poses: dict[str, Segment | None]
+    z_up: bool
+
+
+class Decoder:
+    """Makes frames of packets; remembers names and axes, which are not in each of them."""
+
+    def __init__(self) -> None:
+        self._subjects: dict[int, Subject] = {}
+        self._z_up = True
+
+    def frame(self, body: bytes) -> Frame | None:
+        """The frame in the body of a packet, or None if it has only names, axes or answers.
+
+        Raises:
+            Malformed: If the packet is damaged.
+        """
+        number, latency = None, 0.0
+        named: dict[int, Subject] = {}
+        seen: dict[int, list[Segment]] = {}
+        for kind, payload in vicon_datastream.blocks(body):
+            if kind == Kind.GLOBAL_SEGMENTS:
+                subject, segments = vicon_datastream.unpack_segments(payload)
+                seen[subject] = segments
+            elif kind == Kind.FRAME_INFO:
+                number = vicon_datastream.unpack_frame_number(payload)
+            elif kind == Kind.LATENCY_INFO:
+                latency = vicon_datastream.unpack_latency(payload)
+            elif kind == Kind.SUBJECT_INFO:
+                known = vicon_datastream.unpack_subject(payload)
+                named[known.number] = known
+            elif kind == Kind.APPLICATION_INFO:
+                self._z_up = payload[:1] == bytes([vicon_datastream.Z_UP])
+        if named:
+            self._subjects = named  # all of them are sent again when one changes
+        if number is None:
+            return None
+        poses = {
+            known.name: next((s for s in seen.get(known.number, ()) if s.number == known.root), None)
+            for known in self._subjects.values()
+        }
+        return Frame(number, latency if 0.0 <= latency <= OLDEST_S else 0.0, poses, self._z_up)
+
+
+class Reader:
+    """A connection to a DataStream server, which sends every frame as it comes."""
+
+    def __init__(self, host: str, port: int = vicon_datastream.PORT, timeout_s: float = 2.0) -> None:
+        """Connects and asks for frames.
+
+        Raises:
+            OSError: If nobody answers there in time.
+            Malformed: If whoever answers does not speak DataStream, or has no poses to offer.
+        """
+        deadline = time.monotonic() + timeout_s
+        self._framer, self._decoder = Framer(), Decoder()
+        self._waiting: deque[bytes] = deque()  # packets that came with the server's first word
+        self._socket = socket.create_connection((host, port), timeout_s)
+        self._socket.setblocking(False)
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            offered = self._offered(deadline)
+            if Kind.GLOBAL_SEGMENTS not in offered:
+                raise Malformed("the server has no segments to offer")
+            wanted = offered.intersection(vicon_datastream.POSES)
+            stream = vicon_datastream.packet(vicon_datastream.block(Kind.REQUEST_FRAME, b"\x01"))
+            self._socket.sendall(vicon_datastream.pack_kinds(wanted) + stream)
+        except (OSError, Malformed):
+            self._socket.close()
+            raise
+
+    def newest(self, timeout_s: float) -> Frame | None:
+        """The newest frame that has arrived, or None if none comes in time.
+
+        Older ones that wait with it are left out: nobody could tell any more when they arrived.
+
+        Raises:
+            OSError: If the server is gone.
+            Malformed: If the stream is damaged.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._drain()
+            bodies, self._waiting = self._waiting, deque()
+            frames = [frame for body in bodies if (frame := self._decoder.frame(body)) is not None]
+            if frames:
+                return frames[-1]
+            if not self._readable(deadline):
+                return None
+
+    def close(self) -> None:
+        """Ends the connection."""
+        self._socket.close()
+
+    def _offered(self, deadline: float) -> set[int]:
+        while True:
+            if not self._readable(deadline):
+                raise TimeoutError("it is silent")
+            self._drain()
+            while self._waiting:
+                for kind, payload in vicon_datastream.blocks(self._waiting.popleft()):
+                    if kind == Kind.OBJECT_ENUMS:
+                        return vicon_datastream.unpack_kinds(payload)
+
+    def _readable(self, deadline: float) -> bool:
+        waiting = select.poll()
+        waiting.register(self._socket, select.POLLIN)
+        return bool(waiting.poll(1000.0 * max(0.0, deadline - time.monotonic())))
+
+    def _drain(self) -> None:
+        """Takes in all packets that have arrived."""
+        while True:
+            try:
+                received = self._socket.recv(CHUNK)
+            except BlockingIOError:
+                return
+            if not received:
+                raise ConnectionResetError("the server has closed the connection")
+            self._waiting += self._framer.feed(received)

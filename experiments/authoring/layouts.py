@@ -1,0 +1,208 @@
+"""Formations of any size: where the robots stand and who hears whom. Geometry only; `generate` makes files of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Index, norm
+from agents.formation.rigidity import rigidity
+
+GOLDEN: Final = math.pi * (3.0 - math.sqrt(5.0))  # [rad] no two multiples of it fall close together
+RIM: Final = math.cos(math.radians(75.0))  # a hemisphere ends here: below, robots would stand above one another
+SLIVER: Final = math.cos(math.radians(120.0))  # a triangle of the rim that is blunter only bridges a bay of it
+LOWEST: Final = 0.4  # [m] of a robot of a hemisphere, clear of the ground effect
+CANDIDATES: Final = 8  # nearest earlier robots that a Henneberg step chooses from
+SPLIT: Final = 40  # among as many first robots links are split: each split is measured, which takes time
+KEPT: Final = 0.9  # share of the stiffness that a split must leave
+
+
+class LayoutError(ValueError):
+    """A formation that cannot be had; the message says what to ask for instead."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A shape and its links.
+
+    Attributes:
+        title: What it is, for people.
+        position: (N, 3) [m], centred on the origin; z is the height that a flying robot holds, 0 where any will do.
+        pairs: (M, 2) who hears whom, both ways, smaller row first.
+    """
+
+    title: str
+    position: Array
+    pairs: Index
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+def polygon(count: int, spacing: float) -> Layout:
+    """A regular polygon of `count` robots `spacing` [m] apart; each hears its next two neighbours on either side.
+
+    The ring alone could fold; with the second neighbours it is rigid in the plane.
+    """
+    _at_least(count, 3, "polygon")
+    made = circulant(count, (1, 2), spacing)
+    return Layout(f"{count} robots on a regular polygon", made.position, made.pairs)
+
+
+def circulant(count: int, jumps: Sequence[int], spacing: float) -> Layout:
+    """`count` robots on a circle, `spacing` [m] apart; i and i ± j hear each other for each jump j."""
+    _at_least(count, 3, "circulant")
+    wrong = [jump for jump in jumps if not 0 < jump < count]
+    if not jumps or wrong:
+        what = f"jumps of {', '.join(map(str, wrong))}" if wrong else "no jumps"
+        raise LayoutError(f"a circulant of {count} cannot have {what}: give numbers from 1 to {count // 2}")
+    if math.gcd(count, *jumps) != 1:
+        raise LayoutError(f"jumps that all share a divisor with {count} leave the circle in parts: add 1 to them")
+    angle = 2.0 * math.pi * np.arange(count) / count
+    radius = spacing / (2.0 * math.sin(math.pi / count))
+    position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)])
+    first = np.arange(count)
+    both = np.concatenate([np.column_stack([first, (first + jump) % count]) for jump in jumps])
+    said = ", ".join(map(str, sorted(set(jumps))))
+    return Layout(f"{count} robots on a circulant graph with jumps {said}", position, _each_once(both))
+
+
+def grid(rows: int, columns: int, spacing: float) -> Layout:
+    """`rows` × `columns` robots on a square grid, `spacing` [m] apart; each hears the up to eight around it."""
+    if min(rows, columns) < 2:
+        raise LayoutError(f"a grid of {rows}x{columns} is a line, which bends: give 2x2 or more")
+    number = np.arange(rows * columns).reshape(rows, columns)
+    neighbours = (
+        (number[:, :-1], number[:, 1:]),
+        (number[:-1], number[1:]),
+        (number[:-1, :-1], number[1:, 1:]),
+        (number[1:, :-1], number[:-1, 1:]),
+    )
+    both = np.concatenate([np.column_stack([one.ravel(), other.ravel()]) for one, other in neighbours])
+    y, x = np.divmod(np.arange(rows * columns), columns)
+    place = np.column_stack([x - (columns - 1) / 2.0, (rows - 1) / 2.0 - y, np.zeros(rows * columns)])
+    return Layout(f"{rows} × {columns} robots on a grid", spacing * place, _each_once(both))
+
+
+def hemisphere(count: int, spacing: float, apart: float) -> Layout:
+    """`count` robots spread evenly over a hemisphere, linked by its Delaunay triangulation.
+
+    The links are those of the Delaunay triangulation on the sphere: points that are projected stereographically from
+    the opposite pole have the same one in the plane, because circles of the sphere become circles. Blunt triangles of
+    the rim are left out: their long sides would only make the formation slower.
+
+    Args:
+        count: Of robots.
+        spacing: Least distance of two of them [m].
+        apart: Least distance seen from above [m], so that they can start and land below their places.
+    """
+    _at_least(count, 4, "hemisphere")
+    from matplotlib.tri import Triangulation  # noqa: PLC0415 - takes half a second, and only this needs it
+
+    number = np.arange(count)
+    cosine = 1.0 - (number + 0.5) / count * (1.0 - RIM)
+    sine = np.sqrt(1.0 - cosine**2)
+    unit = np.column_stack([sine * np.cos(GOLDEN * number), sine * np.sin(GOLDEN * number), cosine])
+    flat = unit[:, :2] / (1.0 + cosine)[:, None]
+    pairs = _sides(_without_slivers(unit, Triangulation(flat[:, 0], flat[:, 1]).triangles.astype(np.intp)))
+    radius = max(spacing / _nearest(unit), apart / _nearest(unit[:, :2]))
+    position = radius * unit
+    position[:, 2] += LOWEST - position[:, 2].min()
+    return Layout(f"{count} robots on a hemisphere of {radius:.2f} m with Delaunay links", position, pairs)
+
+
+def henneberg(count: int, spacing: float, rng: np.random.Generator) -> Layout:
+    """`count` robots with 2N − 3 links, none of which could be left out: minimally rigid in the plane.
+
+    Built by Henneberg's steps (Die graphische Statik der starren Systeme, 1911): a new robot hears two that are there,
+    or takes the place of a link between two and hears both and a third. By Laman's theorem each keeps what came
+    before rigid for places in general position; the places are a disc of points about `spacing` [m] apart, disturbed
+    by `rng`, and are checked.
+    """
+    _at_least(count, 2, "Henneberg construction")
+    number = np.arange(count)
+    way = 0.6 * spacing * np.sqrt(number + 0.5)
+    place = np.column_stack([way * np.cos(GOLDEN * number), way * np.sin(GOLDEN * number)])
+    place += 0.05 * spacing * rng.uniform(-1.0, 1.0, place.shape)
+    links = {(0, 1)}
+    for new in range(2, count):
+        near = np.argsort(norm(place[:new] - place[new]))[:CANDIDATES]
+        one, other = _firmest(place, new, near)
+        plain = links | {(one, new), (other, new)}
+        links = _split(place, links, plain, near, rng) if 2 < new < SPLIT else plain
+    position = np.column_stack([place - place.mean(axis=0), np.zeros(count)])
+    return Layout(f"{count} robots, minimally rigid (Henneberg)", position, _each_once(np.array(sorted(links))))
+
+
+def _without_slivers(point: Array, triangles: Index) -> Index:
+    """Triangles (T, 3) less those on the rim that are blunt opposite to it, again and again."""
+    while True:
+        sides = np.sort(triangles[:, [[1, 2], [2, 0], [0, 1]]], axis=2)  # opposite to corners 0, 1, 2
+        _, which, times = np.unique(sides.reshape(-1, 2), axis=0, return_inverse=True, return_counts=True)
+        rim = times[which.ravel()].reshape(-1, 3) == 1
+        corner = point[triangles]
+        one, other = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
+        blunt = np.vecdot(one, other) < SLIVER * norm(one) * norm(other)
+        keeps = ~(rim & blunt).any(axis=1)
+        if keeps.all() or not keeps.any():
+            return triangles
+        triangles = triangles[keeps]
+
+
+def _sides(triangles: Index) -> Index:
+    """The sides (M, 2) of triangles (T, 3)."""
+    return _each_once(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
+
+
+def _firmest(place: Array, new: int, near: Index) -> tuple[int, int]:
+    """The two of `near` that hold a new point best: nearly at right angles, and not far away."""
+    way = place[near] - place[new]
+    length = norm(way)
+    unit = way / length[:, None]
+    across = np.abs(unit[:, None, 0] * unit[None, :, 1] - unit[:, None, 1] * unit[None, :, 0])
+    best = int(np.argmax(across / (length[:, None] + length[None, :])))
+    one, other = sorted(int(near[k]) for k in divmod(best, len(near)))
+    return one, other
+
+
+def _split(
+    place: Array, links: set[tuple[int, int]], plain: set[tuple[int, int]], near: Index, rng: np.random.Generator
+) -> set[tuple[int, int]]:
+    """The links with the newest point put in for one of them, if that is nearly as stiff; else the `plain` ones."""
+    known = {int(row) for row in near}
+    new = max(max(pair) for pair in plain)
+    inside = sorted(pair for pair in links if known >= set(pair))
+    if not inside:
+        return plain
+    one, other = inside[rng.integers(len(inside))]
+    third = next(int(row) for row in near if row not in (one, other))
+    tried = (links - {(one, other)}) | {(one, new), (other, new), (third, new)}
+    before, after = (_stiffness(place[: new + 1], each) for each in (plain, tried))
+    return tried if after > KEPT * before else plain
+
+
+def _stiffness(place: Array, links: set[tuple[int, int]]) -> float:
+    """Smallest singular value of the rigidity matrix in the plane, rigid motions left out [m]; 0 if flexible."""
+    position = np.column_stack([place, np.zeros(len(place))])
+    free = np.ones_like(position, dtype=bool)
+    free[:, 2] = False
+    return rigidity(position, np.array(sorted(links)), free).smallest
+
+
+def _nearest(points: Array) -> float:
+    """The least distance between two of (N, k) points."""
+    return min(float(norm(points[k + 1 :] - points[k]).min()) for k in range(len(points) - 1))
+
+
+def _each_once(pairs: Index) -> Index:
+    """Pairs (M, 2), smaller row first, sorted, each once."""
+    return np.unique(np.sort(pairs, axis=1), axis=0).astype(np.intp)
+
+
+def _at_least(count: int, least: int, what: str) -> None:
+    if count < least:
+        raise LayoutError(f"a {what} needs {least} robots or more, not {count}")

@@ -1,0 +1,1 @@
+"""Converts Robotic Park's YAML."""

@@ -1,0 +1,301 @@
+"""The shape that a Robotic Park experiment asks for, and the heights at which its drones are to hold it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask, norm
+from agents.body.kinds import KINDS
+from experiments.authoring.robotic_park.file import Park, Robot, Task
+from experiments.check.realisation import ENOUGH
+
+ROUNDS: Final = 300
+FOUND: Final = 1e-9  # [m] nearer is arithmetic
+MET: Final = 1e-3  # [m] and those with three: no further beginnings are drawn
+BULGE: Final = 1.05  # radius of the dome, as a multiple of the farthest robot's distance from the middle
+DRAWN: Final = 4  # beginnings before the random ones
+ATTEMPTS: Final = 40  # random beginnings
+SPREAD: Final = (0.05, 0.1, 0.3, 0.6)  # [m] standard deviations of theirs
+TINY: Final = 1e-12
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is asked of N robots.
+
+    Attributes:
+        pairs: (M, 2) i, j.
+        distance: (M,) ‖p_i − p_j‖ [m]; NaN where a relative position is asked for.
+        relative: (M, 3) p_i − p_j [m].
+        row: (A,) robots that keep a distance to a point.
+        point: (A, 3) [m].
+        radius: (A,) [m].
+    """
+
+    pairs: Index
+    distance: Array
+    relative: Array
+    row: Index
+    point: Array
+    radius: Array
+
+    def without_points(self) -> Wanted:
+        """The same without distances to points."""
+        return replace(self, row=self.row[:0], point=self.point[:0], radius=self.radius[:0])
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Places (N, 3) [m], how far the worst link misses what it asks for, and how far the worst point [m]."""
+
+    position: Array
+    links: float
+    points: float
+
+    @property
+    def worst(self) -> float:
+        """The larger of the two [m]."""
+        return max(self.links, self.points)
+
+
+def placed(wanted: Wanted, start: Array, climbs: Mask) -> Placed:
+    """Places at what is asked for, as well as it can be met.
+
+    A formation that can be met at the heights of the starts stays there. Else heights are free, and least squares
+    begin at the starts, at a dome above them and at starts that are moved at random (always the same ones): a single
+    beginning ends in a local minimum for about two of three of the shapes in space that the authors fly.
+
+    Args:
+        wanted: Links and points.
+        start: (N, 3) [m].
+        climbs: (N,) robots whose height may be another; the others keep theirs.
+    """
+    best: Placed | None = None
+    for number, (guess, free) in enumerate(_beginnings(start, climbs), 1):
+        found = _fitted(wanted, guess, free)
+        if best is None or round(found.worst, 4) < round(best.worst, 4):
+            best = found
+        if best.worst <= (ENOUGH if number < DRAWN else MET):
+            break
+    assert best is not None
+    return best
+
+
+def _beginnings(start: Array, climbs: Mask) -> Iterator[tuple[Array, Mask]]:
+    """Guesses (N, 3) [m] at the places, each with the robots (N,) whose heights are free."""
+    nobody = np.zeros_like(climbs)
+    middle = start[:, :2].mean(axis=0)
+    away = start[:, :2] - middle
+    way = norm(away)
+    mirrored = start.copy()
+    mirrored[:, 1] = 2.0 * middle[1] - start[:, 1]
+    yield start, nobody
+    yield mirrored, nobody
+    if not climbs.any():
+        return
+    dome = start.copy()
+    dome[climbs, 2] += np.sqrt(np.maximum((BULGE * way.max(initial=0.0)) ** 2 - way[climbs] ** 2, 0.0))
+    yield start, climbs
+    yield dome, climbs
+    random = np.random.default_rng(0)
+    for attempt in range(ATTEMPTS):
+        moved = (start, dome)[attempt % 2] + random.normal(0.0, SPREAD[attempt % len(SPREAD)], start.shape)
+        moved[~climbs, 2] = start[~climbs, 2]
+        yield moved, climbs
+
+
+def _fitted(wanted: Wanted, guess: Array, climbs: Mask) -> Placed:
+    """Least squares by Levenberg's and Marquardt's method."""
+    free = np.ones_like(guess, dtype=bool)
+    free[~climbs, 2] = False
+    position, damping = guess.copy(), 1e-3
+    value, slope = _residuals(wanted, position)
+    for _ in range(ROUNDS):
+        jacobian = slope.reshape(len(value), -1)[:, free.ravel()]
+        normal = jacobian.T @ jacobian + damping * np.eye(int(free.sum()))
+        tried = position.copy()
+        tried[free] -= np.linalg.solve(normal, jacobian.T @ value)
+        with np.errstate(over="ignore", invalid="ignore"):  # too far a step is no better, whatever it comes to
+            then, steeper = _residuals(wanted, tried)
+            before, after = float(value @ value), float(then @ then)
+        if after < before:
+            position, value, slope, damping = tried, then, steeper, max(damping / 10.0, 1e-10)
+        else:
+            damping *= 10.0
+        if damping > 1e9 or before < FOUND**2 or 0.0 <= before - after < 1e-10 * before:
+            break
+    points = len(wanted.row)
+    off = np.abs(value)
+    links = off[: len(off) - points] if points else off
+    return Placed(position, float(links.max(initial=0.0)), float(off[len(off) - points :].max(initial=0.0)))
+
+
+def _residuals(wanted: Wanted, position: Array) -> tuple[Array, Array]:
+    """What is off (K,) and its slope (K, N, 3): distances, then relative positions, then points."""
+    rows = len(position)
+    i, j = wanted.pairs[:, 0], wanted.pairs[:, 1]
+    apart = position[i] - position[j]
+    by_distance, by_place = np.flatnonzero(np.isfinite(wanted.distance)), np.flatnonzero(np.isnan(wanted.distance))
+    length = norm(apart[by_distance]) + TINY
+    number = np.arange(len(by_distance))
+    lengths = np.zeros((len(by_distance), rows, 3))
+    lengths[number, i[by_distance]] = apart[by_distance] / length[:, None]
+    lengths[number, j[by_distance]] = -apart[by_distance] / length[:, None]
+    vectors = np.zeros((len(by_place), 3, rows, 3))
+    number = np.arange(len(by_place))
+    for axis in range(3):
+        vectors[number, axis, i[by_place], axis], vectors[number, axis, j[by_place], axis] = 1.0, -1.0
+    away = position[wanted.row] - wanted.point
+    far = norm(away) + TINY
+    points = np.zeros((len(wanted.row), rows, 3))
+    points[np.arange(len(wanted.row)), wanted.row] = away / far[:, None]
+    value = np.concatenate(
+        [
+            length - wanted.distance[by_distance],
+            (apart[by_place] - wanted.relative[by_place]).ravel(),
+            far - wanted.radius,
+        ]
+    )
+    return value, np.concatenate([lengths, vectors.reshape(-1, rows, 3), points])
+
+
+SHAPE_MET: Final = 0.01  # [m] what is missed by more is another shape
+LOWEST: Final = 0.3  # [m] of a drone
+ALOFT: Final = 0.7  # [m] where drones hover whose pose has no height, as in the authors' files
+MOVED: Final = 0.02  # [m] a height that is another than at the start
+SPACING: Final = 0.6  # [m] between robots whose start is made up
+
+
+@dataclass
+class Notes:
+    """What could not be carried over, each once."""
+
+    said: list[str] = field(default_factory=list)
+
+    def say(self, note: str) -> None:
+        """Adds a note."""
+        if note not in self.said:
+            self.said.append(note)
+
+
+@dataclass(frozen=True)
+class Heights:
+    """Where N robots start and are to be.
+
+    Attributes:
+        start: (N, 3) [m]; z is where drones were to begin.
+        shape: (N, 3) [m].
+        hover: (N,) heights that are held [m]; 0 on the floor.
+        anchored: Whether distances to the origin agree with the others, and are carried over.
+        centre: What becomes of the origin [m].
+    """
+
+    start: Array
+    shape: Array
+    hover: Array
+    anchored: bool
+    centre: tuple[float, float, float]
+
+
+def tasks(park: Park) -> Iterator[tuple[Robot, Task]]:
+    """Robots that have one."""
+    for robot in park.robots:
+        if robot.task is not None:
+            yield robot, robot.task
+
+
+def heights_of(park: Park, notes: Notes) -> Heights:
+    """The heights, from the shape in space if links tell one.
+
+    The origin of their files is a point about which drones spread while they climb: where the shape is not flat, no
+    robot stands on the floor and the origin is not told otherwise, the whole is lifted so that the lowest drone keeps
+    the height at which it starts.
+    """
+    flies = np.array([KINDS[robot.kind].flies for robot in park.robots])
+    start = _starts(park, notes)
+    start[~flies, 2] = 0.0
+    start[flies & (start[:, 2] < LOWEST), 2] = ALOFT
+    wanted = _wanted(park, start, flies)
+    plain = Heights(start, start, np.round(start[:, 2], 3), len(wanted.pairs) == 0, (0.0, 0.0, 0.0))
+    if not len(wanted.pairs):
+        return plain
+    told = any(relation.centre is not None for _, task in tasks(park) for relation in task.relations)
+    found, anchored = placed(wanted, start, flies), len(wanted.row) > 0
+    off = found.worst
+    if anchored and off > SHAPE_MET:
+        found, anchored = placed(wanted.without_points(), start, flies), False
+        if found.links <= SHAPE_MET:
+            notes.say(
+                "distances to the origin: no shape was found that meets them and those between robots; the best one"
+                f" misses by {1e3 * off:.0f} mm, so those to the origin are left out"
+            )
+    if found.links > SHAPE_MET:
+        notes.say(
+            f"the distances: no shape was found that meets them, even in space; the best one misses by"
+            f" {1e3 * found.links:.0f} mm, so drones hold the heights at which they start"
+        )
+        return plain
+    shape, lift = found.position, 0.0
+    flat = not (np.abs(shape[:, 2] - start[:, 2])[flies] > MOVED).any()
+    if flies.all() and not told and not flat:
+        lift = float(start[:, 2].min() - shape[:, 2].min())
+        shape = shape + np.array([0.0, 0.0, lift])
+    hover = np.where(flies, np.round(shape[:, 2], 3), 0.0)
+    if hover[flies].min(initial=LOWEST) < LOWEST:
+        notes.say(f"the shape needs a drone at {hover[flies].min():.2f} m: drones hold the heights of their starts")
+        return replace(plain, anchored=False)
+    if (np.abs(hover - start[:, 2])[flies] > MOVED).any():
+        notes.say(
+            "their drones climb while they form the shape, zenpark's hold a height: each takes off to that which it has"
+            " in the shape"
+        )
+    if anchored and abs(lift) > MOVED:
+        notes.say(f"the origin: lifted to {lift:.2f} m, so that the lowest drone hovers where it was to start")
+    return Heights(start, shape, hover, anchored, (0.0, 0.0, round(lift, 3)))
+
+
+def _starts(park: Park, notes: Notes) -> Array:
+    """Starts (N, 3) [m]; robots whose start is not told stand on a ring, in the order of the file."""
+    count = len(park.robots)
+    angle = 2.0 * np.pi * np.arange(count) / max(count, 1)
+    radius = max(SPACING, count * SPACING / (2.0 * np.pi))
+    ring = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)]).round(2)
+    lost = [robot.name for robot in park.robots if robot.pose is None]
+    if lost:
+        notes.say(
+            f"starts: the file has none for {', '.join(lost)}; MADE UP here, on a ring; name a file that has them with"
+            " --poses (an index of robots, a Webots world or a table)"
+        )
+    return np.array([ring[row] if robot.pose is None else robot.pose for row, robot in enumerate(park.robots)])
+
+
+def _wanted(park: Park, start: Array, flies: Mask) -> Wanted:
+    row = {robot.name: number for number, robot in enumerate(park.robots)}
+    pairs, distance, relative = [], [], []
+    anchored, point, radius = [], [], []
+    for robot, task in tasks(park):
+        i = row[robot.name]
+        for relation in task.relations:
+            if relation.name in row:
+                j = row[relation.name]
+                pairs.append((i, j))
+                distance.append(relation.values[0] if task.kind == "distance" else np.nan)
+                x, y, z = (*relation.values, 0.0, 0.0)[:3]
+                level = start[i, 2] - start[j, 2]
+                relative.append((x, y, z if flies[i] or flies[j] else level))
+            elif relation.name == "origin" and len(relation.values) == 1:
+                anchored.append(i)
+                point.append(relation.centre or (0.0, 0.0, 0.0))
+                radius.append(relation.values[0])
+    return Wanted(
+        np.array(pairs, dtype=np.intp).reshape(-1, 2),
+        np.array(distance, dtype=float),
+        np.array(relative, dtype=float).reshape(-1, 3),
+        np.array(anchored, dtype=np.intp),
+        np.array(point, dtype=float).reshape(-1, 3),
+        np.array(radius, dtype=float),
+    )

@@ -1,0 +1,20 @@
+"""Experiments that come with zenpark, one file each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+FOLDER: Final = Path(__file__).parent
+SCHEMA: Final = "zenpark.schema.json"
+_ARENA: Final = ".arena.toml"  # how the names of arena files end here, which are no experiments
+
+
+def names() -> list[str]:
+    """Names of all entries, sorted."""
+    return sorted(file.stem for file in FOLDER.glob("*.toml") if not file.name.endswith(_ARENA))
+
+
+def arenas() -> list[str]:
+    """Names of all arena files, sorted."""
+    return sorted(file.name for file in FOLDER.glob(f"*{_ARENA}"))

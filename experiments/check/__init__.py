@@ -1,0 +1,1 @@
+"""Can it work? Theory and an ideal run, as findings with remedies. Imports file, definition."""

@@ -1,0 +1,298 @@
+"""One case of an experiment in numbers: its network, the shape that it asks for, and the motion to be expected."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from agents.arrays import Array, Index, Mask, norm
+from agents.decision.assignment import Assignment
+from agents.decision.position_control import REACHED
+from agents.formation.changes import wanted
+from agents.formation.graph import Links, components, edges
+from agents.formation.rigidity import Redundancy, Rigidity
+from agents.plugins.laws import Law
+from agents.plugins.planners import Planner
+from experiments.check.findings import FORGIVEN
+from experiments.check.ideal_run import Prediction, closed
+from experiments.check.realisation import (
+    Shape,
+    algebraic_connectivity,
+    as_taken,
+    expendable,
+    realise,
+    stiffness,
+    unfolded,
+)
+from experiments.check.stability import Modes, modes
+from experiments.definition import assignment as assign
+from experiments.definition import bodies
+from experiments.definition.experiment import Experiment
+from experiments.definition.formation import Pattern, errors
+from experiments.definition.links import pairs
+from experiments.file.problems import Path
+from experiments.metrics.measure import WINDOW_S
+from twins.scene import Scene
+
+MANY: Final = 500  # robots of which it is not asked any more what can be lost: the time grows with their third power
+STANDS: Final = 0.001  # [m] moved by less in `WINDOW_S`
+GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """The numbers of one case.
+
+    Attributes:
+        experiment: The case.
+        assignment: Of all its robots; without avoidance, and without the links that only avoidance needs.
+        leaders: Names.
+        silent: Rows that hear nobody.
+        start: (N, 3) on the floor [m].
+        parts: Of the network.
+        fiedler: Algebraic connectivity.
+        pattern: The links, what becomes of them, and when they are there.
+        asked: The links of the beginning, with what the law takes them to ask for.
+        standing: (E,) those that are there at the beginning, however far the robots are from each other.
+        shapes: Places that were tried for the last stage of the formation, the best of which is to be its end.
+        shape: The best for the beginning; None if no link stands then.
+        later: The best after each change.
+        planar: Rigidity with heights held.
+        spatial: Rigidity in full space.
+        spare: What the formation can lose and stay rigid, of the pairs `edges(...)` of the links that stand at the
+            beginning; None if it is not rigid, if its links ask for more than distances, or if it has too many robots.
+        modes: Of the sampled loop at the shape.
+        prediction: The motion.
+        error: (T, E) of each link along it [m]; 0 while it is not there.
+        scene: What stands in the arena.
+    """
+
+    experiment: Experiment
+    assignment: Assignment
+    leaders: tuple[str, ...]
+    silent: Index
+    start: Array
+    parts: int
+    fiedler: float
+    pattern: Pattern
+    asked: Links
+    standing: Mask
+    shapes: tuple[Shape, ...]
+    shape: Shape | None
+    later: tuple[Shape, ...]
+    planar: Rigidity | None
+    spatial: Rigidity | None
+    spare: Redundancy | None
+    modes: Modes | None
+    prediction: Prediction
+    error: Array
+    scene: Scene
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.assignment.names
+
+    @property
+    def edges(self) -> int:
+        """How many pairs are linked, directions ignored."""
+        return len(edges(self.assignment.links))
+
+    @property
+    def speed(self) -> Array:
+        """(N,) that each robot may drive or fly at [m/s]."""
+        own = np.array([kind.speed for kind in self.assignment.kinds])
+        return np.asarray(np.minimum(own, self.assignment.limits.speed))
+
+    @property
+    def pull(self) -> Array:
+        """(N,) the speed at which each robot follows a goal that is a full clamp away [m/s]."""
+        hz = self.experiment.rates.coordination_hz
+        return np.minimum(self.speed, closed(self.assignment.kinds, hz) * self.assignment.clamp * hz)
+
+    @property
+    def legs(self) -> list[tuple[int, str, Planner]]:
+        """Number in the timeline, robot and planner of each leg."""
+        built = {name: iter(legs) for (rows, legs) in self.assignment.legs for name in [self.names[rows[0]]]}
+        return [(k, leg.robot, next(built[leg.robot]).planner) for k, leg in enumerate(self.experiment.timeline)]
+
+    @property
+    def departure(self) -> float:
+        """When the first robot leaves by plan or the shape changes, after the start; infinity if neither [s]."""
+        timeline = self.experiment.timeline
+        leaves = [timeline[k].at_s for k, _, plan in self.legs if plan.speed() > 0]
+        return min((at for at in (*leaves, *(each.at for each in self.pattern.changes)) if at > 0), default=math.inf)
+
+    @property
+    def fastest(self) -> tuple[int, str, Planner] | None:
+        """The leg that asks for most speed."""
+        return max(self.legs, key=lambda leg: leg[2].speed(), default=None)
+
+    @property
+    def follower(self) -> int | None:
+        """The slowest row that follows the formation and no plan."""
+        planned = [self.names.index(robot) for _, robot, _ in self.legs]
+        rows = np.setdiff1d(self.assignment.links.listener, planned)
+        return int(rows[self.pull[rows].argmin()]) if len(rows) else None
+
+    @property
+    def mean_error(self) -> Array:
+        """(T, E) of each link over the last `WINDOW_S` [m]."""
+        window = max(1, round(WINDOW_S * self.experiment.rates.coordination_hz))
+        total = np.cumsum(np.concatenate([np.zeros((1, self.error.shape[1])), self.error]), axis=0)
+        end = np.arange(1, len(total))
+        before = np.maximum(
+            end - window, 0
+        )  # the window fills up at the start, as it does in `experiments.metrics.measure`
+        return np.asarray((total[end] - total[before]) / (end - before)[:, None])
+
+    def acquired(self, until: float) -> float | None:
+        """From when on the mean of every link over `WINDOW_S` keeps within the tolerance, up to `until` [s]."""
+        time = self.prediction.time
+        mean = self.mean_error[time <= until + 1e-9]
+        bad = np.flatnonzero(mean.max(axis=1, initial=0.0) > self.experiment.tolerance + FORGIVEN)
+        if not len(mean) or (len(bad) and bad[-1] == len(mean) - 1):
+            return None
+        return float(time[bad[-1] + 1]) if len(bad) else 0.0
+
+    def stopped(self, at: int) -> Index:
+        """Robots on wheels that stand at sample `at`, because their goals are too near to drive to."""
+        at %= len(self.prediction.time)
+        time, position, pattern = self.prediction.time, self.prediction.position, self.pattern
+        links, anchors, hz = pattern.links, self.assignment.anchors, self.experiment.rates.coordination_hz
+        if pattern.changes:
+            links = wanted(links, pattern.changes, np.full(len(links), time[at]))
+        there, here = pattern.present(time[at : at + 1], position[at : at + 1]), position[at]
+        links = links if there is None else links.take(there[0])
+        offset = self.assignment.law.offset(here, here[links.speaker], links)
+        offset = offset if anchors is None else offset + anchors.offset(here)
+        stands = norm(position[at] - position[max(0, at - round(WINDOW_S * hz))]) < STANDS
+        wheels = np.array([not kind.flies for kind in self.assignment.kinds])
+        length = norm(offset[:, :2])
+        return np.flatnonzero(wheels & stands & (length > 0.1 * REACHED) & (length < 2.0 * REACHED))
+
+    def link(self, number: int) -> str:
+        """A link in words."""
+        links = self.assignment.links
+        return f"{self.names[links.speaker[number]]} - {self.names[links.listener[number]]}"
+
+    def pair(self, number: int) -> str:
+        """One of the pairs `edges(...)` of the links that stand at the beginning, in words."""
+        first, second = edges(self.asked.take(self.standing))[number]
+        return f"{self.names[first]} - {self.names[second]}"
+
+    def link_path(self, number: int) -> Path:
+        """Where a link stands in the file."""
+        wanted = self.assignment.links.listener[number], self.assignment.links.speaker[number]
+        wanted_names = tuple(self.names[row] for row in wanted)
+        return next(
+            (("formation", "links", text) for text in self.experiment.formation.links if wanted_names in pairs(text)),
+            ("formation", "links"),
+        )
+
+
+def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
+    """All the numbers of one case that goes like `prediction`."""
+    names = tuple(experiment.robots)
+    bare = msgspec.structs.replace(experiment, avoidance=None, architecture="distributed")
+    assignment = assign.assign(bare, names)
+    pattern = Pattern.of(experiment, names)
+    links, rows, hz = assignment.links, len(names), experiment.rates.coordination_hz
+    start, _ = bodies.start(experiment, names)
+    aloft = start.copy()
+    aloft[:, 2] = np.nan_to_num(assignment.hover)
+    anchored = np.zeros(0, dtype=np.intp) if assignment.anchors is None else assignment.anchors.row
+    silent = np.setdiff1d(np.arange(rows), np.concatenate([links.listener, anchored]))
+    standing = np.ones(len(links), dtype=bool) if pattern.presence is None else pattern.presence.at_first()
+    stages: list[list[Shape]] = []
+    shape, planar, spatial, spare, loop = None, None, None, None, None
+    asked = as_taken(assignment.law, links)
+    if standing.any() or len(anchored):
+        for at, wanted in zip((0.0, *(each.at + each.over for each in pattern.changes)), pattern.stages(), strict=True):
+            there = standing if pattern.presence is None else pattern.presence.planned(at)
+            stage = _shapes(experiment, assignment, as_taken(assignment.law, wanted), there, prediction, aloft, silent)
+            stages.append(stage)
+        shape = _best(stages[0])
+        here = asked.take(standing)
+        planar, spatial = stiffness(shape.position, here, silent, assignment.anchors)
+        if planar.rigid and spatial is not None and rows <= MANY:
+            spare = expendable(shape.position, here, silent)
+        share = closed(assignment.kinds, hz)
+        within = experiment.duration_s
+        loop = modes(assignment.law, here, shape.position, share, hz, anchors=assignment.anchors, within_s=within)
+    return Analysis(
+        experiment=experiment,
+        assignment=assignment,
+        leaders=tuple(assign.leaders(experiment)),
+        silent=silent,
+        start=start,
+        parts=components(links, rows),
+        fiedler=algebraic_connectivity(links, rows),
+        pattern=pattern,
+        asked=asked,
+        standing=standing,
+        shapes=tuple(stages[-1]) if stages else (),
+        shape=shape,
+        later=tuple(_best(each) for each in stages[1:]),
+        planar=planar,
+        spatial=spatial,
+        spare=spare,
+        modes=loop,
+        prediction=prediction,
+        error=link_errors(assignment.law, pattern, prediction),
+        scene=bodies.scene(experiment),
+    )
+
+
+def link_errors(law: Law, pattern: Pattern, prediction: Prediction) -> Array:
+    """Error of each link (T, E) along the motion [m]; 0 while it is not there."""
+    return np.nan_to_num(errors(law, pattern, prediction.time, prediction.position))
+
+
+def _best(shapes: Sequence[Shape]) -> Shape:
+    return min(shapes, key=lambda each: each.worst)
+
+
+def _shapes(  # noqa: PLR0917 - one caller
+    experiment: Experiment,
+    assignment: Assignment,
+    wanted: Links,
+    there: Mask,
+    prediction: Prediction,
+    aloft: Array,
+    silent: Index,
+) -> list[Shape]:
+    """Where the robots end, where they start, what the distances suggest, and random places, until one is exact."""
+    end, rows, links = prediction.position[-1], len(aloft), wanted.take(there)
+    moves = np.ones(rows, dtype=bool)
+    moves[silent] = False
+    rng = np.random.default_rng(experiment.seed)
+
+    def guesses() -> Iterator[Array]:
+        yield end
+        plane = unfolded(links, aloft[:, 2])
+        anchor = silent[:1] if len(silent) else np.arange(rows)
+        for mirror in (1.0, -1.0):
+            flipped = plane * [1.0, mirror, 1.0]
+            flipped[:, :2] += (end[anchor] - flipped[anchor]).mean(axis=0)[:2]
+            yield _rest(flipped, end, moves)
+        yield _rest(aloft, end, moves)
+        for _ in range(min(10, GUESSES // rows)):
+            place = rng.uniform(-0.5, 0.5, (rows, 2)) * experiment.arena.size[:2]
+            yield _rest(np.column_stack([place, aloft[:, 2]]), end, moves)
+
+    found = []
+    for each in realise(links, guesses(), moves, assignment.anchors):
+        error = np.zeros(len(there))
+        error[there] = each.error
+        found.append(replace(each, error=error))
+    return found
+
+
+def _rest(guess: Array, end: Array, moves: Mask) -> Array:
+    """Leaders stay where their plans leave them."""
+    return np.where(moves[:, None], guess, end)

@@ -1,0 +1,440 @@
+"""`zenpark check`: says whether an experiment can work before anything moves.
+
+That a file can be read at all is for `experiments.file.document` to say; here the experiment is held against theory
+(`theory`) and against an ideal run of it (`motion`), each case for itself.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from agents.network.messages import MAX_PAYLOAD
+from experiments.check import motion, safety, theory
+from experiments.check import obstacles as surroundings
+from experiments.check.analysis import Analysis, analyse, link_errors
+from experiments.check.findings import FORGIVEN, Claim, Severity, few, listed
+from experiments.check.ideal_run import Prediction, message_rate, predict, undisturbed
+from experiments.definition import assignment as assign
+from experiments.definition import bodies, standby
+from experiments.definition.experiment import Channel, Experiment, Network
+from experiments.file import document
+from experiments.file.document import Document
+from experiments.file.overrides import parse
+from experiments.file.problems import DocumentError, Path, Problem, line_column, nearest, places
+from experiments.file.text import parsed
+
+NOT_RANDOM: Final = "not-random"
+HEARD_BYTES: Final = 200  # of one heard pose in telemetry
+QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
+ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")
+MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}
+WIDEST: Final = 110  # columns of print
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is to be said of an experiment.
+
+    Attributes:
+        severity: Of an error, the experiment cannot work; of a warning, it may not do what was meant; a note is good
+            news, or explains.
+        code: One word for programs.
+        message: What it is, with numbers.
+        remedy: What to change; empty for notes.
+        where: file:line:column, or the `--set` at fault; empty where it concerns the whole.
+    """
+
+    severity: Severity
+    code: str
+    message: str
+    remedy: str
+    where: str
+
+    def __str__(self) -> str:
+        """As a line for people."""
+        return f"{MARK[self.severity]} {self.message}" + (f"; {self.remedy}" if self.remedy else "")
+
+
+def chance(analysis: Analysis) -> Iterator[Claim]:
+    """Do seeds change anything."""
+    if not assign.uses_chance(analysis.experiment):
+        message = "nothing in this file is random: runs of other seeds are the same"
+        remedy = "add what nature adds, such as [disturbance.all] with position_sigma = 0.0005"
+        yield Claim("warning", NOT_RANDOM, message, remedy, ("disturbance",))
+
+
+def telemetry(analysis: Analysis) -> Iterator[Claim]:
+    """Does what a robot hears between two samples of telemetry fit into one message."""
+    experiment, links = analysis.experiment, assign.heard_links(analysis.experiment)
+    if not len(links):
+        return
+    heard = np.bincount(links.listener)
+    size = float(heard.max()) * experiment.rates.pose_hz / experiment.rates.state_hz * HEARD_BYTES
+    if size > MAX_PAYLOAD:
+        name = analysis.names[int(heard.argmax())]
+        message = (
+            f"{name} may hear {size / HEARD_BYTES:.0f} poses between two samples of telemetry, "
+            f"{size / 1024.0:.0f} kB: each sample is sent in {int(np.ceil(size / MAX_PAYLOAD))} messages or more"
+        )
+        yield Claim("warning", "telemetry-split", message, "raise rates.state_hz", ("rates", "state_hz"))
+
+
+SUBJECTS: Final = (
+    *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
+    *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
+    *(motion.flight, motion.starts, motion.formation, motion.softness, motion.walls, motion.encounters),
+    *(motion.speeds, motion.rates, motion.ends),
+    safety.architecture,
+    safety.safety,
+    chance,
+    telemetry,
+)
+
+
+class Figures(msgspec.Struct, frozen=True, kw_only=True):
+    """The numbers of one case; None where they have no meaning, as those of a formation without links.
+
+    Attributes:
+        robots: How many.
+        arena: Its size, x, y, z [m].
+        obstacles: What each is, by name.
+        links: Directed ones.
+        edges: Pairs that are linked, directions ignored.
+        parts: Of the network.
+        leaders: Names.
+        algebraic_connectivity: Of the network without directions.
+        rank: Of the rigidity matrix when heights are held, `rank_needed` for a rigid formation.
+        rank_needed: See `rank`.
+        rank_space: The same in full space.
+        rank_space_needed: See `rank_space`.
+        smallest_singular: Of the rigidity matrix when heights are held, rigid motions left out [m].
+        smallest_eigenvalue: Its square [m²].
+        spare_links: Pairs without any one of which the formation stays rigid; None where that has no meaning.
+        vital_links: The other pairs.
+        spare_robots: Robots without any one of which it stays rigid.
+        vital_robots: The other robots.
+        residual_mm: Worst link of the best shape.
+        loop_gain: h·μ·λ_max; 2 is where the formation hunts.
+        slowest_mode_s: Time constant of the slowest mode that moves.
+        free_modes: Modes that are slower than the run: nothing brings them back in time.
+        speed_needed: Of the fastest plan [m/s].
+        speed_available: Of the slowest follower [m/s].
+        acquired_s: When the formation keeps within the tolerance, before any plan begins.
+        end_error_mm: Worst link at the end.
+        end: Where each robot is expected to end [m].
+        end_inside: Whether all of them are inside the arena then.
+        messages_hz: Poses that all robots send in a second, estimated.
+        predicted_s: How much of the run was predicted.
+    """
+
+    robots: int
+    arena: tuple[float, float, float]
+    obstacles: dict[str, str]
+    links: int
+    edges: int
+    parts: int
+    leaders: tuple[str, ...]
+    algebraic_connectivity: float
+    rank: int | None
+    rank_needed: int | None
+    rank_space: int | None
+    rank_space_needed: int | None
+    smallest_singular: float | None
+    smallest_eigenvalue: float | None
+    spare_links: int | None
+    vital_links: tuple[str, ...]
+    spare_robots: int | None
+    vital_robots: tuple[str, ...]
+    residual_mm: float | None
+    loop_gain: float | None
+    slowest_mode_s: float | None
+    free_modes: int
+    speed_needed: float | None
+    speed_available: float | None
+    acquired_s: float | None
+    end_error_mm: float | None
+    end: dict[str, tuple[float, float, float]]
+    end_inside: bool
+    messages_hz: float
+    predicted_s: float
+
+
+def check(given: Document, settings: Sequence[str] = ()) -> list[Finding]:
+    """Everything there is to say of all cases: errors first, then warnings, then notes.
+
+    Args:
+        given: As `document.read` returned it.
+        settings: The overrides that it was read with, so that a finding can point at one.
+    """
+    return _findings(given, settings, _analyses(given.cases()))
+
+
+def figures(experiment: Experiment) -> Figures:
+    """The numbers of one case."""
+    return _figures(_analyses({"": experiment})[""])
+
+
+def command(file: str, *, settings: Sequence[str], as_json: bool) -> int:
+    """`zenpark check`; returns the exit code: 0, or 2 if there is an error.
+
+    Raises:
+        DocumentError: If the file cannot be read and `as_json` is false; the command line prints it.
+    """
+    try:
+        given = document.read(file, settings)
+    except DocumentError as error:
+        if not as_json:
+            raise
+        _print_json(file, [_unreadable(each) for each in error.problems], {})
+        return 2
+    analyses = _analyses(given.cases())
+    found = _findings(given, settings, analyses)
+    numbers = {name: _figures(analysis) for name, analysis in analyses.items()}
+    if as_json:
+        _print_json(str(given.path), found, numbers)
+    else:
+        _print_table(given, found, numbers)
+    return 2 if any(each.severity == "error" for each in found) else 0
+
+
+def schema_command() -> int:
+    """`zenpark schema`; returns the exit code."""
+    print(json.dumps(document.schema(), indent=2))
+    return 0
+
+
+def _unreadable(problem: Problem) -> Finding:
+    where = f"{problem.file}:{problem.line}:{problem.column}" if problem.line else problem.file
+    return Finding("error", "document", problem.message, problem.hint, where)
+
+
+@QUIET
+def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
+    """Of each case; the geometry of those that differ only in trigger, channel and noise is computed once."""
+    flights: dict[bytes, Prediction] = {}
+    known: dict[bytes, Analysis] = {}
+    found = {}
+    for name, case in cases.items():
+        case = standby.taking_part(case)  # noqa: PLW2901
+        quiet = undisturbed(case)
+        flight = msgspec.json.encode(quiet)
+        if flight not in flights:
+            flights[flight] = predict(quiet)
+        bare = msgspec.structs.replace(
+            case,
+            trigger="periodic",
+            prediction=None,
+            architecture="distributed",
+            channel=Channel(),
+            network=Network(),
+            disturbance={},
+            cases={},
+        )
+        key, prediction = msgspec.json.encode(bare), flights[flight]
+        if key not in known:
+            known[key] = analyse(bare, prediction)
+        found[name] = _of_case(known[key], case, prediction)
+    return found
+
+
+def _of_case(known: Analysis, case: Experiment, prediction: Prediction) -> Analysis:
+    """The analysis of a case whose links, shape and plans are those of `known`."""
+    told = assign.assign(case, tuple(case.robots))
+    assignment = replace(known.assignment, trigger=told.trigger, predictor=told.predictor)
+    error = link_errors(assignment.law, known.pattern, prediction)
+    if error[-1].max(initial=0.0) > case.tolerance >= known.error[-1].max(initial=0.0):
+        known = analyse(known.experiment, prediction)  # it ends elsewhere: another shape may be near
+    return replace(known, experiment=case, assignment=assignment, prediction=prediction, error=error)
+
+
+@QUIET
+def _findings(given: Document, settings: Sequence[str], analyses: Mapping[str, Analysis]) -> list[Finding]:
+    """What every case has is said once; what only some have, with their names."""
+    holders: dict[Claim, list[str]] = {}
+    for name, analysis in analyses.items():
+        for subject in SUBJECTS:
+            for claim in few(subject(analysis)):
+                holders.setdefault(claim, []).append(name)
+    index = _Index(given, settings)
+    found = []
+    for claim, names in holders.items():
+        message = claim.message
+        if len(names) < len(analyses):
+            said = ", ".join(f"'{name}'" for name in names)
+            message = f"in case{'s' * (len(names) > 1)} {said}: {message}"
+        where = index.where(claim.path, names) if claim.path else ""
+        found.append(Finding(claim.severity, claim.code, message, claim.remedy, where))
+    return sorted(found, key=lambda each: ORDER.index(each.severity))
+
+
+class _Index:
+    """Where the paths of a document stand, in its file or behind a `--set`."""
+
+    def __init__(self, given: Document, settings: Sequence[str]) -> None:
+        is_json = given.path.suffix.lower() == ".json"
+        content = parsed(given.text, str(given.path), json=is_json)
+        self._document, self._places = given, places(given.text, json=is_json)
+        self._overrides = [parse(setting, content) for setting in settings]
+
+    def where(self, path: Path, cases: Sequence[str]) -> str:
+        """The place of `path`, or of the nearest table around it; in the first of `cases` that changes it, if any."""
+        for override in reversed(self._overrides):
+            short = min(len(override.path), len(path))
+            if override.path[:short] == path[:short] and override.case in (None, *cases):
+                return f"--set {override.flag}"
+        stands, place = nearest(self._places, path)
+        for name in cases:
+            own, there = nearest(self._places, ("cases", name, *path))
+            if len(own) > 2:
+                stands, place = own, there
+                break
+        file = self._document.arenas.get(cases[0], self._document.arenas.get("")) if cases else None
+        if file is not None and path[:1] == ("arena",):
+            inside, within = nearest(file.places, path)
+            if len(inside) > len(stands) - 2 * (stands[:1] == ("cases",)):
+                line, column = line_column(file.text, within.value)
+                return f"{file.label}:{line}:{column}"
+        if not stands:
+            return str(self._document.path)
+        line, column = line_column(self._document.text, place.value)
+        return f"{self._document.path}:{line}:{column}"
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity."""
+    return value if np.isfinite(value) else None
+
+
+def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
+    ok = all(each.severity != "error" for each in found)
+    said = msgspec.to_builtins({"file": file, "ok": ok, "findings": found, "figures": numbers})
+    print(json.dumps(said, indent=2))
+
+
+def _print_table(given: Document, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
+    width = min(WIDEST, shutil.get_terminal_size((WIDEST, 24)).columns)
+    lines = [f"{given.path}: {given.experiment.title}", ""]
+    for each in found:
+        lines += textwrap.wrap(each.message, width, initial_indent=f"{MARK[each.severity]} ", subsequent_indent="  ")
+        if each.severity != "note":
+            remedy = f"{each.where}: {each.remedy}" if each.where else each.remedy
+            lines += textwrap.wrap(
+                remedy, width, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False
+            )
+    lines += ["", *_rows(numbers), ""]
+    count = {severity: sum(each.severity == severity for each in found) for severity in ORDER}
+    lines.append(f"{_counted(count['error'], 'error')}, {_counted(count['warning'], 'warning')}")
+    encoding = sys.stdout.encoding or "utf-8"  # a terminal may know neither ticks nor Greek
+    print("\n".join(lines).encode(encoding, "replace").decode(encoding))
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count or 'no'} {what}{'s' * (count != 1)}"
+
+
+def _rows(numbers: Mapping[str, Figures]) -> list[str]:
+    """One line for each figure; where the cases differ, each with its name."""
+    said = {name: _worded(each) for name, each in numbers.items()}
+    lines = []
+    for label in next(iter(said.values())):
+        values = {name: words[label] for name, words in said.items()}
+        same = len(set(values.values())) == 1
+        shown = next(iter(values.values())) if same else ", ".join(f"{name} {word}" for name, word in values.items())
+        lines.append(f"  {label:<36}{shown}")
+    return lines
+
+
+def _worded(of: Figures) -> dict[str, str]:
+    """Figures as they are printed."""
+
+    def number(value: float | None, form: str, unit: str = "") -> str:
+        return "-" if value is None else f"{value:{form}}{unit}"
+
+    return {
+        "robots": f"{of.robots}, leader: {', '.join(of.leaders) or 'none'}",
+        "arena": f"{' × '.join(f'{length:g}' for length in of.arena)} m",
+        "obstacles": listed([f"{name} ({what})" for name, what in of.obstacles.items()]) or "none",
+        "links": f"{of.links} one-way, {of.edges} pairs",
+        "algebraic connectivity": number(of.algebraic_connectivity, ".3f"),
+        "rigidity rank, heights held": f"{number(of.rank, 'd')} of {number(of.rank_needed, 'd')}",
+        "rigidity rank in space": f"{number(of.rank_space, 'd')} of {number(of.rank_space_needed, 'd')}",
+        "smallest rigidity eigenvalue": number(of.smallest_eigenvalue, ".2g", " m²"),
+        "single links it can lose": _spared(of.spare_links, len(of.vital_links)),
+        "single robots it can lose": _spared(of.spare_robots, len(of.vital_robots)),
+        "distances met to": number(of.residual_mm, ".1f", " mm"),
+        "loop gain h·μ·λ, hunts at 2": number(of.loop_gain, ".3g"),
+        "slowest mode": number(of.slowest_mode_s, ".1f", " s")
+        + (f", {of.free_modes} slower than the run: free" if of.free_modes else ""),
+        "speed of the fastest plan": number(of.speed_needed, ".3f", " m/s"),
+        "speed of the slowest follower": number(of.speed_available, ".3f", " m/s"),
+        "formation acquired after": number(of.acquired_s, ".1f", " s"),
+        "worst link at the end": number(of.end_error_mm, ".1f", " mm"),
+        "all end inside the arena": "yes" if of.end_inside else "no",
+        "poses sent, estimated": number(of.messages_hz, ".1f", " per second"),
+    }
+
+
+def _spared(spare: int | None, vital: int) -> str:
+    return "-" if spare is None else f"{spare} of {spare + vital}"
+
+
+@QUIET
+def _figures(analysis: Analysis) -> Figures:
+    experiment = analysis.experiment
+    shape, planar, spatial, loop = analysis.shape, analysis.planar, analysis.spatial, analysis.modes
+    spare = analysis.spare
+    assignment, prediction, limits = analysis.assignment, analysis.prediction, analysis.assignment.limits
+    end, fastest, follower = prediction.position[-1], analysis.fastest, analysis.follower
+    rate = message_rate(
+        assignment.trigger,
+        assignment.law,
+        assignment.links,
+        prediction,
+        [bodies.disturbance(experiment, name) for name in analysis.names],
+        kinds=assignment.kinds,
+        predictor=assignment.predictor,
+        hz=experiment.rates.pose_hz,
+        rng=np.random.default_rng(experiment.seed),
+    )
+    last = float(prediction.time[-1])
+    return Figures(
+        robots=len(analysis.names),
+        arena=experiment.arena.size,
+        obstacles={name: surroundings.described(obstacle) for name, obstacle in experiment.arena.obstacles.items()},
+        links=len(assignment.links),
+        edges=analysis.edges,
+        parts=analysis.parts,
+        leaders=analysis.leaders,
+        algebraic_connectivity=analysis.fiedler,
+        rank=planar.rank if planar else None,
+        rank_needed=planar.needed if planar else None,
+        rank_space=spatial.rank if spatial else None,
+        rank_space_needed=spatial.needed if spatial else None,
+        smallest_singular=planar.smallest if planar else None,
+        smallest_eigenvalue=planar.smallest**2 if planar else None,
+        spare_links=int(spare.pairs.sum()) if spare else None,
+        vital_links=tuple(analysis.pair(int(k)) for k in np.flatnonzero(~spare.pairs)) if spare else (),
+        spare_robots=int(spare.robots.sum()) if spare else None,
+        vital_robots=tuple(analysis.names[row] for row in np.flatnonzero(~spare.robots)) if spare else (),
+        residual_mm=_finite(1e3 * shape.worst) if shape else None,
+        loop_gain=_finite(loop.gain) if loop else None,
+        slowest_mode_s=_finite(loop.slowest_s) if loop else None,
+        free_modes=loop.free if loop else 0,
+        speed_needed=_finite(fastest[2].speed()) if fastest else None,
+        speed_available=None if follower is None else float(analysis.pull[follower]),
+        acquired_s=analysis.acquired(min(analysis.departure, last)) if shape else None,
+        end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape else None,
+        end={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(analysis.names, end, strict=True)},
+        end_inside=bool(((end >= limits.low - FORGIVEN) & (end <= limits.high + FORGIVEN)).all()),
+        messages_hz=rate,
+        predicted_s=last,
+    )

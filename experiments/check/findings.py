@@ -1,0 +1,44 @@
+"""A claim about an experiment: what its numbers mean to the user, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+from experiments.file.problems import Path
+
+Severity = Literal["error", "warning", "note"]
+
+SHOWN: Final = 5  # claims of one sort; the others are counted
+FORGIVEN: Final = 1e-6  # of rounding
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Something to say about a path of the experiment file."""
+
+    severity: Severity
+    code: str
+    message: str
+    remedy: str = ""
+    path: Path = ()
+
+
+def listed(words: Sequence[str], most: int = 4) -> str:
+    """Words with commas; the last of many are counted."""
+    more = len(words) - most
+    return ", ".join(words) if more <= 0 else f"{', '.join(words[:most])} and {more} more"
+
+
+def few(claims: Iterable[Claim]) -> list[Claim]:
+    """The first claims of each code; the last that is kept tells how many more there are."""
+    by_code: dict[str, list[Claim]] = {}
+    for claim in claims:
+        by_code.setdefault(claim.code, []).append(claim)
+    kept = []
+    for same in by_code.values():
+        kept += same[:SHOWN]
+        if len(same) > SHOWN:
+            kept[-1] = replace(kept[-1], message=f"{kept[-1].message}; and {len(same) - SHOWN} more like this")
+    return kept

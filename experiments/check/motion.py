@@ -1,0 +1,339 @@
+"""What the expected motion says: does the formation come together, in time, inside the arena, without collisions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Mask, norm
+from agents.decision.position_control import REACHED
+from agents.formation.graph import BY_DISTANCE
+from agents.plugins.planners import Planner
+from experiments.check.analysis import Analysis, link_errors
+from experiments.check.findings import FORGIVEN, Claim
+from experiments.check.ideal_run import approaches, isolated, repeat, repetitions, undisturbed
+from experiments.check.theory import FAR_OFF, OFF
+
+CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
+NEARLY: Final = 0.9  # of its speed: what is left is needed to catch up
+SOFT: Final = 3.0  # time constants of a mode, of whose error 5 % are left then, that are to fit into the run
+SETTLED: Final = 1e-3  # [m] slower than this per decision, robots have come to rest
+
+
+def starts(analysis: Analysis) -> Iterator[Claim]:
+    """Do the robots start inside the arena and clear of one another; flying ones too start on the floor."""
+    names, limits, start = analysis.names, analysis.assignment.limits, analysis.start[:, :2]
+    inside = np.minimum(start - limits.low[:2], limits.high[:2] - start).min(axis=1)
+    problems = []
+    for row in np.flatnonzero(inside < limits.margin - FORGIVEN):
+        message = (
+            f"{names[row]} starts {max(0.0, inside[row]):.2f} m from a wall, inside the margin of {limits.margin:g} m"
+        )
+        remedy = "start it farther inside, or reduce margin in [safety]"
+        problems.append(Claim("warning", "start-margin", message, remedy, ("robots", names[row], "start")))
+    radius = np.array([kind.radius for kind in analysis.assignment.kinds])
+    i, j = np.triu_indices(len(names), 1)
+    apart = norm(start[i] - start[j])
+    for k in np.flatnonzero(apart < radius[i] + radius[j] - FORGIVEN):
+        first, second, needed = names[i[k]], names[j[k]], radius[i[k]] + radius[j[k]]
+        message = f"{first} and {second} start {apart[k]:.2f} m apart, but need {needed:.2f} m to stand side by side"
+        remedy = "all start on the floor, flying ones too: move one of them"
+        problems.append(Claim("error", "start-overlap", message, remedy, ("robots", second, "start")))
+    yield from problems
+    if not problems:
+        yield Claim("note", "starts", "every robot starts inside the arena, clear of the others")
+
+
+def flight(analysis: Analysis) -> Iterator[Claim]:
+    """Does the undisturbed flight go through: does it begin, how much of it was flown, what was wrong on the way."""
+    experiment, prediction = analysis.experiment, analysis.prediction
+    if prediction.stuck:
+        message = f"the run does not begin, even undisturbed: {prediction.stuck}"
+        yield Claim("error", "not-begun", message, "see what its robots wait for", ("robots",))
+        return
+    end = float(prediction.time[-1])
+    if _cut(analysis):
+        message = f"flown for the first {end:g} s of {experiment.duration_s:g} s only"
+        yield Claim("note", "predicted-in-part", message, "", ("duration_s",))
+    for each in prediction.incidents:
+        name = analysis.names[each.row]
+        message = f"{name} at {each.time:.1f} s, though nothing disturbs it: {each.text}"
+        yield Claim("warning", "hazard", message, "see docs/safety.md for what this means", ("robots", name))
+
+
+def _cut(analysis: Analysis) -> bool:
+    """Whether only the beginning of the run was flown."""
+    experiment = analysis.experiment
+    return bool(analysis.prediction.time[-1] < experiment.duration_s - 1.0 / experiment.rates.coordination_hz)
+
+
+def formation(analysis: Analysis) -> Iterator[Claim]:
+    """Does the formation come together, and is it there at the end."""
+    experiment, prediction, shape = analysis.experiment, analysis.prediction, analysis.shape
+    last = analysis.error[-1]
+    if (
+        shape is None
+        or shape.worst > FAR_OFF
+        or prediction.stuck
+        or (_cut(analysis) and last.max() > experiment.tolerance)
+    ):
+        return
+    end, worst = float(prediction.time[-1]), int(last.argmax())
+    left = f"{analysis.link(worst)} is {1e3 * last[worst]:.0f} mm off after {end:g} s"
+    allowed = f"(tolerance {1e3 * experiment.tolerance:g} mm)"
+    if last[worst] <= experiment.tolerance:
+        departure = min(analysis.departure, end)
+        formed = analysis.acquired(departure)
+        if formed is not None:
+            yield Claim("note", "acquired", f"the formation is acquired after {formed:.1f} s; at the end {left}")
+            return
+        at = int(np.searchsorted(prediction.time, departure + 1e-9)) - 1
+        then = analysis.error[at]
+        early = f"{analysis.link(int(then.argmax()))} is still {1e3 * then.max():.0f} mm off {allowed}"
+        if (stopped := _stopped(analysis, at, early)) is not None:
+            yield stopped
+            return
+        changes = any(each.at == departure for each in analysis.pattern.changes)
+        what, path = ("shape changes", ("formation", "changes")) if changes else ("plans begin", ("timeline",))
+        message = f"the formation is not acquired when the {what} at {departure:g} s: {early}"
+        remedy = "begin later, start nearer to the shape, or raise the gain"
+        yield Claim("warning", "acquired-late", message, remedy, path)
+    elif (stopped := _stopped(analysis, -1, f"{left} {allowed}")) is not None:
+        yield stopped
+    elif analysis.shapes[0].worst > OFF:
+        message = f"from these starts the robots end in another shape, a local minimum: {left} {allowed}"
+        remedy = "start them nearer to the shape, in the order in which they stand in it"
+        yield Claim("warning", "local-minimum", message, remedy, ("formation", "links"))
+    elif (
+        len(prediction.time) > 1
+        and np.ptp(prediction.position[-2:, analysis.silent], axis=0).max(initial=0.0) > SETTLED
+    ):
+        message = f"the formation lags behind its leader: {left} {allowed}"
+        yield Claim("warning", "lags", message, "lead more slowly, or raise the gain or the clamp", ("timeline",))
+    else:
+        message = f"the formation is not acquired in time: {left} {allowed}"
+        remedy = "give a longer duration_s, start nearer to the shape, or raise the gain"
+        yield Claim("warning", "not-acquired", message, remedy, ("duration_s",))
+
+
+def softness(analysis: Analysis) -> Iterator[Claim]:
+    """Does a soft formation that is acquired without noise stay so with the noise of its file."""
+    experiment, loop, shape = analysis.experiment, analysis.modes, analysis.shape
+    bare, end = isolated(experiment), float(analysis.prediction.time[-1])
+    if (
+        loop is None
+        or not (loop.free or SOFT * loop.slowest_s > experiment.duration_s)
+        or shape is None
+        or shape.worst > FAR_OFF
+        or analysis.prediction.stuck
+        or bare == undisturbed(experiment)
+    ):
+        return
+    spans = []
+    for until in dict.fromkeys((min(analysis.departure, end), end)):
+        formed = analysis.acquired(until)
+        if formed is None:
+            return
+        spans.append((formed, until))
+    count = repetitions(bare)
+    lost, worst, said = 0, experiment.tolerance + FORGIVEN, ""
+    for flight in repeat(bare, count):
+        if flight.stuck:
+            continue
+        error, time = link_errors(analysis.assignment.law, analysis.pattern, flight), flight.time
+        due = np.any([(time > (formed + until) / 2.0) & (time <= until + 1e-9) for formed, until in spans], axis=0)
+        off = replace(analysis, prediction=flight, error=error).mean_error[due]
+        largest = float(off.max(initial=0.0))
+        lost += largest > experiment.tolerance + FORGIVEN
+        if largest > worst:
+            worst = largest
+            at, link = np.unravel_index(off.argmax(), off.shape)
+            said = f"{analysis.link(int(link))} is {1e3 * worst:.0f} mm off at {time[due][at]:.1f} s"
+    if lost < min(2, count):  # one of five may be chance: of such experiments one in four was lost with other seeds
+        return
+    free = f"{loop.free} mode{'s' * (loop.free > 1)} slower than the run"
+    modes = free if loop.free else f"slowest mode {loop.slowest_s:.1f} s"
+    seeds = f"seed {experiment.seed}" if count == 1 else f"seeds {experiment.seed} to {experiment.seed + count - 1}"
+    message = (
+        f"soft formation, {modes}: acquired after {spans[0][0]:.1f} s without noise, but with the noise of "
+        f"[disturbance] outside the tolerance of {1e3 * experiment.tolerance:g} mm later, in {lost} of {count} flights "
+        f"({seeds}): {said}"
+    )
+    remedy = "raise the gain, add links that stiffen the formation, or allow a larger tolerance"
+    yield Claim("warning", "soft", message, remedy, ("formation", "links"))
+
+
+def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:
+    """That robots on wheels which stand at sample `at` keep the formation from being acquired."""
+    experiment, links = analysis.experiment, analysis.pattern.links
+    off = np.flatnonzero(analysis.error[at] > experiment.tolerance)
+    ends = np.union1d(links.listener[off], links.speaker[off])
+    stopped = np.intersect1d(analysis.stopped(at), ends)
+    if not len(stopped) or np.setdiff1d(ends, np.union1d(stopped, analysis.silent)).size:
+        return None
+    near = f"{1e3 * REACHED:g} mm"
+    message = (
+        f"the formation is not acquired, because robots on wheels stop {near} before their goals: links may stay "
+        f"e = {near}/(μ d²) off; {left}"
+    )
+    name = "gain" if links.wants is None or (links.wants[off] == BY_DISTANCE).any() else "stiffness"
+    enough = 1.1 * getattr(experiment.formation, name) * float(analysis.error[at].max()) / experiment.tolerance
+    remedy = f"raise {name} to {enough:.2g} or more, or allow a larger tolerance"
+    return Claim("warning", "wheels-stop", message, remedy, ("formation", name))
+
+
+def walls(analysis: Analysis) -> Iterator[Claim]:
+    """Does anybody leave the arena, or come so near to a wall that it is held back."""
+    names, limits, track = analysis.names, analysis.assignment.limits, analysis.prediction.position
+    beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
+    outside = beyond.max(axis=2) > FORGIVEN
+    tight = beyond[..., :2].max(axis=2) > FORGIVEN - limits.margin
+    tight &= ~tight[0]  # who starts there has been told
+    problems = [_left(analysis, int(row), outside[:, row]) for row in np.flatnonzero(outside.any(axis=0))]
+    for row in np.flatnonzero(tight.any(axis=0) & ~outside.any(axis=0)):
+        time, place = _first(analysis, int(row), tight[:, row])
+        message = f"{names[row]} comes within the margin of {limits.margin:g} m of a wall at {time:.1f} s, at {place}"
+        remedy = "it will be held back there: enlarge size in [arena], or lead the formation away from the wall"
+        problems.append(Claim("warning", "near-wall", message, remedy, ("arena", "size")))
+    yield from problems
+    if not problems:
+        yield Claim("note", "inside", "the expected paths stay inside the arena")
+
+
+def encounters(analysis: Analysis) -> Iterator[Claim]:
+    """Does anybody hit another robot, or land on one; those too near at the start are not told again."""
+    names, kinds, start = analysis.names, analysis.assignment.kinds, analysis.start
+    radius = np.array([kind.radius for kind in kinds])
+    near = [
+        each
+        for each in approaches(analysis.prediction, kinds, CLEARANCE)
+        if norm(start[each.first] - start[each.second]) >= radius[each.first] + radius[each.second] - FORGIVEN
+    ]
+    near.sort(key=lambda each: each.distance)
+    for each in near:
+        first, second = names[each.first], names[each.second]
+        touch = radius[each.first] + radius[each.second]
+        message = (
+            f"{first} and {second} come within {each.distance:.2f} m at {each.time:.1f} s; they touch at {touch:.2f} m"
+        )
+        path = ("robots", second, "start")
+        robots = analysis.experiment.robots
+        if analysis.experiment.avoidance is None or not (robots[first].avoids or robots[second].avoids):
+            yield Claim("warning", "too-close", message, "move the start of one of them", path)
+        else:
+            yield Claim("note", "avoidance-acts", f"{message}: avoidance will have to act", "", path)
+    if _cut(analysis) or analysis.prediction.stuck:
+        return
+    final, links = analysis.prediction.position[-1], analysis.assignment.links
+    for row in np.flatnonzero([kind.flies for kind in kinds]):
+        below = (final[:, 2] < final[row, 2] - FORGIVEN) & (norm(final[:, :2] - final[row, :2]) < radius + radius[row])
+        for under in np.flatnonzero(below):
+            targets = ("formation", "links")
+            if ((links.listener == row) & (links.speaker == under)).any():
+                message = f"{names[row]} ends above {names[under]}, and goes aside before it lands"
+                yield Claim("note", "lands-beside", message, "", targets)
+                continue
+            message = f"{names[row]} ends above {names[under]}, which it does not hear, and would land on it"
+            remedy = "change their distances, link them, or end the timeline elsewhere"
+            yield Claim("warning", "lands-on", message, remedy, targets)
+
+
+def _first(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
+    """When a row is first there, and its place then in words."""
+    at = int(where.argmax())
+    x, y, _ = analysis.prediction.position[at, row]
+    return float(analysis.prediction.time[at]), f"({x:.2f}, {y:.2f})"
+
+
+def _left(analysis: Analysis, row: int, outside: Mask) -> Claim:
+    name = analysis.names[row]
+    time, place = _first(analysis, row, outside)
+    begun = [k for k, robot, _ in analysis.legs if robot == name and analysis.experiment.timeline[k].at_s <= time]
+    message = f"{name} would leave the arena at {time:.1f} s, at {place}"
+    if row in analysis.silent and begun:
+        remedy = "shorten the plan, start it elsewhere, or enlarge size in [arena]"
+        return Claim("error", "leaves-arena", f"{message}, by its plan", remedy, ("timeline", begun[-1], "plan"))
+    remedy = "start the formation farther inside, lead it elsewhere, or enlarge size in [arena]"
+    return Claim("error", "leaves-arena", message, remedy, ("robots", name, "start"))
+
+
+def speeds(analysis: Analysis) -> Iterator[Claim]:
+    """Do plans ask for more speed than the robots have."""
+    names, timeline, problems = analysis.names, analysis.experiment.timeline, []
+    for number, robot, plan in analysis.legs:
+        row, asked, path = names.index(robot), plan.speed(), ("timeline", number, "plan")
+        leads = row in analysis.silent
+        has = float((analysis.speed if leads else analysis.pull)[row])
+        what = f"the leg at {timeline[number].at_s:g} s asks {robot} for {asked:.3g} m/s"
+        remedy = f"plan for less than {NEARLY * has:.2g} m/s"
+        if leads and asked > has * (1.0 + 1e-9):
+            problems.append(Claim("error", "leader-too-fast", f"{what}; it has {has:.3g} m/s", remedy, path))
+        elif asked > NEARLY * has:
+            message = f"{what} of the {has:.3g} m/s at which it can follow a plan: it cannot catch up"
+            problems.append(Claim("warning", "leader-near-limit", message, remedy, path))
+    fastest = analysis.fastest
+    if fastest is not None and analysis.follower is not None:
+        number, robot, plan = fastest
+        has, asked = float(analysis.pull[analysis.follower]), plan.speed()
+        if has < asked:
+            rates = f"follows at {has:.2g} m/s at most, {robot} leads at {asked:.2g} m/s"
+            message = f"{names[analysis.follower]} {rates}: it lags, and catches up afterwards"
+            clamp = math.ceil(110.0 * analysis.assignment.clamp * asked / has) / 100.0
+            slow = asked > analysis.speed[analysis.follower]
+            remedy = "lead more slowly" if slow else f"lead more slowly, or raise clamp in [formation] to {clamp:g}"
+            problems.append(Claim("warning", "followers-lag", message, remedy, ("timeline", number, "plan")))
+    yield from problems
+    if not problems and fastest is not None:
+        asked = fastest[2].speed()
+        yield Claim("note", "speeds", f"no plan asks for more than the robots have ({asked:.2g} m/s at most)")
+
+
+def rates(analysis: Analysis) -> Iterator[Claim]:
+    """Can the trigger be asked as often as it wants, and do decisions see news."""
+    rates, trigger = analysis.experiment.rates, analysis.assignment.trigger
+    asked = 1.0 / rates.pose_hz
+    for field in ("period_s", "maximum_silence_s"):
+        period = getattr(trigger, field, None)
+        if period is None:
+            continue
+        times, path = period / asked, ("trigger", field)
+        message = f"the trigger wants to speak every {period:g} s, but is asked every {asked:g} s"
+        if times < 1.0 - FORGIVEN:
+            remedy = f"raise pose_hz in [rates] to {1.0 / period:g}, or {field} to {asked:g}"
+            yield Claim("warning", "trigger-too-fast", message, remedy, path)
+        elif field == "period_s" and abs(times - round(times)) > FORGIVEN * times:
+            message += f": it speaks every {math.ceil(times) * asked:g} s"
+            yield Claim("warning", "trigger-uneven", message, f"use a multiple of {asked:g}", path)
+    if rates.pose_hz < rates.coordination_hz:
+        message = f"decisions at {rates.coordination_hz:g} Hz see poses that come at {rates.pose_hz:g} Hz at most"
+        remedy = "raise pose_hz, or lower coordination_hz"
+        yield Claim("warning", "decides-unheard", message, remedy, ("rates", "pose_hz"))
+
+
+def ends(analysis: Analysis) -> Iterator[Claim]:
+    """Is the last leg of each robot over before the run is."""
+    timeline, duration = analysis.experiment.timeline, analysis.experiment.duration_s
+    last = {robot: (number, plan) for number, robot, plan in analysis.legs}
+    for robot, (number, plan) in last.items():
+        at, row = timeline[number].at_s, analysis.names.index(robot)
+        when = min(round(at * analysis.experiment.rates.coordination_hz), len(analysis.prediction.time) - 1)
+        lasts = _lasts(plan, analysis.prediction.position[when, row], analysis.experiment.robots[robot].start)
+        if lasts is not None and at + lasts > duration * (1.0 + 1e-9) + 0.1:
+            message = f"the leg of {robot} at {at:g} s lasts {lasts:.3g} s, but the run ends at {duration:g} s"
+            remedy = f"give a duration_s of {math.ceil(at + lasts):g} or more, or a faster or shorter plan"
+            yield Claim("warning", "leg-cut", message, remedy, ("timeline", number, "plan"))
+
+
+def _lasts(plan: Planner, anchor: Array, start: Sequence[float]) -> float | None:
+    """How long a plan moves its robot [s], to within 1 %; None if for ever."""
+    elapsed = np.geomspace(0.01, 1e6, 2000)
+    heading = np.full(len(elapsed), start[2] if len(start) > 2 else 0.0)
+    target, _ = plan.target(elapsed, np.tile(anchor, (len(elapsed), 1)), heading)
+    away = np.flatnonzero(norm(target - target[-1]) > OFF)
+    if not len(away):
+        return 0.0
+    return float(elapsed[away[-1] + 1]) if away[-1] < len(elapsed) - 50 else None

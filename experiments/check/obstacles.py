@@ -1,0 +1,171 @@
+"""What stands in the arena: does it get in anybody's way, and can robots know of it, touch it and push it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask
+from agents.plugins import registry
+from agents.plugins.avoidance import Avoidance
+from experiments.check.analysis import Analysis
+from experiments.check.findings import FORGIVEN, Claim, listed
+from experiments.definition.bodies import WORLD
+from experiments.definition.experiment import Robot
+from twins import scene as outlines
+from twins.scene import Obstacle
+from twins.sensing.range_sensors import OF_KIND
+
+TWINS: Final = ("twin", WORLD)  # bodies that are simulated without the wire of a real one
+AVOID: Final = 'or let robots avoid it: [avoidance] with kind = "barrier"'
+
+
+def described(obstacle: Obstacle) -> str:
+    """What an obstacle is, in a few words."""
+    if obstacle.box is not None:
+        what = f"box {obstacle.box[0]:g} × {obstacle.box[1]:g} m"
+    else:
+        what = "wall" if obstacle.radius is None else f"cylinder of radius {obstacle.radius:g} m"
+    above = f", {obstacle.bottom:g} m above the floor" if obstacle.bottom else ""
+    return what + above + (f", {obstacle.mass:g} kg" if obstacle.mass else "") + (", moves" if obstacle.plan else "")
+
+
+def obstacles(analysis: Analysis) -> Iterator[Claim]:
+    """Does anybody drive or fly into an obstacle, as far as avoidance does not prevent it."""
+    scene, prediction = analysis.scene, analysis.prediction
+    if not scene.names:
+        return
+    radius = np.array([kind.radius for kind in analysis.assignment.kinds])
+    low, high = _heights(analysis, prediction.position[..., 2])
+    poses = scene.along(prediction.time)
+    avoids = _avoids(analysis)
+    met = []
+    for number in range(len(scene.names)):
+        gap = outlines.distance(scene, number, poses[:, None, number], prediction.position[..., :2]) - radius
+        near = (gap < -FORGIVEN) & outlines.at_height(scene, number, low, high)
+        for keeps in (True, False):
+            rows = np.flatnonzero(near.any(axis=0) & (avoids == keeps))
+            if len(rows):
+                met.append(_met(analysis, number, rows, near[:, rows], keeps=keeps))
+    yield from met
+    if not met:
+        yield Claim("note", "obstacles", "the expected paths keep clear of all obstacles")
+    for number, (name, plan) in enumerate(zip(scene.names, scene.plans, strict=True)):
+        beyond = np.maximum(poses[:, number, :2] - scene.high[:2], scene.low[:2] - poses[:, number, :2]).max(axis=1)
+        if plan is not None and beyond.max() > FORGIVEN:
+            when = prediction.time[(beyond > FORGIVEN).argmax()]
+            message = f"the middle of '{name}' leaves the arena at {when:.1f} s"
+            remedy = "shorten its plan, or start it elsewhere"
+            yield Claim("warning", "obstacle-leaves", message, remedy, ("arena", "obstacles", name, "plan"))
+
+
+def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: bool) -> Claim:
+    """That `rows` (K,) are where an obstacle is, at the times `near` (T, K); they `keep` clear of it or not."""
+    scene, prediction, names = analysis.scene, analysis.prediction, analysis.names
+    name, path = scene.names[number], ("arena", "obstacles", scene.names[number])
+    which = int(near.argmax(axis=0).argmin())
+    first, at = int(rows[which]), int(near[:, which].argmax())
+    x, y = prediction.position[at, first, :2]
+    who = listed([names[row] for row in rows])
+    when = f"at {prediction.time[at]:.1f} s, around ({x:.2f}, {y:.2f})"
+    when = f", {names[first]} first {when}" if len(rows) > 1 else f" {when}"
+    if keeps:
+        message = f"the path of {who} crosses '{name}'{when}: avoidance will have to act"
+        return Claim("note", "avoidance-acts", message, "", path)
+    if np.isfinite(scene.mass[number]):
+        return Claim("note", "pushes", f"{who} would push '{name}'{when}", "", path)
+    remedy = f"lead the formation around it, {AVOID}"
+    return Claim("warning", "hits-obstacle", f"{who} would run into '{name}'{when}", remedy, path)
+
+
+def contacts(analysis: Analysis) -> Iterator[Claim]:
+    """Does the engine know of the contacts that the arena is made for."""
+    experiment, scene = analysis.experiment, analysis.scene
+    kind, _ = registry.split(experiment.world.engine)
+    touching = getattr(registry.struct(registry.ENGINES, kind), "contacts", True)
+    for name, obstacle in experiment.arena.obstacles.items():
+        if obstacle.mass is not None and not touching:
+            message = f"'{name}' has a mass, but in the engine '{kind}' nothing is pushed: it stands fast"
+            remedy = 'choose another: engine = "pymunk" in [world], or leave mass out'
+            yield Claim("warning", "not-pushed", message, remedy, ("arena", "obstacles", name, "mass"))
+    if touching and scene.walled:
+        start = analysis.start[:, :2]
+        gap = np.minimum(start - scene.low[:2], scene.high[:2] - start).min(axis=1)
+        for row in np.flatnonzero(gap < [kind.radius - FORGIVEN for kind in analysis.assignment.kinds]):
+            name, needed = analysis.names[row], analysis.assignment.kinds[row].radius
+            message = f"{name} starts in a wall of the arena: {max(gap[row], 0.0):.2f} m off, but needs {needed:.2f} m"
+            remedy = "start it farther inside, or leave the walls out: walls = false in [arena]"
+            yield Claim("error", "start-overlap", message, remedy, ("robots", name, "start"))
+
+
+def perception(analysis: Analysis) -> Iterator[Claim]:
+    """Can robots that shall avoid know of what is around them."""
+    experiment, scene = analysis.experiment, analysis.scene
+    if experiment.avoidance is None:
+        return
+    avoidance: Avoidance = registry.build(registry.AVOIDANCES, experiment.avoidance)
+    deaf = set() if avoidance.hears == "all" else {analysis.names[row] for row in analysis.silent}
+    height = np.nan_to_num(analysis.assignment.hover)
+    low, high = _heights(analysis, height)
+    for row, name in enumerate(analysis.names):
+        if _eyes(experiment.robots[name]) or not experiment.robots[name].avoids:
+            continue
+        seen = [k for k in range(len(scene.names)) if outlines.at_height(scene, k, low[row], high[row])]
+        there = [f"'{scene.names[k]}'" for k in seen]
+        flies = analysis.assignment.kinds[row].flies
+        remedy = f'give it some: sensors = ["{"multiranger" if flies else "lds01"}"] in [robots.{name}]'
+        if there:
+            message = f"{name} has no range sensors: it cannot avoid {listed(there)}"
+            yield Claim("warning", "sees-nothing", message, remedy, ("robots", name))
+        elif name in deaf:
+            message = f"{name} hears nobody and has no range sensors: it avoids nothing"
+            remedy += ', or hears = "all" in [avoidance]'
+            yield Claim("warning", "sees-nothing", message, remedy, ("robots", name))
+
+
+def reality(analysis: Analysis) -> Iterator[Claim]:
+    """Do worlds, mirrors and shadows make sense for the bodies of the robots."""
+    experiment, robots = analysis.experiment, analysis.experiment.robots
+    peopled = any(robot.body == WORLD for robot in robots.values())
+    bare = not (peopled or experiment.arena.obstacles or experiment.arena.walls)
+    for name, robot in robots.items():
+        if robot.ranges == "world" and robot.body == WORLD:
+            message = f'{name} lives in the world, whose range sensors are its own: ranges = "world" adds nothing'
+            yield Claim("warning", "ranges-twice", message, "leave ranges out", ("robots", name, "ranges"))
+        elif robot.ranges == "world" and not _eyes(robot):
+            message = f"{name} has no range sensors that the world could serve"
+            remedy = 'say which: sensors = ["multiranger"], or leave ranges out'
+            yield Claim("warning", "ranges-of-nothing", message, remedy, ("robots", name, "ranges"))
+        elif robot.ranges == "world" and bare:
+            message = f"{name} takes its ranges from a world in which nothing stands and nobody lives"
+            remedy = 'add [arena.obstacles], a robot with body = "world", or leave ranges out'
+            yield Claim("warning", "ranges-of-nothing", message, remedy, ("robots", name, "ranges"))
+        if robot.shadow is not None and robot.body in TWINS:
+            message = f"{name} is a twin, so its shadow only compares one twin with another"
+            yield Claim("warning", "shadow-of-twin", message, "leave shadow out", ("robots", name, "shadow"))
+    alone = [name for name, robot in robots.items() if robot.body == "twin" and robot.ranges != "world"]
+    if alone and (experiment.arena.obstacles or experiment.avoidance is not None):
+        who = f"{listed(alone)} {'is' if len(alone) == 1 else 'are'}"
+        message = f'in real time {who} in no common place and without range sensors, unless body = "world"'
+        yield Claim("note", "alone", message, "", ("robots", alone[0]))
+
+
+def _avoids(analysis: Analysis) -> Mask:
+    """(N,) which rows keep clear of anything."""
+    robots = analysis.experiment.robots.values()
+    return np.array([robot.avoids for robot in robots]) & (analysis.experiment.avoidance is not None)
+
+
+def _eyes(robot: Robot) -> tuple[str, ...]:
+    """Its range sensors."""
+    return OF_KIND.get(robot.kind, ()) if robot.sensors is None else tuple(robot.sensors)
+
+
+def _heights(analysis: Analysis, z: Array) -> tuple[Array, Array]:
+    """Lower and upper end (..., N) of robots whose position is at `z` (..., N) [m]."""
+    kinds = analysis.assignment.kinds
+    height = np.array([kind.height for kind in kinds])
+    low = np.where([kind.flies for kind in kinds], z - 0.5 * height, 0.0)
+    return low, low + height

@@ -1,0 +1,408 @@
+"""Can a formation exist, and does it hold its shape: the numbers, without any motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask, norm
+from agents.formation.anchors import Anchors
+from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, edges
+from agents.formation.rigidity import Redundancy, Rigidity, redundancy, rigidity
+from agents.plugins.laws import Law, Mixed
+
+TAKES: Final = {"distance": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
+TINY: Final = 1e-18  # [m²] no length is zero
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Equations (M) of links and anchors.
+
+    Attributes:
+        value: (M,) how far each is off [m].
+        tail: (M,) row i.
+        head: (M,) row j, −1 for anchors.
+        slope: (M, 2) derivative of the value by x and y of row i; that by row j is its negative.
+    """
+
+    value: Array
+    tail: Index
+    head: Index
+    slope: Array
+
+    def jacobian(self, rows: Index, count: int) -> Array:
+        """Derivatives (M, 2 R) of all values by x and y of `rows` (R,), of `count` robots."""
+        column = np.full(count + 1, -1)  # the last stands for what is no robot
+        column[rows] = np.arange(len(rows))
+        number, slopes = np.arange(len(self.value)), np.zeros((len(self.value), len(rows), 2))
+        for end, sign in ((self.tail, 1.0), (self.head, -1.0)):
+            at = column[end]
+            moves = at >= 0
+            slopes[number[moves], at[moves]] = sign * self.slope[moves]
+        return slopes.reshape(len(self.value), -1)
+
+    def normal(self, rows: Index, count: int) -> tuple[Array, Array]:
+        """JᵀJ (2 R, 2 R) and Jᵀ value (2 R,) of the `jacobian` J, which need not be made for it: it is nearly empty."""
+        column = np.full(count + 1, -1)
+        column[rows] = np.arange(len(rows))
+        square = np.zeros((len(rows), len(rows), 2, 2))
+        slope = np.zeros((len(rows), 2))
+        outer = self.slope[:, :, None] * self.slope[:, None, :]
+        ends = ((column[self.tail], 1.0), (column[self.head], -1.0))
+        for one, sign in ends:
+            moves = one >= 0
+            np.add.at(slope, one[moves], sign * (self.value[:, None] * self.slope)[moves])
+            for other, against in ends:
+                both = moves & (other >= 0)
+                np.add.at(square, (one[both], other[both]), sign * against * outer[both])
+        size = 2 * len(rows)
+        return square.transpose(0, 2, 1, 3).reshape(size, size), slope.ravel()
+
+
+def as_taken(law: Law, links: Links) -> Links:
+    """The links with what the law takes them to ask for: `distance` sees a distance in a relative position as well."""
+    wants = TAKES.get(getattr(law, "NEEDS", "any"))
+    if wants is None or links.wants is None:
+        return links
+    return replace(links, wants=None if wants == BY_DISTANCE else np.full(len(links), wants))
+
+
+def residuals(links: Links, anchors: Anchors | None, position: Array) -> Residuals:
+    """The equations at `position` (N, 3) [m]; of links as `as_taken` gives them."""
+    apart = position[links.listener] - position[links.speaker]
+    wants = np.full(len(links), BY_DISTANCE) if links.wants is None else links.wants
+    parts = [_of_lengths(apart, links, np.flatnonzero(wants == BY_DISTANCE))]
+    if links.wants is not None and links.relative is not None and links.bearing is not None:
+        at = np.flatnonzero(wants == BY_RELATIVE)
+        parts.append(
+            _of_vectors(apart[at] - links.relative[at], np.broadcast_to(np.eye(3), (len(at), 3, 3)), links, at)
+        )
+        at = np.flatnonzero(wants == BY_BEARING)
+        parts.append(_of_vectors(*_beside(apart[at], links.bearing[at]), links, at))
+    if anchors is not None:
+        parts.append(_of_anchors(anchors, position))
+    columns = zip(*((each.value, each.tail, each.head, each.slope) for each in parts), strict=True)
+    return Residuals(*(np.concatenate(column) for column in columns))
+
+
+def _of_lengths(apart: Array, links: Links, at: Index) -> Residuals:
+    length = np.sqrt(np.einsum("ek,ek->e", apart[at], apart[at]) + TINY)
+    return Residuals(
+        length - links.distance[at], links.listener[at], links.speaker[at], apart[at, :2] / length[:, None]
+    )
+
+
+def _of_vectors(value: Array, slope: Array, links: Links, at: Index) -> Residuals:
+    """Three equations of each link: its vector (K, 3) and the derivative of that (K, 3, 3)."""
+    return Residuals(
+        value.reshape(-1), np.repeat(links.listener[at], 3), np.repeat(links.speaker[at], 3),
+        slope[:, :, :2].reshape(-1, 2),
+    )  # fmt: skip
+
+
+def _beside(apart: Array, bearing: Array) -> tuple[Array, Array]:
+    """From the ray along each bearing to x, as the law `bearing` sees it, and its derivative."""
+    flat = np.isnan(bearing[:, 2])
+    bearing, apart = bearing.copy(), apart.copy()
+    bearing[flat, 2] = apart[flat, 2] = 0.0
+    along = np.vecdot(apart, bearing)
+    ahead = (along > 0.0)[:, None, None]
+    value = apart - np.maximum(along, 0.0)[:, None] * bearing
+    return value, np.eye(3) - np.where(ahead, bearing[:, :, None] * bearing[:, None, :], 0.0)
+
+
+def _of_anchors(anchors: Anchors, position: Array) -> Residuals:
+    away = anchors.away(position)
+    matrix = anchors.whole[:, None, None] * np.eye(3) + anchors.along[:, None, None] * (
+        anchors.axis[:, :, None] * anchors.axis[:, None, :]
+    )
+    ring = np.flatnonzero(anchors.distance > 0.0)
+    length = np.sqrt(norm(away[ring]) ** 2 + TINY)
+    direction = np.einsum("ak,akl->al", away[ring] / length[:, None], matrix[ring])[:, :2]
+    on = np.flatnonzero(anchors.distance == 0.0)
+    tail = np.concatenate([anchors.row[ring], np.repeat(anchors.row[on], 3)])
+    return Residuals(
+        np.concatenate([length - anchors.distance[ring], away[on].reshape(-1)]),
+        tail,
+        np.full(len(tail), -1),
+        np.concatenate([direction, matrix[on][:, :, :2].reshape(-1, 2)]),
+    )
+
+
+EXACT = 1e-9  # [m] link errors below this are arithmetic
+ENOUGH = 3e-4  # [m] distances written with four decimals are met as well as can be; a better shape is not sought
+SLOWLY = 1e-2  # of what is left: improvements of an error that is small already are not worth their time
+ROUNDED = 1e-3  # [m] distances written with three decimals contradict one another by less
+POINT = 1e-6  # [m] robots that are nearer than this to each other stand in one point, which nothing turns
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A place for every robot that meets the distances as well as they can be met.
+
+    Attributes:
+        position: (N, 3) [m].
+        error: (E,) of each link as its law measures it, |‖p_i − p_j‖ − d_ij| for distances [m].
+        anchored: (A,) of each anchor [m].
+    """
+
+    position: Array
+    error: Array
+    anchored: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def worst(self) -> float:
+        """The largest error of a link or an anchor [m]."""
+        return max(float(self.error.max(initial=0.0)), float(self.anchored.max(initial=0.0)))
+
+
+def link_errors(links: Links, position: Array) -> Array:
+    """|‖p_i − p_j‖ − d_ij| (..., E) [m] of positions (..., N, 3)."""
+    offset = position[..., links.listener, :] - position[..., links.speaker, :]
+    return np.asarray(np.abs(norm(offset) - links.distance))
+
+
+def realise(links: Links, guesses: Iterable[Array], moves: Mask, anchors: Anchors | None = None) -> list[Shape]:
+    """Places where links and anchors have what they ask for, one for each guess, until one is good.
+
+    Args:
+        links: With what they ask for, see `residuals.as_taken`.
+        guesses: (N, 3) each [m]; heights are held where they are.
+        moves: (N,) rows that may be placed elsewhere in the plane.
+        anchors: Distances to what stands still.
+
+    Returns:
+        The shapes that were found, in the order of the guesses; only the last one may be good.
+    """
+    found = []
+    for guess in guesses:
+        position = _fitted(links, anchors, guess, np.flatnonzero(moves))
+        error = Mixed().error(position, position[links.speaker], links)
+        found.append(Shape(position, error, np.zeros(0) if anchors is None else anchors.error(position)))
+        if found[-1].worst < ENOUGH:
+            break
+    return found
+
+
+def unfolded(links: Links, height: Array) -> Array:
+    """A first guess (N, 3) [m] at the shape: the two main axes of the distances through the network.
+
+    Torgerson's scaling, with shortest ways through the network for the distances that no link gives; robots in
+    different parts of it are put as far apart as the longest way.
+    """
+    rows = len(height)
+    way = np.full((rows, rows), np.inf)
+    rise = height[links.listener] - height[links.speaker]
+    far = np.sqrt(np.maximum(links.distance**2 - rise**2, 0.0))
+    way[links.listener, links.speaker] = np.where(np.isnan(far), 1.0, far)  # any length suits a direction
+    way = np.minimum(way, way.T)
+    np.fill_diagonal(way, 0.0)
+    for over in range(rows):
+        way = np.minimum(way, way[:, over, None] + way[None, over, :])
+    way[~np.isfinite(way)] = way[np.isfinite(way)].max()
+    way = np.minimum(way, 1e6)  # its square must be a number
+    centring = np.eye(rows) - 1.0 / rows
+    values, axes = np.linalg.eigh(-0.5 * centring @ way**2 @ centring)
+    plane = axes[:, -2:] * np.sqrt(np.maximum(values[-2:], 0.0))
+    return np.column_stack([np.zeros((rows, 2 - plane.shape[1])), plane, height])
+
+
+def _fitted(links: Links, anchors: Anchors | None, guess: Array, rows: Index) -> Array:
+    """Least squares of the residuals over x and y of `rows`, by Levenberg's and Marquardt's method."""
+    position, damping = guess.copy(), 1e-3
+    now = residuals(links, anchors, position)
+    for _ in range(200):
+        normal, slope = now.normal(rows, len(guess))
+        step = np.linalg.solve(normal + damping * np.eye(len(slope)), -slope).reshape(-1, 2)
+        tried = position.copy()
+        tried[rows, :2] += step
+        then = residuals(links, anchors, tried)
+        before, after = float(now.value @ now.value), float(then.value @ then.value)
+        if after < before:
+            position, damping, now = tried, max(damping / 10.0, 1e-10), then
+        else:
+            damping *= 10.0
+        small = float(np.abs(now.value).max(initial=0.0)) < ENOUGH
+        least = SLOWLY * before if small else 1e-9 * before
+        if damping > 1e9 or before < (EXACT / 100) ** 2 or 0.0 <= before - after < least:
+            break
+    return position
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """Distances that contradict one another whatever the rest of the formation does.
+
+    Attributes:
+        rows: Two robots whose heights alone are farther apart than they should be, or the three of a triangle.
+        ceiling: Height of the higher ones at which they would just be met [m]; NaN where no height would do.
+        high: The rows of the higher ones.
+    """
+
+    rows: tuple[int, ...]
+    ceiling: float
+    high: tuple[int, ...]
+
+
+def conflicts(links: Links, height: Array) -> list[Conflict]:
+    """Pairs and triangles of linked robots that cannot be met with the held heights (N,) [m]."""
+    rows = len(height)
+    wanted = np.full((rows, rows), np.nan)
+    wanted[links.listener, links.speaker] = links.distance
+    wanted = np.where(np.isnan(wanted), wanted.T, wanted)
+    rise = np.abs(height[:, None] - height[None, :])
+    found = []
+    for i, j in np.argwhere(np.triu(wanted < rise - ROUNDED)):
+        high = int(i if height[i] > height[j] else j)
+        found.append(Conflict((int(i), int(j)), float(wanted[i, j] + min(height[i], height[j])), (high,)))
+    planar = np.sqrt(np.maximum(wanted**2 - rise**2, 0.0))
+    planar[wanted < rise - ROUNDED] = np.nan
+    seen = set()
+    for i, j in edges(links):
+        for k in np.flatnonzero(planar[i, j] > planar[i] + planar[j] + ROUNDED):
+            triangle = tuple(sorted((int(i), int(j), int(k))))
+            if triangle not in seen:
+                seen.add(triangle)
+                found.append(_of_triangle(triangle, wanted, height))
+    return found
+
+
+def _of_triangle(triangle: tuple[int, ...], wanted: Array, height: Array) -> Conflict:
+    """What height would close it: that of the triangle itself, standing on the two that share a height."""
+    for apex in triangle:
+        left, right = (row for row in triangle if row != apex)
+        if height[left] == height[right] != height[apex]:
+            base = wanted[left, right]
+            sides = np.array([base, wanted[left, apex], wanted[right, apex]])
+            half = sides.sum() / 2.0
+            square = half * float(np.prod(half - sides))
+            if square > 0.0:
+                high = (apex,) if height[apex] > height[left] else (left, right)
+                return Conflict(triangle, float(min(height[apex], height[left]) + 2.0 * math.sqrt(square) / base), high)
+    return Conflict(triangle, math.nan, ())
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """Relative positions that do not add up: around `rows`, each linked to the next and the last to the first.
+
+    Attributes:
+        rows: Two robots of which each asks for something else, or more around a ring.
+        link: The one that closes the ring.
+        gap: How far its ends miss each other [m].
+    """
+
+    rows: tuple[int, ...]
+    link: int
+    gap: float
+
+
+def contradictions(links: Links) -> list[Contradiction]:
+    """Rings of links by relative position whose vectors do not add up to zero, the shortest rings first."""
+    if links.wants is None or links.relative is None:
+        return []
+    here = np.flatnonzero(links.wants == BY_RELATIVE)
+    place: dict[int, Array] = {}
+    above: dict[int, int] = {}
+    neighbours: dict[int, list[tuple[int, Array]]] = {}
+    for k in here.tolist():
+        i, j = int(links.listener[k]), int(links.speaker[k])
+        neighbours.setdefault(j, []).append((i, links.relative[k]))
+        neighbours.setdefault(i, []).append((j, -links.relative[k]))
+    for root in neighbours:
+        if root in place:
+            continue
+        place[root], queue = np.zeros(3), [root]
+        for at in queue:
+            for to, step in neighbours[at]:
+                if to not in place:
+                    place[to], above[to] = place[at] + step, at
+                    queue.append(to)
+    found = []
+    for k in here.tolist():
+        i, j = int(links.listener[k]), int(links.speaker[k])
+        gap = float(norm((place[i] - place[j] - links.relative[k])[None, :2])[0])
+        if gap > ROUNDED:
+            found.append(Contradiction(_ring(i, j, above), k, gap))
+    return sorted(found, key=lambda each: len(each.rows))
+
+
+def _ring(one: int, other: int, above: dict[int, int]) -> tuple[int, ...]:
+    """The way from one row to another through a tree of which `above` tells the parents."""
+
+    def up(row: int) -> list[int]:
+        way = [row]
+        while way[-1] in above:
+            way.append(above[way[-1]])
+        return way
+
+    first, second = up(one), up(other)
+    while len(first) > 1 and len(second) > 1 and first[-2] == second[-2]:
+        first.pop()
+        second.pop()
+    return (*first, *reversed(second[:-1]))
+
+
+def stiffness(
+    position: Array, links: Links, led: Index, anchors: Anchors | None = None
+) -> tuple[Rigidity, Rigidity | None]:
+    """Infinitesimal rigidity when heights are held, and in full space if all links ask for distances.
+
+    Leaders (rows `led`) keep their places among themselves by their plans, so a bar stands between any two of them.
+    Where links ask for more than distances, or robots are anchored, the formation is rigid if nothing moves it but
+    translations, a rotation and a growth: as many of those as they leave free.
+    """
+    pairs = np.array([(i, j) for i in led for j in led if i < j], dtype=np.intp).reshape(-1, 2)
+    if links.wants is not None or anchors is not None:
+        return _told_more(position, links, pairs, anchors), None
+    pairs = np.unique(np.concatenate([edges(links), pairs]), axis=0).astype(np.intp)
+    moves = np.ones_like(position, dtype=bool)
+    moves[:, 2] = False
+    return rigidity(position, pairs, moves), rigidity(position, pairs)
+
+
+def expendable(position: Array, links: Links, led: Index) -> Redundancy:
+    """What a formation by distances can lose and stay rigid while heights are held: of its `edges`, and of its robots.
+
+    Bars between leaders, rows `led`, cannot be lost as links are; they go with their robots.
+    """
+    own = edges(links)
+    bars = np.array([(i, j) for i in led for j in led if i < j], dtype=np.intp).reshape(-1, 2)
+    pairs = np.concatenate([own, bars[~(bars[:, None] == own).all(axis=2).any(axis=1)]])
+    moves = np.ones_like(position, dtype=bool)
+    moves[:, 2] = False
+    found = redundancy(position, pairs, moves)
+    return Redundancy(found.pairs[: len(own)], found.robots)
+
+
+def _told_more(position: Array, links: Links, bars: Index, anchors: Anchors | None) -> Rigidity:
+    rows = len(position)
+    matrix = residuals(links, anchors, position).jacobian(np.arange(rows), rows)
+    stiff = np.zeros((len(bars), 2, rows, 2))
+    number = np.arange(len(bars))
+    for axis in (0, 1):
+        stiff[number, axis, bars[:, 0], axis], stiff[number, axis, bars[:, 1], axis] = 1.0, -1.0
+    matrix = np.concatenate([matrix, stiff.reshape(-1, 2 * rows)])
+    x, y = (position - position.mean(axis=0))[:, :2].T
+    zero, one = np.zeros(rows), np.ones(rows)
+    alike = np.stack([np.stack(each, axis=1).ravel() for each in ((one, zero), (zero, one), (-y, x), (x, y))])
+    alike = alike[norm(alike) > POINT]
+    kept = len(alike) - np.linalg.matrix_rank(matrix @ alike.T, tol=1e-6)
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    rank = int((singular > 1e-9 * max(1.0, float(singular.max(initial=0.0)))).sum())
+    needed = 2 * rows - int(kept)
+    return Rigidity(rank, needed, float(singular[needed - 1]) if 0 < needed <= len(singular) else 0.0)
+
+
+def algebraic_connectivity(links: Links, rows: int) -> float:
+    """Second smallest eigenvalue of the Laplacian of the network without directions (Fiedler); 0 for one robot."""
+    between = np.zeros((rows, rows))
+    i, j = edges(links).T
+    between[i, j] = between[j, i] = 1.0
+    values = np.linalg.eigvalsh(np.diag(between.sum(axis=1)) - between)
+    return max(0.0, float(values[1])) if rows > 1 else 0.0

@@ -1,0 +1,104 @@
+"""Do the settings of `[safety]` go together, and with the formation and the starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import norm
+from agents.plugins import registry
+from agents.safety.setpoint_filter import ESCAPED
+from experiments.check.analysis import Analysis
+from experiments.check.findings import FORGIVEN, Claim, listed
+from experiments.definition import assignment, bodies
+from experiments.definition.assignment import guided
+
+SLOW_M_S: Final = 0.2  # no robot comes down more slowly
+
+
+def safety(analysis: Analysis) -> Iterator[Claim]:
+    """What `[safety]` makes impossible, or makes no sense."""
+    chosen = analysis.experiment.safety
+    if chosen.battery_min < chosen.battery_low:
+        message = (
+            f"a robot takes off with a charge of {chosen.battery_min:.0%} and lands below {chosen.battery_low:.0%}, "
+            "as soon as it is up"
+        )
+        yield Claim("warning", "battery", message, "raise battery_min above battery_low", ("safety", "battery_min"))
+    if chosen.cut_outside <= ESCAPED:
+        message = (
+            f"motors are cut {chosen.cut_outside:g} m outside the arena, before a drone lands, which it does at "
+            f"{ESCAPED:g} m"
+        )
+        yield Claim("warning", "cut-outside", message, f"raise it above {ESCAPED:g}", ("safety", "cut_outside"))
+    for name, robot in analysis.experiment.robots.items():
+        if robot.hover is not None and robot.hover > SLOW_M_S * chosen.landing_s:
+            message = f"{name} may still be landing from {robot.hover:g} m when landing_s cuts its motors"
+            remedy = f"raise landing_s to {robot.hover / SLOW_M_S:g} or more"
+            yield Claim("warning", "landing", message, remedy, ("safety", "landing_s"))
+    if chosen.separation is not None:
+        yield from _separation(analysis, chosen.separation)
+
+
+def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
+    """Pairs that hear each other: at the start, as the formation wants them, and on their way."""
+    names, path = tuple(analysis.experiment.robots), ("safety", "separation")
+    links, heard = assignment.all_links(analysis.experiment), assignment.heard_links(analysis.experiment)
+    pairs = sorted({tuple(sorted(pair)) for pair in zip(heard.listener.tolist(), heard.speaker.tolist(), strict=True)})
+    wanted = {
+        tuple(sorted(pair)): distance
+        for *pair, distance in zip(
+            links.listener.tolist(), links.speaker.tolist(), links.distance.tolist(), strict=True
+        )
+    }
+    start, _ = bodies.start(analysis.experiment, names)
+    quiet = True
+    for first, second in pairs:
+        who = f"{names[first]} and {names[second]}"
+        apart = float(norm(start[first] - start[second]))
+        track = analysis.prediction.position
+        least = float(norm(track[:, first] - track[:, second]).min())
+        if apart < limit - FORGIVEN:
+            message = f"{who} start {apart:.2f} m apart, nearer than the separation of {limit:g} m: neither takes off"
+            yield Claim("error", "separation-start", message, "start them farther apart, or reduce separation", path)
+        elif wanted.get((first, second), np.inf) < limit - FORGIVEN:
+            message = (
+                f"{who} are to be {wanted[first, second]:.2f} m apart, nearer than the separation of {limit:g} m: they "
+                "hold before they are there"
+            )
+            yield Claim("warning", "separation-link", message, "reduce separation, or ask for more distance", path)
+        elif least < limit - FORGIVEN:
+            message = f"{who} come within {least:.2f} m, nearer than the separation of {limit:g} m: they hold there"
+            yield Claim("warning", "separation-path", message, "start elsewhere, or reduce separation", path)
+        else:
+            continue
+        quiet = False
+    if quiet and len(pairs) < len(names) * (len(names) - 1) // 2:
+        message = f"only the {len(pairs)} pairs that hear each other keep the separation of {limit:g} m"
+        yield Claim("note", "separation", message, "", path)
+
+
+def architecture(analysis: Analysis) -> Iterator[Claim]:
+    """Who decides for whom, what happens when the centre is gone, and whether the trigger suits that."""
+    experiment, path = analysis.experiment, ("architecture",)
+    steered = guided(experiment)
+    if not steered:
+        return
+    everyone, rate = len(steered) == len(experiment.robots), experiment.rates.coordination_hz
+    whom = f"all {len(steered)} robots" if everyone else listed(steered)
+    rest = "" if everyone else "; the others decide for themselves, and hear these as before"
+    hold = f"if it is gone, or its goals are older than {experiment.safety.link_silence_s:g} s, they hold"
+    what = "centralised" if everyone else "hybrid"
+    yield Claim("note", what, f"{what}: a centre decides for {whom} {rate:g} times a second{rest}; {hold}", "", path)
+    if experiment.safety.link_silence_s <= 1.0 / rate:
+        message = f"goals come every {1.0 / rate:g} s, and are too old after {experiment.safety.link_silence_s:g} s"
+        remedy = "give safety.link_silence_s more than twice that, or decide more often"
+        yield Claim("error", "goals-too-old", message, remedy, ("safety", "link_silence_s"))
+    kind, _ = registry.split(experiment.trigger)
+    if getattr(registry.struct(registry.TRIGGERS, kind), "judges_errors", False):
+        message = (
+            f"the trigger '{kind}' judges by the formation error, which robots that are guided do not know: it is 0"
+        )
+        yield Claim("warning", "error-unknown", message, "take another one, such as send-on-delta", ("trigger",))

@@ -1,0 +1,276 @@
+"""What theory says of a formation: is it one, can it exist, does it hold its shape, does the sampled loop settle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Index, Mask
+from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, components, reached
+from experiments.check.analysis import Analysis
+from experiments.check.findings import FORGIVEN, Claim, Severity, listed
+from experiments.check.realisation import Conflict, Shape, conflicts, contradictions
+from experiments.file.problems import Path
+
+FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
+OFF: Final = 0.001  # [m] more than written digits explain
+FEW: Final = 6  # names that are listed
+HUNTS: Final = 2.0  # of the share of an error that one decision corrects
+RINGS: Final = 1.2  # beyond 1 an error changes its sign; what is left to 2 is for lag that the model does not have
+
+
+def network(analysis: Analysis) -> Iterator[Claim]:
+    """Does everybody hear of a leader, in one network."""
+    names, links, leaders = analysis.names, analysis.assignment.links, analysis.leaders
+    path = ("formation", "links")
+    if not len(links):
+        yield Claim("note", "no-formation", "no links: every robot follows its own plan, or stays where it is")
+        return
+    rows = len(names)
+    sources = np.array([names.index(name) for name in leaders], dtype=np.intp)
+    listens = np.isin(np.arange(rows), links.listener)
+    anchors = analysis.assignment.anchors
+    if anchors is not None and len(sources):  # who knows a place is led by it
+        sources = np.union1d(sources, anchors.row)
+    problems = []
+    if len(sources):
+        lost = np.flatnonzero(~reached(links, rows, sources) & listens)
+        if len(lost):
+            who = listed([names[row] for row in lost])
+            message = f"{who} cannot hear of the leader ({listed(leaders)}), neither directly nor through others"
+            remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
+            problems.append(Claim("error", "leader-unknown", message, remedy, path))
+    linked = np.union1d(links.listener, links.speaker)
+    parts = analysis.parts - (rows - len(linked))  # robots without links go their own way
+    apart = analysis.experiment.avoidance is not None and len(leaders) >= analysis.parts
+    if parts > 1 and anchors is not None and reached(links, rows, anchors.row)[linked].all():
+        yield Claim("note", "parts", f"{parts} formations, each of which is anchored", "", path)
+    elif parts > 1 and apart:
+        message = f"{parts} formations that know of each other only to keep clear"
+        yield Claim("note", "parts", message, "", path)
+    elif parts > 1:
+        message = f"the network falls into {parts} parts that know nothing of each other"
+        problems.append(Claim("error", "parts", message, "join them by links, or make them separate experiments", path))
+    deaf = [names[row] for row in analysis.silent if names[row] not in leaders]
+    if deaf:
+        message = f"{listed(deaf)} hears nobody and is no leader: it takes no part in the formation"
+        problems.append(Claim("warning", "hears-nobody", message, f'add "... > {deaf[0]}" to its links', path))
+    for name in leaders:
+        if names.index(name) not in links.speaker:
+            message, remedy = f"nobody listens to the leader {name}", f'add "{name} > ..." for one of the others'
+            problems.append(Claim("error" if len(leaders) == 1 else "warning", "leader-unheard", message, remedy, path))
+    yield from problems
+    if not problems:
+        said = f"everybody hears of {listed(leaders)}" if leaders else "no leader: the formation finds its own place"
+        whole = "the network is whole; " if analysis.parts == 1 else ""
+        yield Claim("note", "connected", f"{whole}{said}")
+
+
+def realisation(analysis: Analysis) -> Iterator[Claim]:
+    """Can everything that links and anchors ask for be met while heights are held, at the start and later."""
+    shape = analysis.shape
+    if shape is None:
+        return
+    if shape.worst <= OFF:
+        yield Claim("note", "realisable", f"{_asked(analysis)} can be met to {1e3 * shape.worst:.1f} mm")
+    else:
+        yield from _unmet(analysis, shape)
+    for number, later in _later(analysis):
+        if later.worst > OFF and shape.worst <= OFF:
+            severity: Severity = "error" if later.worst > FAR_OFF else "warning"
+            worst = analysis.link(int(later.error.argmax()))
+            message = f"the shape after this change cannot be met: at best, {worst} is {1e3 * later.worst:.1f} mm off"
+            remedy = "change the other links with it, or by less; heights are held"
+            yield Claim(severity, "change-not-realisable", message, remedy, ("formation", "changes", number))
+
+
+def _asked(analysis: Analysis) -> str:
+    """What the links ask for, in a word."""
+    wants = analysis.asked.wants
+    found = {BY_DISTANCE} if wants is None else set(wants[analysis.standing].tolist())
+    words = {BY_DISTANCE: "distances", BY_RELATIVE: "offsets", BY_BEARING: "bearings"}
+    said = [word for want, word in words.items() if want in found]
+    return "the " + " and ".join(said or ["anchors"])
+
+
+def _later(analysis: Analysis) -> list[tuple[int, Shape]]:
+    """The shape after each change, with the number that the change has in the file."""
+    given = analysis.experiment.formation.changes
+    return list(zip(sorted(range(len(given)), key=lambda k: given[k].at_s), analysis.later, strict=False))
+
+
+def _unmet(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
+    severity: Severity = "error" if shape.worst > FAR_OFF else "warning"
+    anchors = analysis.assignment.anchors
+    if anchors is not None and shape.anchored.max(initial=0.0) >= shape.error.max(initial=0.0):
+        name = analysis.names[int(anchors.row[shape.anchored.argmax()])]
+        message = f"{name} cannot keep the distance of its anchor: at best, it is {1e3 * shape.worst:.1f} mm off"
+        remedy = "change it, or the links of this robot; it holds its height, and distances are in space"
+        yield Claim(severity, "anchor-not-realisable", message, remedy, ("formation", "anchors", name))
+        return
+    off = f"at best, {analysis.link(int(shape.error.argmax()))} is {1e3 * shape.worst:.1f} mm off"
+    rings = contradictions(analysis.asked.take(analysis.standing))
+    for ring in rings[:1]:
+        names = [analysis.names[row] for row in ring.rows]
+        way = f"around {listed([*names, names[0]], 8)}" if len(names) > 2 else f"between {names[0]} and {names[1]}"
+        message = f"the offsets {way} do not add up: their ends are {1e3 * ring.gap:.1f} mm apart; {off}"
+        link = int(np.flatnonzero(analysis.standing)[ring.link])
+        remedy = "give offsets of one drawing: those around a ring add up to zero"
+        yield Claim(severity, "offsets-contradict", message, remedy, analysis.link_path(link))
+    found = conflicts(_by_distance(analysis), np.nan_to_num(analysis.assignment.hover))
+    heights = [each for each in found if math.isfinite(each.ceiling)]
+    for high in list(dict.fromkeys(each.high for each in heights)):
+        lowest = min((each for each in heights if each.high == high), key=lambda each: each.ceiling)
+        yield _too_high(analysis, lowest, off)
+    for conflict in [each for each in found if not math.isfinite(each.ceiling)]:
+        inside = _inside(analysis, conflict)
+        longest = int(inside[analysis.asked.distance[inside].argmax()])
+        sides = _sides(analysis, conflict)
+        message = f"{sides} make no triangle: the longest is longer than the others together; {off}"
+        remedy = f"shorten {analysis.link(longest)}, or lengthen the other two"
+        yield Claim(severity, "no-triangle", message, remedy, analysis.link_path(longest))
+    if not found and not rings:
+        worst = [int(k) for k in np.argsort(-shape.error) if shape.error[k] > shape.worst / 2]
+        at_fault = listed(list(dict.fromkeys(_pair(analysis, k) for k in worst)))
+        message = f"{_asked(analysis)} contradict one another around {at_fault}; {off}"
+        remedy = f"give {_asked(analysis)[4:]} that one drawing has, or fewer of them"
+        if len(analysis.silent) > 1:
+            remedy += "; the leaders' own places count as well"
+        yield Claim(severity, "not-realisable", message, remedy, analysis.link_path(worst[0]))
+
+
+def _measured(analysis: Analysis) -> Mask:
+    """Which links (E,) stand at the start and ask for a distance."""
+    wants = analysis.asked.wants
+    return analysis.standing if wants is None else analysis.standing & (wants == BY_DISTANCE)
+
+
+def _by_distance(analysis: Analysis) -> Links:
+    return analysis.asked.take(_measured(analysis))
+
+
+def _inside(analysis: Analysis, conflict: Conflict) -> Index:
+    """The links by distance among the robots of a conflict."""
+    links, rows = analysis.asked, conflict.rows
+    return np.flatnonzero(_measured(analysis) & np.isin(links.listener, rows) & np.isin(links.speaker, rows))
+
+
+def _pair(analysis: Analysis, link: int | np.intp) -> str:
+    """The same words for both directions of a link."""
+    links = analysis.assignment.links
+    i, j = sorted((int(links.speaker[link]), int(links.listener[link])))
+    return f"{analysis.names[i]} - {analysis.names[j]}"
+
+
+def _sides(analysis: Analysis, conflict: Conflict) -> str:
+    distance = analysis.asked.distance
+    said = {_pair(analysis, k): f"{_pair(analysis, k)} ({distance[k]:g} m)" for k in _inside(analysis, conflict)}
+    return ", ".join(said.values())
+
+
+def _too_high(analysis: Analysis, conflict: Conflict, off: str) -> Claim:
+    names = analysis.names
+    who = listed([names[row] for row in conflict.high])
+    held = max(float(np.nan_to_num(analysis.assignment.hover[row])) for row in conflict.high)
+    message = f"{who} is too high at {held:g} m for {_sides(analysis, conflict)}; {off}"
+    remedy = f"hover lower than {conflict.ceiling:.3f} m, or lengthen these links"
+    return Claim("error", "too-high", message, remedy, ("robots", names[conflict.high[0]], "hover"))
+
+
+def rigidity(analysis: Analysis) -> Iterator[Claim]:
+    """Do the distances leave only one shape nearby, in the motions that the robots have."""
+    planar, spatial = analysis.planar, analysis.spatial
+    if planar is None or not analysis.standing.any() or analysis.parts > 1:
+        return
+    rank = f"rank {planar.rank} of {planar.needed} in the motions that the robots have"
+    if not planar.rigid:
+        more = planar.needed - planar.rank
+        asked = {"the distances": "every distance"}.get(_asked(analysis), _asked(analysis))
+        message = f"the formation is not rigid, {rank}: it can change its shape and still meet {asked}"
+        remedy = f"add {more} link{'s' * (more > 1)} at least, between robots that are not linked yet"
+        yield Claim("warning", "not-rigid", message, remedy, ("formation", "links"))
+    else:
+        flying = (
+            ""
+            if spatial is None or spatial.rigid
+            else f"; in space {spatial.rank} of {spatial.needed}, not needed while heights are held"
+        )
+        yield Claim("note", "rigid", f"the formation is rigid, {rank}{flying}")
+
+
+def presence(analysis: Analysis) -> Iterator[Claim]:
+    """Do links that come and go leave the network whole, as the motion is expected."""
+    pattern, prediction = analysis.pattern, analysis.prediction
+    there = pattern.present(prediction.time, prediction.position)
+    if there is None or analysis.parts > 1:
+        return
+    apart = np.array([components(pattern.links.take(mask), len(analysis.names)) for mask in _runs(there)])
+    begins = np.concatenate([[0], 1 + np.flatnonzero((there[1:] != there[:-1]).any(axis=1))])
+    broken = np.flatnonzero(apart > 1)
+    count = there.sum(axis=1)
+    if not len(broken):
+        message = f"links come and go, {count.min()} to {count.max()} at a time, and the network is always whole"
+        yield Claim("note", "whole", message)
+        return
+    first = int(broken[0])
+    end = float(prediction.time[begins[first + 1]]) if first + 1 < len(begins) else analysis.experiment.duration_s
+    message = (
+        f"the network falls into {apart[first]} parts from {prediction.time[begins[first]]:.1f} s "
+        f"to {end:.1f} s, because links come and go"
+    )
+    near = analysis.experiment.formation.proximity is not None
+    remedy = "start nearer to each other, or give a longer range" if near else "let links overlap in time"
+    path: Path = ("formation", "proximity", "range") if near else ("formation", "links")
+    yield Claim("warning", "comes-apart", message, remedy, path)
+
+
+def _runs(there: Mask) -> Mask:
+    """Of masks over time (T, E), the first of every run of equal ones."""
+    return np.asarray(there[np.concatenate([[True], (there[1:] != there[:-1]).any(axis=1)])])
+
+
+def redundancy(analysis: Analysis) -> Iterator[Claim]:
+    """Which single links and robots the formation can lose and stay rigid."""
+    spare = analysis.spare
+    if spare is None or analysis.parts > 1:
+        return
+    links = _lost("link", spare.pairs, [analysis.pair(int(k)) for k in np.flatnonzero(~spare.pairs)])
+    robots = _lost("robot", spare.robots, [analysis.names[int(row)] for row in np.flatnonzero(~spare.robots)])
+    yield Claim("note", "redundancy", f"{links}; {robots}")
+
+
+def _lost(what: str, spare: Mask, needed: list[str]) -> str:
+    """What can be lost, in words that stay short."""
+    if not needed:
+        return f"it stays rigid without any one {what}"
+    if len(needed) == len(spare):
+        return f"it stays rigid only with every {what}"
+    if len(needed) > FEW:
+        return f"{len(spare) - len(needed)} of its {len(spare)} {what}s can be lost, one at a time"
+    return f"it stays rigid without any one {what} but {listed(needed)}"
+
+
+def stability(analysis: Analysis) -> Iterator[Claim]:
+    """Does the sampled loop settle, near the shape."""
+    loop, shape, formation = analysis.modes, analysis.shape, analysis.experiment.formation
+    if loop is None or shape is None or shape.worst > FAR_OFF:
+        return
+    name = "gain" if _measured(analysis).any() or not analysis.standing.any() else "stiffness"
+    path, gain = ("formation", name), float(getattr(formation, name))
+    took = f"one decision takes {loop.gain:.3g} of the stiffest error (h·{'μ' if name == 'gain' else 'k'}·λ)"
+    calm = f"use a {name} below {gain * RINGS / max(loop.gain, 1e-12):.2g}"
+    if loop.gain >= HUNTS:
+        yield Claim("error", "hunts", f"the formation hunts: {took}, and from {HUNTS:g} on it grows", calm, path)
+    elif shape.worst <= FORGIVEN and loop.radius > 1.0 + FORGIVEN:
+        message = f"the formation drifts away from its shape: an error grows by {loop.radius:.4f} with every decision"
+        remedy = "let more links be heard by both ends; a ring of one-way links can turn for ever"
+        yield Claim("error", "unstable", message, remedy, ("formation", "links"))
+    elif loop.gain > RINGS:
+        yield Claim(
+            "warning", "rings", f"the formation rings: {took}, and its sign changes before it fades", calm, path
+        )
+    else:
+        yield Claim("note", "stable", f"the loop settles: {took}, less than {RINGS:g}")

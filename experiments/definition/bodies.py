@@ -1,0 +1,200 @@
+"""The body of each robot: which one, its kind, start pose and disturbance, and the scene around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from agents.arrays import Array
+from agents.body.interface import BodyRequest, Disturbance
+from agents.body.kinds import KINDS, Kind
+from agents.network.keys import Keys
+from agents.plugins import registry
+from experiments.definition.experiment import Experiment
+from twins import scene as outlines
+from twins.scene import Scene, World
+from twins.sensing.range_sensors import OF_KIND
+
+TRIES: Final = 200  # places that are drawn for a robot before it stays where the file puts it
+
+
+CLEAR: Final = 0.02  # [m] between robots that are scattered
+
+
+WORLD: Final = "world"  # the body of a robot that lives in the twin service
+
+
+VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
+
+
+def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
+    """The kinds of these robots."""
+    return tuple(KINDS[experiment.robots[name].kind] for name in names)
+
+
+def start(experiment: Experiment, names: Sequence[str]) -> tuple[Array, Array]:
+    """Where robots start: position (n, 3) [m] on the floor and yaw (n,) [rad]."""
+    given = [(*experiment.robots[name].start, 0.0)[:3] for name in names]
+    pose = np.array(given, dtype=float).reshape(-1, 3)
+    return np.concatenate([pose[:, :2], np.zeros((len(pose), 1))], axis=1), pose[:, 2]
+
+
+def scattered(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[Array, Array]:
+    """As `start`, scattered by the seed as the file asks; who is scattered overlaps no other robot and no obstacle.
+
+    A place is drawn for each robot of the experiment, in the order of the file, whoever asks: all processes agree.
+    """
+    position, yaw = start(experiment, tuple(experiment.robots))
+    begin = experiment.start
+    if begin.scatter > 0.0 or begin.scatter_yaw > 0.0:
+        rng = np.random.default_rng([seed, 0x73746172])
+        kinds_of, stands = kinds(experiment, tuple(experiment.robots)), scene(experiment)
+        radius = np.array([kind.radius for kind in kinds_of])
+        half = 0.5 * np.array(experiment.arena.size[:2]) - experiment.safety.margin
+        given = position[:, :2].copy()
+        for row in range(len(position)):
+            yaw[row] += begin.scatter_yaw * rng.uniform(-1.0, 1.0)
+            for _ in range(TRIES):
+                place = np.clip(
+                    given[row] + begin.scatter * rng.uniform(-1.0, 1.0, 2), radius[row] - half, half - radius[row]
+                )
+                gap = np.hypot(*(position[:, :2] - place).T) - radius - radius[row]
+                gap[row] = np.inf
+                if (gap > CLEAR).all() and _free(stands, place, kinds_of[row]):
+                    position[row, :2] = place
+                    break
+    rows = [list(experiment.robots).index(name) for name in names]
+    return position[rows], yaw[rows]
+
+
+def _free(stands: Scene, place: Array, kind: Kind) -> bool:
+    """Whether a robot that stands at `place` (2,) [m] keeps clear of all obstacles."""
+    return all(
+        outlines.distance(stands, k, stands.pose[k], place) > kind.radius + CLEAR
+        for k in range(len(stands.names))
+        if outlines.at_height(stands, k, 0.0, kind.height)
+    )
+
+
+def world(experiment: Experiment, names: Sequence[str], copies: int = 1, *, sensing: bool | None = None) -> World:
+    """The place that `names` share, in `copies`; with range sensors if somebody uses them, or as `sensing` says."""
+    used = experiment.avoidance is not None if sensing is None else sensing
+    carried = []
+    for name in names:
+        robot = experiment.robots[name]
+        own = OF_KIND[robot.kind] if robot.sensors is None else tuple(robot.sensors)
+        carried.append(own if used or robot.sensors else ())
+    return World(
+        copy=np.repeat(np.arange(copies), len(names)),
+        scene=scene(experiment),
+        engine=experiment.world.engine,
+        sensors=tuple(carried) * copies,
+        sensor_noise=experiment.world.sensor_noise,
+        mirrored=np.zeros(len(names) * copies, dtype=bool),
+    )
+
+
+def scene(experiment: Experiment) -> Scene:
+    """What stands in the arena."""
+    arena = experiment.arena
+    plans = {
+        name: registry.build(registry.PLANNERS, obstacle.plan)
+        for name, obstacle in arena.obstacles.items()
+        if obstacle.plan is not None
+    }
+    return Scene.furnished(arena.size, arena.obstacles, plans, walled=arena.walls)
+
+
+def shadows(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Array:
+    """How often the twin beside each robot is put onto it (n,) [s]: infinite for once, NaN for robots without one."""
+    period = []
+    for name in names:
+        shadow = experiment.robots[name].shadow
+        period.append(np.nan if shadow is None else np.inf if shadow.restart_s is None else shadow.restart_s)
+    return np.tile(np.array(period), copies)
+
+
+def hover(experiment: Experiment, names: Sequence[str]) -> Array:
+    """Heights that robots hold (n,) [m], NaN for ground robots."""
+    return np.array([experiment.robots[name].hover or np.nan for name in names])
+
+
+def disturbance(experiment: Experiment, name: str) -> Disturbance:
+    """What nature adds to a robot: `all`, overridden by its kind, overridden by its own name, field by field."""
+    merged: dict[str, object] = {}
+    for scope in ("all", experiment.robots[name].kind, name):
+        if (given := experiment.disturbance.get(scope)) is not None:
+            fields = msgspec.structs.asdict(given)
+            merged.update({field: value for field, value in fields.items() if value is not None})
+    return Disturbance(**merged)  # type: ignore[arg-type]
+
+
+def request(
+    experiment: Experiment, names: Sequence[str], seeds: Sequence[int], endpoints: Sequence[str] = ()
+) -> BodyRequest:
+    """What the bodies of `names` are opened with, one repetition for each seed; `endpoints` are the routers.
+
+    Twins start where `scattered` puts them; hardware is where it is.
+    """
+    copies = len(seeds)
+    placed = [scattered(experiment, names, seed) for seed in seeds]
+    return BodyRequest(
+        names=tuple(names) * copies,
+        kinds=kinds(experiment, names) * copies,
+        addresses=tuple(experiment.robots[name].body for name in names) * copies,
+        start=np.concatenate([position for position, _ in placed]),
+        yaw=np.concatenate([yaw for _, yaw in placed]),
+        rate_hz=experiment.rates.body_hz,
+        seeds=tuple(seed for seed in seeds for _ in names),
+        disturbance=tuple(disturbance(experiment, name) for name in names) * copies,
+        external=tuple(experiment.robots[name].position == "external" for name in names) * copies,
+        device=tuple(experiment.robots[name].device for name in names) * copies,
+        endpoints=tuple(endpoints),
+        keys=Keys(experiment.network.realm),
+    )
+
+
+# what `--bodies protocol` makes of each kind: its protocol twin, the process that its robots share (several Crazyflies
+# hang on one radio, all Tellos of a computer on one port), and who knows where it is
+PROTOCOL: Final[dict[str, tuple[str, str | None, str]]] = {
+    "crazyflie": ("crazyflie-twin", "radio0", "body"),
+    "tello": ("tello-twin", "tellos", "external"),
+    "khepera4": ("khepera4-twin", None, "external"),
+    "turtlebot3": ("turtlebot3-twin", None, "external"),
+}
+
+
+BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
+
+
+def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
+    """The experiment with every robot in the body that `--bodies` names; as it is without.
+
+    Args:
+        experiment: A case.
+        bodies: One of `BODIES`, or None.
+    """
+    if bodies is None:
+        return experiment
+    if bodies == "protocol":
+        return behind_protocols(experiment)
+    seen = bodies == WORLD and experiment.positioning == VICON_TWIN
+    robots = {
+        name: msgspec.structs.replace(
+            robot, body=bodies, position=robot.position if seen else "body", ranges="body", device={}
+        )
+        for name, robot in experiment.robots.items()
+    }
+    return msgspec.structs.replace(experiment, robots=robots)
+
+
+def behind_protocols(experiment: Experiment) -> Experiment:
+    """The experiment with every robot behind its real bridge and a protocol twin, and simulated motion capture."""
+    robots = {}
+    for name, robot in experiment.robots.items():
+        body, process, position = PROTOCOL[robot.kind]
+        robots[name] = msgspec.structs.replace(robot, body=body, process=process, position=position)
+    return msgspec.structs.replace(experiment, robots=robots, positioning=VICON_TWIN)

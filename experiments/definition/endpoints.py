@@ -1,0 +1,60 @@
+"""Where the routers of an experiment are, and which lab lets one in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from agents.network import lab
+from agents.network.endpoints import EndpointError
+
+if TYPE_CHECKING:  # numpy comes with it, and an emergency stop waits for nothing that it does not need
+    from experiments.definition.experiment import Experiment
+
+
+def folder(experiment: Experiment, file: Path, chosen: str | None = None) -> Path | None:
+    """The folder of the lab: that of the command line, or the one that the file names, which lies beside it."""
+    if chosen is not None:
+        return Path(chosen).absolute()
+    own = experiment.network.lab
+    return None if own is None else file.absolute().parent / own
+
+
+def routers(experiment: Experiment, file: Path, connect: Sequence[str], chosen: str | None = None) -> list[str]:
+    """The routers of an experiment, each with its lab if there is one; empty where neither says which.
+
+    Args:
+        experiment: Its `network.connect` holds if nothing else is said.
+        file: The experiment's.
+        connect: Of the command line.
+        chosen: The lab of the command line.
+
+    Raises:
+        EndpointError: If a router of a lab asks for no certificates.
+    """
+    endpoints = listed(connect) or experiment.network.connect or []
+    try:
+        return lab.secured(endpoints, folder(experiment, file, chosen))
+    except lab.LabError as error:
+        raise EndpointError(str(error)) from None
+
+
+def listed(given: Iterable[str]) -> list[str]:
+    """Endpoints, each as it is or, behind an @, line by line from a file.
+
+    Raises:
+        EndpointError: If a file cannot be read.
+    """
+    found: list[str] = []
+    for each in given:
+        if not each.startswith("@"):
+            found.append(each)
+            continue
+        try:
+            found += Path(each[1:]).read_text("utf-8").split("\n")
+        except (OSError, UnicodeDecodeError) as error:
+            raise EndpointError(
+                f"{each[1:]}: cannot be read ({error}); `zenpark run` writes one, network.txt"
+            ) from None
+    return [each for each in found if each]

@@ -1,0 +1,452 @@
+"""An experiment: what its file says, as typed, frozen structs. SI units; the name says where a unit is another.
+
+`experiments.file.document` reads the file into these and says where it is wrong.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from agents.body.interface import Disturbance
+from twins.scene import Obstacle
+
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Rate = Annotated[float, Meta(gt=0, le=2000)]
+Delay = Annotated[float, Meta(ge=0, le=60)]
+AtLeastOne = Annotated[float, Meta(ge=1)]
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Planar = tuple[float, float]
+Vector = Annotated[list[float], Meta(min_length=2, max_length=3)]
+Spatial = tuple[Positive, Positive, Positive]
+Choice = str | dict[str, Any]  # a plug-in by name, or a table with its `kind` and its parameters
+
+
+class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A table of the experiment file."""
+
+
+class StartBox(Part, frozen=True):
+    """A part of the floor where robots may start."""
+
+    at: Annotated[Planar, Meta(description="its middle, x, y [m]")]
+    size: Annotated[tuple[Positive, Positive], Meta(description="x, y [m]")]
+
+
+class Shadow(Part, frozen=True):
+    """A twin that runs beside a robot and gets the same setpoints, to see how far they agree."""
+
+    restart_s: Annotated[
+        Positive | None,
+        Meta(description="the twin is put onto the robot this often [s]; left out: once, at the common start"),
+    ] = 5.0
+
+
+class Arena(Part, frozen=True):
+    """The box that the robots must not leave: centred on the origin, floor at z = 0."""
+
+    size: Annotated[Spatial, Meta(description="x, y, z [m]")] = (4.0, 4.0, 2.5)
+    file: Annotated[
+        str | None, Meta(description="an arena file whose [arena] this one begins with; beside the experiment file")
+    ] = None
+    walls: Annotated[bool, Meta(description="its border is a wall: robots touch it, range sensors see it")] = True
+    obstacles: Annotated[dict[Name, Obstacle], Meta(description="what stands in it")] = {}
+    starts: Annotated[
+        dict[Name, StartBox], Meta(description="where robots may be put before a run; none given: anywhere")
+    ] = {}
+
+
+class Rates(Part, frozen=True):
+    """How often things happen; pose_hz, coordination_hz and state_hz divide body_hz."""
+
+    body_hz: Annotated[Rate, Meta(description="position control and body")] = 100.0
+    pose_hz: Annotated[Rate, Meta(description="how often the trigger is asked")] = 50.0
+    coordination_hz: Annotated[Rate, Meta(description="how often a new goal is decided")] = 10.0
+    state_hz: Annotated[Rate, Meta(description="telemetry for recorder and viewers")] = 50.0
+
+
+class Robot(Part, frozen=True):
+    """One robot."""
+
+    kind: Annotated[str, Meta(description="crazyflie, tello, khepera4 or turtlebot3")]
+    start: Annotated[list[float], Meta(min_length=2, max_length=3, description="x, y [m] and, if wanted, yaw [rad]")]
+    body: Annotated[
+        str, Meta(description="twin (in its own process), world (in the twin service), or the address of the real one")
+    ] = "twin"
+    hover: Annotated[Positive | None, Meta(description="height that a flying robot holds [m]")] = None
+    position: Annotated[
+        Literal["body", "external"], Meta(description="its own estimate, or what is published on its key `position`")
+    ] = "body"
+    device: Annotated[dict[str, Any], Meta(description="settings of its hardware; the body knows them")] = {}
+    process: Annotated[Name | None, Meta(description="robots of one name share one process")] = None
+    sensors: Annotated[
+        list[str] | None, Meta(description="range sensors of its twin; left out: those that its kind has")
+    ] = None
+    ranges: Annotated[
+        Literal["body", "world"], Meta(description="its own range sensors, or what the world says it would see")
+    ] = "body"
+    shadow: Annotated[Shadow | None, Meta(description="a twin beside it")] = None
+    avoids: Annotated[
+        bool, Meta(description="whether it keeps clear of others where the experiment has an avoidance")
+    ] = True
+    standby: Annotated[
+        bool, Meta(description="not started, and nobody waits for it, until `zenpark robot add` lets it join the run")
+    ] = False
+
+
+class Target(Part, frozen=True):
+    """What a link asks for, one of the three: how far apart, where from each other, or in which direction."""
+
+    distance: Annotated[Positive | None, Meta(description="[m]")] = None
+    offset: Annotated[
+        Vector | None,
+        Meta(description="x, y (, z) of the second robot from the first [m]; z left out: as they hold their heights"),
+    ] = None
+    bearing: Annotated[
+        Vector | None,
+        Meta(description="direction x, y (, z) from the first robot to the second; seen from above if z is left out"),
+    ] = None
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("distance", "offset", "bearing") if getattr(self, name) is not None]
+        if len(given) != 1:
+            said = " and ".join(given) or "none of them"
+            raise ValueError(f"a link asks for distance, offset or bearing, not for {said}; give one of the three")
+        if self.bearing is not None and not any(self.bearing):
+            raise ValueError("a bearing of zeros has no direction; give x, y, such as [1.0, 0.0]")
+
+
+class Link(Target, frozen=True):
+    """A link that asks for something else than a distance, has a gain of its own, or is there for a time."""
+
+    gain: Annotated[Positive | None, Meta(description="the formation's if left out")] = None
+    from_s: Annotated[NotNegative, Meta(description="the link is there from then on [s]")] = 0.0
+    until_s: Annotated[Positive | None, Meta(description="and until then [s]; left out: to the end")] = None
+
+    def __post_init__(self) -> None:
+        Target.__post_init__(self)
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError("`until_s` must be later than `from_s`; or leave it out")
+
+
+class Anchor(Part, frozen=True):
+    """A distance that a robot keeps to a point, to a line through it, or to a plane through it."""
+
+    distance: Annotated[NotNegative, Meta(description="[m]; 0: on it")] = 0.0
+    to: Annotated[Vector | None, Meta(description="the point, x, y (, z) [m]; left out: the origin")] = None
+    along: Annotated[Vector | None, Meta(description="direction of a line through that point")] = None
+    across: Annotated[Vector | None, Meta(description="direction across a plane through that point")] = None
+    gain: Annotated[
+        Positive | None, Meta(description="left out: twice the formation's gain, or its stiffness where distance is 0")
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.along is not None and self.across is not None:
+            raise ValueError("`along` means a line and `across` a plane; give one of them")
+        for name in ("along", "across"):
+            direction = getattr(self, name)
+            if direction is not None and not any(direction):
+                raise ValueError(f"`{name}` has no direction; give x, y, such as [1.0, 0.0]")
+
+
+class Change(Part, frozen=True):
+    """From `at_s` on, the formation goes smoothly to another shape."""
+
+    at_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
+    over_s: Annotated[NotNegative, Meta(description="how long it takes [s]; 0: at once")] = 5.0
+    links: Annotated[
+        dict[str, Positive | Target],
+        Meta(description="links that ask for something else then"),
+    ] = {}
+    scale: Annotated[Positive, Meta(description="of the shape seen from above, as it is then; heights stay")] = 1.0
+    rotate: Annotated[float, Meta(description="to the left [rad]; not for distances, which know no direction")] = 0.0
+
+
+class Proximity(Part, frozen=True):
+    """Links that are there while two robots are near each other."""
+
+    range: Annotated[Positive, Meta(description="nearer than this they become neighbours [m]")]
+    release: Annotated[Positive | None, Meta(description="farther than this no more [m]; left out: 1.1 range")] = None
+    distance: Annotated[
+        Positive | None,
+        Meta(description="what any two robots without a link keep then [m]; left out: only the links of the file"),
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.release is not None and self.release < self.range:
+            raise ValueError("`release` must not be nearer than `range`; or leave it out")
+
+
+class Formation(Part, frozen=True):
+    """Which shape, by which law."""
+
+    law: Annotated[Choice, Meta(description="a registered law")] = "distance"
+    update: Annotated[
+        Choice | None, Meta(description="a trigger: when a robot computes the law anew; left out: at every decision")
+    ] = None
+    gain: Annotated[
+        Positive, Meta(description="μ of links that ask for a distance [1/(m²·decision)] (paper, eq. (6))")
+    ] = 3.0
+    stiffness: Annotated[Positive, Meta(description="k of links that ask for an offset or a bearing [1/decision]")] = (
+        0.5
+    )
+    clamp: Annotated[Positive, Meta(description="largest step of the goal per axis and decision [m]")] = 0.1
+    tracking_gain: Annotated[NotNegative, Meta(description="k [1/(m²·decision)] (paper, eq. (7))")] = 3.0
+    leader: Annotated[Name | None, Meta(description="left out: every robot that listens to nobody")] = None
+    links: Annotated[
+        dict[str, Positive | Link], Meta(description='"A > B": B listens to A; "A - B": both listen; distance [m]')
+    ] = {}
+    anchors: Annotated[
+        dict[Name, Positive | Anchor],
+        Meta(description="by robot: distance to the origin [m], or to another place"),
+    ] = {}
+    changes: Annotated[list[Change], Meta(description="other shapes, in order of time")] = []
+    proximity: Annotated[Proximity | None, Meta(description="links by range; left out: they are always there")] = None
+
+
+class Leg(Part, frozen=True):
+    """From `at_s` on, a robot follows a plan."""
+
+    at_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
+    robot: Name
+    plan: Annotated[Choice, Meta(description="a registered planner")]
+
+
+class LinkChannel(Part, frozen=True):
+    """What is otherwise on one link; what is left out is as on all others."""
+
+    delay_s: Annotated[Delay | None, Meta(description="from speaker to listener [s]")] = None
+    jitter_s: Annotated[Delay | None, Meta(description="mean of an exponential addition [s]")] = None
+    loss: Annotated[Share | None, Meta(description="share of samples that never arrive")] = None
+    burst: Annotated[AtLeastOne | None, Meta(description="mean number of samples that are lost in a row")] = None
+    bandwidth: Annotated[Positive | None, Meta(description="[bit/s] of payload")] = None
+    queue_s: Annotated[Delay | None, Meta(description="longest wait for a link that is busy [s]")] = None
+
+
+class Outage(Part, frozen=True):
+    """A time in which nothing passes on some links."""
+
+    from_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
+    until_s: Annotated[Positive | None, Meta(description="[s] after it; left out: to the end")] = None
+    links: Annotated[
+        list[str], Meta(description='"A > B": what A says to B; "A - B": both ways; left out, and robots too: all')
+    ] = []
+    robots: Annotated[list[Name], Meta(description="all links to and from these")] = []
+
+    def __post_init__(self) -> None:
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError("`until_s` must be later than `from_s`; or leave it out")
+
+
+class Channel(Part, frozen=True):
+    """What the network does to poses between robots: modelled in virtual time, added at the listener in real time."""
+
+    delay_s: Annotated[
+        Delay,
+        Meta(description="from speaker to listener [s]; in real time what the network itself takes counts towards it"),
+    ] = 0.001
+    jitter_s: Annotated[Delay, Meta(description="mean of an exponential addition [s]")] = 0.0
+    loss: Annotated[Share, Meta(description="share of samples that never arrive")] = 0.0
+    burst: Annotated[
+        AtLeastOne | None,
+        Meta(description="mean number of samples that are lost in a row; left out: each is lost or not by itself"),
+    ] = None
+    bandwidth: Annotated[Positive | None, Meta(description="of each link [bit/s] of payload; left out: no limit")] = (
+        None
+    )
+    queue_s: Annotated[
+        Delay, Meta(description="a sample that would wait longer for its link to be free is dropped [s]")
+    ] = 0.5
+    outages: Annotated[list[Outage], Meta(description="times in which nothing passes")] = []
+    links: Annotated[
+        dict[str, LinkChannel], Meta(description='"A > B": what A says to B; "A - B": both ways; what is otherwise')
+    ] = {}
+
+
+class Network(Part, frozen=True):
+    """The network of a run in real time."""
+
+    realm: Annotated[Name, Meta(description="first chunk of every key")] = "park"
+    connect: Annotated[
+        list[str] | None, Meta(description="endpoints of routers that run already; left out: one is started")
+    ] = None
+    listen: Annotated[
+        list[str] | None,
+        Meta(
+            description="endpoints of the router that is started; left out: on loopback, and hosts reach it through "
+            "their ssh connection; of several routers, each has one in turn"
+        ),
+    ] = None
+    topology: Annotated[
+        Literal["routers", "mesh"],
+        Meta(description="all meet at routers; or without any, each robot is linked with exactly its neighbours"),
+    ] = "routers"
+    addresses: Annotated[
+        dict[Name, str],
+        Meta(description="where robots listen in a mesh; left out: at free ports on loopback"),
+    ] = {}
+    routers: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=8,
+            description="how many are started, each in a process of its own; who loses one goes on at the next",
+        ),
+    ] = 1
+    address: Annotated[
+        str | None,
+        Meta(description="name of this machine for hosts, where `listen` is given; left out: as ssh came from there"),
+    ] = None
+    encoding: Annotated[Literal["json", "msgpack"], Meta(description="of the payloads")] = "json"
+    lab: Annotated[
+        str | None,
+        Meta(description="folder of certificates (`zenpark keys init`), beside this file; left out: loopback only"),
+    ] = None
+
+
+class Host(Part, frozen=True):
+    """Another machine, whose robots are started there."""
+
+    address: Annotated[
+        str | None,
+        Meta(
+            description="what ssh takes: a name of its configuration, user@machine, ssh://user@machine:port; left out: "
+            "its robots are started there by hand or at boot, and join"
+        ),
+    ] = None
+    zenpark: Annotated[str, Meta(description="the command there; a path counts from the home folder")] = (
+        "zenpark/zenpark"
+    )
+    lab: Annotated[
+        str, Meta(description="folder there for the certificates of its robots, in a lab; counts from the home folder")
+    ] = "zenpark-lab"
+    robots: Annotated[list[Name], Meta(description="who runs there; robots that no host names run here")] = []
+    tags: Annotated[list[Name], Meta(description="by which `zenpark hosts` chooses among hosts")] = []
+
+
+class Safety(Part, frozen=True):
+    """The last word before a body."""
+
+    speed: Annotated[Positive | None, Meta(description="[m/s], if lower than the kind's own")] = None
+    goal_step: Annotated[Positive, Meta(description="farthest goal from where the robot is [m]")] = 0.5
+    margin: Annotated[NotNegative, Meta(description="how far inside the walls goals stay [m]")] = 0.05
+    own_silence_s: Annotated[Positive, Meta(description="own position older than this is none: hold [s]")] = 0.5
+    blind_s: Annotated[
+        NotNegative, Meta(description="a flying robot that has no position of its own for this long lands [s]")
+    ] = 0.3
+    link_silence_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
+    lost_neighbour: Annotated[
+        Literal["drop", "hold", "land"], Meta(description="what a robot does then: go on without it, hold, or land")
+    ] = "drop"
+    lost_conductor: Annotated[
+        Literal["finish", "land"], Meta(description="what robots do when the conductor is gone in mid-run")
+    ] = "finish"
+    offline_s: Annotated[
+        Positive, Meta(description="a robot without a router holds, and after this lands: no stop reaches it [s]")
+    ] = 10.0
+    separation: Annotated[
+        Positive | None,
+        Meta(
+            description="nearer than this to another robot that it hears, from middle to middle, a robot holds; nearer "
+            "than half of it, or touching, it lands [m]; left out: not watched"
+        ),
+    ] = None
+    cut_outside: Annotated[Positive, Meta(description="a drone this far outside the arena has its motors cut [m]")] = (
+        0.75
+    )
+    overspeed: Annotated[
+        float, Meta(gt=1, description="a robot that moves faster than this times what its kind can holds, then lands")
+    ] = 2.5
+    tilt: Annotated[
+        float, Meta(gt=0, lt=4, description="a drone that leans more than this has its motors cut [rad]")
+    ] = 1.2
+    battery_low: Annotated[Share, Meta(description="with less charge than this a robot lands; 0: never")] = 0.1
+    battery_min: Annotated[Share, Meta(description="with less charge than this it does not take off; 0: always")] = 0.2
+    landing_s: Annotated[
+        Positive, Meta(description="a drone that takes longer than this to land has its motors cut [s]")
+    ] = 20.0
+    loop_silence_s: Annotated[
+        Positive, Meta(description="a robot whose control loop hangs for this long is landed from outside of it [s]")
+    ] = 0.5
+
+
+class World(Part, frozen=True):
+    """The place that all twins share in virtual time, and those with `body = "world"` in real time."""
+
+    engine: Annotated[Choice, Meta(description="a registered engine")] = "point-mass"
+    sensor_noise: Annotated[NotNegative, Meta(description="of range sensors, as a multiple of the real ones'")] = 1.0
+    patience_s: Annotated[
+        Positive, Meta(description="a robot whose world is gone holds for this long, then lands [s]")
+    ] = 30.0
+
+
+class Start(Part, frozen=True):
+    """How a run begins."""
+
+    deadline_s: Annotated[Positive, Meta(description="how long to wait for all robots to be ready [s]")] = 20.0
+    missing: Annotated[Literal["abort", "go-on"], Meta(description="when one is not ready by then")] = "abort"
+    scatter: Annotated[
+        NotNegative, Meta(description="twins start up to this far from `start`, on each axis, by the seed [m]")
+    ] = 0.0
+    scatter_yaw: Annotated[NotNegative, Meta(description="and turned by up to this, by the seed [rad]")] = 0.0
+
+
+class Hybrid(Part, frozen=True):
+    """Some robots are guided by the centre, the others decide for themselves."""
+
+    kind: Annotated[Literal["hybrid"], Meta(description='"hybrid"')]
+    robots: Annotated[list[Name], Meta(min_length=1, description="those that the centre guides")]
+
+
+class Experiment(Part, frozen=True):
+    """One experiment, or one case of it after `document.cases`."""
+
+    title: str
+    robots: Annotated[dict[Name, Robot], Meta(min_length=1)]
+    duration_s: Annotated[Positive, Meta(description="from the common start [s]", le=86400)]
+    spares: Annotated[
+        dict[Name, Robot], Meta(description="robots that wait to take over the name of another one of their kind")
+    ] = {}
+    on_loss: Annotated[
+        Literal["none", "restart", "replace"],
+        Meta(description="when a robot is lost in mid-run: go on without it, start it again, or let a spare take over"),
+    ] = "none"
+    source: Annotated[str, Meta(description="where it was published")] = ""
+    seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 1
+    tolerance: Annotated[Positive, Meta(description="a link is acquired when its error stays below [m]")] = 0.05
+    arena: Arena = Arena()
+    rates: Rates = Rates()
+    formation: Formation = Formation()
+    timeline: list[Leg] = []
+    architecture: Annotated[
+        Literal["distributed", "centralised"] | Hybrid,
+        Meta(description="who decides: every robot for itself, or one process for all or some of them"),
+    ] = "distributed"
+    trigger: Annotated[Choice, Meta(description="a registered trigger: when a robot speaks")] = "periodic"
+    prediction: Annotated[
+        Choice | None,
+        Meta(description="where a robot is believed to be between two messages; left out: as the trigger needs it"),
+    ] = None
+    positioning: Annotated[
+        str | None, Meta(description='who measures `position = "external"`: vicon://HOST[:PORT], or vicon-twin')
+    ] = None
+    disturbance: Annotated[
+        dict[str, Disturbance], Meta(description='by kind or by robot; "all" for every one; the narrower wins')
+    ] = {}
+    avoidance: Annotated[
+        Choice | None, Meta(description="how robots keep clear of what they see and hear; left out: they do not")
+    ] = None
+    world: World = World()
+    channel: Channel = Channel()
+    network: Network = Network()
+    hosts: Annotated[dict[Name, Host], Meta(description="other machines, and which robots run there")] = {}
+    safety: Safety = Safety()
+    start: Start = Start()
+    cases: Annotated[
+        dict[Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], dict[str, Any]],
+        Meta(description="each may override any field; the first is the reference of every ratio"),
+    ] = {}

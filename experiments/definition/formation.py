@@ -1,0 +1,198 @@
+"""From the formation of a file to arrays: links and what they ask for, anchors, changes, and the errors of a motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask, norm
+from agents.formation.anchors import Anchors
+from agents.formation.changes import Change, Presence, Reshaping, wanted
+from agents.formation.graph import BY_DISTANCE, Links
+from agents.plugins.laws import Distance, Law
+from experiments.definition.experiment import Anchor, Experiment
+from experiments.definition.experiment import Change as Described
+from experiments.definition.links import UNKNOWN, OneWay, height, one_way_links, pairs, target
+
+AT_ONCE: Final = 200_000  # errors of links that are held in memory at once
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """The links that there may be, with their targets of the beginning; what becomes of them, and when they are there.
+
+    Attributes:
+        links: (E), sorted by listener, then speaker.
+        changes: Of their targets, in order of time.
+        presence: When they are there; None if always.
+    """
+
+    links: Links
+    changes: tuple[Change, ...]
+    presence: Presence | None
+
+    @classmethod
+    def of(cls, experiment: Experiment, names: Sequence[str]) -> Pattern:
+        """The links between robots; `names` are the rows, and links with an end elsewhere are left out."""
+        row = {name: number for number, name in enumerate(names)}
+        there = [link for link in one_way_links(experiment) if link.listener in row and link.speaker in row]
+        there.sort(key=lambda link: (row[link.listener], row[link.speaker]))
+        wants = np.array([link.wanted.wants for link in there], dtype=np.intp)
+        plain = bool((wants == BY_DISTANCE).all())
+        links = Links(
+            np.array([row[link.listener] for link in there], dtype=np.intp),
+            np.array([row[link.speaker] for link in there], dtype=np.intp),
+            np.array([link.wanted.distance for link in there], dtype=float),
+            np.array([link.gain for link in there], dtype=float),
+            None if plain else _vectors([link.wanted.relative for link in there]),
+            None if plain else _vectors([link.wanted.bearing for link in there]),
+            None if plain else wants,
+        )
+        return cls(links, _changes_of(experiment, there), _presence_of(there))
+
+    def take(self, which: Index) -> Pattern:
+        """Some of the links, or the same in another order."""
+        changes = tuple(change.take(which) for change in self.changes)
+        return Pattern(self.links.take(which), changes, None if self.presence is None else self.presence.take(which))
+
+    def heard_by(self, rows: Index) -> Pattern:
+        """The links on which these rows listen, as `Links.of` gives them."""
+        at, listener = self.links.heard_by(rows)
+        mine = self.take(at)
+        return replace(mine, links=replace(mine.links, listener=listener))
+
+    def without_listeners(self, rows: Index) -> Pattern:
+        """The links on which others than these rows listen."""
+        return self.take(np.flatnonzero(~np.isin(self.links.listener, rows))) if len(rows) else self
+
+    def and_then(self, others: Links) -> Pattern:
+        """With other links behind them, which do not change and are always there."""
+        changes = tuple(change.padded(len(others)) for change in self.changes)
+        presence = None if self.presence is None else self.presence.padded(len(others))
+        return Pattern(self.links.and_then(others), changes, presence)
+
+    def repeated(self, times: int, rows: int) -> Pattern:
+        """The same in `times` copies of an experiment of `rows` robots, one copy behind the other."""
+        many = self.take(np.tile(np.arange(len(self.links)), times))
+        return replace(many, links=self.links.repeated(times, rows))
+
+    def stages(self) -> list[Links]:
+        """The links with their targets at the beginning, and after each change."""
+        count, ends = len(self.links), [change.at + change.over + 1.0 for change in self.changes]
+        later = (wanted(self.links, self.changes[: k + 1], np.full(count, end)) for k, end in enumerate(ends))
+        return [self.links, *later]
+
+    def present(self, time: Array, position: Array) -> Mask | None:
+        """Which links are there (T, E), on true positions (T, N, 3) at times (T,); None if all always are."""
+        if self.presence is None:
+            return None
+        reshaping = Reshaping(self.links, (), self.presence)
+        there = np.empty((len(time), len(self.links)), dtype=bool)
+        for k, t in enumerate(time.tolist()):
+            reshaping.move(np.full(position.shape[1], t), position[k], position[k, self.links.speaker])
+            there[k] = reshaping.there
+        return there
+
+
+def errors(law: Law, pattern: Pattern, time: Array, position: Array) -> Array:
+    """Error of each link (T, E) as the law measures it; NaN where the link is not there or an end is unknown.
+
+    Args:
+        law: Its `error` is asked for all times at once.
+        pattern: The links.
+        time: (T,) since the common start [s].
+        position: (T, N, 3) true [m].
+    """
+    links = pattern.links
+    if isinstance(law, Distance) and not pattern.changes:
+        error = np.abs(norm(position[:, links.listener] - position[:, links.speaker]) - links.distance)
+    else:
+        step = max(1, AT_ONCE // max(1, len(links)))
+        begins = range(0, len(time), step)
+        parts = [_errors(law, pattern, time[k : k + step], position[k : k + step]) for k in begins]
+        error = np.concatenate([np.zeros((0, len(links))), *parts])
+    there = pattern.present(time, position)
+    return error if there is None else np.where(there, error, np.nan)
+
+
+def _errors(law: Law, pattern: Pattern, time: Array, position: Array) -> Array:
+    links, (count, rows) = pattern.links, position.shape[:2]
+    many = links.repeated(count, rows)
+    if pattern.changes:
+        all_of_them = np.tile(np.arange(len(links)), count)
+        changes = [change.take(all_of_them) for change in pattern.changes]
+        many = wanted(many, changes, np.repeat(time, len(links)))
+    flat = position.reshape(-1, 3)
+    return law.error(flat, flat[many.speaker], many).reshape(count, len(links))
+
+
+def anchors_of(experiment: Experiment, names: Sequence[str], only: Sequence[str] | None = None) -> Anchors | None:
+    """The anchors of these robots, or of some `only`, each once; None if there are none."""
+    formation = experiment.formation
+    anchored = formation.anchors if only is None else [name for name in formation.anchors if name in only]
+    there = [(row, formation.anchors[name]) for row, name in enumerate(names) if name in anchored]
+    if not there:
+        return None
+    anchors = [each if isinstance(each, Anchor) else Anchor(distance=each) for _, each in there]
+    to_origin = 2.0 * formation.gain  # twice that of a link: as the authors' controllers pull to the origin
+    return Anchors(
+        row=np.array([row for row, _ in there], dtype=np.intp),
+        point=_vectors([_spatial(each.to) for each in anchors]),
+        axis=_vectors([_unit(each.along or each.across) for each in anchors]),
+        whole=np.array([0.0 if each.across is not None else 1.0 for each in anchors]),
+        along=np.array([float(each.across is not None) - float(each.along is not None) for each in anchors]),
+        distance=np.array([each.distance for each in anchors]),
+        gain=np.array([each.gain or (to_origin if each.distance > 0.0 else formation.stiffness) for each in anchors]),
+    )
+
+
+def _presence_of(one_way: Sequence[OneWay]) -> Presence | None:
+    columns = [(link.since, link.until, link.reach, link.release) for link in one_way]
+    table = np.array(columns, dtype=float).reshape(-1, 4)
+    if (table[:, 0] <= 0.0).all() and np.isinf(table[:, 1:]).all():
+        return None
+    return Presence(*table.T)
+
+
+def _changes_of(experiment: Experiment, one_way: Sequence[OneWay]) -> tuple[Change, ...]:
+    rise = np.array([height(experiment, link.listener) - height(experiment, link.speaker) for link in one_way])
+    in_order = sorted(experiment.formation.changes, key=lambda each: each.at_s)
+    return tuple(_change(experiment, each, one_way, rise) for each in in_order)
+
+
+def _change(experiment: Experiment, described: Described, one_way: Sequence[OneWay], rise: Array) -> Change:
+    new = {
+        pair: target(experiment, text, given, pair[0])
+        for text, given in described.links.items()
+        for pair in pairs(text)
+    }
+    then = [new.get((link.listener, link.speaker)) for link in one_way]
+    return Change(
+        at=described.at_s,
+        over=described.over_s,
+        distance=np.array([math.nan if each is None else each.distance for each in then]),
+        relative=_vectors([UNKNOWN if each is None else each.relative for each in then]),
+        bearing=_vectors([UNKNOWN if each is None else each.bearing for each in then]),
+        scale=described.scale,
+        turn=described.rotate,
+        rise=rise,
+    )
+
+
+def _spatial(vector: Sequence[float] | None) -> tuple[float, float, float]:
+    x, y, z = (*(vector or (0.0, 0.0)), 0.0)[:3]
+    return x, y, z
+
+
+def _unit(direction: Sequence[float] | None) -> tuple[float, float, float]:
+    x, y, z = _spatial(direction)
+    length = math.hypot(x, y, z) or 1.0
+    return x / length, y / length, z / length
+
+
+def _vectors(rows: Sequence[Sequence[float]]) -> Array:
+    return np.array(rows, dtype=float).reshape(-1, len(UNKNOWN))

@@ -1,0 +1,167 @@
+"""The links of a formation as the file writes them: "A > B" (B listens to A), "A - B" (both listen)."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Final
+
+from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE
+from agents.plugins import registry
+from experiments.definition.experiment import Experiment, Link, Target
+
+_LINK: Final = re.compile(r"\s*(\w+)\s*([>-])\s*(\w+)\s*", re.ASCII)
+_ALMOST: Final = re.compile(r"\s*(\w+)\s*([^\w\s]+)\s*(\w+)\s*", re.ASCII)
+FORM: Final = 'a link reads "A > B" (B listens to A) or "A - B" (both listen)'
+UNKNOWN: Final = (math.nan, math.nan, math.nan)
+RELEASE: Final = 1.1  # of the range: what separates coming from going, so that a link does not flicker
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a one-way link asks for: see `agents.formation.graph.Links`."""
+
+    wants: int
+    distance: float
+    relative: tuple[float, float, float] = UNKNOWN
+    bearing: tuple[float, float, float] = UNKNOWN
+
+
+@dataclass(frozen=True)
+class OneWay:
+    """A one-way link: who listens to whom, for what, with which gain, and when.
+
+    Attributes:
+        listener: Name.
+        speaker: Name.
+        wanted: What it asks for.
+        gain: Of the law.
+        since: From when on [s].
+        until: Until when [s], infinity to the end.
+        reach: Nearer than this it is there [m], infinity always.
+        release: Farther than this it is there no more [m].
+        text: As the file writes it; empty for links by proximity only.
+    """
+
+    listener: str
+    speaker: str
+    wanted: Wanted
+    gain: float
+    since: float = 0.0
+    until: float = math.inf
+    reach: float = math.inf
+    release: float = math.inf
+    text: str = ""
+
+
+def pairs(text: str) -> tuple[tuple[str, str], ...]:
+    """The (listener, speaker) pairs that a link stands for, one or two.
+
+    Raises:
+        ValueError: If it reads otherwise; the message is what to write instead.
+    """
+    match = _LINK.fullmatch(text)
+    if match is None:
+        raise ValueError(_remedy(text))
+    first, sign, second = match.groups()
+    return ((second, first),) if sign == ">" else ((second, first), (first, second))
+
+
+def one_way_links(experiment: Experiment) -> list[OneWay]:
+    """Every link that there may be, in the robots' order: by listener, then speaker.
+
+    Raises:
+        ValueError: If a link is not written as it must be; never for an experiment that `document.read` returned.
+        KeyError: If it names no robot; likewise.
+    """
+    formation = experiment.formation
+    near = formation.proximity
+    reach, release = (math.inf, math.inf) if near is None else (near.range, near.release or RELEASE * near.range)
+    found = []
+    for text, link in formation.links.items():
+        given = link if isinstance(link, Link) else Link(distance=link)
+        for listener, speaker in pairs(text):
+            wanted = target(experiment, text, given, listener)
+            gain = _gain(experiment, wanted.wants) if given.gain is None else given.gain
+            until = math.inf if given.until_s is None else given.until_s
+            found.append(OneWay(listener, speaker, wanted, gain, given.from_s, until, reach, release, text))
+    if near is not None and near.distance is not None:
+        there = {(link.listener, link.speaker) for link in found}
+        wanted = Wanted(BY_DISTANCE, near.distance)
+        gain = _gain(experiment, BY_DISTANCE)
+        found += [
+            OneWay(a, b, wanted, gain, reach=reach, release=release)
+            for a in experiment.robots
+            for b in experiment.robots
+            if a != b and (a, b) not in there
+        ]
+    row = {name: number for number, name in enumerate(experiment.robots)}
+    return sorted(found, key=lambda link: (row[link.listener], row[link.speaker]))
+
+
+def parse_links(experiment: Experiment) -> list[tuple[str, str, float, float]]:
+    """Every directed link as (listener, speaker, distance [m], gain), in the robots' order: by listener, then speaker.
+
+    The distance is NaN where only a direction is asked for.
+
+    Raises:
+        ValueError: If a link is not written as it must be; never for an experiment that `document.read` returned.
+        KeyError: If it names no robot; likewise.
+    """
+    return [(link.listener, link.speaker, link.wanted.distance, link.gain) for link in one_way_links(experiment)]
+
+
+def target(experiment: Experiment, text: str, given: Target | float, listener: str) -> Wanted:
+    """What a link asks of one of its ends, each way that it can be told.
+
+    Args:
+        experiment: For the heights that robots hold.
+        text: The link, which says what is the first robot and what the second.
+        given: What stands behind it.
+        listener: The end that is asked.
+    """
+    given = given if isinstance(given, Target) else Target(distance=given)
+    if given.distance is not None:
+        return Wanted(BY_DISTANCE, given.distance)
+    second, first = pairs(text)[0]
+    sign = 1.0 if listener == second else -1.0
+    if given.bearing is not None:
+        length = math.hypot(*given.bearing)
+        toward = [sign * value / length for value in given.bearing]
+        return Wanted(BY_BEARING, math.nan, UNKNOWN, (*toward, math.nan)[:3])  # type: ignore[arg-type]
+    offset = list(given.offset or ())
+    rise = height(experiment, second) - height(experiment, first)
+    x, y, z = (sign * value for value in (offset if len(offset) == 3 else [*offset, rise]))
+    length = math.hypot(x, y, z)
+    bearing = (x / length, y / length, z / length) if length > 0.0 else UNKNOWN
+    return Wanted(BY_RELATIVE, length, (x, y, z), bearing)
+
+
+def height(experiment: Experiment, name: str) -> float:
+    """The height that a robot holds [m]."""
+    return experiment.robots[name].hover or 0.0
+
+
+def _gain(experiment: Experiment, wants: int) -> float:
+    """The formation's gain for what a link asks, as the law takes it."""
+    formation = experiment.formation
+    law = registry.struct(registry.LAWS, registry.split(formation.law)[0])
+    by = getattr(law, "PULLS_BY", "gain")
+    if by == "by link":
+        by = "gain" if wants == BY_DISTANCE else "stiffness"
+    return formation.stiffness if by == "stiffness" else formation.gain
+
+
+def _remedy(text: str) -> str:
+    almost = _ALMOST.fullmatch(text)
+    if almost is None:
+        return FORM
+    first, sign, second = almost.groups()
+    if "<" in sign and ">" in sign:
+        return f'write "{first} - {second}" when both listen'
+    if "<" in sign:
+        return f'write "{second} > {first}" when {first} listens to {second}'
+    if ">" in sign:
+        return f'write "{first} > {second}" when {second} listens to {first}'
+    return f'write "{first} > {second}" when {second} listens to {first}, "{first} - {second}" when both listen'

@@ -1,0 +1,72 @@
+"""A network without routers: where every member listens, and who is linked with whom."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from agents.network import endpoints as topology
+from agents.network import lab
+from agents.network.access_control import Rights
+from agents.network.endpoints import Endpoint, free_endpoint
+from experiments.definition import access_rights, assignment, bodies
+from experiments.definition.bodies import VICON_TWIN
+from experiments.definition.experiment import Experiment
+
+ENDPOINTS: Final = "network.txt"  # what to say behind --connect to look at a run: @FOLDER/network.txt
+
+
+def members(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
+    """The endpoints of all members of a mesh, each with its owner: robots, then whoever serves them.
+
+    All cases of a file have the same: a robot is at one place in all of them.
+
+    Args:
+        cases: Of the experiment.
+        secure: Whether ports that are chosen ask for certificates.
+    """
+    found: dict[str, str] = {}
+    services: dict[str, None] = {"recorder": None}
+    for case in cases:
+        for group in access_rights.processes(case):
+            given = next((case.network.addresses[name] for name in group if name in case.network.addresses), "")
+            found.setdefault(topology.TOGETHER.join(group), given)
+        if any(bodies.WORLD in (robot.body, robot.ranges) for robot in case.robots.values()):
+            services["world"] = None
+        if assignment.guided(case):
+            services["centre"] = None
+        if case.positioning == VICON_TWIN:
+            services[VICON_TWIN] = None
+    services["conductor"] = None
+    taken = set(found.values())
+    for name in (*found, *services):
+        while not found.get(name):
+            chosen = free_endpoint(0, "tls" if secure else "tcp")
+            if chosen not in taken:
+                found[name] = chosen
+                taken.add(chosen)
+    return [topology.owned(endpoint, name) for name, endpoint in found.items()]
+
+
+def listeners(experiment: Experiment) -> dict[str, list[str]]:
+    """At which names of machines the identities of a lab listen in a mesh; nobody where there are routers."""
+    if experiment.network.topology != "mesh":
+        return {}
+    here = ["localhost", "127.0.0.1", "::1"]
+    given = experiment.network.addresses
+    robots = {name: [Endpoint.parse(given[name]).host] if name in given else here for name in experiment.robots}
+    return {**dict.fromkeys(("recorder", "world", "centre", "twin", "operator"), here), **robots}
+
+
+def near(experiment: Experiment, names: Sequence[str], endpoints: Sequence[str]) -> list[str]:
+    """What of the endpoints concerns robots that share a process: see `topology.near`."""
+    if not topology.is_mesh(endpoints):
+        return list(endpoints)
+    return topology.near(endpoints, access_rights.heard(experiment), names)
+
+
+def rights(experiment: Experiment, endpoints: Sequence[str]) -> Rights | None:
+    """Who may do what, for a member of a mesh, which enforces it itself; None where routers do, or nobody."""
+    if not topology.is_mesh(endpoints) or lab.of(endpoints) is None:
+        return None
+    return access_rights.rights([experiment])

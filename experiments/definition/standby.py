@@ -1,0 +1,69 @@
+"""Robots in reserve: those on standby, which somebody may add to a run, and spares, which take over a name."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import TypeVar
+
+import msgspec
+
+from experiments.definition.experiment import Experiment, Hybrid
+from experiments.definition.links import pairs
+
+T = TypeVar("T")
+
+
+def taking_part(experiment: Experiment) -> Experiment:
+    """The experiment without its robots on standby, as it runs while nobody adds them: in virtual time nobody can."""
+    robots = {name: robot for name, robot in experiment.robots.items() if not robot.standby}
+    if len(robots) == len(experiment.robots):
+        return experiment
+    formation, channel, who = experiment.formation, experiment.channel, experiment.architecture
+    links = _between(formation.links, robots)
+    changes = [
+        msgspec.structs.replace(change, links={text: to for text, to in change.links.items() if text in links})
+        for change in formation.changes
+    ]
+    outages = [
+        msgspec.structs.replace(
+            outage,
+            links=list(_between(dict.fromkeys(outage.links), robots)),
+            robots=[name for name in outage.robots if name in robots],
+        )
+        for outage in channel.outages
+    ]
+    outages = [  # one that names nobody any more would mean everybody
+        short for short, whole in zip(outages, channel.outages, strict=True)
+        if short.links or short.robots or not (whole.links or whole.robots)
+    ]  # fmt: skip
+    if isinstance(who, Hybrid):
+        led = [name for name in who.robots if name in robots]
+        who = "distributed" if not led else "centralised" if len(led) == len(robots) else Hybrid(who.kind, led)
+    return msgspec.structs.replace(
+        experiment,
+        robots=robots,
+        formation=msgspec.structs.replace(
+            formation,
+            leader=formation.leader if formation.leader in robots else None,
+            links=links,
+            anchors={name: anchor for name, anchor in formation.anchors.items() if name in robots},
+            changes=changes,
+        ),
+        timeline=[leg for leg in experiment.timeline if leg.robot in robots],
+        architecture=who,
+        channel=msgspec.structs.replace(channel, links=_between(channel.links, robots), outages=outages),
+        hosts={
+            name: msgspec.structs.replace(host, robots=[robot for robot in host.robots if robot in robots])
+            for name, host in experiment.hosts.items()
+        },
+    )
+
+
+def _between(links: Mapping[str, T], robots: Collection[str]) -> dict[str, T]:
+    """Those of the links whose ends are both among `robots`."""
+    return {text: to for text, to in links.items() if {*pairs(text)[0]} <= {*robots}}
+
+
+def absent(experiment: Experiment) -> dict[str, str]:
+    """Robots that nobody starts from here, for their hosts have no address; by robot its host."""
+    return {robot: name for name, host in experiment.hosts.items() if host.address is None for robot in host.robots}

@@ -1,0 +1,156 @@
+"""Arena files: one arena in a file of its own, with which the [arena] of an experiment begins.
+
+`file = "lab.toml"` in [arena] names a TOML file beside the experiment file, or one of the catalogue. It holds the
+single table [arena]; the experiment's own keys win over it, obstacles and start boxes merge by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from agents.plugins.registry import did_you_mean
+from experiments.catalogue import index
+from experiments.definition.experiment import Arena, Part
+from experiments.file import structure
+from experiments.file import text as syntax
+from experiments.file.consistency import of_arena
+from experiments.file.overrides import merged
+from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places
+from experiments.file.problems import Path as Keys
+
+LOOKED_AT: Final = 100  # files beside an experiment, for the one that was meant
+_HERE: Final = ("arena", "file")
+_FIELDS: Final = frozenset(Arena.__struct_fields__)
+_BELONGS: Final = "belongs in the experiment file: an arena file holds nothing but [arena]"
+
+
+class _Whole(Part, frozen=True):
+    """What an arena file holds."""
+
+    arena: Arena
+
+
+@dataclass(frozen=True)
+class ArenaFile:
+    """An arena file that holds no error.
+
+    Attributes:
+        name: As the experiment names it.
+        label: As its errors name it.
+        text: As it stands there.
+        table: Its [arena].
+    """
+
+    name: str
+    label: str
+    text: str
+    table: dict[str, Any]
+
+    @cached_property
+    def places(self) -> dict[Keys, Place]:
+        """Where everything stands in it."""
+        return places(self.text)
+
+    def located(self, fault: Fault) -> Problem:
+        """A fault in it, with its place."""
+        stands, place = nearest(self.places, fault.path)
+        offset = place.key if fault.on_key and stands == fault.path else place.value
+        return at_offset(self.label, self.text, offset, fault.message, fault.hint)
+
+
+class Misnamed(ValueError):
+    """An arena file that cannot be had; the fault is the experiment's."""
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__(fault.message)
+        self.fault = fault
+
+
+def named(document: Mapping[str, Any]) -> str | None:
+    """The arena file that a document names, if it names one as it should."""
+    arena = document.get("arena")
+    name = arena.get("file") if isinstance(arena, dict) else None
+    return name if isinstance(name, str) else None
+
+
+def furnished(document: Mapping[str, Any], file: ArenaFile | None) -> dict[str, Any]:
+    """A document with what its arena file holds in its own [arena], which names no file any more."""
+    if file is None:
+        return dict(document)
+    own = {key: value for key, value in document["arena"].items() if key != "file"}
+    return {**document, "arena": merged(file.table, own, ("arena",))}
+
+
+def load(name: str, folder: Path) -> ArenaFile:
+    """Reads and checks an arena file.
+
+    Args:
+        name: As the experiment names it.
+        folder: That of the experiment file.
+
+    Raises:
+        Misnamed: If there is no such file.
+        DocumentError: With everything that is wrong in it.
+    """
+    if not name.strip() or "\0" in name or Path(name).name != name:
+        hint = "put it beside the experiment file, and give its name alone"
+        raise Misnamed(Fault(_HERE, f"{name!r} is no name of a file", hint))
+    file = folder / name
+    if not file.exists() and (index.FOLDER / name).is_file():
+        file = index.FOLDER / name
+    label = str(file)
+    try:
+        text = syntax.decoded(syntax.content(file, label), label)
+    except FileNotFoundError:
+        hint = did_you_mean(name, _others(folder))
+        raise Misnamed(Fault(_HERE, f"there is no arena file {label}", hint or "write one beside this file")) from None
+    try:
+        content = syntax.parsed(text, label, json=False)
+    except RecursionError:
+        raise DocumentError([Problem(label, 0, 0, "tables or lists are nested too deeply", "flatten them")]) from None
+    read = ArenaFile(name, label, text, content.get("arena", {}))
+    _refuse(read, [*structure.storable(content), *_misshapen(content)])
+    _refuse(read, list(of_arena(msgspec.convert(content, _Whole).arena)))
+    return read
+
+
+def _others(folder: Path) -> list[str]:
+    """Arena files that there are: beside the experiment file those without robots, and those of the catalogue."""
+    found = []
+    for file in sorted(folder.glob("*.toml"))[:LOOKED_AT]:
+        try:
+            text = file.read_text("utf-8", errors="replace")
+        except OSError:
+            continue  # a folder, or nobody may read it
+        if "[arena" in text and "[robots" not in text:
+            found.append(file.name)
+    return list(dict.fromkeys([*found, *index.arenas()]))
+
+
+def _misshapen(content: Mapping[str, Any]) -> Iterator[Fault]:
+    """Everything by which the content is no arena file."""
+    for fault in structure.faults(content, _Whole):
+        path = fault.path
+        if not path:
+            yield replace(fault, hint="write [arena] above its keys, such as size = [4.0, 4.0, 2.5]")
+        elif len(path) == 1 and path != ("arena",):
+            yield replace(fault, hint="write [arena] above it" if path[0] in _FIELDS else f"it {_BELONGS}")
+        elif "belongs at the top" in fault.hint:
+            yield replace(fault, hint=f"'{path[-1]}' {_BELONGS}")
+        else:
+            yield fault
+    arena = content.get("arena")
+    if isinstance(arena, dict) and "file" in arena:
+        yield Fault(_HERE, "an arena file cannot name another", "copy what is needed from there", on_key=True)
+
+
+def _refuse(read: ArenaFile, faults: list[Fault]) -> None:
+    problems = dict.fromkeys(read.located(fault) for fault in faults)
+    if problems:
+        raise DocumentError(sorted(problems, key=lambda problem: (problem.line, problem.column)))

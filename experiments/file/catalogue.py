@@ -1,0 +1,115 @@
+"""The ready-made experiments of the catalogue, and the files that are begun from them."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+from agents.plugins.registry import did_you_mean
+from experiments.catalogue import index
+from experiments.file import arena_file
+from experiments.file.arena_file import ArenaFile
+from experiments.file.json_schema import write_schema
+from experiments.file.problems import DocumentError, Problem
+from experiments.file.text import reason
+
+
+def names() -> list[tuple[str, str]]:
+    """Name and title of every experiment of the catalogue, by name."""
+    return [(name, str(tomllib.loads(_entry(name).read_text("utf-8"))["title"])) for name in index.names()]
+
+
+def path(name: str) -> Path:
+    """The file of a catalogue entry.
+
+    Raises:
+        DocumentError: If there is none of that name.
+    """
+    if name not in index.names():
+        raise DocumentError([no_entry(name)])
+    return _entry(name)
+
+
+def copy(name: str, target: Path) -> Path:
+    """Copies a catalogue entry; beside it its arena file, and the schema that its first line shows to editors.
+
+    Args:
+        name: Of the entry.
+        target: The new file, or a folder for it.
+
+    Returns:
+        The file that was written.
+
+    Raises:
+        DocumentError: If there is no such entry, or the target exists or cannot be written, or another arena file of
+            that name is there.
+    """
+    source = path(name)
+    return write_new(source.read_text("utf-8"), target / source.name if target.is_dir() else target, furnished=True)
+
+
+def write_new(text: str, target: Path, *, furnished: bool = False) -> Path:
+    """Writes a new experiment file, with the schema beside it that its first line shows to editors.
+
+    Args:
+        text: Of the file.
+        target: The file.
+        furnished: The text is a catalogue entry's: the arena file that it names comes along.
+
+    Returns:
+        The file.
+
+    Raises:
+        DocumentError: If the target exists or cannot be written, or another arena file of that name is there.
+    """
+    try:
+        beside = _arena_beside(text, target.parent) if furnished else None
+        with target.open("x", encoding="utf-8") as new:
+            new.write(text)
+        if beside is not None:
+            (target.parent / beside.name).write_text(beside.text, encoding="utf-8")
+        if not (target.parent / index.SCHEMA).exists():
+            write_schema(target.parent / index.SCHEMA)
+    except FileExistsError:
+        hint = "choose another name; nothing was changed"
+        raise DocumentError([Problem(str(target), 0, 0, "exists already", hint)]) from None
+    except (OSError, ValueError) as error:
+        hint = "choose a place that exists and may be written to"
+        raise DocumentError([Problem(str(target), 0, 0, f"cannot be written: {reason(error)}", hint)]) from error
+    return target
+
+
+def _arena_beside(text: str, folder: Path) -> ArenaFile | None:
+    """The arena file that an entry needs in a folder.
+
+    Raises:
+        DocumentError: If another one of that name is there.
+    """
+    name = arena_file.named(tomllib.loads(text))
+    if name is None:
+        return None
+    wanted, there = arena_file.load(name, index.FOLDER), folder / name
+    if there.exists() and there.read_text("utf-8") != wanted.text:
+        hint = "choose another folder, or rename that file; nothing was changed"
+        raise DocumentError([Problem(str(there), 0, 0, "is another arena than that of the entry", hint)])
+    return wanted
+
+
+def _entry(name: str) -> Path:
+    return index.FOLDER / f"{name}.toml"
+
+
+def no_entry(name: str) -> Problem:
+    """Neither a file nor an entry has this name."""
+    hint = did_you_mean(name, index.names())
+    return Problem(name, 0, 0, "neither a file nor an experiment of the catalogue", f"{hint} (zenpark new copies one)")
+
+
+def found(name: str | Path) -> Path:
+    """The file of that name, or that of the catalogue entry; a folder of the same name does not hide an entry."""
+    file = Path(name)
+    known = str(name) in index.names()
+    try:
+        return _entry(str(name)) if known and not file.is_file() else file
+    except (OSError, ValueError):  # a name too long, or with a character that no name has
+        return file

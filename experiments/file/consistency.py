@@ -1,0 +1,271 @@
+"""Does an experiment make sense: what no single field of it can tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from agents.body.kinds import KINDS
+from agents.plugins import registry
+from agents.plugins.registry import did_you_mean
+from experiments.definition.experiment import Arena, Experiment, Hybrid, Robot
+from experiments.file import consistency_formation, consistency_network
+from experiments.file.problems import Fault
+from twins import scene as outlines
+from twins.scene import Scene
+from twins.sensing.range_sensors import SENSORS
+
+
+def standby_faults(experiment: Experiment) -> Iterator[Fault]:
+    """Reserves that nobody could call upon, or not one by one."""
+    robots = experiment.robots
+    for name, robot in robots.items():
+        if robot.standby and robot.process is not None:
+            message = f"'{name}' is on standby and shares the process '{robot.process}' with robots that may run"
+            yield Fault(("robots", name, "process"), message, "give it a process of its own: leave `process` out")
+    if all(robot.standby for robot in robots.values()):
+        name = next(iter(robots))
+        yield Fault(("robots", name, "standby"), "all robots are on standby", "let one or more take part")
+    kinds = {robot.kind for robot in robots.values()}
+    for name, spare in experiment.spares.items():
+        path = ("spares", name)
+        if name in robots:
+            yield Fault(path, f"'{name}' is the name of a robot already", "rename one of them", on_key=True)
+        if spare.kind not in kinds:
+            hint = f"spares take over from robots of their kind: {', '.join(sorted(kinds))}"
+            yield Fault((*path, "kind"), f"no robot is a {spare.kind}", hint)
+        if spare.process is not None:
+            yield Fault((*path, "process"), f"'{name}' begins in a process of its own", "leave `process` out")
+        if spare.standby:
+            yield Fault((*path, "standby"), "a spare always waits", "leave `standby` out")
+        if registry.body_name(spare.body) in registry.names(registry.DEVICES):
+            message = f"'{name}' is behind a protocol twin ('{spare.body}'), which starts before the run only"
+            yield Fault((*path, "body"), message, "give it the body twin, or a real one")
+    if experiment.on_loss == "replace" and not experiment.spares:
+        message = "who is lost is to be replaced, but there is no spare"
+        yield Fault(("on_loss",), message, 'add [spares.NAME], or say on_loss = "restart"')
+
+
+_RESERVED: Final = (
+    "all",
+    "estop",
+    "run",
+    "world",
+    "centre",
+    *KINDS,
+)  # they mean something in keys and in [disturbance]
+_WALL: Final = "wall"  # the border of the arena, where contacts are told
+
+
+def faults(experiment: Experiment) -> Iterator[Fault]:
+    """Everything that contradicts something else, with its path in the file."""
+    yield from _rates(experiment)
+    yield from of_arena(experiment.arena)
+    for name, robot in experiment.robots.items():
+        yield from _robot(experiment, ("robots", name), robot)
+    for name, robot in experiment.spares.items():
+        yield from _robot(experiment, ("spares", name), robot)
+    yield from standby_faults(experiment)
+    yield from _furnished(experiment)
+    yield from consistency_formation.faults(experiment)
+    yield from consistency_network.channel_faults(experiment)
+    yield from consistency_network.host_faults(experiment)
+    yield from _timeline(experiment)
+    yield from _architecture(experiment)
+    yield from _triggers(experiment)
+    for name in experiment.disturbance:
+        known = ("all", *KINDS, *experiment.robots)
+        if name not in known:
+            message = f"'{name}' is neither a robot nor a kind of robots"
+            yield Fault(("disturbance", name), message, did_you_mean(name, known), on_key=True)
+
+
+def of_arena(arena: Arena) -> Iterator[Fault]:
+    """What is wrong with an arena by itself; paths begin at the top of a document."""
+    scene = Scene.furnished(arena.size, arena.obstacles, {}, walled=arena.walls)
+    x, y, z = arena.size
+    for number, (name, obstacle) in enumerate(arena.obstacles.items()):
+        path = ("arena", "obstacles", name)
+        if name == _WALL:
+            message = f"an obstacle cannot be called '{_WALL}', which means the border of the arena"
+            yield Fault(path, message, "rename it", on_key=True)
+        if outlines.outside(scene, number):
+            message = f"'{name}' stands outside of the arena, of which the middle is 0, 0"
+            hint = f"x lies between {-x / 2:g} and {x / 2:g}, y between {-y / 2:g} and {y / 2:g}; or enlarge size"
+            yield Fault((*path, "at"), message, hint)
+        if obstacle.bottom >= z:
+            message = f"'{name}' begins at {obstacle.bottom:g} m: the arena is {z:g} m high"
+            yield Fault((*path, "bottom"), message, f"give it a bottom below {z:g}, or enlarge size")
+    for name, box in arena.starts.items():
+        for axis in (0, 1):
+            beyond = abs(box.at[axis]) + box.size[axis] / 2 - arena.size[axis] / 2
+            if beyond > 1e-9:
+                message = f"the start box '{name}' reaches {beyond:.2g} m beyond the arena along {'xy'[axis]}"
+                yield Fault(("arena", "starts", name, "at"), message, "move it, make it smaller, or enlarge size")
+
+
+def _furnished(experiment: Experiment) -> Iterator[Fault]:
+    """Do robots and what stands in the arena go together at the start."""
+    arena, robots = experiment.arena, experiment.robots
+    scene = Scene.furnished(arena.size, arena.obstacles, {}, walled=arena.walls)
+    for number, name in enumerate(arena.obstacles):
+        path = ("arena", "obstacles", name)
+        if name in robots:
+            yield Fault(path, f"'{name}' is the name of a robot already", "rename one of them", on_key=True)
+        for robot, each in robots.items():
+            if each.kind not in KINDS:
+                continue
+            kind, place = KINDS[each.kind], np.array(each.start[:2])
+            if not outlines.at_height(scene, number, 0.0, kind.height):  # who flies stands on the floor before
+                continue
+            missing = kind.radius - float(outlines.distance(scene, number, scene.pose[number], place))
+            if missing > 1e-9:
+                message = f"'{robot}' starts in the obstacle '{name}'"
+                hint = f"move one of them by {missing + 0.01:.2f} m or more: all start on the floor, flying ones too"
+                yield Fault(("robots", robot, "start"), message, hint)
+    boxes = arena.starts
+    for robot, each in robots.items():
+        x, y = each.start[:2]
+        inside = [
+            max(abs(x - box.at[0]) - box.size[0] / 2, abs(y - box.at[1]) - box.size[1] / 2) <= 1e-9
+            for box in boxes.values()
+        ]
+        if boxes and not any(inside):
+            where = ", ".join(f"'{name}' around ({box.at[0]:g}, {box.at[1]:g})" for name, box in boxes.items())
+            message = f"'{robot}' starts outside of the boxes where robots may start"
+            yield Fault(("robots", robot, "start"), message, f"start it in {where}; or change [arena.starts]")
+
+
+def _rates(experiment: Experiment) -> Iterator[Fault]:
+    body = experiment.rates.body_hz
+    for name in ("pose_hz", "coordination_hz", "state_hz"):
+        ratio = body / getattr(experiment.rates, name)
+        if abs(ratio - max(1, round(ratio))) > 1e-9 * ratio:
+            yield Fault(
+                ("rates", name),
+                f"{name} = {body / ratio:g} does not divide body_hz = {body:g}",
+                f"the nearest that does: {name} = {_divisor(body, body / ratio):g}",
+            )
+
+    samples = experiment.duration_s * experiment.rates.state_hz
+    if samples < 1.0 - 1e-9:
+        message = f"duration_s = {experiment.duration_s:g} holds less than two samples of telemetry"
+        hint = f"give it {1.0 / experiment.rates.state_hz:g} s or more, or raise rates.state_hz"
+        yield Fault(("duration_s",), message, hint)
+
+
+def _divisor(body: float, wanted: float) -> float:
+    """The nearest rate that divides `body` and can be written in a few digits."""
+    written = (float(f"{body / times:g}") for times in range(1, 1001))
+    exact = [rate for times, rate in enumerate(written, 1) if rate * times == body]
+    return min(exact, key=lambda rate: abs(rate - wanted), default=body)
+
+
+def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
+    name = path[1]
+    if name in _RESERVED:
+        yield Fault(
+            path, f"a robot cannot be called '{name}', which has a meaning of its own", "rename it", on_key=True
+        )
+    body = registry.body_name(robot.body)
+    bodies = [*registry.names(registry.BODIES), *registry.names(registry.DEVICES)]
+    if body not in bodies:
+        yield Fault((*path, "body"), f"no {body!r} among the bodies", did_you_mean(body, bodies))
+    if robot.kind in KINDS:
+        yield from _hover(experiment, path, robot)
+    else:
+        yield Fault((*path, "kind"), f"no {robot.kind!r} among the kinds of robots", did_you_mean(robot.kind, KINDS))
+    for number, sensor in enumerate(robot.sensors or []):
+        if sensor not in SENSORS:
+            message = f"no {sensor!r} among the range sensors"
+            yield Fault((*path, "sensors", number), message, did_you_mean(sensor, SENSORS))
+    for axis, size in enumerate(experiment.arena.size[:2]):
+        if abs(robot.start[axis]) > size / 2:
+            yield Fault(
+                (*path, "start", axis),
+                f"'{name}' starts outside of the arena",
+                f"{'xy'[axis]} lies between {-size / 2:g} and {size / 2:g}; or enlarge size in [arena]",
+            )
+    if len(robot.start) == 3 and abs(robot.start[2]) > 2 * math.pi:
+        radians = math.remainder(math.radians(robot.start[2]), 2 * math.pi)
+        yield Fault((*path, "start", 2), "the yaw is in radians", f"{robot.start[2]:g} degrees are {radians:.4f}")
+
+
+def _hover(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
+    name, top, margin = path[1], experiment.arena.size[2], experiment.safety.margin
+    if not KINDS[robot.kind].flies:
+        if robot.hover is not None:
+            yield Fault(
+                (*path, "hover"), f"'{name}' is a {robot.kind}, which does not fly", "leave hover out", on_key=True
+            )
+    elif robot.hover is None:
+        message = f"'{name}' is a {robot.kind}, which flies: it needs a height to hold"
+        yield Fault(path, message, f"add hover = {min(0.8, top / 2):g}, in metres")
+    elif robot.hover > top - margin:
+        yield Fault(
+            (*path, "hover"),
+            f"'{name}' cannot hover at {robot.hover:g} m: the arena is {top:g} m high, less a margin of {margin:g} m",
+            f"use a hover of at most {max(0.0, top - margin):g}, or enlarge size in [arena]",
+        )
+
+
+def _triggers(experiment: Experiment) -> Iterator[Fault]:
+    """Does each trigger stand where it makes sense, with the prediction that it needs."""
+    kind, _ = registry.split(experiment.trigger)
+    spoken = registry.struct(registry.TRIGGERS, kind)
+    if "communication" not in getattr(spoken, "places", ("communication",)):
+        message = f"'{kind}' tells when the law is computed anew, not when a robot speaks"
+        yield Fault(("trigger",), message, f"put it into [formation] as update = '{kind}', and another trigger here")
+    needed = getattr(spoken, "prediction", "hold")
+    if experiment.prediction is not None and needed != "hold":
+        given, _ = registry.split(experiment.prediction)
+        if given == "hold":
+            message = f"'{kind}' counts on neighbours that extrapolate, but prediction = 'hold' says that they do not"
+            hint = f"leave prediction out, which means '{needed}', or take the trigger send-on-delta"
+            yield Fault(("prediction",), message, hint)
+    if experiment.formation.update is None:
+        return
+    kind, given_too = registry.split(experiment.formation.update)
+    if "control" not in getattr(registry.struct(registry.TRIGGERS, kind), "places", ("control",)):
+        message = f"'{kind}' tells when a robot speaks, not when the law is computed anew"
+        yield Fault(("formation", "update"), message, "take another one, such as send-on-delta or relative-control")
+    if given_too.get("smoothing_s"):
+        message = "smoothing_s is for what is said; nothing is said where the law is computed"
+        yield Fault(("formation", "update", "smoothing_s"), message, "leave it out", on_key=True)
+
+
+def _architecture(experiment: Experiment) -> Iterator[Fault]:
+    """Does a hybrid architecture name some of the robots, and not all."""
+    hybrid, path = experiment.architecture, ("architecture", "robots")
+    if not isinstance(hybrid, Hybrid):
+        return
+    for number, name in enumerate(hybrid.robots):
+        if name not in experiment.robots:
+            yield Fault((*path, number), f"no robot is called '{name}'", did_you_mean(name, experiment.robots))
+        elif name in hybrid.robots[:number]:
+            yield Fault((*path, number), f"'{name}' is named twice", "name it once")
+    if set(experiment.robots) <= set(hybrid.robots):
+        message = "a hybrid architecture in which the centre guides every robot is a centralised one"
+        yield Fault(path, message, 'write architecture = "centralised", or leave some robots out')
+
+
+def _timeline(experiment: Experiment) -> Iterator[Fault]:
+    before: dict[str, float] = {}
+    for number, leg in enumerate(experiment.timeline):
+        path = ("timeline", number)
+        if leg.robot not in experiment.robots:
+            yield Fault(
+                (*path, "robot"), f"no robot is called '{leg.robot}'", did_you_mean(leg.robot, experiment.robots)
+            )
+        if leg.at_s >= experiment.duration_s:
+            message = f"this leg begins at {leg.at_s:g} s, when the run of {experiment.duration_s:g} s is over"
+            yield Fault((*path, "at_s"), message, "begin earlier, or give a longer duration_s")
+        if leg.at_s <= before.get(leg.robot, -1.0):
+            message = f"this leg of '{leg.robot}' begins at {leg.at_s:g} s, not after the one before it"
+            yield Fault(
+                (*path, "at_s"), message, f"sort its legs by time; the one before begins at {before[leg.robot]:g} s"
+            )
+        before[leg.robot] = max(leg.at_s, before.get(leg.robot, -1.0))

@@ -1,0 +1,134 @@
+"""Does a formation make sense: its links, what they ask for, its anchors and its changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from agents.plugins import registry
+from agents.plugins.registry import did_you_mean
+from experiments.definition.experiment import Change, Experiment, Link, Target
+from experiments.definition.links import FORM, height, pairs
+from experiments.file.problems import Fault, Path
+
+ROUNDED = 1e-3  # [m] heights written with three decimals
+
+
+def faults(experiment: Experiment) -> Iterator[Fault]:
+    """Everything in [formation] that contradicts something else."""
+    found = list(_links(experiment))
+    yield from found
+    for name in experiment.formation.anchors:
+        if name not in experiment.robots:
+            path = ("formation", "anchors", name)
+            yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, experiment.robots), on_key=True)
+    if found:
+        return  # what follows looks links up
+    for text, link in experiment.formation.links.items():
+        path = ("formation", "links", text)
+        yield from _asked(experiment, text, link, path)
+        if isinstance(link, Link) and link.from_s >= experiment.duration_s:
+            message = f"this link begins at {link.from_s:g} s, when the run of {experiment.duration_s:g} s is over"
+            yield Fault((*path, "from_s"), message, "begin earlier, or give a longer duration_s")
+    for number, change in enumerate(experiment.formation.changes):
+        yield from _change(experiment, number, change)
+    near = experiment.formation.proximity
+    if near is not None and near.distance is None and not experiment.formation.links:
+        message = "there are no links that could come and go by range"
+        hint = "add distance = 0.5, which any two robots keep while they are near each other, or [formation.links]"
+        yield Fault(("formation", "proximity"), message, hint)
+
+
+def _links(experiment: Experiment) -> Iterator[Fault]:
+    robots = experiment.robots
+    leader = experiment.formation.leader
+    if leader is not None and leader not in robots:
+        yield Fault(("formation", "leader"), f"no robot is called '{leader}'", did_you_mean(leader, robots))
+    said: dict[tuple[str, str], str] = {}
+    for text in experiment.formation.links:
+        path = ("formation", "links", text)
+        try:
+            both = pairs(text)
+        except ValueError as error:
+            hint = str(error)
+            yield Fault(path, f"{text!r} is no link", hint if hint == FORM else f"{hint}; {FORM}", on_key=True)
+            continue
+        for name in dict.fromkeys(reversed(both[0])):
+            if name not in robots:
+                yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, robots), on_key=True)
+        if both[0][0] == both[0][1]:
+            yield Fault(path, f"'{both[0][0]}' cannot listen to itself", "name two robots", on_key=True)
+            continue
+        again = [pair for pair in both if pair in said]
+        if again:
+            listener, speaker = again[0]
+            message = f"that {listener} listens to {speaker} is already said by '{said[again[0]]}'"
+            yield Fault(path, message, "keep one of the two", on_key=True)
+        said.update(dict.fromkeys(both, text))
+
+
+def kind_of(given: Target | float) -> str:
+    """The word for what a link asks for."""
+    if not isinstance(given, Target):
+        return "distance"
+    return next(name for name in ("distance", "offset", "bearing") if getattr(given, name) is not None)
+
+
+def _asked(experiment: Experiment, text: str, given: Target | float, path: Path) -> Iterator[Fault]:
+    """Can the law do with what a link asks for, and can robots that hold their heights do it."""
+    name, _ = registry.split(experiment.formation.law)
+    needs, kind = getattr(registry.struct(registry.LAWS, name), "NEEDS", "any"), kind_of(given)
+    can = {"distance": ("distance", "offset"), "relative": ("offset",), "bearing": ("bearing", "offset")}
+    words = {"distance": "a distance or an offset", "relative": "an offset", "bearing": "a bearing or an offset"}
+    if needs in can and kind not in can[needs]:
+        message = f"the law '{name}' needs {words[needs]} of every link; this one asks for a {kind}"
+        example = {"relative": "{ offset = [0.6, 0.0] }", "bearing": "{ bearing = [1.0, 0.0] }"}.get(needs, "0.6")
+        yield Fault(path, message, f'write "{text}" = {example}, or take law = "mixed", which goes by each link')
+        return
+    if not isinstance(given, Target):
+        return
+    second, first = pairs(text)[0]
+    rise = height(experiment, second) - height(experiment, first)
+    if given.offset is not None:
+        if needs == "bearing" and not any(given.offset) and rise == 0.0:
+            yield Fault((*path, "offset"), "an offset of zeros has no direction", "give x, y other than 0")
+        if len(given.offset) == 3 and abs(given.offset[2] - rise) > ROUNDED:
+            message = f"'{second}' is held {rise:g} m above '{first}', not {given.offset[2]:g} m"
+            yield Fault((*path, "offset", 2), message, "leave the third number out, or change hover")
+    slope = given.bearing[2] if given.bearing is not None and len(given.bearing) == 3 else None
+    if slope is not None and slope * rise <= 0.0 and not slope == rise == 0.0:
+        message = f"'{second}' is held {rise:g} m above '{first}': this direction is never met"
+        yield Fault((*path, "bearing", 2), message, "leave the third number out: a direction seen from above")
+
+
+def _change(experiment: Experiment, number: int, change: Change) -> Iterator[Fault]:
+    path = ("formation", "changes", number)
+    if change.at_s >= experiment.duration_s:
+        message = f"this change begins at {change.at_s:g} s, when the run of {experiment.duration_s:g} s is over"
+        yield Fault((*path, "at_s"), message, "begin earlier, or give a longer duration_s")
+    before = {pair: given for text, given in experiment.formation.links.items() for pair in pairs(text)}
+    kinds = {kind_of(given) for given in before.values()}
+    for text, given in change.links.items():
+        where = (*path, "links", text)
+        try:
+            both = pairs(text)
+        except ValueError as error:
+            yield Fault(where, f"{text!r} is no link", str(error), on_key=True)
+            continue
+        if not set(both) <= set(before):
+            hint = did_you_mean(text, experiment.formation.links)
+            yield Fault(where, f"{text!r} is none of the formation's links", hint, on_key=True)
+            continue
+        old, new = kind_of(before[both[0]]), kind_of(given)
+        if old != new:
+            message = f"{text!r} asks for a {old} before, and for a {new} then: there is no way between them"
+            yield Fault(where, message, f"give a {old}")
+        else:
+            yield from _asked(experiment, text, given, where)
+    if change.rotate and kinds == {"distance"}:
+        message = "nothing here knows a direction: distances are met whichever way the formation faces"
+        yield Fault((*path, "rotate"), message, "give links an offset or a bearing, and law a law that goes by them")
+    if change.scale != 1.0:
+        for text, given in experiment.formation.links.items():
+            if isinstance(given, Target) and given.bearing is not None and len(given.bearing) == 3 and given.bearing[2]:
+                message = f"the slope of {text!r} changes when the formation grows and heights are held"
+                yield Fault((*path, "scale"), message, "give that bearing as seen from above, without the third number")

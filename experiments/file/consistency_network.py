@@ -1,0 +1,214 @@
+"""Do hosts, robots and network go together."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Final
+
+from agents.network.endpoints import Endpoint
+from agents.plugins import registry
+from agents.plugins.registry import did_you_mean
+from experiments.definition import assignment
+from experiments.definition.experiment import Experiment, LinkChannel
+from experiments.definition.link_conditions import of_link
+from experiments.definition.links import pairs
+from experiments.file.problems import Fault, Path, shown
+
+_WHAT: Final = {"address": "address that ssh takes", "zenpark": "path of a command", "lab": "path of a folder"}
+_WRITE: Final = {
+    "address": "write it like lab1, pi@192.0.2.7 or ssh://pi@192.0.2.7:2222; all else belongs in ~/.ssh/config",
+    "zenpark": "write it like zenpark/zenpark, without blanks or options",
+    "lab": "write it like zenpark-lab, without blanks",
+}
+
+
+def host_faults(experiment: Experiment) -> Iterator[Fault]:
+    """Robots that nobody or two hosts have, processes and bodies that cannot be divided, endpoints that clash."""
+    where: dict[str, str] = {}
+    for host, each in experiment.hosts.items():
+        for name, value in (("address", each.address), ("zenpark", each.zenpark), ("lab", each.lab)):
+            if value is not None and not re.fullmatch(r"[^\s\x00-\x1f-][^\s\x00-\x1f]*", value):
+                message = f"{shown(value)} is no {_WHAT[name]}"
+                yield Fault(("hosts", host, name), message, _WRITE[name])
+        for number, robot in enumerate(each.robots):
+            path = ("hosts", host, "robots", number)
+            if robot not in experiment.robots:
+                yield Fault(path, f"no robot is called '{robot}'", did_you_mean(robot, experiment.robots))
+            elif robot in where:
+                message = f"'{robot}' runs on '{where[robot]}' already"
+                yield Fault(path, message, "name it once: a robot is one process on one machine")
+            else:
+                where[robot] = host
+                yield from _body(experiment, host, number)
+    yield from _processes(experiment, where)
+    yield from _network(experiment)
+
+
+def _body(experiment: Experiment, host: str, number: int) -> Iterator[Fault]:
+    robot = experiment.hosts[host].robots[number]
+    body = experiment.robots[robot].body
+    if body in registry.names(registry.DEVICES):
+        message = f"'{robot}' is behind a protocol twin ('{body}'), which runs on this machine and cannot be seen there"
+        yield Fault(("hosts", host, "robots", number), message, "let it run here, or give it another body")
+
+
+def _processes(experiment: Experiment, where: dict[str, str]) -> Iterator[Fault]:
+    """A process is on one machine, and so are all of its robots."""
+    first: dict[str, str] = {}
+    for name, robot in experiment.robots.items():
+        if robot.process is None:
+            continue
+        other = first.setdefault(robot.process, name)
+        if where.get(other) != where.get(name):
+            message = f"'{name}' and '{other}' share the process '{robot.process}' but not the machine"
+            hint = "name both in the same host, or give them processes of their own"
+            yield Fault(("robots", name, "process"), message, hint)
+
+
+def _network(experiment: Experiment) -> Iterator[Fault]:
+    network = experiment.network
+    if network.listen is not None and network.connect is not None:
+        message = "`listen` is for the router that zenpark starts, `connect` for routers that run already"
+        yield Fault(("network", "listen"), message, "leave one of them out", on_key=True)
+    for name, endpoints in (("listen", network.listen), ("connect", network.connect)):
+        if endpoints is not None and not endpoints:
+            yield Fault(("network", name), f"`{name}` is empty", "leave it out, or give an endpoint")
+        for number, endpoint in enumerate(endpoints or ()):
+            try:
+                Endpoint.parse(endpoint)
+            except ValueError as error:
+                message, _, hint = str(error).partition("; ")
+                yield Fault(("network", name, number), message, hint)
+    if network.topology == "mesh":
+        yield from _mesh(experiment)
+    elif network.addresses:
+        hint = 'add topology = "mesh", or leave addresses out'
+        yield Fault(("network", "addresses"), "`addresses` are where robots listen in a mesh", hint, on_key=True)
+    if network.routers > 1 and network.connect is not None:
+        message = "`routers` says how many zenpark starts, and with `connect` it starts none"
+        hint = "leave routers out; link the routers that you start: zenpark router --connect OTHER"
+        yield Fault(("network", "routers"), message, hint, on_key=True)
+    if network.listen and len(network.listen) % network.routers:
+        message = f"{network.routers} routers cannot share {len(network.listen)} endpoints"
+        yield Fault(("network", "routers"), message, "give each an endpoint of its own in listen, or leave listen out")
+    if network.address is not None and network.listen is None:
+        message = "`address` says where hosts find what `listen` listens on, and that is not given"
+        hint = 'add listen = ["tls/0.0.0.0:7447"], or leave address out: hosts then use their ssh connection'
+        yield Fault(("network", "address"), message, hint, on_key=True)
+
+
+def _mesh(experiment: Experiment) -> Iterator[Fault]:
+    """A mesh has no routers, and who is elsewhere must be told where to listen."""
+    network = experiment.network
+    for name, given in (("listen", network.listen), ("connect", network.connect), ("routers", network.routers > 1)):
+        if given:
+            message = f"a mesh has no routers, and `{name}` is about them"
+            yield Fault(("network", name), message, "leave it out, or leave topology out", on_key=True)
+    away = {robot: host for host, each in experiment.hosts.items() for robot in each.robots}
+    for robot, host in away.items():
+        if robot in experiment.robots and robot not in network.addresses:
+            message = f"'{robot}' runs on '{host}', and nobody knows where it listens there"
+            hint = f'add addresses.{robot} = "tls/ADDRESS:PORT" to [network], with a lab; or leave topology out'
+            yield Fault(("network", "topology"), message, hint)
+    for robot, endpoint in network.addresses.items():
+        path = ("network", "addresses", robot)
+        if robot not in experiment.robots:
+            yield Fault(path, f"no robot is called '{robot}'", did_you_mean(robot, experiment.robots))
+        try:
+            found = Endpoint.parse(endpoint)
+        except ValueError as error:
+            message, _, hint = str(error).partition("; ")
+            yield Fault(path, message, hint)
+        else:
+            if found.is_wildcard:
+                yield Fault(path, "nobody can connect to every address", "give the one at which its neighbours find it")
+
+
+FORM: Final = '"A > B" is what A says to B, "A - B" goes both ways'
+AT: Final = ("channel", "links")
+ROUNDING: Final = 1e-9
+
+
+def channel_faults(experiment: Experiment) -> Iterator[Fault]:
+    """Everything in [channel] that contradicts something else."""
+    channel = experiment.channel
+    yield from _bursts(of_link(channel), ("channel",), LinkChannel(loss=channel.loss, burst=channel.burst))
+    there = _heard(experiment) if channel.links or any(outage.links for outage in channel.outages) else None
+    said: dict[tuple[str, str], str] = {}
+    for text, own in channel.links.items():
+        path = (*AT, text)
+        yield from _link(experiment, there, text, path, on_key=True)
+        yield from _bursts(of_link(channel, own), path, own)
+        for pair in _pairs(text):
+            if pair in said:
+                message = f"what {pair[1]} says to {pair[0]} has its settings by '{said[pair]}' already"
+                yield Fault(path, message, "keep one of the two", on_key=True)
+                break
+            said[pair] = text
+    for number, outage in enumerate(channel.outages):
+        where = ("channel", "outages", number)
+        if outage.from_s >= experiment.duration_s:
+            message = f"this outage begins at {outage.from_s:g} s, when the run of {experiment.duration_s:g} s is over"
+            yield Fault((*where, "from_s"), message, "begin earlier, or give a longer duration_s")
+        for k, text in enumerate(outage.links):
+            yield from _link(experiment, there, text, (*where, "links", k))
+        for k, robot in enumerate(outage.robots):
+            if robot not in experiment.robots:
+                hint = did_you_mean(robot, experiment.robots)
+                yield Fault((*where, "robots", k), f"no robot is called '{robot}'", hint)
+
+
+def _pairs(text: str) -> tuple[tuple[str, str], ...]:
+    """As `links.pairs`; nothing where that is reported elsewhere."""
+    try:
+        return pairs(text)
+    except ValueError:
+        return ()
+
+
+def _link(
+    experiment: Experiment, there: set[tuple[str, str]] | None, text: str, path: Path, *, on_key: bool = False
+) -> Iterator[Fault]:
+    """Is this a link on which something is said; `there` are all of those, if they are known."""
+    both = _pairs(text)
+    if not both:
+        yield Fault(path, f"{text!r} is no link", FORM, on_key=on_key)
+        return
+    unknown = [name for name in dict.fromkeys(reversed(both[0])) if name not in experiment.robots]
+    for name in unknown:
+        yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, experiment.robots), on_key=on_key)
+    if unknown:
+        return
+    deaf = [pair for pair in both if there is not None and pair not in there]
+    if deaf:
+        listener, speaker = deaf[0]
+        hint = f"leave it out, or let {listener} listen to {speaker} in [formation.links]; {FORM}"
+        yield Fault(path, f"{listener} does not listen to {speaker}", hint, on_key=on_key)
+
+
+def _heard(experiment: Experiment) -> set[tuple[str, str]] | None:
+    """Who listens to whom, for the formation or for avoidance; None where that cannot be told, which is said there."""
+    try:
+        links = assignment.heard_links(experiment)
+    except (ValueError, KeyError):
+        return None
+    names = tuple(experiment.robots)
+    return {(names[i], names[j]) for i, j in zip(links.listener.tolist(), links.speaker.tolist(), strict=True)}
+
+
+def _bursts(held: LinkChannel, path: Path, own: LinkChannel) -> Iterator[Fault]:
+    """Losses in a row: `held` is what holds on a link, `own` what stands at this place of the file."""
+    loss, burst = held.loss or 0.0, held.burst
+    if burst is None or (own.loss is None and own.burst is None):
+        return
+    at = (*path, "burst" if own.burst is not None else "loss")
+    if loss == 0.0:
+        if own.burst is not None:
+            yield Fault(
+                at, "burst says how losses come, and nothing is lost here", "give a loss too, or leave burst out"
+            )
+    elif loss < 1.0 and burst * (1.0 - loss) < 1.0 - ROUNDING:
+        least = 1.0 / (1.0 - loss)
+        message = f"where {100 * loss:g} % is lost by chance, {least:.3g} are lost in a row on average, not {burst:g}"
+        yield Fault(at, message, f"give a burst of at least {least:.3g}, or leave burst out: losses by chance")

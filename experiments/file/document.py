@@ -1,0 +1,373 @@
+"""Reads an experiment file, with its cases and the changes of the command line, and says all that is wrong with it.
+
+document = read("robotic-park", ["robots.CF01.hover=0.7"])
+for name, experiment in document.cases().items(): ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from agents.plugins import registry
+from agents.plugins.registry import did_you_mean
+from experiments.definition.experiment import Experiment
+from experiments.definition.links import parse_links
+from experiments.file import arena_file, catalogue, consistency, structure
+from experiments.file.arena_file import ArenaFile
+from experiments.file.json_schema import schema, write_schema
+from experiments.file.overrides import Override, OverrideError, assign, merged, parse, used
+from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places
+from experiments.file.problems import Path as Keys
+from experiments.file.text import LARGEST, content, decoded, parsed
+
+__all__ = [
+    "LARGEST", "Document", "DocumentError", "Problem", "parse_links", "read", "read_text", "schema", "write_json",
+    "write_schema",
+]  # fmt: skip
+
+_Table = dict[str, Any]
+TEXT: Final = "text"  # what an experiment is called that stands in no file
+_ABOVE: Final = (("arena",), ("arena", "file"))  # changes after which the arena may begin with another file
+
+
+@dataclass(frozen=True)
+class Document:
+    """An experiment file that holds no error.
+
+    Attributes:
+        path: The file that was read.
+        text: As it stands there.
+        experiment: What it says, before any case changes it; `--set` is in it. Its arena is complete, whatever file it
+            begins with.
+        arenas: The arena file of each case that has one; of the file without cases under the empty name.
+    """
+
+    path: Path
+    text: str
+    experiment: Experiment
+    resolved: Mapping[str, Experiment]
+    arenas: Mapping[str, ArenaFile] = field(default_factory=dict)
+
+    def cases(self) -> dict[str, Experiment]:
+        """Each case as an experiment of its own, in the order of the file; one called "default" if it has none."""
+        return dict(self.resolved)
+
+    def keep(self, file: Path) -> None:
+        """Writes the text to a file, and the arena files that it names beside it."""
+        file.write_text(self.text, encoding="utf-8")
+        for each in self.arenas.values():
+            (file.parent / each.name).write_text(each.text, encoding="utf-8")
+
+    @property
+    def listing(self) -> str:
+        """The text, and below it those of the arena files that it names: for people."""
+        return listed([self.text, *dict.fromkeys(each.text for each in self.arenas.values())])
+
+
+def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
+    """Reads and checks an experiment.
+
+    Args:
+        path: A .toml file, a .json file as `write_json` makes it, or a name of the catalogue.
+        overrides: `path=value` each, as behind `--set`; a later one wins, and all win over the cases, but for those
+            that address one (`cases.event.trigger.threshold=0.02`).
+
+    Raises:
+        DocumentError: With everything that is wrong and where, whatever is in the file.
+    """
+    file = catalogue.found(path)
+    label = str(path) if file == Path(path) else str(file)
+    try:
+        text = decoded(content(file, label), label)
+    except FileNotFoundError:
+        raise DocumentError([catalogue.no_entry(label)]) from None
+    return _document(file, label, text, overrides)
+
+
+def read_text(text: str, overrides: Sequence[str] = ()) -> Document:
+    """As `read`, of an experiment that stands in no file: its text, in TOML; arena files are those of this folder.
+
+    Raises:
+        DocumentError: As `read`; places are those in `TEXT`.
+    """
+    return _document(Path(TEXT), TEXT, decoded(text.encode(), TEXT), overrides)
+
+
+def _document(file: Path, label: str, text: str, overrides: Sequence[str]) -> Document:
+    is_json = file.suffix.lower() == ".json"
+    try:
+        return _Reading(file, label, text, is_json, parsed(text, label, json=is_json), tuple(overrides)).document()
+    except RecursionError:
+        raise DocumentError([Problem(label, 0, 0, "tables or lists are nested too deeply", "flatten them")]) from None
+
+
+def received(text: str, label: str) -> Document:
+    """An experiment that came as JSON over a pipe; its arena is in it.
+
+    Raises:
+        DocumentError: With everything that is wrong with it.
+    """
+    return _Reading(Path(label), label, text, True, parsed(text, label, json=True), ()).document()
+
+
+def listed(texts: Sequence[str]) -> str:
+    """The text of an experiment file, and below it those of its arena files: for people."""
+    return "\n\n# ---- the arena file ----\n\n".join(texts)
+
+
+def write_json(experiment: Experiment) -> bytes:
+    """The experiment as JSON that `read` takes; what has its default is left out."""
+    return msgspec.json.format(msgspec.json.encode(experiment), indent=2) + b"\n"
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """One reading of one file: what is at hand when something must be located."""
+
+    file: Path
+    label: str
+    text: str
+    is_json: bool
+    content: dict[str, Any]
+    flags: tuple[str, ...]
+
+    def document(self) -> Document:
+        """See `read`."""
+        overrides = self._overrides()
+        self._refuse(structure.storable(self.content), overrides)
+        base, tables, cases, files = self._changed(overrides)
+        nested = [
+            Fault(("cases", name, "cases"), "a case cannot hold cases", "leave them out", on_key=True)
+            for name, table in tables.items()
+            if "cases" in table
+        ]
+        first = structure.faults(base)
+        found = {name: structure.faults(case) for name, case in cases.items()}
+        self._refuse([*nested, *first, *_of_cases(tables, found, first)], overrides, files)
+
+        experiment = msgspec.convert(base, Experiment)
+        resolved = {name: msgspec.convert(case, Experiment) for name, case in cases.items()}
+        first = list(consistency.faults(experiment))
+        found = {name: list(consistency.faults(case)) for name, case in resolved.items()}
+        self._refuse([*first, *_of_cases(tables, found, first)], overrides, files)
+        return Document(self.file, self.text, experiment, resolved or {"default": experiment}, files)
+
+    def _changed(
+        self, overrides: Sequence[Override]
+    ) -> tuple[_Table, dict[str, _Table], dict[str, _Table], dict[str, ArenaFile]]:
+        """The document with `--set`, the tables of its cases, each case merged into the document, and arena files.
+
+        What an arena file holds is put below what the experiment says of its arena, and `--set` finds it there. Only a
+        change of which file that is must come first.
+        """
+        plain = deepcopy(self.content)
+        of_all = [override for override in overrides if override.path[0] != "cases" and override.case is None]
+        above = [override for override in overrides if override.path in _ABOVE]
+        late = [each for each in of_all if each.path[0] == "arena" and each not in above]
+        unused = set(of_all)
+        for override in overrides:
+            table = plain if override.case is None else _tables(plain).get(override.case, {})
+            if override not in late and self._assigned(table, override, part=override.case is not None):
+                unused.discard(override)
+        files: dict[str, ArenaFile] = {}
+        base = self._furnished(plain, "", overrides, files)
+        tables, cases = _tables(plain), {}
+        for name, table in tables.items():
+            own = deepcopy(merged(_without_cases(plain), _without_cases(table)))
+            mine = [*of_all, *(each for each in overrides if each.case == name)]
+            for override in mine:
+                if override in above:
+                    self._assigned(own, override)
+            cases[name] = self._furnished(own, name, overrides, files)
+            for override in mine:
+                if override not in above and self._assigned(cases[name], override):
+                    unused.discard(override)
+        for override in late:
+            if self._assigned(base, override):
+                unused.discard(override)
+        if unused:
+            known = [base, *cases.values()]
+            raise DocumentError([_nowhere(override, known) for override in of_all if override in unused])
+        return base, tables, cases, files
+
+    def _furnished(
+        self, document: _Table, case: str, overrides: Sequence[Override], files: dict[str, ArenaFile]
+    ) -> _Table:
+        """The document with what its arena file holds; that file is added to `files`."""
+        name = arena_file.named(document)
+        if name is None:
+            return document
+        try:
+            known = (each for each in files.values() if each.name == name)
+            files[case] = next(known, None) or arena_file.load(name, self.file.parent)
+        except arena_file.Misnamed as error:
+            path = ("cases", case, *error.fault.path) if case else error.fault.path
+            self._refuse([replace(error.fault, path=path)], overrides)
+        return deepcopy(arena_file.furnished(document, files[case]))
+
+    def _overrides(self) -> list[Override]:
+        overrides, problems = [], []
+        for flag in self.flags:
+            try:
+                override = parse(flag, self.content)
+            except OverrideError as error:
+                problems.append(_of_flag(flag, str(error), error.hint))
+                continue
+            overrides.append(override)
+            problems += [
+                _of_flag(flag, fault.message, fault.hint) for fault in structure.storable(override.value, override.path)
+            ]
+        if problems:
+            raise DocumentError(problems)
+        return overrides
+
+    def _assigned(self, document: dict[str, Any], override: Override, *, part: bool = False) -> bool:
+        try:
+            return assign(document, override, part=part)
+        except OverrideError as error:
+            raise DocumentError([_of_flag(override.flag, str(error), error.hint)]) from None
+
+    def _refuse(
+        self,
+        faults: Iterator[Fault] | Sequence[Fault],
+        overrides: Sequence[Override],
+        files: Mapping[str, ArenaFile] | None = None,
+    ) -> None:
+        """Raises if there is any fault, all in the order of the file."""
+        problems = dict.fromkeys(self._located(fault, overrides, files or {}) for fault in faults)
+        if problems:
+            ours = (self.label, *(problem.file for problem in problems if not problem.line))
+            raise DocumentError(sorted(problems, key=lambda each: (each.file not in ours, each.line, each.column)))
+
+    def _located(self, fault: Fault, overrides: Sequence[Override], files: Mapping[str, ArenaFile]) -> Problem:
+        path = fault.path
+        inside = path[2:] if path[:1] == ("cases",) else path
+        for override in reversed(overrides):
+            whole = override.whole
+            if path[: len(whole)] == whole or (override.case is None and inside[: len(whole)] == whole):
+                return _of_flag(override.flag, fault.message, fault.hint)
+            if whole[: len(path)] == path and path not in self._places:
+                return _of_flag(override.flag, fault.message, fault.hint)
+        stands, place = nearest(self._places, path)
+        file = files.get("")
+        if file is not None and len(nearest(file.places, path)[0]) > len(stands):
+            return file.located(fault)
+        offset = place.key if fault.on_key and stands == path else place.value
+        return at_offset(self.label, self.text, offset, fault.message, fault.hint)
+
+    @cached_property
+    def _places(self) -> dict[Keys, Place]:
+        return places(self.text, json=self.is_json)
+
+
+def _of_flag(flag: str, message: str, hint: str) -> Problem:
+    return Problem(f"--set {flag}", 0, 0, message, hint)
+
+
+def _nowhere(override: Override, documents: Sequence[Mapping[str, Any]]) -> Problem:
+    """A parameter that no trigger, law or plan of the experiment has."""
+    end = next(end for end in range(1, len(override.path)) if structure.group_of(override.path[:end]))
+    known = dict.fromkeys(name for document in documents for name in used(document, override.path[:end]))
+    parameter = str(override.path[end])
+    message = f"no {override.path[end - 1]} of this experiment has a parameter '{parameter}'"
+    return _of_flag(override.flag, message, did_you_mean(parameter, known))
+
+
+def _of_cases(
+    tables: Mapping[str, _Table], found: Mapping[str, Sequence[Fault]], first: Sequence[Fault]
+) -> Iterator[Fault]:
+    """Faults of the cases that the file without cases does not have, where the case's own table causes them."""
+    for name, faults in found.items():
+        for fault in faults:
+            if fault in first:
+                continue
+            own = _beginning(tables[name], fault.path)
+            message = fault.message
+            if own != fault.path:
+                message = f"in case '{name}', {'.'.join(map(str, fault.path))}: {message}"
+            yield Fault(("cases", name, *own), message, fault.hint, fault.on_key and own == fault.path)
+
+
+def _tables(document: _Table) -> dict[str, _Table]:
+    """What each case changes, as far as these are tables at all."""
+    cases = document.get("cases")
+    return {name: table for name, table in cases.items() if isinstance(table, dict)} if isinstance(cases, dict) else {}
+
+
+def _without_cases(table: _Table) -> _Table:
+    return {key: value for key, value in table.items() if key != "cases"}
+
+
+def _beginning(table: object, path: Keys) -> Keys:
+    """The longest beginning of a path that leads somewhere in a table."""
+    at: Any = table
+    for length, step in enumerate(path):
+        try:
+            at = at[step]
+        except (KeyError, IndexError, TypeError):
+            return path[:length]
+    return path
+
+
+def case_document(experiment: Experiment) -> bytes:
+    """A case in one line, for robots that have no file of it; where the others are is no robot's business."""
+    arena = msgspec.structs.replace(experiment.arena, file=None)  # what stood there is in it
+    return msgspec.json.encode(msgspec.structs.replace(experiment, arena=arena, hosts={}))
+
+
+def chosen_case(read: Document, name: str | None) -> Experiment:
+    """A case of an experiment by name; the first if none is named.
+
+    Raises:
+        DocumentError: If it has no such case.
+    """
+    cases = read.cases()
+    if name is None:
+        return next(iter(cases.values()))
+    if name not in cases:
+        hint = registry.did_you_mean(name, cases)
+        raise DocumentError([Problem(str(read.path), 0, 0, f"no case '{name}' in this experiment", hint)])
+    return cases[name]
+
+
+if TYPE_CHECKING:
+    pass
+
+
+def load(file: str | Path, *changes: str) -> Document:
+    """An experiment by its file or its name in the catalogue, with fields changed as behind `--set`.
+
+    Raises:
+        DocumentError: With everything that is wrong and where.
+    """
+    return read(file, changes)
+
+
+def loads(text: str, *changes: str) -> Document:
+    """As `load`, of an experiment that is written where it is used, in a notebook or a script.
+
+    Raises:
+        DocumentError: With everything that is wrong and where.
+    """
+    return read_text(text, changes)
+
+
+def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Experiment]:
+    """The cases of an experiment, all or those named, in the order of the file.
+
+    Raises:
+        DocumentError: If it has no case of that name.
+    """
+    cases = read.cases()
+    for name in names:
+        if name not in cases:
+            hint = f"its cases: {', '.join(cases)}"
+            raise DocumentError([Problem(f"--case {name}", 0, 0, "no such case in this experiment", hint)])
+    return {name: case for name, case in cases.items() if not names or name in names}

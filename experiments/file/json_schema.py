@@ -1,0 +1,101 @@
+"""The JSON schema of the experiment file, for editors: completion, units and errors while typing.
+
+Draft 7, because Taplo (the TOML extension of most editors) misreads the tuples of later drafts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from agents.body.kinds import KINDS
+from agents.plugins import registry
+from experiments.definition.experiment import Experiment
+
+_CHOICES: Final = (
+    ("Experiment", "trigger", registry.TRIGGERS),
+    ("Experiment", "prediction", registry.PREDICTORS),
+    ("Formation", "update", registry.TRIGGERS),
+    ("Formation", "law", registry.LAWS),
+    ("Leg", "plan", registry.PLANNERS),
+    ("Obstacle", "plan", registry.PLANNERS),
+    ("Experiment", "avoidance", registry.AVOIDANCES),
+    ("World", "engine", registry.ENGINES),
+)
+_CASE: Final = "InCase"
+
+
+def schema() -> dict[str, Any]:
+    """The schema, with every plug-in that is installed."""
+    _, definitions = msgspec.json.schema_components([Experiment], ref_template="#/definitions/{name}")
+    definitions = {name: _draft7(each) for name, each in definitions.items()}
+    for owner, name, group in _CHOICES:
+        field = definitions[owner]["properties"][name]
+        kept = {key: field[key] for key in ("description", "default") if key in field}
+        definitions[owner]["properties"][name] = {**kept, **_choice(group, definitions)}
+    definitions["Robot"]["properties"]["kind"]["enum"] = list(KINDS)
+    partial = {name + _CASE: _partial(each) for name, each in definitions.items()}
+    del partial["Experiment" + _CASE]["properties"]["cases"]
+    definitions["Experiment"]["properties"]["cases"]["additionalProperties"] = {
+        "$ref": f"#/definitions/Experiment{_CASE}"
+    }
+    top = definitions.pop(
+        "Experiment"
+    )  # in full: a reference at the top would hide its neighbours from draft-7 readers
+    whole = {"$schema": "http://json-schema.org/draft-07/schema#", **top, "definitions": definitions | partial}
+    return dict(msgspec.json.decode(msgspec.json.encode(whole)))  # plain lists and tables, defaults included
+
+
+def write_schema(path: Path) -> None:
+    """Writes the schema to a file."""
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(schema()), indent=2) + b"\n")
+
+
+def _choice(group: str, definitions: dict[str, Any]) -> dict[str, Any]:
+    """A plug-in by name, if it needs no parameters, or as a table with its `kind`."""
+    bare, tables = [], []
+    for name in registry.names(group):
+        (reference,), parts = msgspec.json.schema_components(
+            [registry.struct(group, name)], ref_template="#/definitions/{name}"
+        )
+        own = parts.pop(reference["$ref"].rpartition("/")[2])
+        definitions.update({part: _draft7(each) for part, each in parts.items()})
+        own = _draft7(own)
+        if not own.get("required"):
+            bare.append(name)
+        own["properties"] = {"kind": {"const": name}, **own.get("properties", {})}
+        own["required"] = ["kind", *own.get("required", [])]
+        tables.append(own)
+    return {"anyOf": ([{"enum": bare}] if bare else []) + tables}
+
+
+def _draft7(node: Mapping[str, Any]) -> dict[str, Any]:
+    """Tuples as draft 7 writes them."""
+    result = _below(node, _draft7)
+    if "prefixItems" in result:
+        result["items"], result["additionalItems"] = result.pop("prefixItems"), False
+    return result
+
+
+def _partial(node: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with nothing required: a case holds only what it changes."""
+    result = _below(node, _partial)
+    if "$ref" in result:
+        result["$ref"] += _CASE
+    return {key: value for key, value in result.items() if key not in ("required", "default")}
+
+
+def _below(node: Mapping[str, Any], change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> dict[str, Any]:
+    """A node with every node right below it changed."""
+    result: dict[str, Any] = {}
+    for key, value in node.items():
+        if isinstance(value, dict):
+            result[key] = change(value)
+        elif isinstance(value, list):
+            result[key] = [change(each) if isinstance(each, dict) else each for each in value]
+        else:
+            result[key] = value
+    return result

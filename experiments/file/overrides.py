@@ -1,0 +1,238 @@
+"""Changes to a document: those of a case, and those of `--set path=value` on the command line."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any, Final
+
+import msgspec
+
+from agents.plugins.registry import did_you_mean
+from experiments.definition.experiment import Experiment, Formation, World
+from experiments.definition.links import pairs
+from experiments.file.problems import Path
+from experiments.file.structure import group_of, parameters
+from experiments.file.text import endless
+
+DEEPEST: Final = 20  # names of a path; no value of an experiment lies deeper
+_PART: Final = re.compile(r"\s*+(?:\"([^\"]*)\"|'([^']*)'|([^.\"']++))\s*+(?:\.|$)")
+_SHAPES: Final = frozenset({"box", "radius", "wall"})
+_CHOICES: Final[Mapping[Path, type[msgspec.Struct]]] = {
+    ("trigger",): Experiment,
+    ("world", "engine"): World,
+    ("formation", "law"): Formation,
+}
+
+
+class OverrideError(ValueError):
+    """A `--set` that cannot be understood; `hint` says what to write."""
+
+    def __init__(self, message: str, hint: str) -> None:
+        super().__init__(message)
+        self.hint = hint
+
+
+@dataclass(frozen=True, eq=False)
+class Override:
+    """One `--set`.
+
+    Attributes:
+        flag: As it was written.
+        path: Into the document, or into the table of `case`.
+        value: Of the type that TOML gives it.
+        case: The only case that it is for, if it is for one.
+    """
+
+    flag: str
+    path: Path
+    value: Any
+    case: str | None
+
+    @property
+    def whole(self) -> Path:
+        """From the top of the file."""
+        return self.path if self.case is None else ("cases", self.case, *self.path)
+
+
+def parse(flag: str, document: Mapping[str, Any]) -> Override:
+    """`path=value`; the shell may have eaten the quotes of a key, so blanks are part of one.
+
+    Raises:
+        OverrideError: If it is not of that form, or names a case that the document does not have.
+    """
+    key, equals, text = flag.partition("=")
+    path = _path(key)
+    if len(path) > DEEPEST:
+        raise OverrideError(f"nothing lies {len(path)} tables deep", "leave out what is too much")
+    if not equals or not path:
+        raise OverrideError("this is not of the form path=value", "write, for example, --set formation.gain=2.5")
+    if not flag.isprintable():
+        raise OverrideError("this holds characters that are no text", "leave them out")
+    case = None
+    if path[0] == "cases" and len(path) > 2:
+        cases = document.get("cases")
+        known = list(cases) if isinstance(cases, dict) else []
+        case, path = str(path[1]), path[2:]
+        if not isinstance(cases, dict) or not isinstance(cases.get(case), dict):
+            raise OverrideError(
+                f"the file has no case '{case}'", did_you_mean(case, known) or "it has no [cases] at all"
+            )
+    if path[0] == "timeline" and len(path) > 1 and re.fullmatch(r"[0-9]{1,6}", str(path[1])):
+        path = (path[0], int(path[1]), *path[2:])
+    return Override(flag, path, _typed(text.strip()), case)
+
+
+def assign(document: dict[str, Any], override: Override, *, part: bool = False) -> bool:
+    """Puts the value in its place.
+
+    A parameter of a trigger, law or plan is left alone where the kind that is chosen has no such parameter: `--set
+    trigger.threshold=0.02` is for the cases that have a threshold.
+
+    Args:
+        document: Changed in place.
+        override: What to put where.
+        part: `document` holds only what a case changes, so what is missing from it is not missing.
+
+    Returns:
+        Whether there was a place for it.
+
+    Raises:
+        OverrideError: If the path leads nowhere.
+    """
+    at: Any = document
+    *way, last = override.path
+    path: Path = ()
+    for name in way:
+        path = (*path, name)
+        step = _known(at, name, path, part=part)
+        inside = _as_table(at[int(step)] if isinstance(at, list) else at.get(step), path, part=part)
+        if inside is None:
+            inside = {}
+        if not isinstance(inside, dict | list):
+            raise OverrideError(
+                f"'{step}' is no table, so it has no '{override.path[len(path)]}'", f"set {step} itself"
+            )
+        group, below = group_of(path), override.path[len(path)]
+        if group and not part and isinstance(inside, dict) and below not in ("kind", *_own(inside, group)):
+            return False
+        at[step] = inside
+        at = inside
+    last = _known(at, last, override.path, part=True)
+    if group_of(path) and last == "kind" and at.get("kind") != override.value:
+        at.clear()
+    at[last] = deepcopy(override.value)
+    return True
+
+
+def merged(document: Mapping[str, Any], changes: Mapping[str, Any], path: Path = ()) -> dict[str, Any]:
+    """A document with the changes of a case: tables merge, everything else replaces.
+
+    A trigger, law or plan of another kind replaces the whole table, because the parameters of the old kind mean
+    nothing to the new one; an obstacle has one shape, and a new one replaces it. A link is the same link however it is
+    written.
+    """
+    result = dict(document)
+    for name, value in changes.items():
+        key = _same_link(name, result) if path == ("formation", "links") else name
+        here = (*path, key)
+        old = _as_table(result.get(key), here) if isinstance(value, dict) else None
+        if isinstance(old, dict) and here[:-1] == ("arena", "obstacles") and _SHAPES & value.keys():
+            old = {part: each for part, each in old.items() if part not in _SHAPES}
+        other = group_of(here) and isinstance(old, dict) and value.get("kind", old.get("kind")) != old.get("kind")
+        result[key] = merged(old, value, here) if isinstance(old, dict) and not other else value
+    return result
+
+
+def used(document: Mapping[str, Any], path: Path) -> Iterable[str]:
+    """The parameters of the plug-in that a document chooses at `path`."""
+    at: Any = document
+    for step in path[:-1]:
+        at = at.get(step, {}) if isinstance(at, dict) else at[int(step)]
+    choice = _as_table(at.get(path[-1]), path)
+    group = group_of(path)
+    return _own(choice, group) if group and isinstance(choice, dict) else []
+
+
+def _own(choice: Mapping[str, Any], group: str) -> list[str]:
+    return parameters(group, str(choice.get("kind")))
+
+
+def _known(at: dict[str, Any] | list[Any], step: str | int, path: Path, *, part: bool) -> str | int:
+    """The step as the document knows it.
+
+    Raises:
+        OverrideError: If it leads nowhere.
+    """
+    if isinstance(at, list):
+        if not re.fullmatch(r"[0-9]{1,6}", str(step)) or int(step) >= len(at):
+            raise OverrideError(f"there is no '{step}' in '{path[-2]}'", f"it is a list: 0 to {len(at) - 1}")
+        return int(step)
+    if path[:-1] == ("formation", "links"):
+        return _same_link(str(step), at)
+    if path[0] == "robots" and len(path) == 2 and not part and step not in at:
+        raise OverrideError(f"no robot is called '{step}'", did_you_mean(str(step), at))
+    return str(step)
+
+
+def _default(path: Path) -> Any:  # noqa: ANN401 - whatever a document may say there
+    """What is chosen where nothing is said."""
+    struct = _CHOICES.get(path)
+    if struct is None:
+        return None
+    names = struct.__struct_fields__
+    return struct.__struct_defaults__[names.index(str(path[-1])) - len(names)]
+
+
+def _as_table(value: object, path: Path, *, part: bool = False) -> object:
+    """The long form of what may be written short: a choice by its name, a link by its distance."""
+    if group_of(path):
+        value = _default(path) if value is None and not part else value
+        return {"kind": value} if isinstance(value, str) else value
+    if path[:-1] == ("formation", "links") and isinstance(value, int | float) and not isinstance(value, bool):
+        return {"distance": value}
+    return value
+
+
+def _same_link(text: str, links: Mapping[str, Any]) -> str:
+    """The key under which a document already has this link, or `text`."""
+    if text in links:
+        return text
+    try:
+        wanted = set(pairs(text))
+    except ValueError:
+        return text
+    for key in links:
+        try:
+            if set(pairs(key)) == wanted:
+                return key
+        except ValueError:
+            continue  # it is reported where links are checked
+    return text
+
+
+def _path(key: str) -> Path:
+    """The parts of a dotted key; empty if it is none."""
+    path: list[str] = []
+    at = 0
+    while at < len(key):
+        match = _PART.match(key, at)
+        if match is None:
+            return ()
+        path.append(next(part for part in match.groups() if part is not None).strip())
+        at = match.end()
+    return () if key.rstrip().endswith(".") or "" in path else tuple(path)
+
+
+def _typed(text: str) -> object:
+    """What TOML makes of a value; the bare text if it makes nothing of it."""
+    if endless(text):
+        return text
+    try:
+        values = tomllib.loads(f"value = {text}")
+    except ValueError:
+        return text
+    return values["value"] if len(values) == 1 else text

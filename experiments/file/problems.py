@@ -1,0 +1,244 @@
+"""Where things stand in a TOML or JSON file: from a path in the parsed document to line and column.
+
+No maintained TOML reader tells positions. The scanner here runs over text that `tomllib` has accepted, and only when
+there is something to report, so it needs no checks of its own.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import msgspec
+
+Path = tuple[str | int, ...]
+
+_BLANK: Final = re.compile(r"(?:\s+|#[^\n]*)*")
+_SPACE: Final = re.compile(r"[ \t]*")
+_STRING: Final = re.compile(
+    r'"""(?:[^\\]|\\.)*?"{3,5}|' + r"'''.*?'{3,5}|" + r'"(?:[^"\\\n]|\\.)*"|' + r"'[^'\n]*'", re.DOTALL
+)
+_BARE_KEY: Final = re.compile(r"[^\s.=:\[\]{}\"'#,]+")
+_BARE_VALUE: Final = re.compile(r"[^,\]}#\n]*")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a key and its value begin, as offsets into the text."""
+
+    key: int
+    value: int
+
+
+def places(text: str, *, json: bool = False) -> dict[Path, Place]:
+    """Every path of a valid document, tables and list items included, and where it first stands."""
+    scan = _Scan(text, json)
+    if json:
+        scan.value((), _blank(text, 0))
+    else:
+        scan.document()
+    return scan.found
+
+
+def nearest(found: dict[Path, Place], path: Path) -> tuple[Path, Place]:
+    """The longest beginning of `path` that stands in the text."""
+    for length in range(len(path), 0, -1):
+        if path[:length] in found:
+            return path[:length], found[path[:length]]
+    return (), Place(0, 0)
+
+
+def line_column(text: str, offset: int) -> tuple[int, int]:
+    """1-based line and column, in characters."""
+    return text.count("\n", 0, offset) + 1, offset - text.rfind("\n", 0, offset)
+
+
+@dataclass
+class _Scan:
+    text: str
+    json: bool
+    found: dict[Path, Place] = field(default_factory=dict)
+    items: dict[Path, int] = field(default_factory=dict)  # how many [[headers]] each list of tables has so far
+
+    def document(self) -> None:
+        """Headers and `key = value` lines, to the end."""
+        table: Path = ()
+        at = _blank(self.text, 0)
+        while at < len(self.text):
+            if self.text[at] == "[":
+                table, at = self.header(at)
+            else:
+                at = self.pair(table, at)
+            at = _blank(self.text, at)
+
+    def header(self, start: int) -> tuple[Path, int]:
+        """`[a.b]` or `[[a.b]]`: the table that follows, and where the header ends."""
+        opening = 2 if self.text.startswith("[[", start) else 1
+        parts, at = self.key(start + opening)
+        table: Path = ()
+        for number, (name, offset) in enumerate(parts):
+            table = (*table, name)
+            self.found.setdefault(table, Place(offset, start))
+            if opening == 2 and number == len(parts) - 1:
+                self.items[table] = self.items.get(table, 0) + 1
+            if table in self.items:
+                table = (*table, self.items[table] - 1)
+                self.found.setdefault(table, Place(start, start))
+        return table, at + opening
+
+    def pair(self, table: Path, start: int) -> int:
+        """`a.b = value` (or `"a": value`) in `table`; where it ends."""
+        parts, at = self.key(start)
+        at = _blank(self.text, at + 1)
+        path = table
+        for name, offset in parts:
+            path = (*path, name)
+            self.found.setdefault(path, Place(offset, at))
+        return self.value(path, at)
+
+    def key(self, at: int) -> tuple[list[tuple[str, int]], int]:
+        """The parts of a dotted key with their offsets, and where the delimiter behind it stands."""
+        parts = []
+        while True:
+            at = _end(_SPACE, self.text, at)
+            quoted = _STRING.match(self.text, at)
+            end = quoted.end() if quoted else _end(_BARE_KEY, self.text, at)
+            parts.append((self.unquoted(at, end) if quoted else self.text[at:end], at))
+            at = _end(_SPACE, self.text, end)
+            if self.text[at : at + 1] != ".":
+                return parts, at
+            at += 1
+
+    def unquoted(self, start: int, end: int) -> str:
+        """A quoted key without its quotes and escapes."""
+        quoted = self.text[start:end]
+        return str(msgspec.json.decode(quoted) if self.json else tomllib.loads(f"key = {quoted}")["key"])
+
+    def value(self, path: Path, at: int) -> int:
+        """Whatever stands behind `=`; where it ends."""
+        opening = self.text[at : at + 1]
+        if opening == "[":
+            return self.several(path, at, "]")
+        if opening == "{":
+            return self.several(path, at, "}")
+        string = _STRING.match(self.text, at)
+        return string.end() if string else _end(_BARE_VALUE, self.text, at)
+
+    def several(self, path: Path, at: int, closing: str) -> int:
+        """A list or an inline table; where it ends."""
+        number = 0
+        at = _blank(self.text, at + 1)
+        while at < len(self.text) and self.text[at] != closing:
+            if closing == "]":
+                item = (*path, number)
+                self.found.setdefault(item, Place(at, at))
+                at, number = self.value(item, at), number + 1
+            else:
+                at = self.pair(path, at)
+            at = _blank(self.text, at)
+            if self.text[at : at + 1] == ",":
+                at = _blank(self.text, at + 1)
+        return at + 1
+
+
+def _end(pattern: re.Pattern[str], text: str, at: int) -> int:
+    match = pattern.match(text, at)
+    return match.end() if match else at
+
+
+def _blank(text: str, at: int) -> int:
+    """Behind white space, line ends and comments."""
+    return _end(_BLANK, text, at)
+
+
+SHOWN = 100  # characters of a source line; longer ones are cut around the place
+MOST = 20  # problems that are told at once
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something wrong at a path of the document, not yet located in the text.
+
+    Attributes:
+        path: Keys and list indices from the top of the document.
+        message: What is wrong.
+        hint: What to do.
+        on_key: The key itself is wrong, not its value.
+    """
+
+    path: Path
+    message: str
+    hint: str = ""
+    on_key: bool = False
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something wrong at a place. Line and column are 1-based, 0 where there is no text to point into.
+
+    Attributes:
+        file: As the user named it; or the command-line flag that is at fault.
+        line: Line number.
+        column: In characters.
+        message: What is wrong.
+        hint: What to do.
+        source: The line of text.
+    """
+
+    file: str
+    line: int
+    column: int
+    message: str
+    hint: str = ""
+    source: str = ""
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+        parts = [f"{_printable(place)}: {_printable(self.message)}"]
+        if self.line:
+            shown, caret = _window(self.source, self.column - 1)
+            parts += [f"{self.line:>6} | {shown}", f"       | {caret}^"]
+        if self.hint:
+            parts.append(f"       = {_printable(self.hint)}" if self.line else f"  {_printable(self.hint)}")
+        return "\n".join(parts)
+
+
+class DocumentError(ValueError):
+    """An experiment that cannot be read, with everything that is wrong with it."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        told = [str(problem) for problem in problems[:MOST]]
+        if len(problems) > MOST:
+            told.append(f"and {len(problems) - MOST} more")
+        super().__init__("\n".join(told))
+        self.problems = list(problems)
+
+
+def at_offset(file: str, text: str, offset: int, message: str, hint: str = "") -> Problem:
+    """A problem at an offset into the text."""
+    line, column = line_column(text, offset)
+    return Problem(file, line, column, message, hint, text.split("\n")[line - 1])
+
+
+def shown(value: object) -> str:
+    """A value of the document, short enough for one line."""
+    words = {True: "true", False: "false", None: "null"}
+    text = words[value] if value is None or isinstance(value, bool) else repr(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def _window(source: str, column: int) -> tuple[str, str]:
+    """The part of a line around a column, and the blanks that lead to that column (tabs stay, so that they line up)."""
+    first = max(0, column - SHOWN // 2) if len(source) > SHOWN else 0
+    part = source[first : first + SHOWN]
+    blanks = "".join("\t" if letter == "\t" else " " for letter in part[: column - first])
+    cut = "..." if first else ""
+    return cut + _printable(part), " " * len(cut) + blanks
+
+
+def _printable(text: str) -> str:
+    """Control characters and lone surrogates replaced: they would upset the terminal."""
+    return "".join(letter if letter.isprintable() or letter == "\t" else "\ufffd" for letter in text)

@@ -1,0 +1,312 @@
+"""Does a document have the shape of an experiment: known keys, nothing missing, values of the right type and range.
+
+`msgspec.convert` stops at the first error and does not tell which entry of a table it is in. The walk here goes down
+the same annotations and lets msgspec judge one value at a time, so that everything is found, each with its path.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
+
+import msgspec
+
+from agents.plugins import registry
+from agents.plugins.registry import did_you_mean
+from experiments.definition.experiment import Experiment
+from experiments.file.problems import DocumentError, Fault, Path, Problem, shown
+
+LARGEST: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
+_REMEDY: Final = {  # of what is missing
+    "title": 'add title = "what this experiment shows"',
+    "duration_s": "add duration_s = 30.0",
+    "robots": 'add at least one: [robots.KH01] with kind = "khepera4" and start = [0.0, 0.0]',
+    "start": "add start = [0.0, 0.0], in metres",
+    "at_s": "add at_s = 0.0, in seconds after the common start",
+    "robot": 'add robot = "..." with the name of one of the robots',
+    "plan": 'add plan = { kind = "line", move_by = [0.5, 0.0], speed = 0.1 }',
+}
+_WORDS: Final = {
+    "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false", "array": "a list",
+    "object": "a table",
+}  # fmt: skip
+_FIELDS: Final = frozenset(Experiment.__struct_fields__)
+
+
+def storable(value: object, path: Path = ()) -> Iterator[Fault]:
+    """Numbers that no experiment can hold, though TOML can write them."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from storable(each, (*path, key))
+    elif isinstance(value, list):
+        for number, each in enumerate(value):
+            yield from storable(each, (*path, number))
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield Fault(path, f"'{_name(path)}' is {value}, which is no quantity", "give a finite number")
+    elif isinstance(value, float) and abs(value) > LARGEST:
+        yield Fault(path, f"'{_name(path)}' is {value:g}, larger than anything here can be", "give a smaller number")
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        yield Fault(path, f"'{_name(path)}' has more digits than a 64-bit integer holds", "give a smaller number")
+
+
+def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment, path: Path = ()) -> list[Fault]:
+    """Everything by which a document is not what it should be; empty if `msgspec.convert` takes it.
+
+    A part of one may be looked at by itself: `path` is where it stands in the whole.
+    """
+    found = _table(document, struct, path)
+    strayed = {str(fault.path[-1]) for fault in found if "belongs at the top" in fault.hint}
+    return [
+        fault for fault in found if fault.path or not any(f"'{key}' is missing" == fault.message for key in strayed)
+    ]
+
+
+def group_of(path: Path) -> str | None:
+    """The entry-point group that the choice at this path is made from, if a choice stands there."""
+    match path:
+        case ("trigger",) | ("formation", "update"):
+            group = registry.TRIGGERS
+        case ("prediction",):
+            group = registry.PREDICTORS
+        case ("formation", "law"):
+            group = registry.LAWS
+        case ("timeline", int(), "plan") | ("arena", "obstacles", str(), "plan"):
+            group = registry.PLANNERS
+        case ("avoidance",):
+            group = registry.AVOIDANCES
+        case ("world", "engine"):
+            group = registry.ENGINES
+        case _:
+            return None
+    return group
+
+
+def parameters(group: str, kind: str) -> list[str]:
+    """Names of the parameters of a plug-in, none if it cannot be used."""
+    try:
+        return list(_fields_of(registry.struct(group, kind)))
+    except registry.PluginError:
+        return []
+
+
+def _value(value: object, annotation: object, path: Path, note: str) -> list[Fault]:
+    group = group_of(path)
+    if group is not None and isinstance(value, str | dict):
+        return _choice(value, group, path)
+    plain, note = _plain(annotation, note)
+    inner: list[Fault] = []
+    if _is_struct(plain):
+        return _table(value, plain, path) if isinstance(value, dict) else [_no_table(value, path)]
+    if get_origin(plain) is dict:
+        if not isinstance(value, dict):
+            return [_no_table(value, path)]
+        of_key, of_value = get_args(plain)
+        for key, each in value.items():
+            inner += _key(key, of_key, (*path, key)) or _value(each, of_value, (*path, key), note)
+    elif get_origin(plain) is list and isinstance(value, dict):
+        header = ".".join(map(str, path))
+        return [Fault(path, f"'{_name(path)}' must be a list, not a table", f"write [[{header}]], with two brackets")]
+    elif get_origin(plain) is list and isinstance(value, list):
+        for number, each in enumerate(value):
+            inner += _value(each, get_args(plain)[0], (*path, number), note)
+    elif get_origin(plain) in (Union, types.UnionType) and isinstance(value, dict):
+        tables = [each for each in get_args(plain) if _is_struct(each)]
+        if len(tables) == 1:
+            return _table(value, tables[0], path)
+    return inner or _judged(value, annotation, path, note)
+
+
+def _table(
+    value: Mapping[str, Any], struct: type[msgspec.Struct], path: Path, plugin: tuple[str, str] | None = None
+) -> list[Fault]:
+    """A table against a struct: unknown keys, missing keys, then each value, then the struct's own checks.
+
+    Args:
+        value: The table, without the `kind` of a plug-in.
+        struct: What it should be.
+        path: Where it stands.
+        plugin: Group and kind, if these are a plug-in's parameters.
+    """
+    fields = _fields_of(struct)
+    found, meant = [], set()
+    for key in value:
+        if key not in fields:
+            hint = did_you_mean(key, fields)
+            meant |= {name for name in fields if hint == f"did you mean '{name}'?"}
+            found.append(_unknown(key, hint, path, plugin))
+    for name, field in fields.items():
+        if name in value:
+            found += _value(value[name], field.type, (*path, name), "")
+        elif field.required and name not in meant:
+            _, note = _plain(field.type, "")
+            hint = _REMEDY.get(name) or f"add {name} = ... ({note})"
+            found.append(Fault(path, f"'{name}' is missing{_in(path)}", hint))
+    return found or _judged(value, struct, path, "", fields)
+
+
+@cache
+def _fields_of(struct: type[msgspec.Struct]) -> Mapping[str, msgspec.structs.FieldInfo]:
+    """By their names in a file. Cached: working out what annotations mean takes longer than judging a table by them."""
+    return {field.encode_name: field for field in msgspec.structs.fields(struct)}
+
+
+def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) -> Fault:
+    """A key that its table does not have; perhaps another one does."""
+    if plugin is not None:
+        group, kind = plugin
+        other = _kind_with(group, [key])
+        hint = f"'{other}' has it" if other else hint
+        return Fault((*path, key), f"unknown parameter '{key}' of {kind!r}", hint, on_key=True)
+    if path and key in _FIELDS:
+        hint = f"'{key}' belongs at the top of the file, above the first [table]"
+    return Fault((*path, key), f"unknown key '{key}'{_in(path)}", hint, on_key=True)
+
+
+def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
+    """A plug-in and its parameters."""
+    known, what = registry.names(group), group.rpartition(".")[2]
+    if isinstance(value, dict) and not isinstance(value.get("kind"), str):
+        for key in value:
+            if key != "kind" and (hint := did_you_mean(key, ["kind"])).startswith("did you mean"):
+                message = f"unknown key '{key}' in '{_name(path)}', which lacks its kind"
+                return [Fault((*path, key), message, hint, on_key=True)]
+        likely = _kind_with(group, [key for key in value if key != "kind"])
+        hint = f'add kind = "{likely}"' if likely else f'add kind = "..."; known: {", ".join(known)}'
+        return [Fault((*path, "kind"), f"'{_name(path)}' must say its kind, as text", hint)]
+    kind, given = registry.split(value)
+    where = path if isinstance(value, str) else (*path, "kind")
+    if kind not in known:
+        return [Fault(where, f"no {shown(kind)} among the {what}", did_you_mean(kind, known))]
+    try:
+        struct = registry.struct(group, kind)
+    except registry.PluginError as error:
+        return [Fault(where, str(error), f"repair or uninstall it, or choose another of the {what}")]
+    return _table(given, struct, path, (group, kind))
+
+
+def _kind_with(group: str, keys: Sequence[str]) -> str | None:
+    """The first plug-in that has all these parameters."""
+    return next((kind for kind in registry.names(group) if set(keys) <= set(parameters(group, kind))), None)
+
+
+def _judged(
+    value: object,
+    annotation: object,
+    path: Path,
+    note: str,
+    fields: Mapping[str, msgspec.structs.FieldInfo] | None = None,
+) -> list[Fault]:
+    """What msgspec says of a value, in words."""
+    try:
+        msgspec.convert(value, annotation)
+    except msgspec.ValidationError as error:
+        text, _, where = str(error).partition(" - at `")
+        for step in re.findall(r"\[(\d+)\]", where):
+            path, value = (*path, int(step)), _item(value, int(step))
+        if fields is not None:  # a struct's own check can only name its field in words
+            named = next(
+                (
+                    name
+                    for name in fields
+                    if isinstance(value, dict) and name in value and re.search(rf"\b{re.escape(name)}\b", text)
+                ),
+                None,
+            )
+            text, _, hint = text.partition("; ")
+            return [Fault(path if named is None else (*path, named), text, hint or note)]
+        return [_in_words(text, value, annotation, path, note)]
+    return []
+
+
+def _in_words(text: str, value: object, annotation: object, path: Path, note: str) -> Fault:
+    name = _name(path)
+    plain, _ = _plain(annotation, note)
+    if get_origin(plain) is Literal:
+        return Fault(path, f"'{name}' cannot be {shown(value)}", did_you_mean(str(value), map(str, get_args(plain))))
+    words = [word for part in get_args(plain) if get_origin(part) is Literal for word in get_args(part)]
+    if get_origin(plain) in (Union, types.UnionType) and words and isinstance(value, str):
+        return Fault(path, f"'{name}' cannot be {shown(value)}", did_you_mean(value, words))
+    match = re.fullmatch(r"Expected `([^`]+)`(.*?)(?:, got `.*`)?", text)
+    if match is None:
+        return Fault(path, f"'{name}': {text}", note)
+    wanted = [_WORDS.get(word, word) for word in match[1].split(" | ") if word != "null"]
+    limit = re.sub(r"\.0$", "", match[2])
+    if "matching regex" in limit:
+        limit = " of letters, digits and _ that begins with a letter"
+    if isinstance(value, bool) or not isinstance(value, list | dict):
+        limit += f", not {shown(value)}"
+    return Fault(path, f"'{name}' must be {' or '.join(wanted)}{limit}", note)
+
+
+def _key(key: str, annotation: object, path: Path) -> list[Fault]:
+    if _judged(key, annotation, path, "") or "\n" in key:  # `$` of a pattern lets a last line end pass
+        what = "letters, digits and _ . -" if path[0] == "cases" else "letters, digits and _, beginning with a letter"
+        return [Fault(path, f"{shown(key)} cannot be a name", f"use {what}", on_key=True)]
+    return []
+
+
+def _no_table(value: object, path: Path) -> Fault:
+    header = ".".join(map(str, path))
+    if isinstance(value, list) and path == ("robots",):
+        return Fault(path, "'robots' must be tables with names", "write [robots.KH01], one header for each robot")
+    return Fault(path, f"'{_name(path)}' must be a table, not {shown(value)}", f"write [{header}] above its keys")
+
+
+def _plain(annotation: object, note: str) -> tuple[Any, str]:
+    """An annotation without its constraints, and its description; that of the innermost wins."""
+    while get_origin(annotation) is Annotated:
+        for meta in get_args(annotation)[1:]:
+            note = getattr(meta, "description", None) or note
+        annotation = get_args(annotation)[0]
+    return annotation, note
+
+
+def _item(value: object, number: int) -> object:
+    return value[number] if isinstance(value, list) else None
+
+
+def _is_struct(annotation: object) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, msgspec.Struct)
+
+
+def _name(path: Path) -> str:
+    """How the user knows a path: the last key, with its indices."""
+    first = max((number for number, step in enumerate(path) if isinstance(step, str)), default=0)
+    return "".join(f"[{step}]" if isinstance(step, int) else str(step) for step in path[first:])
+
+
+def _in(path: Path) -> str:
+    return f" in '{_name(path)}'" if path else ""
+
+
+OBJECT: Final = "write an object, '{\"name\": value}'"
+
+
+def table(flag: str, text: str, struct: type[msgspec.Struct] | None = None, path: Path = ()) -> dict[str, Any]:
+    """The object that stands behind a flag.
+
+    Args:
+        flag: Such as "--obstacle".
+        text: What stands behind it.
+        struct: What it must be; None: any object.
+        path: Where it would stand in an experiment file, if it could.
+
+    Raises:
+        DocumentError: If it is no JSON, no object, or not what it must be.
+    """
+    place = f"{flag} {text}"
+    try:
+        value = msgspec.json.decode(text)
+    except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
+        why = str(error).removeprefix("JSON is malformed: ")
+        raise DocumentError([Problem(place, 0, 0, f"is not JSON: {why}", OBJECT)]) from None
+    if not isinstance(value, dict):
+        raise DocumentError([Problem(place, 0, 0, "is no JSON object", OBJECT)])
+    found = [] if struct is None else faults(value, struct, path)
+    if found:
+        raise DocumentError([Problem(place, 0, 0, fault.message, fault.hint) for fault in found])
+    return value

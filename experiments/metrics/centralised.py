@@ -1,0 +1,95 @@
+"""What the architecture of a case costs: messages, delays, and the load of the centre."""
+
+from __future__ import annotations
+
+import statistics
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask
+from experiments.definition import assignment
+from experiments.metrics.results import Guidance
+from experiments.recording.trace import Trace
+
+
+@dataclass(frozen=True)
+class Delays:
+    """Mean, 95th percentile and maximum [s]; None where there was none."""
+
+    mean: float | None
+    p95: float | None
+    largest: float | None
+
+    @classmethod
+    def of(cls, delay: Array) -> Delays:
+        """Of all (A,)."""
+        if not len(delay):
+            return cls(None, None, None)
+        return cls(float(delay.mean()), float(np.quantile(delay, 0.95)), float(delay.max()))
+
+
+def guided_rows(trace: Trace) -> Mask:
+    """Which robots (N,) a centre decides for."""
+    return np.isin(np.array(trace.robots), assignment.guided(trace.experiment))
+
+
+def centre_hears(trace: Trace) -> Mask:
+    """Which robots (N,) the centre listens to: those that it guides, and those to whom they listen."""
+    rows = guided_rows(trace)
+    net = assignment.all_links(trace.experiment)
+    hears = rows.copy()
+    hears[net.speaker[rows[net.listener]]] = True
+    return np.asarray(hears & rows.any())
+
+
+def delays(trace: Trace) -> list[Delays]:
+    """Of each robot."""
+    goals = trace.goals
+    none = Delays.of(np.zeros(0))
+    if goals is None:
+        return [none] * len(trace.robots)
+    return [Delays.of(goals.delay[goals.follower == row]) for row in range(len(trace.robots))]
+
+
+def goals_to(trace: Trace) -> tuple[Index, Index]:
+    """How many goals were sent to each robot (N,), and their payload (N,) [bytes]."""
+    rows, goals = len(trace.robots), trace.goals
+    if goals is None:
+        return np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
+    size = np.bincount(goals.robot, weights=goals.bytes, minlength=rows)
+    return np.bincount(goals.robot, minlength=rows), size.astype(np.intp)
+
+
+def deliveries(trace: Trace, sent: Index) -> int:
+    """Messages counted once for everybody who listens, when robots `sent` (N,) poses: to each other, to the centre, and
+    the goals."""
+    listeners = np.bincount(assignment.heard_links(trace.experiment).speaker, minlength=len(sent)) + centre_hears(trace)
+    return int(sent @ listeners) + (0 if trace.goals is None else len(trace.goals.time))
+
+
+def guidance(trace: Trace) -> Guidance | None:
+    """What deciding in one process came to."""
+    goals = trace.goals
+    if goals is None:
+        return None
+    duration = float(trace.time[-1] - trace.time[0])
+    all_of_them = Delays.of(goals.delay)
+    load = [report.load for report in goals.reports] if trace.clock == "real" else []
+    missed = [report.missed for report in goals.reports]
+    return Guidance(
+        guided=assignment.guided(trace.experiment),
+        goals=len(goals.time),
+        goals_hz=len(goals.time) / duration,
+        goal_bytes=int(goals.bytes.sum()),
+        goals_lost=max(0, len(goals.time) - int(goals.reached.sum())),
+        heard=int(goals.heard.sum()),
+        poses_lost=int(goals.lost.sum() + goals.dropped.sum()),
+        delay_mean_s=all_of_them.mean,
+        delay_p95_s=all_of_them.p95,
+        delay_max_s=all_of_them.largest,
+        load=statistics.fmean(load) if load else None,
+        load_max=max(load, default=None),
+        missed=sum(max(0, b - a) for a, b in pairwise(missed)),
+    )

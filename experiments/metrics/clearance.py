@@ -1,0 +1,153 @@
+"""How near robots came to each other and to what stands in the arena, surface to surface, and what touched.
+
+Robots are upright cylinders of the radius and height of their kind; a position is that of the lowest point. Everything
+is taken on true positions, at the samples of the trace; unknown ones touch nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.arrays import Array, Mask, norm
+from agents.body.kinds import KINDS
+from agents.plugins import registry
+from experiments.definition import bodies
+from experiments.metrics.results import Approach, Collision
+from experiments.recording.trace import WALL, Trace
+from twins import scene as outlines
+
+TOUCH_M = 1e-6  # [m] less overlap than this is rounding
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """Distances between surfaces [m], negative where they overlap; times since the common start [s].
+
+    Attributes:
+        robots: Closest approach of each robot to another one; None where there is no other.
+        arena: Closest approach of each robot to an obstacle or a wall.
+        overlaps: Every maximal time in which two robots, or a robot and a thing, overlapped: when it began, how deep it
+            became, and who.
+    """
+
+    robots: tuple[Approach | None, ...]
+    arena: tuple[Approach | None, ...]
+    overlaps: tuple[Collision, ...]
+
+    @classmethod
+    def of(cls, trace: Trace) -> Clearance:
+        """Of a whole trace. What can be pushed counts only where nothing could have pushed it."""
+        names, solid = trace.robots, _Cylinders.of(trace)
+        robots: list[Approach | None] = [None] * len(names)
+        arena: list[Approach | None] = [None] * len(names)
+        overlaps: list[Collision] = []
+        for i, name in enumerate(names[:-1]):
+            gap = solid.between(i)
+            for j, other in enumerate(names[i + 1 :]):
+                robots[i] = _nearer(robots[i], trace.time, gap[:, j], (name, other))
+                robots[i + 1 + j] = _nearer(robots[i + 1 + j], trace.time, gap[:, j], (other, name))
+                overlaps += _overlaps(trace.time, gap[:, j], (name, other))
+        for thing, gap in _to_things(trace, solid):
+            for i, name in enumerate(names):
+                arena[i] = _nearer(arena[i], trace.time, gap[:, i], (name, thing))
+                overlaps += _overlaps(trace.time, gap[:, i], (name, thing))
+        overlaps.sort(key=lambda each: (each.time_s, each.first, each.second))
+        return cls(tuple(robots), tuple(arena), tuple(overlaps))
+
+
+def collisions(trace: Trace, clearance: Clearance) -> tuple[Collision, ...]:
+    """What touched, in order of time: what the world saw, and what no world watches for, worked out from positions.
+
+    A world sees everything that touches a robot that it carries; robots that it does not carry are outside of it.
+    """
+    if trace.contacts is None:
+        return clearance.overlaps
+    carried = {name for name in trace.robots if trace.clock == "virtual" or _lives_in_world(trace, name)}
+    seen = [
+        Collision(each.stamp, each.first, each.second, each.impulse, each.overlap)
+        for each in trace.contacts
+        if each.first in trace.robots or each.second in trace.robots
+    ]
+    unseen = [each for each in clearance.overlaps if not carried & {each.first, each.second}]
+    return tuple(sorted([*seen, *unseen], key=lambda each: each.time_s))
+
+
+def _lives_in_world(trace: Trace, name: str) -> bool:
+    return registry.body_name(trace.experiment.robots[name].body) == bodies.WORLD
+
+
+@dataclass(frozen=True)
+class _Cylinders:
+    """The robots as solids: where their axes are (T, N, 2), their bottoms and tops (T, N), NaN where unknown."""
+
+    axis: Array
+    radius: Array
+    bottom: Array
+    top: Array
+    flies: Mask
+
+    @classmethod
+    def of(cls, trace: Trace) -> _Cylinders:
+        kinds = [KINDS[trace.experiment.robots[name].kind] for name in trace.robots]
+        height = np.array([kind.height for kind in kinds])
+        radius, flies = np.array([kind.radius for kind in kinds]), np.array([kind.flies for kind in kinds])
+        bottom = trace.true_position[..., 2]
+        return cls(trace.true_position[..., :2], radius, bottom, bottom + height, flies)
+
+    def between(self, i: int) -> Array:
+        """Gaps (T, N − i − 1) of robot i to all that come after it."""
+        rest = slice(i + 1, None)
+        level = norm(self.axis[:, rest] - self.axis[:, i, None]) - (self.radius[rest] + self.radius[i])
+        upright = np.maximum(self.bottom[:, i, None] - self.top[:, rest], self.bottom[:, rest] - self.top[:, i, None])
+        return _gap(level, upright, self.flies[rest] | self.flies[i])
+
+
+def _gap(level: Array, upright: Array, free: Mask) -> Array:
+    """Signed distance of upright solids from those of their outlines seen from above, and of their heights (T, k).
+
+    How deep they overlap is the shortest way out; upward only where one of the two is `free` (k,) to go there.
+    """
+    outside = np.hypot(np.maximum(level, 0.0), np.maximum(upright, 0.0))
+    gap = outside + np.minimum(np.maximum(level, np.where(free | (upright > 0.0), upright, -np.inf)), 0.0)
+    return np.where(np.isfinite(gap), gap, np.inf)
+
+
+def _nearer(known: Approach | None, time: Array, gap: Array, who: tuple[str, str]) -> Approach | None:
+    """The closest of what is known and of gaps (T,) over time."""
+    k = int(gap.argmin())
+    if not np.isfinite(gap[k]) or (known is not None and known.gap <= gap[k]):
+        return known
+    return Approach(who, float(gap[k]), float(time[k]))
+
+
+def _overlaps(time: Array, gap: Array, who: tuple[str, str]) -> list[Collision]:
+    """One collision for each maximal time in which a gap (T,) is negative."""
+    inside = gap < -TOUCH_M
+    if not inside.any():
+        return []
+    return [Collision(float(time[begin]), *who, None, -float(gap[begin:end].min())) for begin, end in _spans(inside)]
+
+
+def _spans(inside: Mask) -> list[tuple[int, int]]:
+    """First and last + 1 of each run."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
+    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
+
+
+def _to_things(trace: Trace, solid: _Cylinders) -> Iterator[tuple[str, Array]]:
+    """Each obstacle, and the arena's walls, with the gaps (T, N) of all robots to it."""
+    scene = bodies.scene(trace.experiment)
+    poses = scene.along(trace.time)
+    for k, name in enumerate(scene.names):
+        if trace.contacts is not None and math.isfinite(scene.mass[k]):
+            continue
+        level = outlines.distance(scene, k, poses[:, k, None], solid.axis) - solid.radius
+        upright = np.maximum(scene.bottom[k] - solid.top, solid.bottom - scene.top[k])
+        yield name, _gap(level, upright, solid.flies)
+    if scene.walled:
+        room = np.minimum(solid.axis - scene.low[:2], scene.high[:2] - solid.axis).min(axis=2)
+        yield WALL, np.where(np.isfinite(room), room - solid.radius, np.inf)

@@ -1,0 +1,281 @@
+"""What a run comes to in numbers: the indices of the paper (section IV-B), and what says whether to believe them.
+
+All errors are taken on true positions. A robot that died has NaN positions from then on: its links are left out from
+that moment, integrals cover what is known (`coverage` says how much), and the means leave that robot out. The figures
+of a run that was interrupted cover the time until then.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import norm
+from agents.formation.graph import Links
+from experiments.definition import link_conditions
+from experiments.metrics import centralised
+from experiments.metrics.clearance import Clearance, collisions
+from experiments.metrics.results import INDICES, Approach, Belief, CaseMetrics, Collision, Passage, Phase, RobotMetrics
+from experiments.metrics.shadow import agreement
+from experiments.metrics.signals import (
+    LinkErrors,
+    after_last,
+    beliefs,
+    closest,
+    gaps,
+    integrals,
+    leaders,
+    mean_known,
+    net_rotation,
+    network_away,
+    outside_arena,
+    passages,
+    phase_starts,
+    transmissions,
+)
+from experiments.recording.trace import Trace
+
+WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
+BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
+TROUBLES: Final = ("late", "unread")  # kinds of events that tell of the run itself, not of a robot's doing
+KNOWN: Final = 0.95  # a robot whose position is known for less of the run counts as died
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _mean(robots: Sequence[RobotMetrics]) -> dict[str, float | None]:
+    """Each index averaged over the robots for which it is known; `acquired_s` only if all of them acquired."""
+    mean: dict[str, float | None] = {}
+    for index in INDICES:
+        known = [value for value in (getattr(robot, index) for robot in robots) if value is not None]
+        complete = len(known) == len(robots) or index != "acquired_s"
+        mean[index] = statistics.fmean(known) if known and complete else None
+    return mean
+
+
+def measure(trace: Trace) -> CaseMetrics:
+    """All metrics of one case.
+
+    Raises:
+        ValueError: If the trace has fewer than two samples, so that nothing can be integrated.
+    """
+    if len(trace.time) < 2:
+        raise ValueError(f"case '{trace.case}' holds fewer than two samples: the run ended before it began")
+    names, errors = trace.robots, LinkErrors.of(trace)
+    bounds = bounds_of(trace)
+    phases = _phases(trace, errors, bounds)
+    clearance = Clearance.of(trace)
+    touched = collisions(trace, clearance)
+    passed = passages(trace)
+    robots = _robots(trace, errors, phases, touched, clearance, passed=passed)
+
+    leading = leaders(trace.experiment)
+    died = tuple(robot.robot for robot in robots if robot.known < KNOWN and robot.robot not in leading)
+    kept = [i for i, name in enumerate(names) if name not in leading and name not in died]
+    together = [_all([phase[i].acquired_s for i in kept if errors.own[:, i].any()]) for phase in phases]
+    rotation: list[float | None] = []
+    for k, (_, begin, end) in enumerate(bounds):
+        after = begin + round((together[k] or 0.0) / float(trace.time[1] - trace.time[0]))
+        formed = k > 0 or together[k] is not None  # before, there is no shape that one could turn
+        rotation.append(net_rotation(trace.true_position[after:end, kept], trace.time[after:end]) if formed else None)
+
+    held = beliefs(trace, errors.net)
+    rms = np.sqrt(mean_known(held**2))
+    largest = np.where(np.isfinite(held), held, -np.inf).max(axis=0, initial=-np.inf)
+    gap, row, one, other = closest(trace.true_position)
+    beyond = outside_arena(trace)
+    farthest = int(beyond.argmax())
+    ticks = int(trace.ticks.sum())
+    planned, step = trace.experiment.duration_s, float(trace.time[1] - trace.time[0])
+    return CaseMetrics(
+        case=trace.case,
+        seed=trace.seed,
+        clock=trace.clock,
+        duration_s=float(trace.time[-1] - trace.time[0]),
+        planned_s=planned,
+        interrupted=float(trace.time[-1]) < planned - 1.5 * step,  # a whole one may end one sample short
+        tolerance=trace.experiment.tolerance,
+        starts_s=tuple(start for start, _, _ in bounds),
+        robots=robots,
+        leaders=leading,
+        died=died,
+        mean=_mean([robots[i] for i in kept]),
+        acquired_s=tuple(together),
+        rotation_rad_s=tuple(rotation),
+        j2=sum(_cost(robot) for robot in robots),
+        belief=tuple(
+            Belief(names[i], names[j], _number(rms[k]), _number(largest[k]))
+            for k, (i, j) in enumerate(zip(errors.net.listener, errors.net.speaker, strict=True))
+        ),
+        belief_rms=_number(math.sqrt(mean_known(held.reshape(-1) ** 2))),
+        belief_max=_number(largest.max(initial=-np.inf)),
+        closest=_number(gap),
+        closest_between=(names[one], names[other]) if math.isfinite(gap) else (),
+        closest_at_s=float(trace.time[row]) if math.isfinite(gap) else None,
+        excursion=max(0.0, float(beyond[farthest])),
+        excursion_robot=names[farthest] if beyond[farthest] > 0.0 else "",
+        lost=int(trace.lost.sum()),
+        dropped=sum(each.dropped for each in passed),
+        passages=passed,
+        modelled=link_conditions.modelled(trace.experiment),
+        missed_deadlines=int(trace.missed_deadlines.sum()),
+        missed_share=_share(trace.missed_deadlines.sum(), ticks),
+        collisions=touched,
+        watched=trace.contacts is not None,
+        near=_nearest(clearance.robots),
+        near_arena=_nearest(clearance.arena),
+        intervened_share=_share(trace.interventions.sum(), ticks),
+        avoided_share=_share(trace.avoided.sum(), ticks),
+        world_factor=_slowest(trace),
+        away_s=network_away(errors.alive, trace.time)[0],
+        troubles=tuple(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
+        network_messages=sum(robot.messages + robot.goals for robot in robots),
+        network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
+        deliveries=centralised.deliveries(trace, np.array([robot.messages for robot in robots], dtype=np.intp)),
+        guidance=centralised.guidance(trace),
+    )
+
+
+def bounds_of(trace: Trace) -> list[tuple[float, int, int]]:
+    """Start [s], first row and last row + 1 of each phase; legs that begin within one sample are one phase."""
+    starts = phase_starts(trace)
+    begins, first = np.unique(np.searchsorted(trace.time, np.array(starts) - 1e-9), return_index=True)
+    ends = [*begins[1:], len(trace.time)]
+    return [(starts[k], int(begin), int(end)) for k, begin, end in zip(first, begins, ends, strict=True)]
+
+
+def _phases(trace: Trace, errors: LinkErrors, bounds: Sequence[tuple[float, int, int]]) -> list[list[Phase]]:
+    """Per phase and robot: when it was acquired, and what was left of the error by its end."""
+    window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0])))
+    found = []
+    for start, begin, end in bounds:
+        acquired = errors.part(begin, end).acquired(window, trace.experiment.tolerance)
+        worst = errors.part(max(begin, end - window), end).worst(trace.robots)
+        found.append([Phase(start, when, *left) for when, left in zip(acquired, worst, strict=True)])
+    return found
+
+
+def _robots(
+    trace: Trace,
+    errors: LinkErrors,
+    phases: Sequence[Sequence[Phase]],
+    touched: Sequence[Collision],
+    clearance: Clearance,
+    *,
+    passed: Sequence[Passage],
+) -> tuple[RobotMetrics, ...]:
+    rows, time, mine = len(trace.robots), trace.time, errors.own
+    duration = float(time[-1] - time[0])
+    total = errors.per_robot()
+    iae, itae, rmse = integrals(total, time)
+    there = ~errors.away
+    coverage = (np.isfinite(errors.error[there]).mean(axis=0) @ mine) / np.maximum(mine.sum(axis=0), 1.0)
+    unsettled = ~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0))
+    settled = after_last(unsettled & (there[:, None] | np.isfinite(total)), time)
+    sent, recorded = transmissions(trace)
+    size = np.bincount(trace.sent.robot, weights=trace.sent.bytes, minlength=rows)
+    linked = np.zeros((rows, rows), dtype=bool)  # what only avoidance listens to does not belong to the formation
+    told = centralised.guided_rows(trace)[errors.net.listener]  # what they would listen to, the centre hears
+    linked[errors.net.listener[~told], errors.net.speaker[~told]] = True
+    by_listeners = linked[trace.heard.listener, trace.heard.speaker]
+    heard = np.bincount(trace.heard.speaker[by_listeners], minlength=rows)
+    listeners = np.bincount(errors.net.speaker[~told], minlength=rows) + centralised.centre_hears(trace)
+    if trace.goals is not None:
+        heard += trace.goals.heard
+    goals, goal_bytes, late = *centralised.goals_to(trace), centralised.delays(trace)
+    waits = [(wait.min(), float(np.median(wait)), wait.max()) if len(wait) else (np.nan,) * 3 for wait in gaps(trace)]
+    own = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
+    agreements = agreement(trace)
+    dropped = Counter(dict.fromkeys(trace.robots, 0))
+    for link in passed:
+        dropped[link.speaker] += link.dropped
+    return tuple(
+        RobotMetrics(
+            robot=name,
+            kind=trace.experiment.robots[name].kind,
+            f_hz=float(sent[i]) / duration,
+            messages=int(sent[i]),
+            bytes=int(size[i]),
+            iae=_number(iae[i]),
+            itae=_number(itae[i]),
+            rmse=_number(rmse[i]),
+            acquired_s=phases[0][i].acquired_s,
+            lost=int(trace.lost[i]),
+            dropped=dropped[name],
+            missed_deadlines=int(trace.missed_deadlines[i]),
+            residual=phases[0][i].residual,
+            worst=phases[0][i].worst,
+            phases=tuple(phase[i] for phase in phases[1:]),
+            settle_s=duration if (when := settled[i]) is None else when,
+            missed_share=_share(trace.missed_deadlines[i], trace.ticks[i]),
+            updates=int(trace.decisions[i]),
+            gap_min_s=_number(waits[i][0]),
+            gap_median_s=_number(waits[i][1]),
+            gap_max_s=_number(waits[i][2]),
+            recorded=int(recorded[i]),
+            listeners=int(listeners[i]),
+            heard=int(heard[i]),
+            coverage=float(coverage[i]),
+            known=float(errors.alive[there, i].mean()),
+            collisions=len(own[i]),
+            impulse=max((each.impulse for each in own[i] if each.impulse is not None), default=None),
+            overlap=max((each.overlap for each in own[i]), default=None),
+            short=_short(trace, errors.net, i),
+            near=clearance.robots[i],
+            near_arena=clearance.arena[i],
+            interventions=int(trace.interventions[i]),
+            intervened_share=_share(trace.interventions[i], trace.ticks[i]),
+            avoided=int(trace.avoided[i]),
+            avoided_share=_share(trace.avoided[i], trace.ticks[i]),
+            shadow=agreements[i],
+            goals=int(goals[i]),
+            goal_bytes=int(goal_bytes[i]),
+            delay_mean_s=late[i].mean,
+            delay_p95_s=late[i].p95,
+            delay_max_s=late[i].largest,
+        )
+        for i, name in enumerate(trace.robots)
+    )
+
+
+def _short(trace: Trace, net: Links, row: int) -> float | None:
+    """How far a robot that had a plan was from where that wanted it, at the end [m]; None: no plan, or not known."""
+    began = [leg for leg in trace.experiment.timeline if leg.robot == trace.robots[row] and leg.at_s < trace.time[-1]]
+    if not began or row in net.listener:
+        return None
+    return _number(float(norm(trace.goal[-1, row] - trace.position[-1, row])))
+
+
+def _share(part: float, whole: float) -> float | None:
+    return float(part) / float(whole) if whole else None
+
+
+def _nearest(approaches: Iterable[Approach | None]) -> Approach | None:
+    """The closest of all."""
+    return min((each for each in approaches if each is not None), key=lambda each: each.gap, default=None)
+
+
+def _slowest(trace: Trace) -> float | None:
+    """Lowest real-time factor of the world; while it is paused, time is to stand still."""
+    if trace.clock == "virtual":
+        return None
+    return min((said.factor for said in trace.world if not said.paused), default=None)
+
+
+def _cost(robot: RobotMetrics) -> float:
+    """One robot's share of J2; an error that is unknown costs nothing."""
+    effort = 0.02 * robot.messages + 0.1 * robot.updates + 0.3 * robot.settle_s
+    return effort + 0.1 * (robot.iae or 0.0) + 0.01 * (robot.itae or 0.0)
+
+
+def _all(times: Sequence[float | None]) -> float | None:
+    """When the last one was there; None if one never was, or nobody is asked."""
+    known = [when for when in times if when is not None]
+    return max(known) if known and len(known) == len(times) else None

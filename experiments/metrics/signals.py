@@ -1,0 +1,296 @@
+"""What metrics and figures take from a trace, as arrays: distance errors, acquisition, rotation, beliefs, gaps.
+
+Positions that are unknown are NaN; nothing here lets one robot's NaN reach another robot's numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask, norm
+from agents.formation.graph import Links
+from agents.plugins import registry
+from experiments.definition import assignment
+from experiments.definition.experiment import Experiment
+from experiments.definition.formation import Pattern, errors
+from experiments.metrics.results import Passage
+from experiments.recording.losses import unrecorded
+from experiments.recording.trace import Trace
+
+RETURN_S: Final = 3.0  # robots come back one after the other when the network does
+
+
+def links_of(trace: Trace) -> Links:
+    """The links of the experiment in the row numbers of the trace."""
+    return Pattern.of(trace.experiment, trace.robots).links
+
+
+def phase_starts(trace: Trace) -> tuple[float, ...]:
+    """When phases begin: the common start, each leg of the timeline and each change of shape within the run [s]."""
+    first, last = float(trace.time[0]), float(trace.time[-1])
+    experiment = trace.experiment
+    begins = {leg.at_s for leg in experiment.timeline} | {change.at_s for change in experiment.formation.changes}
+    return (first, *sorted(at for at in begins if first < at < last))
+
+
+def leaders(experiment: Experiment) -> tuple[str, ...]:
+    """Who is left out of the means; nobody if that would leave out all."""
+    leading = tuple(assignment.leaders(experiment))
+    return () if len(leading) == len(experiment.robots) else leading
+
+
+def own_links(net: Links, rows: int) -> Array:
+    """Which links count for which robot (E, N): those on which it listens, or if there are none, is listened to."""
+    link = np.arange(len(net))
+    hears, heard = np.zeros((2, len(net), rows))
+    hears[link, net.listener] = 1.0
+    heard[link, net.speaker] = 1.0
+    return np.where(hears.any(axis=0), hears, heard)
+
+
+@dataclass(frozen=True)
+class LinkErrors:
+    """How far the links are from what they ask for, and whose they are.
+
+    Attributes:
+        time: (T,) [s].
+        net: The links.
+        own: (E, N) 1 where a link counts for a robot, see `own_links`.
+        error: (T, E) as the law measures it, |‖p_i − p_j‖ − d_ij| for distances [m]; NaN where an end is unknown or
+            the link is not there.
+        alive: (T, N) whether the robot's own position is known.
+        away: (T,) the network was away, see `network_away`: what is unknown then tells nothing of a robot.
+    """
+
+    time: Array
+    net: Links
+    own: Array
+    error: Array
+    alive: Mask
+    away: Mask
+
+    @classmethod
+    def of(cls, trace: Trace) -> LinkErrors:
+        """The errors of a whole trace."""
+        pattern = Pattern.of(trace.experiment, trace.robots)
+        law = registry.build(registry.LAWS, trace.experiment.formation.law)
+        alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
+        error = errors(law, pattern, trace.time, trace.true_position)
+        own, (_, away) = own_links(pattern.links, len(trace.robots)), network_away(alive, trace.time)
+        return cls(trace.time, pattern.links, own, error, alive, away)
+
+    def part(self, begin: int, end: int) -> LinkErrors:
+        """The same from one row in time to another."""
+        rows = slice(begin, end)
+        return LinkErrors(self.time[rows], self.net, self.own, self.error[rows], self.alive[rows], self.away[rows])
+
+    def per_robot(self) -> Array:
+        """e_i(t) = Σ_j e_ij (T, N) [m] over its own links, see `error`; NaN where none of them is known."""
+        known = np.isfinite(self.error)
+        total = np.where(known, self.error, 0.0) @ self.own
+        total[known.astype(float) @ self.own == 0.0] = np.nan
+        return np.asarray(total)
+
+    def acquired(self, window: int, tolerance: float) -> list[float | None]:
+        """Per robot, from when on the mean of each of its links over `window` samples stays within the tolerance [m].
+
+        Seconds since the first sample; None if the last sample is still outside. A neighbour that died does not count.
+        """
+        known = np.isfinite(self.error)
+        edge = np.zeros((1, len(self.net)))
+        total = np.concatenate([edge, np.cumsum(np.where(known, self.error, 0.0), axis=0)])
+        count = np.concatenate([edge, np.cumsum(known, axis=0)])
+        before = np.maximum(np.arange(1, len(total)) - window, 0)  # the window fills up at the start
+        outside = (total[1:] - total[before]) > tolerance * (count[1:] - count[before]) + 1e-12
+        unknown = ((known.astype(float) @ self.own == 0.0) | ~self.alive) & ~self.away[:, None]
+        return after_last((outside.astype(float) @ self.own > 0.0) | unknown, self.time)
+
+    def worst(self, names: Sequence[str]) -> list[tuple[float | None, str]]:
+        """Per robot the mean error of its worst link [m], and who is at the other end of it."""
+        mean = mean_known(self.error)
+        found: list[tuple[float | None, str]] = []
+        for i, mine in enumerate(self.own.T > 0.0):
+            candidates = np.flatnonzero(mine & np.isfinite(mean))
+            if not len(candidates):
+                found.append((None, ""))
+                continue
+            k = candidates[mean[candidates].argmax()]
+            other = self.net.speaker[k] if self.net.listener[k] == i else self.net.listener[k]
+            found.append((float(mean[k]), names[other]))
+        return found
+
+
+def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:
+    """Holes that all robots share and that end: not the robots, the network was gone.
+
+    Args:
+        alive: (T, N) whether a robot's position is known.
+        time: (T,) [s].
+
+    Returns:
+        For how long nobody's position was known [s], and the rows (T,) within `RETURN_S` of that at which some are not.
+    """
+    nobody: Mask = np.asarray(~alive.any(axis=1))
+    ends = np.flatnonzero(alive.any(axis=1))
+    nobody[(ends[-1] if len(ends) else 0) :] = False  # robots that never come back have gone
+    if alive.shape[1] < 2 or not nobody.any():
+        return 0.0, np.zeros(len(time), dtype=bool)
+    moments = time[nobody]
+    after = np.searchsorted(moments, time)
+    padded = np.concatenate([[-np.inf], moments, [np.inf]])
+    near = np.minimum(time - padded[after], padded[after + 1] - time) <= RETURN_S
+    return float(nobody.sum() * (time[1] - time[0])), np.asarray((near & ~alive.all(axis=1)) | nobody)
+
+
+def formation_errors(trace: Trace) -> Array:
+    """e_i(t) (T, N) [m] of each robot over its own links, see `LinkErrors.per_robot`."""
+    return LinkErrors.of(trace).per_robot()
+
+
+def mean_known(values: Array) -> Array:
+    """Mean over the first axis of what is finite; NaN where nothing is (`nanmean` would warn)."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
+
+
+def integral(values: Array, time: Array) -> Array:
+    """Trapezoidal integral over the first axis of (T, N), over the part that is known."""
+    parts = 0.5 * (values[1:] + values[:-1]) * np.diff(time)[:, None]
+    return np.asarray(np.where(np.isfinite(parts), parts, 0.0).sum(axis=0))
+
+
+def integrals(total: Array, time: Array) -> tuple[Array, Array, Array]:
+    """∫ e dt [m s], ∫ t·e dt [m s²] and √(mean e²) [m] of errors (T, N); NaN where nothing is known."""
+    rmse = np.sqrt(mean_known(total**2))
+    known = np.isfinite(rmse)
+    iae, itae = integral(total, time), integral(time[:, None] * total, time)
+    return np.where(known, iae, np.nan), np.where(known, itae, np.nan), np.asarray(rmse)
+
+
+def after_last(bad: Mask, time: Array) -> list[float | None]:
+    """Per column of (n, N): time since the first row from which on nothing is bad; None if the last row is bad."""
+    last = np.where(bad.any(axis=0), len(bad) - 1 - bad[::-1].argmax(axis=0), -1)
+    return [None if k == len(bad) - 1 else float(time[k + 1] - time[0]) for k in last]
+
+
+def net_rotation(position: Array, time: Array) -> float | None:
+    """Rate at which a group turns about its centroid, seen from above [rad/s].
+
+    Args:
+        position: (n, N, 3) [m]; robots with unknown positions are left out.
+        time: (n,) [s].
+
+    The angle against the first pose is the planar Kabsch solution atan2(Σ r × s, Σ r · s), unwrapped in time; the rate
+    is the slope of a straight line through it.
+    """
+    if len(time) < 3:
+        return None
+    flat = position[:, np.isfinite(position[..., :2]).all(axis=(0, 2)), :2]
+    if flat.shape[1] < 2:
+        return None
+    flat = flat - flat.mean(axis=1, keepdims=True)
+    x, y = flat[0].T
+    angle = np.unwrap(np.arctan2(flat[..., 1] @ x - flat[..., 0] @ y, flat[..., 0] @ x + flat[..., 1] @ y))
+    t = time - time.mean()
+    return float(t @ angle) / float(t @ t)
+
+
+def beliefs(trace: Trace, net: Links) -> Array:
+    """Error (T, E) [m] of what is believed on each link: the newest pose heard, carried on by the predictor since.
+
+    NaN before the first pose, and after a death.
+    """
+    predictor = assignment.predictor(trace.experiment)
+    rows, heard = len(trace.robots), trace.heard
+    number = np.full((rows, rows), -1)
+    number[net.listener, net.speaker] = np.arange(len(net))
+    link = number[heard.listener, heard.speaker]
+    error = np.full((len(trace.time), len(net)), np.nan)
+    order = np.argsort(link, kind="stable")
+    ends = np.searchsorted(link[order], np.arange(len(net) + 1))
+    for k, (begin, end) in enumerate(pairwise(ends)):
+        mine = order[begin:end]
+        mine = mine[heard.stamp[mine] >= np.maximum.accumulate(heard.stamp[mine])]  # overtaken samples are ignored
+        if not len(mine):
+            continue
+        at = np.searchsorted(heard.time[mine], trace.time, side="right") - 1
+        newest = mine[at]
+        age = np.maximum(trace.time - heard.stamp[newest], 0.0)
+        believed = predictor.position(heard.position[newest], heard.velocity[newest], age)
+        error[:, k] = norm(believed - trace.true_position[:, net.speaker[k]])
+        error[at < 0, k] = np.nan
+    return error
+
+
+def closest(position: Array) -> tuple[float, int, int, int]:
+    """Smallest distance [m] between two robots, its row in time, and who; infinite if there are no two."""
+    best = (math.inf, 0, 0, 0)
+    for i in range(position.shape[1] - 1):
+        gap = norm(position[:, i + 1 :] - position[:, i, None])
+        gap = np.where(np.isfinite(gap), gap, np.inf)
+        k, j = divmod(int(gap.argmin()), gap.shape[1])
+        best = min(best, (float(gap[k, j]), k, i, i + 1 + j))
+    return best
+
+
+def outside_arena(trace: Trace) -> Array:
+    """How far each robot was outside the arena at its farthest (N,) [m]; negative if it never was."""
+    size = np.array(trace.experiment.arena.size)
+    centre = np.array([0.0, 0.0, 0.5 * size[2]])  # the floor is at z = 0
+    beyond = (np.abs(trace.true_position - centre) - 0.5 * size).max(axis=2)
+    return np.asarray(np.where(np.isfinite(beyond), beyond, -np.inf).max(axis=0))
+
+
+def gaps(trace: Trace) -> list[Array]:
+    """Times between transmissions, per robot [s]."""
+    order = np.lexsort((trace.sent.time, trace.sent.robot))
+    ends = np.searchsorted(trace.sent.robot[order], np.arange(1, len(trace.robots)))
+    return [np.diff(times) for times in np.split(trace.sent.time[order], ends)]
+
+
+def transmissions(trace: Trace) -> tuple[Index, Index]:
+    """Per robot: how many poses it sent, by its running numbers, and how many of them are in the recording."""
+    sent, rate = trace.sent, trace.experiment.rates.pose_hz
+    own: list[list[tuple[float, int]]] = [[] for _ in trace.robots]
+    for row, time, seq in zip(sent.robot.tolist(), sent.time.tolist(), sent.seq.tolist(), strict=True):
+        own[row].append((time, seq))
+    recorded = np.array([len(poses) for poses in own], dtype=np.intp)
+    return recorded + np.array([unrecorded(poses, rate) for poses in own], dtype=np.intp), recorded
+
+
+def passages(trace: Trace) -> tuple[Passage, ...]:
+    """Of every link on which something may be heard, those that only avoidance needs included."""
+    links, rows = assignment.heard_links(trace.experiment), len(trace.robots)
+    count = len(links)
+    dropped = np.zeros(count, dtype=np.intp) if trace.dropped is None else trace.dropped
+    ends = links.listener * rows + links.speaker
+    order = np.argsort(ends)
+    asked = trace.heard.listener * rows + trace.heard.speaker
+    at = np.searchsorted(ends, asked, sorter=order)
+    known = at < count
+    known[known] = ends[order[at[known]]] == asked[known]
+    link, took = order[at[known]], (trace.heard.time - trace.heard.stamp)[known]
+    heard = np.bincount(link, minlength=count)
+    total = np.bincount(link, weights=took, minlength=count)
+    longest = np.full(count, -np.inf)
+    np.maximum.at(longest, link, took)
+    columns = zip(links.listener.tolist(), links.speaker.tolist(), heard.tolist(), dropped.tolist(), strict=True)
+    return tuple(
+        Passage(
+            listener=trace.robots[i],
+            speaker=trace.robots[j],
+            heard=number,
+            dropped=gone,
+            delay_mean=float(total[k]) / number if number else None,
+            delay_max=float(longest[k]) if number else None,
+        )
+        for k, (i, j, number, gone) in enumerate(columns)
+    )

@@ -1,0 +1,119 @@
+"""Several runs together: of the same case with other seeds, and of one case beside another."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import msgspec
+
+from experiments.metrics.results import INDICES, CaseMetrics
+
+SUMS: Final = (
+    "messages",
+    "bytes",
+    "iae",
+    "itae",
+    "lost",
+    "dropped",
+    "missed_deadlines",
+)  # grow with the length of a run
+
+
+def ratio(value: float | None, reference: float | None) -> float | None:
+    """The value over its reference; None where the reference is 0 or either is unknown."""
+    return None if value is None or not reference else value / reference
+
+
+def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index: str) -> list[float | None]:
+    """An index of each run over the reference: of the same seed if all seeds are the same, else over its mean.
+
+    None for what grows with the length of a run if the runs are of different length: one was interrupted.
+    """
+    if index in SUMS and not same_length([*runs, *reference]):
+        return [None] * len(runs)
+    if sorted(run.seed for run in runs) == sorted(run.seed for run in reference):
+        of_seed = {run.seed: run.mean[index] for run in reference}
+        return [ratio(run.mean[index], of_seed[run.seed]) for run in runs]
+    mean = spread([run.mean[index] for run in reference]).mean
+    return [ratio(run.mean[index], mean) for run in runs]
+
+
+def same_length(runs: Sequence[CaseMetrics]) -> bool:
+    """Whether runs can be compared: equally long within 2 %, or as long as each was to be."""
+    lengths = [run.duration_s for run in runs]
+    return not any(run.interrupted for run in runs) or max(lengths) - min(lengths) <= 0.02 * max(lengths)
+
+
+def by_case(cases: Sequence[CaseMetrics]) -> dict[str, list[CaseMetrics]]:
+    """Runs of the same case together, cases in the order of their first run."""
+    grouped: dict[str, list[CaseMetrics]] = {}
+    for case in cases:
+        grouped.setdefault(case.case, []).append(case)
+    return grouped
+
+
+def across_seeds(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Mean, standard deviation and 95 % confidence half-width of each index and ratio over runs of several seeds.
+
+    Returns:
+        `{"seeds": [...], "cases": {case: {"mean" | "ratio": {index: {"mean", "std", "ci95", "n"}}}}}`. `n` counts the
+        seeds for which the value is known; the half-width is Student's, None for fewer than two.
+    """
+    cases = list(dict.fromkeys(case for each in documents for case in each["cases"]))
+    return {
+        "seeds": [each["seed"] for each in documents],
+        "cases": {
+            case: {
+                group: {
+                    index: msgspec.structs.asdict(
+                        spread([each["cases"][case][group][index] for each in documents if case in each["cases"]])
+                    )
+                    for index in INDICES
+                }
+                for group in ("mean", "ratio")
+            }
+            for case in cases
+        },
+    }
+
+
+class Spread(msgspec.Struct, frozen=True):
+    """Mean, standard deviation and 95 % confidence half-width (Student's, None for fewer than two) of `n` values."""
+
+    mean: float | None
+    std: float | None
+    ci95: float | None
+    n: int
+
+
+def spread(values: Sequence[float | None]) -> Spread:
+    """Of what is known among the values."""
+    known = [value for value in values if value is not None]
+    n = len(known)
+    deviation = statistics.stdev(known) if n > 1 else None
+    return Spread(
+        mean=statistics.fmean(known) if known else None,
+        std=deviation,
+        ci95=None if deviation is None else student_95(n - 1) * deviation / math.sqrt(n),
+        n=n,
+    )
+
+
+def student_95(freedom: int) -> float:
+    """Two-sided 95 % quantile of Student's t: exact for 1 and 2, else Fisher's expansion (0.1 % at 3, then better)."""
+    if freedom == 1:
+        return math.tan(0.475 * math.pi)
+    if freedom == 2:
+        return 0.95 * math.sqrt(2.0 / (1.0 - 0.95**2))
+    z = statistics.NormalDist().inv_cdf(0.975)
+    terms = (
+        z,
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
+    )
+    return math.fsum(term / float(freedom) ** k for k, term in enumerate(terms))

@@ -1,0 +1,1 @@
+"""The real clock: conductor, hosts, and the processes that they start."""

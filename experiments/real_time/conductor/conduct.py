@@ -1,0 +1,236 @@
+"""Runs an experiment in real time: a router, a process per robot, a recorder.
+
+See also `experiments.virtual_time.simulation`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from agents.network.access_control import rules
+from agents.network.endpoints import free_endpoints, from_here
+from agents.network.keys import Keys
+from agents.network.lab import LabError, register, require, secured
+from agents.network.lab import of as lab_of
+from agents.network.lab import options as lab_options
+from agents.network.zenoh_config import check_loopback
+from agents.plugins import registry as plugins
+from agents.runtime import run_registry
+from experiments.definition import access_rights, bodies, mesh
+from experiments.definition import endpoints as reach
+from experiments.definition.bodies import choose_bodies
+from experiments.definition.experiment import Experiment
+from experiments.file import document
+from experiments.file.document import Document, chosen
+from experiments.file.problems import DocumentError, Problem
+from experiments.real_time.conductor.conductor import Conductor, Result
+from experiments.real_time.conductor.run_view import Emergency, Shown
+from experiments.real_time.conductor.support import divided
+from experiments.real_time.hosts.hosts import Hosts
+from experiments.real_time.hosts.launcher import Launcher
+from experiments.recording.run_folder import SOURCE
+
+
+@dataclass(frozen=True)
+class Staging:
+    """How an experiment is put on, as far as its file leaves that open.
+
+    Attributes:
+        cases: Which of its cases; all if none is named.
+        bodies: What every robot is put into instead of the body that the file gives it: "twin", "world", or
+            "protocol" for its real bridge and a protocol twin.
+        here: Whether all robots run on this machine, whatever the file says of hosts.
+        lab: Folder of certificates, instead of the file's.
+        identity: Whose certificate the conductor shows, in a lab: an operator's.
+    """
+
+    cases: Sequence[str] = ()
+    bodies: str | None = None
+    here: bool = False
+    lab: str | None = None
+    identity: str = "operator"
+
+
+def conduct(
+    read: Document,
+    folder: Path,
+    staging: Staging,
+    *,
+    show: Shown,
+    interrupted: Callable[[], bool],
+    emergency: Emergency,
+    launching: Callable[[Path], Launcher] = Launcher,
+    tell: Callable[[Sequence[str]], None] = lambda _: None,
+) -> tuple[dict[str, Path], list[str]]:
+    """Runs an experiment in real time: a router, a process per robot, a recorder.
+
+    Args:
+        read: The experiment.
+        folder: Where recordings and logs go; it exists.
+        staging: What the file leaves open.
+        show: Shows the progress.
+        interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
+        emergency: Hears emergency stops; after one no further case begins.
+        launching: Makes the launcher of the processes, given the folder of their logs.
+        tell: Takes what the user should know before it begins.
+
+    Returns:
+        The recordings of the cases that have begun, and what the reader should know.
+
+    Raises:
+        LabError: If a certificate is missing.
+        EndpointError: If a router would have to listen where others could connect, without a lab.
+        RunFailed: If robots are not ready in time, unless the file says to go on without them.
+        Unreachable: If the routers of the file do not answer.
+        HostError: If a host cannot be reached, or has another zenpark.
+        DocumentError: If robots that run on hosts are to be put behind protocol twins, or are hardware that another
+            run of this machine has.
+    """
+    if staging.bodies == "protocol" and read.experiment.hosts and not staging.here:
+        hint = "add --here, which lets all robots run on this machine"
+        raise DocumentError([Problem("--bodies protocol", 0, 0, "protocol twins cannot be seen from hosts", hint)])
+    results: dict[str, Result] = {}
+    read.keep(folder / SOURCE)
+    embodied = {name: choose_bodies(case, staging.bodies) for name, case in chosen(read, staging.cases).items()}
+    if staging.here:
+        embodied = {name: msgspec.structs.replace(case, hosts={}) for name, case in embodied.items()}
+    network = read.experiment.network
+    meshed = network.topology == "mesh"
+    own_router = network.connect is None and not meshed
+    of_lab = reach.folder(read.experiment, read.path, staging.lab)
+    secure = of_lab is not None
+    own = network.listen or free_endpoints(network.routers, protocol="tls" if secure else "tcp")
+    listening = reach.routers(read.experiment, read.path, own if own_router else [], staging.lab)
+    if own_router and not secure:
+        for endpoint in listening:
+            check_loopback(endpoint)
+    endpoints = list(map(from_here, listening)) if own_router else listening
+    if meshed:
+        endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)
+    rights = enforced(embodied.values(), endpoints, folder, staging.identity)
+    (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
+    me = run_registry.mine(
+        "run", read.experiment.title or read.path.stem, endpoints,
+        folder=folder, realm=network.realm, identity=staging.identity, robots=hardware(embodied.values()),
+    )  # fmt: skip
+    with run_registry.registered(me) as unlisted, launching(folder / "logs") as launcher:
+        tell([*([unlisted] if unlisted else []), *beside(me, run_registry.runs(), str(read.path))])
+        for router in divided(listening, network.routers) if own_router else ():
+            router.start(launcher, rights)
+        hosts = Hosts(launcher, endpoints if meshed else listening)
+        # of a mesh nobody is there yet: only the session of each case hears it there
+        keys = Keys(network.realm)
+        hears = (
+            nullcontext() if meshed else emergency.throughout(endpoints, keys, staging.identity, starting=own_router)
+        )
+        with show, hears:
+            for name, experiment in embodied.items():
+                if interrupted() or emergency:
+                    break
+                file = folder / f"{name}.json"
+                file.write_bytes(document.write_json(experiment))
+                results[name] = Conductor(
+                    experiment,
+                    name,
+                    file=file,
+                    source=folder / SOURCE,
+                    folder=folder,
+                    endpoints=endpoints,
+                    rights=rights,
+                    identity=staging.identity,
+                    launcher=launcher,
+                    hosts=hosts,
+                    show=show,
+                    interrupted=interrupted,
+                    emergency=emergency,
+                ).run()
+        left = hosts.sweep()
+    unflown = ", ".join(name for name in embodied if name not in results)
+    stopped = [emergency.words + (f"; not run: {unflown}" if unflown else "")] if emergency else []
+    notes = (
+        stopped + [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
+    )
+    return {case: result.recording for case, result in results.items() if result.start is not None}, notes
+
+
+def hardware(cases: Iterable[Experiment]) -> dict[str, str]:
+    """Robots of some cases by name, with the address of those that are hardware, and the host on which they run."""
+    found: dict[str, str] = {}
+    stood_in = {"twin", bodies.WORLD, "external", *plugins.names(plugins.DEVICES)}
+    for case in cases:
+        hosts = {robot: host for host, each in case.hosts.items() for robot in each.robots}
+        for name, robot in case.robots.items():
+            if plugins.body_name(robot.body) in stood_in:
+                found.setdefault(name, "")
+            else:
+                device = f" {json.dumps(robot.device, sort_keys=True)}" if robot.device else ""
+                found[name] = robot.body + device + (f" on {hosts[name]}" if name in hosts else "")
+    return found
+
+
+def beside(me: run_registry.Run, others: Iterable[run_registry.Run], file: str) -> list[str]:
+    """What there is to say of runs that are up beside one and have robots of the same names.
+
+    Raises:
+        DocumentError: If a robot of the run is hardware that another one has.
+    """
+    said = []
+    for other in others:
+        if (other.pid, other.born) == (me.pid, me.born) or not other.alive:
+            continue
+        taken = sorted(name for name, body in me.robots.items() if body and _has(other, name, body))
+        if taken:
+            stop = (
+                lab_options(other.endpoints[0])
+                if len(other.endpoints) == 1
+                else f"--connect @{other.folder}/{mesh.ENDPOINTS}"
+            )
+            raise DocumentError(
+                [
+                    Problem(
+                        file, 0, 0, f"{', '.join(taken)} ({me.robots[taken[0]]}) is in another run, {other.words}",
+                        f"end that one first: Ctrl-C in its terminal (pid {other.pid}), or `zenpark estop {stop}`",
+                    )
+                ]
+            )  # fmt: skip
+        if same := sorted(me.robots.keys() & other.robots.keys()):
+            said.append(f"another run is up with robots of these names ({', '.join(same)}): {other.words}")
+    return said
+
+
+def _has(other: run_registry.Run, name: str, body: str) -> bool:
+    """Whether another run drives the same device: an address that names none belongs to the robot of that name."""
+    if plugins.body_name(body) == body:
+        return other.robots.get(name) == body
+    return body in other.robots.values()
+
+
+def enforced(
+    cases: Collection[Experiment], endpoints: Sequence[str], folder: Path, operator: str = "operator"
+) -> Path | None:
+    """Who may do what, as a file for the router; None without a lab.
+
+    Robots on hosts have their certificates there, and need none here.
+
+    Raises:
+        LabError: If a certificate is missing, or somebody else's.
+    """
+    of = lab_of(endpoints)
+    if of is None:
+        return None
+    known = register(of)
+    require(of, list(dict.fromkeys(name for case in cases for name in access_rights.needed(case, operator))))
+    role = known.identities[operator].role
+    if role != "operator":
+        raise LabError(f"{operator} is {role} in the lab, and gives no orders: choose an operator with --as")
+    made = access_rights.rights(cases)
+    rules(made, known)  # what is wrong with it is said now, and not by a router that does not start
+    file = folder / "rights.json"
+    file.write_bytes(msgspec.json.format(msgspec.json.encode(made), indent=1))
+    return file

@@ -1,0 +1,412 @@
+"""The conductor of one case in real time: waits until all are ready, gives the common start, walks the phases, lands.
+
+It decides nothing that a robot needs: if it dies, the robots land by themselves and the recorder finishes its file.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from agents.clock import Clock
+from agents.network import messages
+from agents.network.keys import Keys
+from experiments.definition.assignment import guided
+from experiments.definition.experiment import Experiment
+from experiments.real_time.conductor.crew import Crew
+from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
+from experiments.real_time.conductor.orders import lead
+from experiments.real_time.conductor.run_view import OUTPUT, Emergency, Overview, Progress, Seen, Show
+from experiments.real_time.hosts.clock_drift import Drift
+from experiments.real_time.hosts.hosts import Hosts
+from experiments.real_time.hosts.launcher import LAND_S, Launcher
+
+POLL_S: Final = 0.05
+TARDY_S: Final = 0.05  # who begins later than this after the common start is named
+GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
+
+ADOPT_S: Final = 0.5
+MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
+AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead,
+LATE_S: Final = 1.0  # who says that it waits so long after the common start has not heard of it
+BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behind
+LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
+
+
+class RunFailed(RuntimeError):
+    """A run that could not begin, with what is missing and what to do."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a case ended."""
+
+    recording: Path
+    interrupted: bool
+    start: float | None
+    ready_s: float | None
+    lost: tuple[str, ...]
+
+
+class Conductor:
+    """Runs one case."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        case: str,
+        *,
+        file: Path,
+        source: Path,
+        folder: Path,
+        endpoints: Sequence[str],
+        rights: Path | None = None,
+        identity: str = "operator",
+        launcher: Launcher,
+        hosts: Hosts,
+        show: Show,
+        interrupted: Callable[[], bool],
+        emergency: Emergency | None = None,
+    ) -> None:
+        """Prepares a case; nothing is started yet.
+
+        Args:
+            experiment: The case, overrides applied.
+            case: Its name.
+            file: The same as a file, for the processes.
+            source: The experiment file as it was written, for the recording.
+            folder: Where the recording goes.
+            endpoints: Routers.
+            rights: Who may do what, for a router that is started again, in a lab.
+            identity: Whose certificate it shows, in a lab.
+            launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
+            hosts: Other machines, on which robots may be started.
+            show: Called with the progress, about ten times a second.
+            interrupted: Asked whether the user wants to end it.
+            emergency: Hears emergency stops, which end it as well; one of its own if left out.
+        """
+        self._experiment, self._case = experiment, case
+        self._file, self._identity = file, identity
+        self._recording = folder / f"{case}.mcap"
+        self._endpoints = list(endpoints)
+        self._hosts, self._show, self._asked = hosts, show, interrupted
+        self._emergency = Emergency() if emergency is None else emergency
+        self._keys = Keys(experiment.network.realm)
+        self._clock = launcher.clock = Clock()  # of each case, for all its processes here, however late they start
+        steered = guided(experiment)
+        self._robots = {
+            name: Seen(error=None if name in steered else 0.0, out="standby" if robot.standby else "")
+            for name, robot in experiment.robots.items()
+        }
+        self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots, clock=self._clock)
+        self._starting: set[str] = set()
+        self._crew = Crew(
+            experiment,
+            case,
+            file=file,
+            source=source,
+            recording=self._recording,
+            endpoints=self._endpoints,
+            rights=rights,
+            launcher=launcher,
+            hosts=hosts,
+        )
+
+    def run(self) -> Result:
+        """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
+
+        Raises:
+            RunFailed: If robots are not ready in time and the file says that the run must not go on without them.
+        """
+        began = time.monotonic()
+        self._progress.phase = "connecting the hosts" if self._experiment.hosts else "starting"
+        clocks = self._hosts.join(self._experiment)
+        start = ready = None
+        try:
+            self._crew.prepare(self._interrupted)
+            with ExitStack() as stack:
+                self._join(stack)
+                self._adopt()
+                self._crew.start()
+                if self._until("ready", self._patience(), recorder=True):
+                    ready = time.monotonic() - began
+                    self._view.tell_clocks(clocks)
+                    self._drift = stack.enter_context(Drift(self._hosts.followed()))
+                    self._view.say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
+                    if self._take_off():
+                        start = self._start()
+                        self._walk(start)
+                self._land()
+                if start is not None:
+                    self._drift.close()
+                    self._view.tell_drift(*self._drift.news())
+                    clocks, trouble = self._hosts.clocks()
+                    self._view.tell_clocks(clocks)
+                    for each in trouble:
+                        self._view.say("clock", "conductor", each)
+        except RunFailed as failure:
+            self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: say it now
+            self._progress.events.append(messages.Event(self._clock.utc(), "failed", "conductor", self._progress.phase))
+            self._show(self._progress)
+            raise
+        finally:
+            self._crew.end()
+        lost = tuple(name for name, seen in self._robots.items() if seen.out == "lost")
+        return Result(self._recording, self._interrupted(), start, ready, lost)
+
+    def _interrupted(self) -> bool:
+        """Whether somebody wants the run to end."""
+        return bool(self._emergency) or self._asked()
+
+    def _adopt(self) -> None:
+        """Finds robots that were started by hand or at boot, which nobody needs to start.
+
+        Raises:
+            RunFailed: If one of them has flown already.
+        """
+        away = self._crew.away
+        if self._experiment.network.connect is not None or away:  # a router of our own has nobody else
+            self._progress.phase = "looking who is there"
+            began = time.monotonic()
+            while (past := time.monotonic() - began) < ADOPT_S or (self._flown() and past < LEAVE_S):
+                self._look()
+                time.sleep(POLL_S)
+        if flown := self._flown():
+            raise RunFailed(
+                f"{', '.join(flown)}: on the network already, and {self._robots[flown[0]].phase}; a robot that was "
+                "started by hand flies once: end its process and start it again, next time with --once"
+            )
+        there = {name for name, seen in self._robots.items() if seen.alive}
+        for name in self._crew.adopt(there):
+            said = f"is there already, {self._robots[name].phase}" if name in there else f"is started on {away[name]}"
+            self._view.say("adopted", name, f"{said}; not started from here")
+
+    def _flown(self) -> list[str]:
+        """Robots that are there and have flown, or do."""
+        return [name for name, seen in self._robots.items() if seen.alive and seen.reached("airborne")]
+
+    # ------------------------------------------------------------------ phases
+
+    def _until(
+        self, phase: str, limit_s: float, *, recorder: bool = False, meanwhile: Callable[[], None] = lambda: None
+    ) -> bool:
+        """Waits until every robot that is left has reached a phase; False if the user interrupted.
+
+        Raises:
+            RunFailed: If they have not in time, unless the file says to go on without them.
+        """
+        self._progress.phase = f"waiting until all are {phase}"
+        deadline = time.monotonic() + limit_s
+        while True:
+            self._look()
+            if self._interrupted():
+                return False
+            meanwhile()
+            late = [name for name, seen in self._robots.items() if not (seen.reached(phase) or seen.gone)]
+            gone = [name for name, seen in self._robots.items() if seen.out == "lost"]
+            if gone and self._experiment.start.missing == "abort":
+                raise RunFailed(self._excuse(gone, "could not start"))
+            if not late and (not recorder or self._view.recording_begun):
+                return True
+            if time.monotonic() > deadline:
+                if late and self._experiment.start.missing == "abort":
+                    raise RunFailed(self._excuse(late, f"not {phase} after {limit_s:g} s"))
+                for name in late:
+                    self._view.say("late", name, f"not {phase} after {limit_s:g} s: {self._why(name)}")
+                return True
+            time.sleep(POLL_S)
+
+    def _take_off(self) -> bool:
+        """Orders all to climb, those who were not ready just then again when they are; False if interrupted.
+
+        Raises:
+            RunFailed: As `_until`.
+        """
+        refused = self._order(messages.Order("takeoff"))
+
+        def again() -> None:
+            for name in [name for name in refused if self._robots[name].phase == "ready"]:
+                refused.remove(name)
+                refused.extend(self._order(messages.Order("takeoff"), [name]))
+
+        return self._until("airborne", CLIMB_S, meanwhile=again)
+
+    def _patience(self) -> float:
+        """How long to wait until all are ready [s]: robots that go on without a neighbour say so after the deadline."""
+        begin = self._experiment.start
+        return begin.deadline_s + (GO_ON_S if begin.missing == "go-on" else 0.0)
+
+    def _start(self) -> float:
+        """One start time for all, in UTC; returns it."""
+        for name, seen in self._robots.items():
+            if not (seen.gone or AHEAD_S < seen.behind < BEHIND_S):
+                remedy = "set it (NTP), or let zenpark start the robot: [hosts]"
+                self._view.say("clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}")
+        there = [name for name, seen in self._robots.items() if seen.reached("airborne") and not seen.gone]
+        at = self._clock.utc() + lead(len(there))
+        self._view.say("start", "conductor", "common start", stamp=at)
+        self._order(messages.Order("start", at=at), there)
+        self._starting = {*there}
+        return at
+
+    def _walk(self, start: float) -> None:
+        """Follows the run to its end."""
+        legs = sorted(self._experiment.timeline, key=lambda leg: leg.at_s)
+        names = ["formation", *(f"{leg.robot} under way" for leg in legs)]
+        times = [0.0, *(leg.at_s for leg in legs)]
+        reached = -1
+        end = start + self._experiment.duration_s
+        self._changes.begin(start)
+        self._repeat_at = start
+        self._progress.phase = "starting together"
+        while (now := self._clock.utc()) < end + LAND_S and not self._interrupted():
+            self._look()
+            self._view.tell_drift(*self._drift.news())
+            self._progress.elapsed = now - start
+            self._tell_tardy(start)
+            self._start_late(start)
+            while reached + 1 < len(times) and now - start >= times[reached + 1]:
+                reached += 1
+                self._progress.phase = names[reached]
+                self._view.say("phase", "conductor", names[reached], stamp=start + times[reached])
+            busy = self._changes.under_way
+            left = [seen for name, seen in self._robots.items() if not seen.gone and name not in busy]
+            if all(seen.reached("landing") for seen in left) and (left or not busy):
+                return
+            time.sleep(POLL_S)
+
+    def _start_late(self, start: float) -> None:
+        """Repeats the start to robots that still wait: a busy machine may have lost the order, or its answer."""
+        now, busy = self._clock.utc(), self._changes.under_way
+        late = [
+            name
+            for name, seen in self._robots.items()
+            if seen.status is not None and seen.status.phase == "airborne" and seen.status.stamp > start + LATE_S
+            if not seen.gone and name not in busy
+        ]
+        if late and now > self._repeat_at:
+            self._repeat_at = now + LATE_S
+            for name in late:
+                self._view.say("late", name, "still waits for the start; told again")
+            self._view.order(late, messages.Order("start", at=start))
+
+    def _tell_tardy(self, start: float) -> None:
+        """Names robots that were told of the common start and began after it."""
+        for name in list(self._starting):
+            seen = self._robots[name]
+            if seen.began is None and not seen.gone and name not in self._changes.under_way:
+                continue
+            self._starting.remove(name)
+            if seen.began is not None and (tardy := seen.began - start) > TARDY_S:
+                self._view.say("late", name, f"began {tardy:.2f} s after the common start")
+
+    def _land(self) -> None:
+        """Everybody down."""
+        self._view.close_doors()
+        self._changes.close()
+        self._progress.phase = "stopped" if self._emergency else "landing"
+        if self._emergency:
+            self._view.say("stop", "conductor", f"{self._emergency.words}; the run ends here")
+        how = "emergency stop" if self._emergency else "interrupted" if self._interrupted() else ""
+        self._view.say("phase", "conductor", "landing" + (f" ({how})" if how else ""))
+        if any(not (seen.gone or seen.reached("landing")) for seen in self._robots.values()):
+            self._order(messages.Order("land"))
+        deadline = time.monotonic() + LAND_S
+        while time.monotonic() < deadline:
+            self._look()
+            if all(
+                seen.gone or seen.reached("done") or seen.phase in ("starting", "idle")
+                for seen in self._robots.values()
+            ):
+                break
+            time.sleep(POLL_S)
+        self._progress.phase = "done"
+        self._show(self._progress)
+
+    # ------------------------------------------------------------------ what happens meanwhile
+
+    def _join(self, stack: ExitStack) -> None:
+        self._view = Overview(
+            stack,
+            self._experiment,
+            self._endpoints,
+            self._progress,
+            self._recording.parent,
+            identity=self._identity,
+            clock=self._clock,
+        )
+        stack.callback(self._emergency.listen(self._view.session, self._keys).close)
+        self._changes = HotChanges(self._experiment, self._crew, self._view, self._keys)
+
+    def _look(self) -> None:
+        """Takes in what has happened since the last look."""
+        view, now = self._view, self._clock.utc()
+        for name in view.look():
+            self._miss(name)
+        for death in self._crew.deaths():
+            if death.kind == "lost" and self._changes.expects(death.source, death.text):
+                continue
+            view.say(death.kind, death.source, death.text)
+            if death.kind == "recorder":
+                view.recording_begun = True  # nothing to wait for
+            elif death.kind == "lost":
+                self._robots[death.source].alive = False
+                self._changes.lose(death.source)
+        self._progress.events += [messages.Event(now, OUTPUT, place, line) for place, line in self._crew.output()]
+        for name, seen in self._robots.items():
+            if seen.out == "lost" and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
+                self._come_back(name, seen)
+        self._changes.go_on()
+        self._show(self._progress)
+
+    def _miss(self, name: str) -> None:
+        """The token of an adopted robot has vanished for good: all that is known of its end."""
+        if name not in self._crew.adopted or self._changes.expects(name, "it is gone"):
+            return
+        if not self._robots[name].reached("landing"):  # who is down before the others takes its token back
+            self._view.say("lost", name, "is not on the network any more")
+            self._changes.lose(name)
+
+    def _come_back(self, name: str, seen: Seen) -> None:
+        """It was only away, or somebody started it again."""
+        if name in self._changes.under_way:
+            return
+        seen.out = ""
+        joins = "" if seen.reached("running") else f"; `zenpark robot add {name}` lets it join the run"
+        self._view.say("back", name, f"alive again{joins}")
+        if not self._crew.runs(name):
+            self._crew.adopted.add(name)
+
+    def _order(self, order: messages.Order, to: Sequence[str] | None = None) -> list[str]:
+        """Gives an order to all robots that are left, or to some of them; says and returns who refused."""
+        left = [name for name, seen in self._robots.items() if not (seen.gone or seen.status is None)]
+        replies = self._view.order([name for name in left if to is None or name in to], order)
+        refused = {name: reply.reason for name, reply in replies.items() if not reply.ok}
+        for name, reason in refused.items():
+            self._view.say("refused", name, f"{order.order}: {reason}")
+        return list(refused)
+
+    # ------------------------------------------------------------------ words
+
+    def _count(self, phase: str) -> int:
+        return sum(seen.reached(phase) for seen in self._robots.values())
+
+    def _why(self, name: str) -> str:
+        status = self._robots[name].status
+        if status is None:
+            return "its process says nothing yet"
+        return status.reason or f"it is {status.phase}"
+
+    def _excuse(self, names: Sequence[str], what: str) -> str:
+        lines = [f"{', '.join(names)}: {what}; nothing has moved or all have landed"]
+        for name in names:
+            last = self._crew.last_line(name)
+            lines.append(f"  {name}: {self._why(name)}" + (f"\n    {last}" if last else ""))
+        ended = all(self._robots[name].gone for name in names)
+        remedy = "mend that" if ended else "give them more time with start.deadline_s"
+        lines.append(f"  {remedy}, or go on without them with start.missing = 'go-on'")
+        return "\n".join(lines)

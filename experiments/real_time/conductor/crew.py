@@ -1,0 +1,261 @@
+"""The processes of one case: recorder, stand-ins for hardware, robots, and the router that all of them meet at.
+
+Robots are started on the machines that the file says, or by others; all else runs on the launcher's, whose clock is the
+one of the experiment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from agents.arrays import Array
+from experiments.definition import bodies, standby
+from experiments.definition.experiment import Experiment, Robot
+from experiments.file import document
+from experiments.file.document import write_json
+from experiments.real_time.conductor import support
+from experiments.real_time.conductor.support import Servants
+from experiments.real_time.hosts.hosts import STATION, Hosts
+from experiments.real_time.hosts.launcher import LAND_S, Launcher, Process
+
+ALONE_S: Final = 3.0  # a robot that joins a run under way does not wait longer for neighbours that say nothing
+
+
+@dataclass(frozen=True)
+class Death:
+    """A process has ended that should not have: what it was, whom it concerns, what is done.
+
+    `kind` is "recorder", "lost" (a robot's process), "host" (the connection to one), "device" (a protocol
+    twin), or what was started again.
+    """
+
+    kind: str
+    source: str
+    text: str
+
+
+class Crew:
+    """Starts, watches and ends the processes of one case.
+
+    Attributes:
+        adopted: Robots that somebody else has started, or will.
+        away: Robots that are started on a host without address, and that host.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        case: str,
+        *,
+        file: Path,
+        source: Path,
+        recording: Path,
+        endpoints: Sequence[str],
+        rights: Path | None = None,
+        launcher: Launcher,
+        hosts: Hosts,
+    ) -> None:
+        """Nothing is started yet.
+
+        Args:
+            experiment: The case, overrides applied.
+            case: Its name, with which the names of the processes begin.
+            file: The same as a file, for the processes.
+            source: The experiment file as it was written, for the recording.
+            recording: Where it is recorded; the processes' output goes to `logs/` beside it.
+            endpoints: Routers.
+            rights: Who may do what, for a router that is started again, in a lab.
+            launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
+            hosts: Other machines, on which robots may be started; joined before robots are.
+        """
+        self._experiment, self._case = experiment, case
+        self._file, self._source, self._recording = file, source, recording
+        self._launcher, self._hosts = launcher, hosts
+        self._connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
+        self._groups: dict[str, list[str]] = {}  # by process, without the case
+        for name, robot in experiment.robots.items():
+            self._groups.setdefault(robot.process or name, []).append(name)
+        self._recorder = f"{case}-recorder"
+        self._standins: tuple[str, ...] = ()
+        self._centre: tuple[str, ...] = ()
+        self._servants = Servants(
+            experiment,
+            case,
+            file=file,
+            endpoints=endpoints,
+            routers=hosts.routers,
+            rights=rights,
+            launcher=launcher,
+        )
+        self.adopted: set[str] = set()
+        self.away = standby.absent(experiment)
+        self._addressed, self._reached = file, experiment
+        self._joining = file.with_name(f"{case}-joining.json")
+        self._abroad: dict[str, Process] = {}  # by host and group
+
+    def prepare(self, interrupted: Callable[[], bool]) -> None:
+        """Starts all but router and robots: the recorder, then what robots need.
+
+        Args:
+            interrupted: Asked while it waits whether the user wants to end it.
+
+        Raises:
+            StandInError: If a protocol twin or a positioning system does not start in time.
+        """
+        case = ["--case", self._case, "--source", str(self._source)]
+        file = str(self._file)
+        self._launcher.start(
+            self._recorder,
+            "experiments.real_time.processes.recorder",
+            file,
+            str(self._recording),
+            *case,
+            *self._connect,
+        )
+        self._stand_in(interrupted)
+        self._centre = self._servants.start_centre()
+
+    def adopt(self, there: Iterable[str]) -> list[str]:
+        """Robots that are `there` are nobody's to start, nor are those of hosts without address; returns them all."""
+        self.adopted = {*there, *self.away}
+        return sorted(self.adopted)
+
+    def start(self) -> None:
+        """Starts all robots that are neither adopted nor on standby, on their machines."""
+        robots = self._experiment.robots
+        for names in self._groups.values():
+            if missing := [name for name in names if not (name in self.adopted or robots[name].standby)]:
+                self._start(missing, self._addressed, self._reached)
+
+    def start_again(self, names: Sequence[str], bodies: Mapping[str, Robot] | None = None) -> None:
+        """Starts the process of some robots while the run is under way.
+
+        They are told to be ready without neighbours that say nothing, which may be out of the run as well.
+
+        Args:
+            names: All robots of a process, of which none runs.
+            bodies: What has become of them: other robots, which have these names from now on.
+        """
+        robots = {**self._reached.robots, **(bodies or {})}
+        for name in bodies or {}:
+            self._groups[self._group(name)].remove(name)
+            self._groups[name] = [name]
+        self._groups = {group: members for group, members in self._groups.items() if members}
+        self._reached = msgspec.structs.replace(self._reached, robots=robots)
+        begin = msgspec.structs.replace(self._reached.start, missing="go-on", deadline_s=ALONE_S)
+        told = msgspec.structs.replace(self._reached, start=begin)
+        fresh = self._joining.with_suffix(".new")  # who is just being started reads the one or the other
+        fresh.write_bytes(write_json(told))
+        fresh.replace(self._joining)
+        self.adopted -= {*names}
+        self._start(names, self._joining, told)
+
+    def _start(self, names: Sequence[str], file: Path, told: Experiment) -> None:
+        group = self._group(names[0])
+        station, process = self._hosts.of(names[0]), self._process(group)
+        if station is not None:
+            told_case = document.case_document(told)
+            self._abroad[f"{station.name}/{group}"] = station.start(process, names, told_case, self._launcher)
+        else:
+            arguments = [str(file), *names, *self._connect, "--lifeline"]
+            self._launcher.start(process, "experiments.real_time.processes.robot", *arguments)
+
+    def robot(self, name: str) -> Robot:
+        """A robot as it is now: another one may have its name, and its body an address that the file does not know."""
+        return self._reached.robots[name]
+
+    def place(self, name: str, robot: Robot | None = None) -> Array:
+        """Where a robot is put (2,) [m], or where `robot` would be under its name."""
+        robots = self._reached.robots if robot is None else {**self._reached.robots, name: robot}
+        position, _ = bodies.scattered(
+            msgspec.structs.replace(self._reached, robots=robots), [name], self._experiment.seed
+        )
+        return np.asarray(position[0, :2])
+
+    def companions(self, name: str) -> list[str]:
+        """The robots of the same process, itself among them."""
+        return list(self._groups[self._group(name)])
+
+    def runs(self, name: str) -> bool:
+        """Whether the process of a robot was started from here, and has not ended."""
+        return self._launcher.running(self._process(self._group(name)))
+
+    def release(self, name: str) -> None:
+        """Cuts the lifeline of a robot's process: it lands by itself, and ends."""
+        self._launcher.release(self._process(self._group(name)))
+
+    def kill(self, name: str) -> None:
+        """Ends the process of a robot that follows nothing else."""
+        self._launcher.kill(self._process(self._group(name)))
+
+    def end(self) -> None:
+        """Ends all but the router: robots land first, and the recorder sees it."""
+        self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
+        self._launcher.end(self._centre, grace_s=2.0)  # its last word is recorded
+        self._launcher.end([self._recorder], grace_s=5.0)
+        self._launcher.end(self._standins, grace_s=2.0)
+
+    def deaths(self) -> Iterator[Death]:
+        """What has died since the last call; router, world, centre and positioning are started again, a few times."""
+        for process in self._launcher.died():
+            again = self._servants.again(process, self._case)
+            if again is not None:
+                yield Death(again[0], "conductor", again[1])
+            elif process.name in self._standins:
+                what = process.name.removeprefix(f"{self._case}-")
+                text = f"the {what} ended ({process.exit}); robots that need it hold, or land{_because(process)}"
+                yield Death("device", "conductor", text)
+            elif process.name == self._recorder:
+                yield Death("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
+            elif process.name.startswith(STATION):
+                what = f"the connection to it ended ({process.exit}); without a router robots hold{_because(process)}"
+                yield Death("host", process.name.removeprefix(STATION), what)
+            else:
+                for name in self._groups.get(process.name.removeprefix(f"{self._case}-"), []):
+                    yield Death("lost", name, f"its process ended ({process.exit}){_because(process)}")
+
+    def output(self) -> Iterator[tuple[str, str]]:
+        """What processes on other machines have printed since the last call: where, and the line."""
+        for place, process in self._abroad.items():
+            for line in process.news():
+                yield place, line
+
+    def last_line(self, robot: str) -> str:
+        """The last line that the process of a robot wrote; empty if it wrote none."""
+        group = self._group(robot)
+        log = self._recording.parent / "logs" / f"{self._process(group)}.log"
+        return "".join(log.read_text(errors="replace").strip().splitlines()[-1:]) if log.exists() else ""
+
+    def _group(self, robot: str) -> str:
+        return next(group for group, members in self._groups.items() if robot in members)
+
+    def _process(self, group: str) -> str:
+        return f"{self._case}-{group}"
+
+    def _stand_in(self, interrupted: Callable[[], bool]) -> None:
+        """Starts world, protocol twins and positioning, and writes down at which addresses robots are then."""
+        started = support.start(
+            self._experiment,
+            self._file,
+            prefix=self._case,
+            launcher=self._launcher,
+            connect=self._connect,
+            interrupted=interrupted,
+        )
+        self._reached, self._standins = started.experiment, started.names
+        if started.positioning is not None:
+            self._servants.keep(*started.positioning)
+        if self._standins:
+            self._addressed = self._file.with_name(f"{self._case}-addressed.json")
+            self._addressed.write_bytes(write_json(self._reached))
+
+
+def _because(process: Process) -> str:
+    """Its last words, behind a colon."""
+    return "".join(f": {line}" for line in process.tail().strip().splitlines()[-1:])

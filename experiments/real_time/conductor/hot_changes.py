@@ -1,0 +1,392 @@
+"""Robots that are paused, taken out, started again, replaced or added while the run goes on.
+
+The conductor answers orders on a key of its own. What an order asks for takes seconds: each change is a generator that
+goes on by one look at a time, so that the conductor waits for nobody.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import zenoh
+
+from agents.network import messages
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.plugins.registry import did_you_mean
+from experiments.definition.experiment import Experiment
+from experiments.real_time.conductor import replacement
+from experiments.real_time.conductor.crew import Crew
+from experiments.real_time.conductor.replacement import Refused, in_the_way
+from experiments.real_time.conductor.run_view import FROZEN_S, Overview
+from experiments.real_time.hosts.launcher import LAND_S
+
+CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
+READY_S: Final = 5.0  # a robot counts the deadline of the file from when it runs, which is later
+ROOM_S: Final = 20.0  # so long a robot waits until its place is free, where nobody waits for an answer
+RESTARTS: Final = 3  # a robot that is lost more often is not helped by starting it again
+MOST: Final = 100  # orders at once
+INSIST_S: Final = 5.0  # so long an order is repeated that a robot does not follow,
+AGAIN_S: Final = 0.5  # this often
+
+Steps = Generator[None, None, str]  # what was done, at its end
+
+
+@dataclass
+class _Asked:
+    """An order, and its answers so far."""
+
+    order: messages.RunOrder
+    query: zenoh.Query | None = None
+    done: dict[str, str] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class _Change:
+    """What goes on with robots of one process, and for whom."""
+
+    names: tuple[str, ...]
+    steps: Steps
+    asked: _Asked
+
+
+class HotChanges:
+    """Changes of the robots of one case."""
+
+    def __init__(self, experiment: Experiment, crew: Crew, view: Overview, keys: Keys) -> None:
+        """Refuses everything until `begin`.
+
+        Args:
+            experiment: The case.
+            crew: Has the processes.
+            view: Of the network.
+            keys: Of the realm.
+        """
+        self._experiment, self._crew, self._view, self._keys = experiment, crew, view, keys
+        self._robots = view.robots
+        self._start: float | None = None
+        self._changes: list[_Change] = []
+        self._pending: list[_Asked] = []
+        self._leaving: set[str] = set()
+        self._ended: dict[str, str] = {}  # robots whose process has ended while they join, and how
+        self._losses: dict[str, int] = {}
+        self._spares = replacement.Spares(experiment)
+
+    @property
+    def under_way(self) -> set[str]:
+        """Robots that are being changed."""
+        return {name for change in self._changes for name in change.names}
+
+    def begin(self, start: float) -> None:
+        """From now on orders are taken; the common start was, or is, at `start` [s, UTC]."""
+        self._start = start
+
+    def close(self) -> None:
+        """No more orders; what is under way is given up, and all land."""
+        self._start = None
+        for change in self._changes:
+            change.steps.close()
+            self._answer(change, refused="the run is over")
+        self._changes.clear()
+        self._reply()
+
+    def expects(self, name: str, how: str) -> bool:
+        """Whether the end of a robot's process, or of its token, is part of a change: then it is no loss."""
+        if name in self._leaving:
+            return True
+        if name in self.under_way:
+            self._ended[name] = how
+            return True
+        return self._robots[name].gone
+
+    def lose(self, name: str) -> None:
+        """A robot is lost; what the file says of that is done."""
+        self._robots[name].out = "lost"
+        policy = self._experiment.on_loss
+        names = self._crew.companions(name)
+        if policy == "none" or self._start is None or not all(self._robots[each].out == "lost" for each in names):
+            return
+        self._losses[name] = self._losses.get(name, 0) + 1
+        if self._losses[name] > RESTARTS:
+            self._view.say("given up", name, f"lost {self._losses[name]} times")
+            return
+        self._begin(_Asked(messages.RunOrder(policy, names, who="on_loss")))
+
+    def go_on(self) -> None:
+        """Takes new orders, goes on with what is under way, and answers what is done."""
+        for query in network.received(self._view.orders.handler):
+            self._heed(query)
+        for change in list(self._changes):
+            try:
+                next(change.steps)
+            except StopIteration as end:
+                self._answer(change, done=str(end.value))
+            except Refused as refusal:
+                self._answer(change, refused=str(refusal))
+            else:
+                continue
+            self._changes.remove(change)
+        self._reply()
+
+    # ------------------------------------------------------------------ orders and answers
+
+    def _heed(self, query: zenoh.Query) -> None:
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        try:
+            order = messages.decode(payload, str(query.encoding or messages.JSON), messages.RunOrder)
+        except messages.Malformed as error:
+            with query:
+                query.reply_err(str(error).encode(), encoding="text/plain")
+            return
+        if refusal := next(self._refusals(order), None):
+            with query:
+                reply = messages.RunReply(reason=refusal)
+                query.reply(self._keys.run_order, messages.encode(reply), encoding=messages.JSON)
+            return
+        self._begin(_Asked(order, query))
+
+    def _refusals(self, order: messages.RunOrder) -> Iterator[str]:
+        """Why nothing at all is done."""
+        known = self._robots
+        if unknown := next((name for name in order.robots if name not in known), None):
+            yield f"no robot '{unknown[:50]}' in this run; {did_you_mean(unknown[:50], known)}"
+        if not order.robots:
+            yield f"name one or more of {', '.join(known)}"
+        if self._start is None:
+            yield (
+                "robots can be changed between the common start and the landing, and this run is not there: "
+                "ask again after it has begun"
+            )
+        if len(self._pending) >= MOST:
+            yield f"{MOST} orders are under way; wait for them"
+        others = (order.spare, order.body, order.at)
+        if order.order != "replace" and any(other is not None for other in others):
+            yield f"`with`, `body` and `at` belong to replace, not to {order.order}"
+        if order.order == "replace" and len(order.robots) > 1 and any(other is not None for other in others):
+            yield "replace one robot at a time, or leave it to the spares of the file"
+
+    def _begin(self, asked: _Asked) -> None:
+        """One change for all robots of a process that are named."""
+        left = list(dict.fromkeys(asked.order.robots))
+        if asked.query is not None:
+            self._pending.append(asked)
+        who = asked.order.who[:50] or "somebody"
+        while left:
+            names = tuple(name for name in left if name in self._crew.companions(left[0]))
+            left = [name for name in left if name not in names]
+            for name in names:
+                self._view.say(asked.order.order, name, f"asked by {who if who.isprintable() else 'somebody'}")
+            change = _Change(names, self._steps(asked.order, names), asked)
+            if busy := sorted(self.under_way & {*names}):
+                self._answer(change, refused=f"{', '.join(busy)}: is being changed already; wait for that")
+            else:
+                self._changes.append(change)
+
+    def _answer(self, change: _Change, *, done: str = "", refused: str = "") -> None:
+        for name in change.names:
+            self._leaving.discard(name)
+            self._ended.pop(name, None)
+            if refused:
+                change.asked.refused[name] = refused
+                self._view.say("refused", name, f"{change.asked.order.order}: {refused}")
+            else:
+                change.asked.done[name] = done
+                self._view.say("changed", name, done)
+
+    def _reply(self) -> None:
+        for asked in list(self._pending):
+            if asked.done.keys() | asked.refused.keys() >= {*asked.order.robots} and asked.query is not None:
+                self._pending.remove(asked)
+                reply = messages.RunReply(asked.done, asked.refused)
+                with asked.query:
+                    asked.query.reply(self._keys.run_order, messages.encode(reply), encoding=messages.JSON)
+
+    # ------------------------------------------------------------------ what is done
+
+    def _steps(self, order: messages.RunOrder, names: tuple[str, ...]) -> Steps:
+        match order.order:
+            case "pause":
+                return self._tell(names, messages.Order("hold"), "holds where it is")
+            case "resume":
+                return self._tell(names, messages.Order("resume"), "goes on")
+            case "remove":
+                return self._remove(names)
+            case "replace":
+                return self._replace(names, order)
+            case _:
+                return self._let_in(names, order)
+
+    def _tell(self, names: Sequence[str], order: messages.Order, done: str) -> Steps:
+        yield from ()
+        for name in names:
+            if self._robots[name].gone:
+                raise Refused(f"{name} is not in the run: {self._robots[name].out}")
+        for name, reply in self._view.order(names, order).items():
+            if not reply.ok:
+                raise Refused(f"{name}: {reply.reason}")
+        return done
+
+    def _remove(self, names: Sequence[str]) -> Steps:
+        yield from self._leave(names)
+        return "removed: it is down, and the others go on"
+
+    def _leave(self, names: Sequence[str]) -> Generator[None]:
+        """Robots land, and are gone from the network; their process ends if no other robot needs it."""
+        there = [name for name in names if self._robots[name].alive or self._crew.runs(name)]
+        self._leaving |= {*there}
+        for name, reply in self._view.order(there, messages.Order("leave")).items():
+            if not reply.ok and name in self._crew.adopted:
+                raise Refused(f"{name} does not answer, and was not started from here: end its process where it runs")
+            if not reply.ok:
+                self._view.say("silent", name, f"does not answer ({reply.reason}): its lifeline is cut")
+                self._crew.release(name)
+        began, killed = time.monotonic(), False
+        while still := [name for name in there if self._robots[name].alive or self._process_must_end(name, names)]:
+            past = time.monotonic() - began
+            if past > LAND_S and any(name in self._crew.adopted for name in still):
+                raise Refused(f"{', '.join(still)}: told to land, but is still there after {LAND_S:g} s")
+            if not killed and (past > LAND_S or (past > FROZEN_S and all(map(self._frozen, still)))):
+                killed = True
+                for name in still:
+                    self._view.say("killed", name, f"still there after {past:.0f} s")
+                    self._crew.kill(name)
+            if past > LAND_S + FROZEN_S:
+                raise Refused(f"{', '.join(still)}: cannot be ended")
+            yield
+        for name in names:
+            self._robots[name].out = "removed"
+            self._robots[name].forget()
+        self._leaving -= {*names}  # the next process that ends is another one
+
+    def _process_must_end(self, name: str, names: Sequence[str]) -> bool:
+        """Whether a robot's process is still there although it has no other robots that stay."""
+        others = {*self._crew.companions(name)} - {*names}
+        return self._crew.runs(name) and all(self._robots[other].gone for other in others)
+
+    def _frozen(self, name: str) -> bool:
+        status = self._robots[name].status
+        return status is None or self._view.clock.utc() - status.stamp > FROZEN_S
+
+    def _let_in(self, names: Sequence[str], order: messages.RunOrder) -> Steps:
+        """Restart, or add: who is there by hand is only told to join, everybody else is started."""
+        robots, crew = self._robots, self._crew
+        asked = time.monotonic()
+        by_hand = all(robots[name].alive and not crew.runs(name) for name in names)
+        if order.order == "add" and any(robots[name].reached("airborne") and not robots[name].gone for name in names):
+            raise Refused("takes part already; `zenpark robot restart` starts it anew")
+        if by_hand and not any(robots[name].reached("airborne") for name in names):
+            crew.adopted |= {*names}
+            yield from self._join(names)
+            return f"takes part after {time.monotonic() - asked:.1f} s"
+        if foreign := [name for name in names if name in crew.adopted or name in crew.away]:
+            raise Refused(
+                f"{', '.join(foreign)} was not started from here: end its process and start it again where it runs, "
+                f"then `zenpark robot add {' '.join(foreign)}`"
+            )
+        self._require_whole(names)
+        automatic = order.who == "on_loss"
+        places = {name: tuple(crew.place(name)) for name in names if crew.robot(name).body == replacement.TWIN}
+        yield from self._room(places, ROOM_S if automatic else 0.0)
+        yield from self._leave(names)
+        crew.start_again(names)
+        yield from self._join(names)
+        return f"takes part again after {time.monotonic() - asked:.1f} s"
+
+    def _replace(self, names: Sequence[str], order: messages.RunOrder) -> Steps:
+        asked = time.monotonic()
+        name = names[0]
+        if len(self._crew.companions(name)) > 1:
+            raise Refused(f"{name} shares its process with others: restart them together instead")
+        next_one, whose = self._spares.successor(name, self._crew.robot(name), order)
+        if next_one.body == replacement.TWIN:
+            places = {name: tuple(self._crew.place(name, next_one))}
+            yield from self._room(places, ROOM_S if order.who == "on_loss" else 0.0, body_stays=True)
+        yield from self._leave(names)
+        self._crew.start_again(names, {name: next_one})
+        if whose is not None:
+            self._spares.used[whose] = name
+        yield from self._join(names)
+        return f"{whose or next_one.body} has its name and takes part after {time.monotonic() - asked:.1f} s"
+
+    def _join(self, names: Sequence[str]) -> Generator[None]:
+        """From a process that has just begun to one that takes part: ready, up, and on with the others."""
+        robots = self._robots
+        for name in names:
+            robots[name].out = ""
+        try:
+            yield from self._reach(names, "ready", self._experiment.start.deadline_s + READY_S)
+            yield from self._room({name: self._here(name) for name in names}, ROOM_S)
+            yield from self._insist(names, messages.Order("takeoff"))
+            yield from self._reach(names, "airborne", CLIMB_S)
+            for name in names:
+                start = messages.Order("start", at=self._start, origin=robots[name].origin)
+                yield from self._insist([name], start)
+            yield from self._reach(names, "running", FROZEN_S)
+        except Refused:
+            self._leaving |= {*names}
+            self._view.order(names, messages.Order("leave"))
+            for name in names:
+                self._crew.release(name)
+                robots[name].out = "removed"
+            raise
+
+    def _insist(self, names: Sequence[str], order: messages.Order) -> Generator[None]:
+        """An order that may be repeated: a robot may not be ready just then, and a busy machine lose an answer."""
+        began, left = time.monotonic(), list(names)
+        while refused := {name: reply for name, reply in self._view.order(left, order).items() if not reply.ok}:
+            asked = time.monotonic()
+            if asked - began > INSIST_S:
+                raise Refused("; ".join(f"{name}, {order.order}: {reply.reason}" for name, reply in refused.items()))
+            left = list(refused)
+            while time.monotonic() - asked < AGAIN_S:
+                yield
+
+    def _reach(self, names: Sequence[str], phase: str, limit_s: float) -> Generator[None]:
+        began = time.monotonic()
+        while late := [name for name in names if not self._robots[name].reached(phase)]:
+            if ended := next((name for name in names if name in self._ended), None):
+                raise Refused(f"{ended}: {self._ended[ended]}")
+            if time.monotonic() - began > limit_s:
+                status = self._robots[late[0]].status
+                why = "its process says nothing" if status is None else status.reason or f"it is {status.phase}"
+                raise Refused(f"{', '.join(late)}: not {phase} after {limit_s:g} s: {why}")
+            yield
+
+    def _require_whole(self, names: Sequence[str]) -> None:
+        """A process that others need cannot be started anew for some of its robots."""
+        together = self._crew.companions(names[0])
+        if others := [name for name in together if name not in names]:
+            raise Refused(
+                f"{', '.join(names)} shares a process with {', '.join(others)}: name them all, "
+                f"`zenpark robot restart {' '.join(together)}`"
+            )
+
+    # ------------------------------------------------------------------ room
+
+    def _here(self, name: str) -> tuple[float, ...]:
+        place = self._robots[name].place
+        return tuple(self._crew.place(name)) if place is None else place[:2]
+
+    def _room(
+        self, places: dict[str, tuple[float, ...]], patience_s: float, *, body_stays: bool = False
+    ) -> Generator[None]:
+        """Waits until nobody is where robots begin.
+
+        Args:
+            places: Where, x, y [m], by robot.
+            patience_s: For so long [s].
+            body_stays: Whether the body that a name had lies in the way as any other.
+        """
+        began = time.monotonic()
+        while True:
+            robots = {name: self._crew.robot(name) for name in self._robots}
+            found = [in_the_way(*each, robots, self._robots, body_stays=body_stays) for each in places.items()]
+            if not any(found):
+                return
+            if time.monotonic() - began >= patience_s:
+                raise Refused(next(filter(None, found)))
+            yield

@@ -1,0 +1,127 @@
+"""Who takes over the name of a robot: a spare of the experiment file, or another body."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import msgspec
+
+from agents.body.kinds import KINDS
+from agents.network import messages
+from agents.plugins import registry
+from agents.plugins.registry import did_you_mean
+from experiments.definition.bodies import WORLD
+from experiments.definition.experiment import Experiment, Robot
+from experiments.real_time.conductor.run_view import Seen
+
+TWIN: Final = "twin"  # a body that is there as long as its process
+OF_BODY: Final = ("body", "start", "hover", "position", "device", "sensors", "ranges")  # what a spare brings along
+
+
+class Refused(RuntimeError):
+    """A change that is not made, with why and what to do instead."""
+
+
+class Spares:
+    """The spares of an experiment.
+
+    Attributes:
+        used: Those that have taken over a name, and which.
+    """
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._experiment = experiment
+        self.used: dict[str, str] = {}
+
+    def successor(self, name: str, robot: Robot, order: messages.RunOrder) -> tuple[Robot, str | None]:
+        """The robot that is called `name` from now on, and which spare it is, if it is one.
+
+        Args:
+            name: Of a robot.
+            robot: The one that has the name now.
+            order: To replace it.
+
+        Raises:
+            Refused: If there is no such spare or body, or it cannot be what `robot` was.
+        """
+        spare = order.spare
+        if spare is None and order.body is None:
+            spare = self._first(name, robot.kind)
+        if spare is not None and order.body is not None:
+            raise Refused("a spare has a body of its own: leave --body or --with out")
+        made = self._of_spare(spare, name, robot) if spare is not None else self._of_body(order.body or "", robot)
+        if WORLD in (robot.body, made.body) and robot.body != made.body:
+            raise Refused("a robot cannot go into the world, or out of it, in mid-run")
+        if order.at is not None:
+            made = self._put(made, order.at, order.yaw)
+        return made, spare
+
+    def _first(self, name: str, kind: str) -> str:
+        for spare, robot in self._experiment.spares.items():
+            if robot.kind == kind and spare not in self.used:
+                return spare
+        raise Refused(
+            f"the file has no spare {kind} left for {name}: say which body takes over, --body URI, or add [spares.NAME]"
+        )
+
+    def _of_spare(self, spare: str, name: str, robot: Robot) -> Robot:
+        spares = self._experiment.spares
+        if spare not in spares:
+            there = did_you_mean(spare[:50], spares) if spares else "the file has none"
+            raise Refused(f"no spare '{spare[:50]}'; {there}")
+        if spare in self.used:
+            raise Refused(f"{spare} has taken over {self.used[spare]} already")
+        if spares[spare].kind != robot.kind:
+            raise Refused(f"{spare} is a {spares[spare].kind} and cannot be {name}, a {robot.kind}")
+        brought = {field: getattr(spares[spare], field) for field in OF_BODY}
+        return msgspec.structs.replace(robot, **brought, process=None, shadow=None)
+
+    @staticmethod
+    def _of_body(body: str, robot: Robot) -> Robot:
+        word, known = registry.body_name(body), registry.names(registry.BODIES)
+        if word in registry.names(registry.DEVICES):
+            raise Refused(f"{word} needs a simulated device, which is started before the run only")
+        if word not in known:
+            raise Refused(f"no {word[:50]!r} among the bodies; {did_you_mean(word[:50], known)}")
+        device = robot.device if word == registry.body_name(robot.body) else {}
+        return msgspec.structs.replace(robot, body=body, device=device, process=None, shadow=None)
+
+    def _put(self, robot: Robot, at: tuple[float, float], yaw: float) -> Robot:
+        if robot.body != TWIN:
+            raise Refused("only a twin can be put somewhere: put the robot there yourself, and leave --at out")
+        half = [size / 2 for size in self._experiment.arena.size[:2]]
+        if not math.isfinite(yaw) or not all(abs(x) <= limit for x, limit in zip(at, half, strict=True)):
+            raise Refused(f"--at lies outside of the arena, ±{half[0]:g} by ±{half[1]:g} m")
+        return msgspec.structs.replace(robot, start=[*at, yaw])
+
+
+MARGIN_M: Final = 0.1  # free space around a robot that begins to move
+
+
+def in_the_way(
+    name: str, place: Sequence[float], robots: Mapping[str, Robot], seen: Mapping[str, Seen], *, body_stays: bool
+) -> str:
+    """Who is too near to a place for a robot to begin there, however high; empty if nobody is.
+
+    Args:
+        name: Of the robot.
+        place: x, y [m].
+        robots: As they are now.
+        seen: Where they were last.
+        body_stays: Whether the body that had this name lies in the way as any other.
+    """
+    radius = KINDS[robots[name].kind].radius
+    for other, known in seen.items():
+        vanished = robots[other].body == TWIN and not known.alive  # it was but a part of its process
+        if known.place is None or vanished or (other == name and (known.alive or not body_stays)):
+            continue
+        gap = math.dist(known.place[:2], place[:2]) - radius - KINDS[robots[other].kind].radius
+        if gap < MARGIN_M:
+            x, y = place[:2]
+            return (
+                f"{name} would begin at ({x:.2f}, {y:.2f}) m, {max(gap, 0.0):.2f} m from {other}: it needs "
+                f"{MARGIN_M:g} m around it; move one of them, or wait"
+            )
+    return ""

@@ -1,0 +1,190 @@
+"""A lab's certificates on other machines: what one holds, what is the matter with it, and what is to be done.
+
+A station says what its folder holds; only certificates leave it, which are public. Whoever starts the run compares
+them with the register of the lab. Private keys go one way, over ssh, with `zenpark hosts install`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import ssl
+import stat
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from agents.network.endpoints import Endpoint
+from agents.network.lab import AUTHORITY, LabError, files, register
+
+if TYPE_CHECKING:
+    from cryptography import x509
+
+    from experiments.definition.experiment import Host
+
+INSTALL: Final = "`zenpark hosts install FILE` puts the right ones there"
+SHOWN: Final = 12  # digits of a fingerprint, for people
+
+
+class Held(msgspec.Struct, frozen=True, omit_defaults=True):
+    """An identity on a machine: its certificate (PEM, "" if there is none), and what is wrong with its files."""
+
+    name: str
+    certificate: str = ""
+    wrong: str = ""
+
+
+class Holding(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What a folder holds: whom it trusts (PEM), the identities that were asked for, and keys of others."""
+
+    authority: str = ""
+    held: list[Held] = []
+    others: list[str] = []
+
+
+def held(folder: Path, names: Sequence[str]) -> Holding:
+    """What a folder on this machine holds of the identities `names`."""
+    return Holding(
+        _text(folder / f"{AUTHORITY}.pem"),
+        [Held(name, _text(folder / f"{name}.pem"), _wrong(folder, name)) for name in names],
+        sorted(file.stem for file in folder.glob("*.key") if file.stem not in names),
+    )
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text("ascii")
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
+def _wrong(folder: Path, name: str) -> str:
+    certificate, key = folder / f"{name}.pem", folder / f"{name}.key"
+    for file in (certificate, key):
+        if not file.is_file():
+            return f"{file.name} is missing"
+    if stat.S_IMODE(key.stat().st_mode) & 0o077:
+        return f"others can read {key.name}; revoke it if somebody has"
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(certificate, key, lambda: b"")
+    except OSError:  # of which ssl.SSLError is one
+        return f"{key.name} is not the key of {certificate.name}"
+    return ""
+
+
+def fingerprint(certificate: str) -> str:
+    """SHA-256 of a certificate (PEM), in hexadecimal; "none" if it is no certificate."""
+    try:
+        return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate)).hexdigest()
+    except ValueError:
+        return "none"
+
+
+def of_host(name: str, hosts: Mapping[str, Host]) -> list[str]:
+    """Whose certificates belong into the folder of a host: of its robots, and of another's that is the same folder."""
+    place = hosts[name].address, hosts[name].lab
+    return [robot for host in hosts.values() if (host.address, host.lab) == place for robot in host.robots]
+
+
+def ended(folder: Path, names: Sequence[str]) -> Iterator[str]:
+    """What keeps identities of a lab on this machine from being sent, each with its remedy."""
+    known = register(folder).identities
+    for name in names:
+        if name not in known:
+            yield f"{name} is not in the lab {folder}; `zenpark keys issue {folder} {name}` adds it"
+        elif (until := datetime.fromisoformat(known[name].until)) < datetime.now(UTC):
+            yield f"the certificate of {name} ended at {until:%Y-%m-%d %H:%M}; `zenpark keys renew {folder} {name}`"
+        else:
+            try:
+                files(folder, name)
+            except LabError as error:
+                yield str(error)
+
+
+def days_left(folder: Path, names: Sequence[str]) -> float:
+    """How long the first of some certificates is still valid [days], by the register."""
+    known = register(folder).identities
+    ends = [datetime.fromisoformat(known[name].until) for name in names if name in known]
+    return (min(ends) - datetime.now(UTC)).total_seconds() / 86400.0 if ends else 0.0
+
+
+def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
+    """What is the matter with what a machine holds, each with its remedy; nothing, if all of it counts.
+
+    Args:
+        found: What it says.
+        folder: Of the lab, on this machine: its register and `ca.pem`.
+        there: That machine's clock, UTC [s].
+
+    Raises:
+        LabError: If the register cannot be read.
+    """
+    from cryptography import x509  # noqa: PLC0415 - 4.5 MB that runs without a lab do without
+
+    names = ", ".join(each.name for each in found.held)
+    if not found.authority:
+        yield f"has no certificates of {names}; {INSTALL}"
+        return
+    theirs, ours = fingerprint(found.authority), fingerprint(_text(folder / f"{AUTHORITY}.pem"))
+    if theirs != ours:
+        yield (
+            f"its certificates are of another lab, or of one whose authority has been renewed since (ca.pem "
+            f"{theirs[:SHOWN]}, here {ours[:SHOWN]}); {INSTALL}"
+        )
+        return
+    known = register(folder).identities
+    for each in found.held:
+        if each.name not in known:
+            yield f"{each.name} is not in the lab {folder}; `zenpark keys issue {folder} {each.name}`, then {INSTALL}"
+            continue
+        if each.wrong:
+            yield f"{each.wrong}; {INSTALL}"
+            continue
+        try:
+            certificate = x509.load_pem_x509_certificate(each.certificate.encode())
+        except ValueError:
+            yield f"{each.name}.pem is no certificate; {INSTALL}"
+            continue
+        mine = known[each.name]
+        if f"{certificate.serial_number:x}" != mine.serial:
+            what = "renewed" if _common_name(certificate) == mine.common_name else "revoked"
+            yield f"the certificate of {each.name} there has been {what} since; {INSTALL}"
+        elif certificate.not_valid_after_utc < datetime.now(UTC):
+            yield (
+                f"the certificate of {each.name} ended at {certificate.not_valid_after_utc:%Y-%m-%d %H:%M}; "
+                f"`zenpark keys renew {folder} {each.name}`, then {INSTALL}"
+            )
+        elif not certificate.not_valid_before_utc.timestamp() < there < certificate.not_valid_after_utc.timestamp():
+            now = datetime.fromtimestamp(there, UTC)
+            yield f"its clock says {now:%Y-%m-%d %H:%M} UTC, when {each.name} has no valid certificate; set it (NTP)"
+
+
+def unnamed(endpoints: Sequence[str], folder: Path) -> Iterator[str]:
+    """Why robots would not believe a router: the name by which they reach it must stand in its certificate.
+
+    Raises:
+        LabError: If the register cannot be read.
+    """
+    routers = [each for each in register(folder).identities.values() if each.role == "router"]
+    named = {host for router in routers for host in router.hosts}
+    for reached in dict.fromkeys(Endpoint.parse(endpoint).host for endpoint in endpoints):
+        if reached not in named:
+            yield (
+                f"reaches the router at {reached}, which stands in no router's certificate; "
+                f"`zenpark keys renew {folder} router --host {reached}` adds it"
+            )
+
+
+def strays(found: Holding, host: str) -> Iterator[str]:
+    """Keys that do not belong to a machine, with the remedy."""
+    if found.others:
+        keys = ", ".join(f"{name}.key" for name in found.others)
+        yield f"holds {keys}, which do not belong on {host}; `zenpark hosts install FILE` removes them"
+
+
+def _common_name(certificate: x509.Certificate) -> str:
+    from cryptography.x509.oid import NameOID  # noqa: PLC0415
+
+    return "".join(str(each.value) for each in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME))

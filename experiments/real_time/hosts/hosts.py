@@ -1,0 +1,333 @@
+"""The other machines of an experiment, reached through the system's `ssh` with the user's own configuration and keys.
+
+Each host has one connection to a `zenpark station`, which tells its version and its clock, and carries the hosts' way
+to a router that listens on loopback only. Each robot's process has a connection of its own: what it prints, its exit
+code and its lifeline are those of the `ssh` here.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import select
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from typing import Final
+
+import msgspec
+
+from agents import clock
+from agents.clock import Clock
+from agents.network import lab
+from agents.network.endpoints import Endpoint
+from agents.network.messages import HostClock
+from experiments.definition.experiment import Experiment, Host
+from experiments.real_time.hosts import certificates, ssh
+from experiments.real_time.hosts.launcher import RUN, Launcher, Process
+from experiments.real_time.hosts.station import Answer, Question
+from experiments.recording import clocks, version
+
+HELLO_S: Final = 60.0  # the first start of a zenpark that was changed brings its packages up to date
+ANSWER_S: Final = 5.0
+SAMPLES: Final = 24
+HANDSHAKES: Final = 6  # at once with one machine: of more than ten, sshd turns some away (MaxStartups)
+POLL_S: Final = 0.02
+STATION: Final = "host-"  # how the process of the connection to a host is called, before its name
+
+
+class HostError(RuntimeError):
+    """Hosts that cannot take part, with what is in the way and what to do."""
+
+
+class Station:
+    """The connection to a host's station.
+
+    Attributes:
+        name: Of the host, in the experiment file.
+        host: What stands there.
+        address: As ssh takes it.
+        hello: What the station said of itself.
+        endpoints: Routers as the host reaches them.
+        clock: Its clock, as it was measured last.
+        applied: What robots there take off its reading [s].
+        lab: The folder of the lab, on this machine; None without one.
+    """
+
+    def __init__(self, name: str, host: Host, *, launcher: Launcher, routers: Sequence[str], run: str) -> None:
+        """Begins to connect; `greet` waits for it.
+
+        Args:
+            name: Of the host.
+            host: Has an address.
+            launcher: Starts the ssh, and keeps its lifeline.
+            routers: As this machine reaches them; those on loopback go through this connection. Of a lab, if any is.
+            run: By which the station finds the run's processes.
+
+        Raises:
+            HostError: If a router cannot be reached through ssh.
+        """
+        assert host.address is not None
+        self.name, self.host, self.address = name, host, host.address
+        self.clock: HostClock | None = None
+        self.lab = lab.of(routers)
+        self._routers = [Endpoint.parse(router) for router in lab.bare(routers)]
+        self._run = f"{run}.{name}"  # two hosts may be one machine
+        try:
+            carried = [("-R", ssh.forwarded(router)) for router in self._routers if router.is_loopback]
+        except ValueError as error:
+            raise HostError(f"{name}: {error}") from None
+        if shutil.which("ssh") is None:
+            raise HostError(f"{name}: there is no ssh here; install it (Debian, Ubuntu: apt install openssh-client)")
+        words = self.words("station")
+        options = [part for pair in carried for part in pair]
+        self.process = launcher.spawn(f"{STATION}{name}", ssh.command(self.address, words, options), answers=True)
+        stdin, stdout = self.process.handle.stdin, self.process.handle.stdout
+        assert stdin is not None
+        assert stdout is not None
+        self._out, self._in = stdin, stdout
+        self._waiting = select.poll()
+        self._waiting.register(stdout.fileno(), select.POLLIN)
+        self._rest = b""
+        self._starting: list[Process] = []
+        self._robots: list[tuple[Process, Launcher]] = []
+        self._silent = False
+        self.set_out()
+
+    def set_out(self) -> None:
+        """Takes the wall clock as it is now: a step of it in mid-run is no drift of the host's."""
+        self._ours = Clock()
+        self.applied, self._robots = 0.0, []
+
+    def words(self, *arguments: str) -> list[str]:
+        """A zenpark command as it is spelled there, of this run."""
+        return ["env", f"{RUN}={self._run}", self.host.zenpark.removeprefix("~/"), *arguments]
+
+    def greet(self, address: str | None = None) -> None:
+        """Waits until the station answers.
+
+        Args:
+            address: How hosts know this machine; left out: as ssh came from there.
+
+        Raises:
+            HostError: If the host cannot be reached, or zenpark does not run there.
+        """
+        self.hello, _, _ = self.ask(Question("hello"), HELLO_S)
+        ports = iter(ssh.allocated(self.process.log.read_text(errors="replace")))
+        here = address or self.hello.seen_from or "127.0.0.1"
+        try:
+            self.endpoints = [str(self._abroad(router, ports, here)) for router in self._routers]
+        except StopIteration:
+            raise HostError(f"{self.name}: ssh does not say which port it forwards; use listen in [network]") from None
+
+    @staticmethod
+    def _abroad(router: Endpoint, ports: Iterator[int], here: str) -> Endpoint:
+        if router.is_loopback:
+            through = router if router.port else Endpoint("tcp", "", 0, router.rest)
+            return through.at("127.0.0.1", next(ports))
+        return router.at(here) if router.is_wildcard else router
+
+    def ask(self, question: Question, limit_s: float = ANSWER_S) -> tuple[Answer, float, float]:
+        """The answer, when the question left, and when the answer was here, UTC [s].
+
+        Raises:
+            HostError: If none comes in time.
+        """
+        if self._silent or self._out.closed or self._in.closed:
+            raise HostError(self._broken())  # its end was noticed before
+        deadline = time.monotonic() + limit_s
+        text = msgspec.json.encode(question) + b"\n"
+        left = self._ours.utc()
+        with suppress(BrokenPipeError):  # what was said on the other channel tells why
+            os.write(self._out.fileno(), text)
+        while self._waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
+            data = os.read(self._in.fileno(), 65536)
+            back = self._ours.utc()
+            if not data:
+                raise HostError(self._broken())
+            *lines, self._rest = (self._rest + data).split(b"\n")
+            for line in lines:
+                with suppress(msgspec.MsgspecError):  # a greeting of the shell
+                    return msgspec.json.decode(line, type=Answer), left, back
+        self._silent = True  # a late answer would be taken for that to the next question
+        raise HostError(f"{self.name}: its station says nothing for {limit_s:g} s; is that machine overloaded?")
+
+    def _broken(self) -> str:
+        with suppress(TimeoutError):
+            self.process.handle.wait(ANSWER_S)
+        said = self.process.log.read_text(errors="replace")
+        return f"{self.name}: {ssh.explained(self.address, self.host.zenpark, said)}"
+
+    @property
+    def same_version(self) -> bool:
+        """Whether its zenpark is this one."""
+        return self.hello.zenpark == version.digest()
+
+    def measure(self, robots: Sequence[str] = (), samples: int = SAMPLES) -> HostClock:
+        """Measures its clock, by some round trips; `robots` run there.
+
+        Raises:
+            HostError: If it does not answer.
+        """
+        trips = []
+        for _ in range(samples):
+            answer, left, back = self.ask(Question("clock"))
+            trips.append(clocks.Sample(left, answer.clock, back))
+        offset, uncertainty = clocks.offset(trips)
+        self.clock = HostClock(self.name, trips[-1].back, offset, uncertainty, list(robots), self.applied)
+        return self.clock
+
+    def follow(self, applied: float) -> HostClock:
+        """Has its robots take so much off its reading from now on [s], those that are started later too."""
+        assert self.clock is not None
+        self.applied = applied
+        for process, launcher in self._robots:
+            launcher.tell(process, clock.said(-applied))
+        self.clock = msgspec.structs.replace(self.clock, applied=applied)
+        return self.clock
+
+    def holds(self, names: Sequence[str]) -> certificates.Holding:
+        """What its folder holds of the certificates of some robots.
+
+        Raises:
+            HostError: If it does not answer.
+        """
+        return self.ask(Question("certificates", lab=self.folder, names=list(names)))[0].holds
+
+    def distrusted(self, names: Sequence[str]) -> list[str]:
+        """Why its robots and a router would not believe each other, in a lab, each with its remedy.
+
+        Raises:
+            HostError: If it does not answer.
+            LabError: If the register of the lab cannot be read.
+        """
+        if self.lab is None:
+            return []
+        answer = self.ask(Question("certificates", lab=self.folder, names=list(names)))[0]
+        found = [
+            *certificates.faults(answer.holds, self.lab, answer.clock),
+            *certificates.unnamed(self.endpoints, self.lab),
+        ]
+        return [f"{self.name}: {fault}" for fault in found]
+
+    @property
+    def folder(self) -> str:
+        """Of certificates, there."""
+        return self.host.lab.removeprefix("~/")
+
+    def start(self, name: str, robots: Sequence[str], document: bytes, launcher: Launcher) -> Process:
+        """Starts the process of some robots there.
+
+        Args:
+            name: Of the process.
+            robots: That it has.
+            document: The case, in one line.
+            launcher: Starts the ssh.
+        """
+        while len(self._under_way()) >= HANDSHAKES:
+            time.sleep(POLL_S)
+        connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
+        connect += [] if self.lab is None else ["--lab", self.folder]
+        correction = f"{-self.applied:.6f}"
+        words = self.words("agent", "-", *robots, *connect, f"--clock-correction={correction}", "--lifeline")
+        process = launcher.spawn(name, ssh.command(self.address, words), told=document + b"\n")
+        self._starting.append(process)
+        self._robots.append((process, launcher))
+        return process
+
+    def _under_way(self) -> list[Process]:
+        """Processes whose ssh has not got through yet: the other end says at once that it is there."""
+        self._starting = [each for each in self._starting if each.alive and not each.log.stat().st_size]
+        return self._starting
+
+
+class Hosts:
+    """The hosts of one run.
+
+    Attributes:
+        routers: As this machine reaches them, those that listen everywhere as they listen.
+    """
+
+    def __init__(self, launcher: Launcher, routers: Sequence[str]) -> None:
+        """No host is connected yet.
+
+        Args:
+            launcher: Starts the ssh of each process.
+            routers: As this machine reaches them, those that listen everywhere as they listen.
+        """
+        self._launcher, self.routers = launcher, list(routers)
+        self._run = secrets.token_hex(8)
+        self._stations: dict[str, Station] = {}
+        self._robots: dict[str, Station] = {}
+
+    def join(self, experiment: Experiment) -> list[HostClock]:
+        """Connects the hosts of a case that have robots and an address; returns their clocks.
+
+        Raises:
+            HostError: With everything that is in the way, of every host.
+        """
+        wanted = {name: host for name, host in experiment.hosts.items() if host.address is not None and host.robots}
+        fresh = []
+        for name, host in wanted.items():
+            known = self._stations.get(name)
+            if known is None or (known.address, known.host.zenpark) != (host.address, host.zenpark):
+                self._launcher.end([f"{STATION}{name}"], grace_s=0.0)
+                routers = self.routers
+                self._stations[name] = Station(name, host, launcher=self._launcher, routers=routers, run=self._run)
+                fresh.append(self._stations[name])
+        trouble = []
+        for station in fresh:
+            try:
+                station.greet(experiment.network.address)
+                if not station.same_version:
+                    trouble.append(_other_version(station))
+                else:
+                    trouble += station.distrusted(station.host.robots)
+            except HostError as error:
+                trouble.append(str(error))
+        if trouble:
+            for station in fresh:
+                del self._stations[station.name]
+            raise HostError("\n".join(trouble))
+        self._robots = {robot: self._stations[name] for name, host in wanted.items() for robot in host.robots}
+        return [self._begin(self._stations[name], host.robots) for name, host in wanted.items()]
+
+    @staticmethod
+    def _begin(station: Station, robots: Sequence[str]) -> HostClock:
+        station.set_out()
+        return station.follow(station.measure(robots).offset)
+
+    def followed(self) -> list[tuple[Station, list[str]]]:
+        """Hosts of the case, and who runs there."""
+        stations = dict.fromkeys(self._robots.values())
+        return [(each, [name for name, place in self._robots.items() if place is each]) for each in stations]
+
+    def of(self, robot: str) -> Station | None:
+        """Where a robot runs; None: here."""
+        return self._robots.get(robot)
+
+    def clocks(self) -> tuple[list[HostClock], list[str]]:
+        """The clocks of all hosts of the case now, and what is in the way of reading the others."""
+        measured, trouble = [], []
+        for station, robots in self.followed():
+            try:
+                measured.append(station.measure(robots))
+            except HostError as error:
+                trouble.append(str(error))
+        return measured, trouble
+
+    def sweep(self) -> list[str]:
+        """Kills what is left of the run on every host, and says what that was."""
+        killed = []
+        for station in self._stations.values():
+            with suppress(HostError):  # its station does that by itself as soon as the lifeline is lost
+                found = station.ask(Question("sweep"))[0].found
+                killed += [f"{station.name}: process {each.what} {each.text}" for each in found]
+        return killed
+
+
+def _other_version(station: Station) -> str:
+    there, here = station.hello.zenpark[: version.SHOWN], version.digest()[: version.SHOWN]
+    remedy = "`zenpark hosts install FILE` puts this one there"
+    return f"{station.name}: another zenpark is there ({there}, here {here}); {remedy}"

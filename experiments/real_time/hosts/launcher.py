@@ -1,0 +1,242 @@
+"""Starts, watches and ends processes; whatever happens to the launcher, none of them outlives it long.
+
+A process on another machine is an `ssh` here, which hands input, output and exit code through
+(`experiments.real_time.hosts.hosts`).
+
+Each process holds its standard input as a lifeline (`agents.runtime.lifeline`): the launcher writes a byte to it now
+and then, and closing it is the order to end. A killed launcher closes it too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from agents.clock import Clock
+from agents.runtime.lifeline import BEAT_S
+
+ROUTER: Final = "router"  # the first; others are router2, router3, ...
+LAND_S: Final = 15.0  # what robots may take to come down after their lifeline was cut
+TAIL: Final = 12  # lines of a dead process's output that are worth showing
+
+
+@dataclass
+class Process:
+    """A started process: its name, its handle, and the file that its output goes to."""
+
+    name: str
+    handle: subprocess.Popen[bytes]
+    log: Path
+    untold: bytearray = field(default_factory=bytearray)  # what its standard input has yet to get
+    shown: int = 0  # bytes of its output that `Launcher.said` has handed out
+
+    @property
+    def alive(self) -> bool:
+        return self.handle.poll() is None
+
+    @property
+    def exit(self) -> str:
+        """How it ended, in words."""
+        code = self.handle.poll()
+        if code is None:
+            return "still running"
+        return f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
+
+    def news(self) -> list[str]:
+        """The whole lines of its output that were not handed out before."""
+        try:
+            with self.log.open("rb") as output:
+                output.seek(self.shown)
+                lines, ended, _ = output.read().rpartition(b"\n")
+        except OSError:
+            return []
+        self.shown += len(lines) + len(ended)
+        return lines.decode(errors="replace").splitlines()
+
+    def tail(self) -> str:
+        """The end of its output."""
+        try:
+            lines = self.log.read_text(errors="replace").splitlines()
+        except OSError:
+            return ""
+        return "\n".join(lines[-TAIL:])
+
+
+def is_router(process: str) -> bool:
+    """Whether a process of this name is a router."""
+    return process.removeprefix(ROUTER).isdecimal() if process != ROUTER else True
+
+
+class Launcher:
+    """Processes of one run; a context manager that leaves none behind.
+
+    Attributes:
+        clock: That modules read which are started here; None: each reads the wall clock anew.
+    """
+
+    def __init__(self, logs: Path) -> None:
+        """Output of each process goes to a file in the folder `logs`."""
+        self._logs = logs
+        self.clock: Clock | None = None
+        self._processes: dict[str, Process] = {}
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._beat = threading.Thread(target=self._beats, name="heartbeat", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._logs.mkdir(parents=True, exist_ok=True)
+        self._beat.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end([name for name in self._processes if not is_router(name)], grace_s=LAND_S)
+        self.end(list(self._processes), grace_s=0.0)  # everybody is down: nobody needs a router any more
+        self._over.set()
+        self._beat.join()
+
+    def start(self, name: str, module: str, *arguments: str) -> Process:
+        """Starts a module of this project in a process and session of its own; one thread per numeric library."""
+        shared = {} if self.clock is None else self.clock.shared()
+        return self.spawn(name, [sys.executable, "-m", module, *arguments], environment=shared)
+
+    def spawn(
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        told: bytes = b"",
+        answers: bool = False,
+        environment: Mapping[str, str] | None = None,
+    ) -> Process:
+        """Starts any command that holds its standard input as a lifeline.
+
+        Args:
+            name: Of the process, and of its log.
+            command: And its arguments.
+            told: What it reads there before the first heartbeat.
+            answers: Its standard output is the caller's to read, and only its errors are logged.
+            environment: Added to the launcher's own.
+        """
+        own = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        log = self._logs / f"{name}.log"
+        with log.open("ab") as output:
+            handle = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE if answers else output,
+                stderr=output,
+                start_new_session=True,  # Ctrl-C is the launcher's: it lands the robots first
+                env={**own, **(environment or {})},
+            )
+        assert handle.stdin is not None
+        os.set_blocking(handle.stdin.fileno(), False)  # a stopped process must not stop the heartbeat of the others
+        process = Process(name, handle, log, bytearray(told))
+        with self._lock:
+            self._processes[name] = process
+            self._tell(process)
+        return process
+
+    def tell(self, process: Process, line: bytes) -> None:
+        """Says a line on the lifeline of a process; one that has not read the last gets it no more."""
+        with self._lock:
+            if not process.untold:
+                process.untold += line
+                self._tell(process)
+
+    def get(self, name: str) -> Process:
+        """The process of that name."""
+        return self._processes[name]
+
+    def running(self, name: str) -> bool:
+        """Whether a process of that name runs."""
+        with self._lock:
+            return name in self._processes and self._processes[name].alive
+
+    def release(self, name: str) -> None:
+        """Cuts the lifeline of a process: robots land by themselves, then it ends, which `died` tells."""
+        with self._lock:
+            if name in self._processes:
+                self._close(self._processes[name])
+
+    def kill(self, name: str) -> None:
+        """Ends a process that does not even follow its lifeline, at once; `died` tells when it is gone."""
+        with self._lock:
+            if name in self._processes and self._processes[name].alive:
+                os.killpg(self._processes[name].handle.pid, signal.SIGKILL)
+
+    def died(self) -> list[Process]:
+        """Processes that have ended by themselves since the last call; they are forgotten."""
+        with self._lock:
+            dead = [process for process in self._processes.values() if not process.alive]
+            for process in dead:
+                del self._processes[process.name]
+        for process in dead:
+            self._close(process)
+            self._forget(process)
+        return dead
+
+    def end(self, names: Iterable[str], grace_s: float) -> list[Process]:
+        """Ends processes: end of file on the lifeline, after `grace_s` SIGTERM, then SIGKILL; returns those killed."""
+        with self._lock:
+            ending = [self._processes.pop(name) for name in names if name in self._processes]
+        for process in ending:
+            self._close(process)
+        self._wait(ending, grace_s)
+        for number, wait_s in ((signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0)):
+            stubborn = [process for process in ending if process.alive]
+            for process in stubborn:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.handle.pid, number)
+            self._wait(stubborn, wait_s)
+        for process in ending:
+            self._forget(process)
+        return [process for process in ending if (process.handle.returncode or 0) == -signal.SIGKILL]
+
+    @staticmethod
+    def _wait(processes: Sequence[Process], limit_s: float) -> None:
+        deadline = time.monotonic() + limit_s
+        for process in processes:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.handle.wait(max(0.0, deadline - time.monotonic()))
+
+    @staticmethod
+    def _close(process: Process) -> None:
+        if process.handle.stdin is not None:
+            with contextlib.suppress(OSError):
+                process.handle.stdin.close()
+
+    @staticmethod
+    def _forget(process: Process) -> None:
+        """Lets go of what it answered, once it is over."""
+        if process.handle.stdout is not None:
+            process.handle.stdout.close()
+
+    def _beats(self) -> None:
+        while not self._over.wait(BEAT_S):
+            with self._lock:
+                for process in self._processes.values():
+                    process.untold += b"" if process.untold else b"\n"
+                    self._tell(process)
+
+    @staticmethod
+    def _tell(process: Process) -> None:
+        """Writes what fits into the pipe: what reads at the other end may take its time."""
+        if process.handle.stdin is not None:
+            with contextlib.suppress(OSError, ValueError):  # dead, or frozen with a full pipe
+                while process.untold:
+                    del process.untold[: os.write(process.handle.stdin.fileno(), process.untold)]
+
+
+RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run, here or on a host: how they are found again

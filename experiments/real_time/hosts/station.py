@@ -1,0 +1,214 @@
+"""What runs on a host beside its robots: answers the launcher's questions over ssh, and sees that nobody stays behind.
+
+`zenpark station`: questions come in on standard input, a line of JSON each, answers go out on standard output. Standard
+input is the lifeline as well. When it is lost, the station waits until the robots of its run are down and gone, and
+kills the ones that are not in time: a frozen process obeys nobody else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import platform
+import re
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final, Literal
+
+import msgspec
+
+from agents.clock import Clock
+from agents.network import lab
+from agents.network import session as network
+from agents.network.endpoints import EndpointError
+from agents.plugins import registry
+from agents.runtime.lifeline import SILENCE_S
+from experiments.real_time.hosts import certificates
+from experiments.real_time.hosts.launcher import LAND_S, RUN
+from experiments.recording import version
+
+POLL_S: Final = 0.1
+FROZEN_S: Final = 2.0  # after the loss of the lifeline; who hangs for longer than that is killed
+REACH_S: Final = 3.0
+USB: Final = Path("/sys/bus/usb/devices")
+RADIO: Final = {"1915:7777": "Crazyradio", "0483:5740": "Crazyflie on USB"}
+UDEV: Final = "add a udev rule for it and plug it in again (docs/crazyflie.md)"
+
+
+class Question(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What a launcher wants to know: who is there, what the clock says, whether routers and devices can be had.
+
+    `lab` is a folder of certificates, and `names` those that are asked about, or shown to routers.
+    """
+
+    ask: Literal["hello", "clock", "reach", "devices", "certificates", "sweep"]
+    endpoints: list[str] = []
+    bodies: list[str] = []
+    lab: str | None = None
+    names: list[str] = []
+
+
+class Found(msgspec.Struct, frozen=True):
+    """Something that was looked for, and what is the matter with it if it is not well."""
+
+    what: str
+    well: bool
+    text: str
+
+
+class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A station's answer: `clock` is this machine's UTC when the question was read [s]."""
+
+    zenpark: str
+    clock: float
+    version: str = ""
+    python: str = ""
+    machine: str = ""
+    seen_from: str = ""
+    found: list[Found] = []
+    holds: certificates.Holding = certificates.Holding()
+
+
+def answer(question: Question, clock: float) -> Answer:
+    """Answers one question."""
+    code = version.digest()
+    match question.ask:
+        case "clock":
+            return Answer(code, clock)
+        case "reach":
+            return Answer(code, clock, found=[_reach(endpoint, question) for endpoint in question.endpoints])
+        case "certificates":
+            return Answer(code, clock, holds=certificates.held(Path(question.lab or "."), question.names))
+        case "devices":
+            return Answer(code, clock, found=list(devices(question.bodies)))
+        case "sweep":
+            return Answer(code, clock, found=[Found(str(pid), False, "was killed") for pid in kill(_others())])
+        case _:
+            return Answer(
+                code,
+                clock,
+                version=version.number(),
+                python=platform.python_version(),
+                machine=f"{socket.gethostname()} ({platform.system()} {platform.machine()})",
+                seen_from=os.environ.get("SSH_CONNECTION", "").partition(" ")[0],
+            )
+
+
+def _reach(endpoint: str, question: Question) -> Found:
+    began = time.monotonic()
+    identity = question.names[0] if question.names else None
+    try:
+        routers = lab.secured([endpoint], question.lab)
+        with network.open_session(routers, name="zenpark hosts", wait_s=REACH_S, identity=identity):
+            return Found(endpoint, True, f"{(time.monotonic() - began) * 1e3:.0f} ms")
+    except (network.Unreachable, EndpointError, lab.LabError) as error:
+        return Found(endpoint, False, str(error))
+
+
+def devices(bodies: Sequence[str]) -> Iterator[Found]:
+    """What the bodies of a host's robots need there: libraries, radios, serial ports, and the right to use them."""
+    words = {registry.body_name(body) for body in bodies}
+    for word, library in (("radio", "cflib"), ("usb", "cflib"), ("tello", "djitellopy")):
+        if word in words and importlib.util.find_spec(library) is None:
+            yield Found(library, False, "is missing: `./zenpark hardware` there adds it")
+    if words & {"radio", "usb"}:
+        radios = list(_radios())
+        yield from radios or [
+            Found("Crazyradio", False, "none is plugged in: plug one in there, or let its robots run on another host")
+        ]
+    for port in sorted({match[0] for body in bodies if (match := re.search(r"/dev/[\w./-]+", body))}):
+        if not Path(port).exists():
+            yield Found(port, False, "is not there: is it plugged in?")
+        elif not os.access(port, os.R_OK | os.W_OK):
+            yield Found(port, False, "may not be used: sudo usermod -aG dialout $USER, then log in again")
+        else:
+            yield Found(port, True, "may be used")
+
+
+def _radios() -> Iterator[Found]:
+    for device in sorted(USB.glob("*")):
+        try:
+            vendor, product = ((device / name).read_text().strip() for name in ("idVendor", "idProduct"))
+            bus, number = (int((device / name).read_text()) for name in ("busnum", "devnum"))
+        except (OSError, ValueError):
+            continue
+        name = RADIO.get(f"{vendor}:{product}")
+        if name is not None:
+            node = f"/dev/bus/usb/{bus:03}/{number:03}"
+            well = os.access(node, os.W_OK)
+            yield Found(name, well, "may be used" if well else f"{node} may not be written: {UDEV}")
+
+
+def _others() -> list[int]:
+    """Processes of the same run on this machine, but for this one and what it came from."""
+    run = os.environ.get(RUN)
+    if not run:
+        return []
+    mark, found = f"{RUN}={run}".encode(), []
+    for file in Path("/proc").glob("[0-9]*/environ"):
+        pid = int(file.parent.name)
+        with contextlib.suppress(OSError):  # another user's, or gone meanwhile
+            if pid not in (os.getpid(), os.getppid()) and mark in file.read_bytes().split(b"\0"):
+                found.append(pid)
+    return found
+
+
+def _frozen(pid: int) -> bool:
+    """Whether a process was stopped (SIGSTOP): it will not come down by itself."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
+    except OSError:
+        return False  # gone
+
+
+def kill(pids: Sequence[int]) -> list[int]:
+    """Kills processes; returns those that were still there."""
+    killed = []
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+            killed.append(pid)
+    return killed
+
+
+def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
+    """Answers until the lifeline is lost, then sees the robots off; returns the exit code of the process.
+
+    Args:
+        fd: Where the questions come in.
+        patience_s: How long robots may take to land and to be gone [s].
+    """
+    here = Clock()
+    decoder = msgspec.json.Decoder(Question)
+    waiting = select.poll()
+    waiting.register(fd, select.POLLIN)
+    rest = b""
+    with contextlib.suppress(OSError):  # nobody listens any more
+        while waiting.poll(SILENCE_S * 1e3):
+            data = os.read(fd, 65536)
+            clock = here.utc()
+            if not data:
+                break
+            *lines, rest = (rest + data).split(b"\n")
+            for line in lines:
+                if not line.strip():
+                    continue  # a heartbeat
+                try:
+                    question = decoder.decode(line)
+                except msgspec.MsgspecError as error:
+                    print(f"station: not understood: {error}", file=sys.stderr)
+                    continue
+                os.write(1, msgspec.json.encode(answer(question, clock)) + b"\n")
+    lost = time.monotonic()
+    while (left := _others()) and time.monotonic() < lost + patience_s:
+        if time.monotonic() > lost + FROZEN_S and all(_frozen(pid) for pid in left):
+            break  # nobody lands any more
+        time.sleep(POLL_S)
+    kill(_others())
+    return 0

@@ -1,0 +1,1 @@
+"""What each started process runs: robot, recorder, world, centre, protocol twins."""

@@ -1,0 +1,298 @@
+"""The centre as a process: `python -m experiments.real_time.processes.centre FILE`. It decides for the robots that the
+file says.
+
+It hears the poses of those robots, and of whom they listen to, as any neighbour would, and sends each its goal. What is
+decided is `agents.decision.centralised`; here are the clock and the network. It keeps nothing that it would miss after
+a death: it is started again, hears the last poses, learns from the robots' statuses when and where each began, and goes
+on. It runs where the conductor does, on the clock of the experiment: what robots elsewhere stamp is set right there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from math import floor, isfinite, nan
+from typing import Final
+
+import numpy as np
+import zenoh
+
+from agents.arrays import Index
+from agents.clock import Clock
+from agents.decision.centralised import Centre, Told
+from agents.decision.lifecycle import IDLE, Phase
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.channel_model import Channel, Samples
+from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.keys import Keys
+from agents.network.name_ownership import NameTaken, claim
+from agents.network.shutdown import end, held
+from agents.network.validation import reach_of
+from agents.plugins import registry
+from agents.runtime.command_line import told_to_end
+from agents.runtime.lifeline import Lifeline
+from agents.runtime.pose_inbox import Coming, Said, Speaker
+from agents.runtime.telemetry import resident_mb
+from experiments.definition import link_conditions, mesh
+from experiments.definition.assignment import assign_centre, guided
+from experiments.definition.endpoints import routers
+from experiments.definition.experiment import Experiment
+from experiments.file import document
+from experiments.file.document import chosen_case
+from experiments.file.problems import DocumentError, Problem
+
+REPORT_S: Final = 1.0
+DEPTH: Final = 64  # poses of a robot that may wait for the next decision
+ROUNDING_S: Final = 1e-5  # stamps are rounded
+PHASES: Final = {phase.word: int(phase) for phase in Phase}
+EXPLAINED: Final = (DocumentError, registry.PluginError, EndpointError, network.Unreachable)
+
+
+class CentreTaken(RuntimeError):
+    """A centre is on the network already."""
+
+
+class CentreProcess:
+    """Paces a centre, and carries its words."""
+
+    def __init__(
+        self, experiment: Experiment, session: zenoh.Session, keys: Keys, endpoints: Sequence[str] = ()
+    ) -> None:
+        """Declares everything but the token: whoever sees that is listened to. `endpoints` are those of the session."""
+        assignment = assign_centre(experiment)
+        self.centre = centre = Centre(assignment)
+        self._names, self._session, self._keys = assignment.names, session, keys
+        self._router = network.RouterWatch(session, keys.centre_alive, endpoints)
+        self._encoding: messages.Encoding = experiment.network.encoding
+        self._period = assignment.decide_every / assignment.body_hz
+        # what robots say on the tick of a decision is on its way then: half a tick more, and it counts
+        self._patience = 0.5 / assignment.body_hz
+        names, rows = self._names, centre.listens.tolist()
+        reach, rate = reach_of(assignment.limits.low, assignment.limits.high), experiment.rates.pose_hz
+        self._speakers = [
+            Speaker(session, keys, names[row], np.array([link]), reach=reach, rate=rate, depth=DEPTH)
+            for link, row in enumerate(rows)
+        ]
+        self._heard: Index = np.zeros(len(rows), dtype=np.intp)
+        self._channel = Channel(link_conditions.to_centre(experiment, centre.listens))
+        self._guided = [row for row in rows if centre.guided[row]]
+        self._statuses = {row: pubsub.pose_subscriber(session, keys.status(names[row])) for row in self._guided}
+        mime = messages.MIME[self._encoding]
+        self._goals = {row: pubsub.publisher(session, keys.goal(names[row]), mime) for row in self._guided}
+        self._reports = pubsub.pose_publisher(session, keys.centre, messages.JSON)
+        self._phase, self._start = np.full(len(names), IDLE), np.full(len(names), np.inf)
+        self._begun = np.inf
+        self._next = self._utc = 0.0
+        self._clock = Clock()
+        self._seq = round(self._clock.utc() * 1e3)  # beyond whatever a centre before this one had reached
+        self._sent = self._missed = self._malformed = 0
+        self._late_s, self._reported, self._cpu_s = 0.0, 0.0, time.process_time()
+
+    def run(self, over: threading.Event) -> None:
+        """Until told to end."""
+        gc.collect()
+        gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
+        zero = time.monotonic()
+        self._utc = self._clock.at(zero)
+        token = pubsub.alive_token(self._session, self._keys.centre_alive)
+        while not over.wait(max(0.0, zero + self._next + self._patience - time.monotonic())):
+            now = time.monotonic() - zero - self._patience
+            behind = int((now - self._next) / self._period)
+            self._missed += behind
+            t = self._next + behind * self._period
+            self._late_s = max(self._late_s, now - self._next)
+            self._next = t + self._period
+            self._listen(t)
+            self._tell(self.centre.decide(t, self._phase, self._start), t)
+            if t - self._reported >= REPORT_S - 1e-6:
+                self._report(t)
+        self._report(self._next)
+        token.undeclare()  # type: ignore[no-untyped-call]
+
+    def _listen(self, t: float) -> None:
+        """Takes in what has arrived since the last decision."""
+        self._router.silent_since(t)
+        for row, statuses in self._statuses.items():
+            for sample in network.received(statuses.handler):
+                self._heed(row, sample)
+        for speaker in self._speakers:
+            rows = self.centre.listens[speaker.links]
+            for coming in speaker.comings():
+                if coming is Coming.CAME:
+                    self.centre.find(rows)
+                elif coming is Coming.ANEW:
+                    self._begin(speaker)
+                else:
+                    self._channel.forget(speaker.links)
+                    self.centre.lose(rows, t)
+            for said in speaker.news(self._utc + t):
+                if said.anew:
+                    self._begin(speaker)
+                self._send(speaker, said, t)
+        if (got := self._channel.due(t)) is not None:
+            self._believe(got)
+        begun = float(self._start[self._guided].min())
+        if begun != self._begun and isfinite(begun):  # decisions fall on the same instants as those of the robots
+            self._begun = begun
+            self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
+
+    def _begin(self, speaker: Speaker) -> None:
+        """A robot begins a new life."""
+        self._channel.forget(speaker.links)
+        self.centre.forget(self.centre.listens[speaker.links])
+
+    def _send(self, speaker: Speaker, said: Said, t: float) -> None:
+        """One pose has come: it is given to the modelled network."""
+        pose = said.pose
+        start = float(self._start[self._guided].min())
+        if self._within(pose.stamp - self._utc, start):
+            speaker.lost += said.missed
+        self._channel.send(
+            speaker.links,
+            np.array([pose.seq]),
+            np.array([pose.stamp - self._utc]),
+            np.array([pose.position]),
+            np.array([pose.velocity or messages.STILL]),
+            start=np.array([start]),
+            size=np.array([said.size]),
+            now=t,
+            extra=np.array([[nan if pose.yaw is None else pose.yaw, said.measured - self._utc]]),
+        )
+
+    def _believe(self, got: Samples) -> None:
+        """Poses have got through."""
+        assert got.extra is not None  # all bring along their yaw, and when they were measured
+        rows = self.centre.listens[got.link]
+        yaw, measured = got.extra.T
+        self.centre.hear(rows, got.position, got.velocity, yaw, measured, got.arrival)
+        start = float(self._start[self._guided].min())
+        for link, stamp in zip(got.link.tolist(), got.stamp.tolist(), strict=True):
+            self._heard[link] += self._within(stamp, start)
+
+    def _within(self, taken: float, start: float) -> bool:
+        """Whether a pose was taken in the run that began at `start` [s]."""
+        return 0.0 <= taken - start + ROUNDING_S < self.centre.assignment.duration
+
+    def _heed(self, row: int, sample: zenoh.Sample) -> None:
+        try:
+            status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
+            if status.robot != self._names[row] or status.phase not in PHASES or not isfinite(status.started):
+                raise messages.Malformed(f"a status of '{status.robot}', {status.phase}")
+        except messages.Malformed:
+            self._malformed += 1
+            return
+        self._phase[row] = PHASES[status.phase]
+        if status.origin is not None and all(map(isfinite, status.origin)):
+            self.centre.begin(row, status.origin)
+        self._start[row] = status.started - self._utc if status.started > 0.0 else np.inf
+
+    def _tell(self, told: Told, t: float) -> None:
+        """Sends goals, rounded as poses are."""
+        self._seq += 1
+        for k, row in enumerate(told.rows.tolist()):
+            x, y, z = told.goal[k].tolist()
+            yaw = float(told.toward[k])
+            goal = messages.Goal(
+                self._names[row],
+                self._seq,
+                round(self._utc + t, 6),
+                (round(x, 6), round(y, 6), round(z, 6)),
+                round(yaw, 6) if isfinite(yaw) else None,
+                round(self._utc + float(told.rests[k]), 6),
+            )
+            self._goals[row].put(messages.encode(goal, self._encoding))
+        self._sent += len(told.rows)
+
+    def _report(self, t: float) -> None:
+        cpu_s = time.process_time()
+        listened = [speaker.name for speaker in self._speakers]
+        report = messages.CentreState(
+            stamp=self._utc + t,
+            robots=[self._names[row] for row in self._guided],
+            missing=[self._names[row] for row in self.centre.missing()],
+            load=round((cpu_s - self._cpu_s) / max(t - self._reported, self._period), 4),
+            late_s=round(self._late_s, 6),
+            decisions=self.centre.decisions,
+            missed=self._missed,
+            goals=self._sent,
+            heard=dict(zip(listened, self._heard.tolist(), strict=True)),
+            lost={speaker.name: speaker.lost for speaker in self._speakers},
+            dropped=dict(zip(listened, self._channel.dropped.tolist(), strict=True)),
+            malformed=self._malformed + sum(speaker.malformed for speaker in self._speakers),
+            pid=os.getpid(),
+            cpu_s=cpu_s,
+            rss_mb=resident_mb(),
+        )
+        self._cpu_s, self._reported, self._late_s = cpu_s, t, 0.0
+        self._reports.put(messages.encode(report))
+
+
+def serve(
+    file: str, *, case: str | None, connect: Sequence[str], lifeline: bool = False, lab: str | None = None
+) -> int:
+    """Runs the centre of an experiment until it is told to end; returns the exit code.
+
+    Raises:
+        DocumentError: If the file is wrong, has no such case, or no robot that is guided.
+        PluginError: If a law, planner, trigger or predictor cannot be had.
+        CentreTaken: If a centre is on the network already.
+        Unreachable: If no router answers.
+    """
+    began = Clock().utc()
+    read = document.read(file)
+    experiment = chosen_case(read, case)
+    steered = guided(experiment)
+    if not steered:
+        hint = 'write architecture = "centralised" at the top of the file, or choose another case with --case'
+        raise DocumentError([Problem(file, 0, 0, "every robot of this experiment decides for itself", hint)])
+    endpoints = routers(experiment, read.path, connect, lab) or [DEFAULT_ENDPOINT]
+    over = threading.Event()
+    with told_to_end(over.set):
+        if lifeline:
+            Lifeline(over).start()
+        opened = network.open_session(endpoints, name="centre", stop=over, rights=mesh.rights(experiment, endpoints))
+        with held(opened) as (session, declared):
+            keys = Keys(experiment.network.realm)
+            try:
+                declared.append(claim(session, [keys.centre_alive], began=began, endpoints=endpoints, stop=over))
+            except NameTaken:
+                raise CentreTaken(
+                    f"a centre guides the robots of the realm '{keys.realm}' already: end it first, choose another "
+                    "router with --connect, or another network.realm in the experiment file"
+                ) from None
+            process = CentreProcess(experiment, session, keys, endpoints)
+            declared.append(process)
+            heard = [name for name in experiment.robots if name not in steered]
+            print(
+                f"centre ready: guides {', '.join(steered)} at {experiment.rates.coordination_hz:g} Hz"
+                + (f"; {', '.join(heard)} decide for themselves" if heard else "")
+                + f"; realm {experiment.network.realm} at {', '.join(endpoints)}",
+                flush=True,
+            )
+            process.run(over)
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line of the process."""
+    parser = argparse.ArgumentParser(prog="zenpark centre", description="Decides for robots of an experiment.")
+    parser.add_argument("file", help="experiment file, or name in the catalogue")
+    parser.add_argument("--case", help="which case of the file; the first if left out")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent")
+    chosen = parser.parse_args(arguments)
+    try:
+        return serve(chosen.file, case=chosen.case, connect=chosen.connect, lifeline=chosen.lifeline)
+    except (*EXPLAINED, CentreTaken) as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    end(main())

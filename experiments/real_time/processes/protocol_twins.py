@@ -1,0 +1,224 @@
+"""The process of protocol twins: `python -m experiments.real_time.processes.protocol_twins FILE NAME ...`.
+
+It stands where the hardware would stand: it knows the experiment only for where its robots start and what nature does
+to them. It says on standard output at which address each robot is, and tells recorder and simulated motion capture,
+never a robot, where they really are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import selectors
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import Final
+
+import msgspec
+import zenoh
+
+from agents.body.interface import BodyError
+from agents.body.kinds import KINDS
+from agents.clock import Clock
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.keys import Keys
+from agents.network.shutdown import Farewell, end, held
+from agents.plugins import registry
+from agents.runtime.command_line import told_to_end
+from agents.runtime.lifeline import Lifeline
+from experiments.definition import bodies
+from experiments.definition.endpoints import routers
+from experiments.definition.experiment import Experiment, Robot
+from experiments.file import document, structure
+from experiments.file.problems import DocumentError, Problem
+from twins.devices.device import Device, DeviceRequest, Faults
+
+EXPLAINED: Final = (
+    DocumentError,
+    BodyError,
+    registry.PluginError,
+    EndpointError,
+    network.Unreachable,
+    OSError,
+)
+
+
+class DeviceProcess:
+    """Runs a device: waits on its sockets, moves it on, publishes the truth."""
+
+    def __init__(
+        self,
+        device: Device,
+        names: Sequence[str],
+        session: zenoh.Session | None,
+        *,
+        keys: Keys,
+        rate_hz: float,
+        lost: threading.Event,
+    ) -> None:
+        """Without a session nobody is told the truth; `lost` is set when the launcher is gone."""
+        self._device, self._names, self._dt = device, names, 1.0 / rate_hz
+        known = names if session is not None else ()
+        self._truths = [pubsub.publisher(session, keys.truth(name), messages.JSON) for name in known if session]
+        self._lost = lost
+        self._farewell = Farewell(session, keys, names, lost) if session is not None else None
+
+    def run(self, over: threading.Event) -> None:
+        """Until told to end, or until the launcher and then the robots are gone."""
+        zero, clock = time.monotonic(), Clock()
+        due = 0.0
+        with selectors.DefaultSelector() as waiting:
+            while not over.is_set():
+                self._register(waiting)
+                now = time.monotonic() - zero
+                for ready, _ in waiting.select(max(0.0, due - now)):
+                    self._device.serve(ready.fileobj, time.monotonic() - zero)  # type: ignore[arg-type]
+                now = time.monotonic() - zero
+                if now >= due:
+                    self._device.advance(now)
+                    self._tell(clock.at(zero + now))
+                    due = max(due + self._dt, now - 10.0 * self._dt)  # after a long stop it does not hurry
+                    if self._farewell.over() if self._farewell is not None else self._lost.is_set():
+                        return
+
+    def _register(self, waiting: selectors.DefaultSelector) -> None:
+        wanted = {sock.fileno(): sock for sock in self._device.sockets()}
+        known = dict(waiting.get_map())
+        for number, key in known.items():
+            if number not in wanted or wanted[number] is not key.fileobj:
+                waiting.unregister(key.fileobj)
+        for number, sock in wanted.items():
+            if number not in waiting.get_map():
+                waiting.register(sock, selectors.EVENT_READ)
+
+    def _tell(self, stamp: float) -> None:
+        position, yaw = self._device.truth()
+        for name, publisher, where, toward in zip(
+            self._names, self._truths, position.tolist(), yaw.tolist(), strict=False
+        ):
+            publisher.put(messages.encode(messages.position(name, stamp, where, toward)))
+
+
+def stand_in(file: str, names: Sequence[str], *, faults: Faults, connect: Sequence[str], lifeline: bool) -> int:
+    """Runs the protocol twins of robots whose `body` asks for the same one; returns the exit code.
+
+    Raises:
+        DocumentError: If the file is wrong, or the robots do not ask for one and the same protocol twin.
+        Unreachable: If no router answers.
+    """
+    read = document.read(file)
+    experiment = read.experiment
+    words = {experiment.robots[name].body if name in experiment.robots else "" for name in names}
+    known = registry.names(registry.DEVICES)
+    if len(words) != 1 or not words <= set(known):
+        hint = f"their `body` must be one of {', '.join(known)}"
+        raise DocumentError([Problem(file, 0, 0, f"{', '.join(names)} cannot share a protocol twin", hint)])
+    endpoints = routers(experiment, read.path, connect) or [DEFAULT_ENDPOINT]
+    request = DeviceRequest(bodies.request(experiment, names, [experiment.seed], endpoints), faults)
+    word = words.pop()
+    keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
+    return _serve(word, request, keys=keys, rate_hz=rate, connect=endpoints, lifeline=lifeline)
+
+
+def by_hand(
+    kind: str,
+    count: int,
+    *,
+    faults: Faults,
+    device: dict[str, object],
+    connect: Sequence[str],
+    identity: str = "twin",
+) -> int:
+    """Runs `count` protocol twins of a kind of robot, in a row on the floor, without an experiment.
+
+    Args:
+        kind: Of robot.
+        count: How many.
+        faults: What goes wrong on purpose.
+        device: Settings of the device.
+        connect: Routers at which the truth is told, and at which twins that live on Zenoh are reached; may be none.
+        identity: Whose certificate is shown, in a lab.
+
+    Raises:
+        DocumentError: If there is no such protocol twin.
+        Unreachable: If no router answers.
+    """
+    word = f"{kind}-twin"
+    if word not in (known := registry.names(registry.DEVICES)):
+        hint = registry.did_you_mean(kind, [name.removesuffix("-twin") for name in known])
+        raise DocumentError([Problem(f"zenpark twin {kind}", 0, 0, "there is no such protocol twin", hint)])
+    hover = 0.8 if KINDS[kind].flies else None
+    robots = {
+        f"{kind[:2].upper()}{k + 1:02}": Robot(kind=kind, start=[0.5 * k, 0.0], body=word, hover=hover, device=device)
+        for k in range(count)
+    }
+    experiment = Experiment(title=word, robots=robots, duration_s=1.0)
+    endpoints = list(connect) or [DEFAULT_ENDPOINT]
+    request = DeviceRequest(bodies.request(experiment, list(robots), [experiment.seed], endpoints), faults)
+    keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
+    return _serve(word, request, keys=keys, rate_hz=rate, connect=connect, lifeline=False, identity=identity)
+
+
+def _serve(
+    word: str,
+    request: DeviceRequest,
+    *,
+    keys: Keys,
+    rate_hz: float,
+    connect: Sequence[str],
+    lifeline: bool,
+    identity: str = "twin",
+) -> int:
+    """Runs a device until it is told to end, or its lifeline is lost and the robots are gone."""
+    names = request.body.names
+    over, lost = threading.Event(), threading.Event()
+    if lifeline:
+        Lifeline(lost).start()
+    with told_to_end(over.set), ExitStack() as stack:
+        session, declared = None, list[object]()
+        if connect:
+            joined = held(network.open_session(connect, name=word, stop=over, identity=identity))
+            session, declared = stack.enter_context(joined)
+        device: Device = registry.load(registry.DEVICES, word)(request)
+        stack.callback(device.close)
+        for name, address in zip(names, device.addresses, strict=True):
+            print(f"address {name} {address}", flush=True)
+        process = DeviceProcess(device, names, session, keys=keys, rate_hz=rate_hz, lost=lost)
+        declared.append(process)
+        process.run(over)
+    return 0
+
+
+def command(kind: str, count: int, *, faults: str, device: str, connect: Sequence[str], identity: str = "twin") -> int:
+    """`zenpark twin`: as `by_hand`, with faults and settings as JSON."""
+    settings = structure.table("--device", device)
+    return by_hand(kind, count, faults=_faults(faults), device=settings, connect=connect, identity=identity)
+
+
+def _faults(text: str) -> Faults:
+    return msgspec.convert(structure.table("--faults", text, Faults), Faults)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line of the process."""
+    parser = argparse.ArgumentParser(prog="zenpark twin", description="Protocol twins of some robots.")
+    parser.add_argument("file", help="experiment file, or name in the catalogue")
+    parser.add_argument("names", nargs="+", metavar="ROBOT")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
+    parser.add_argument("--faults", default="{}", help="JSON, such as '{\"loss\": 0.05}'")
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent")
+    chosen = parser.parse_args(arguments)
+    try:
+        faults = _faults(chosen.faults)
+        return stand_in(chosen.file, chosen.names, faults=faults, connect=chosen.connect, lifeline=chosen.lifeline)
+    except EXPLAINED as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    end(main())

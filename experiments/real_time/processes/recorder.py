@@ -1,0 +1,283 @@
+"""The recorder process: `python -m experiments.real_time.processes.recorder EXPERIMENT.json TARGET ...`.
+
+A process of its own, so that the death of the conductor costs no recording: it goes on until every robot is gone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from math import isfinite, remainder, tau
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import zenoh
+
+from agents.clock import Clock
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.endpoints import EndpointError
+from agents.network.keys import Keys
+from agents.network.shutdown import AFTER_S, end, held
+from agents.runtime.command_line import told_to_end
+from agents.runtime.lifeline import Lifeline
+from experiments.definition import mesh
+from experiments.file import document
+from experiments.file.problems import DocumentError
+from experiments.recording.reader import RecordingError
+from experiments.recording.writer import Recording
+
+POLL_S: Final = 0.02
+FLUSH_S: Final = 1.0
+FRESH_S: Final = 0.05  # a truth that is farther away in time does not belong to a state
+PATIENCE_S: Final = 0.2  # a state waits so long for the truth that follows it
+TRUTHS: Final = 256  # that are kept of each robot
+NAMED: Final = 100  # keys of which is told that something could not be read
+DEPTH: Final = 20_000  # samples that may wait while the disk does
+RARE: Final = 1_000  # of those that come once a second, or now and then: a ring takes its memory as it first goes round
+
+
+class Recorder:
+    """Takes down what robots and conductor say."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, recording: Recording) -> None:
+        self._keys, self._recording = keys, recording
+        self._connected = True
+        self._session = session
+        self._arrival = Clock()
+        self._unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
+        self._told: dict[str, int] = {}
+        self._alive: set[str] = set()
+        self._poses = pubsub.pose_subscriber(session, keys.pose("*"), DEPTH)
+        self._statuses = pubsub.pose_subscriber(session, keys.status("*"), RARE)
+        self._states = pubsub.subscriber(session, keys.state("*"), DEPTH)
+        self._events = pubsub.pose_subscriber(session, keys.event, RARE, pubsub.EVENTS)
+        self._contacts = pubsub.subscriber(session, keys.contact, RARE)
+        self._world = pubsub.subscriber(session, keys.world, RARE)
+        self._goals = pubsub.subscriber(session, keys.goal("*"), DEPTH)
+        self._centre = pubsub.subscriber(session, keys.centre, RARE)
+        self._clocks = pubsub.pose_subscriber(session, keys.clock, RARE)
+        self._truths = pubsub.subscriber(session, keys.truth("*"), DEPTH)
+        self._truth: dict[str, deque[messages.Position]] = {}
+        self._waiting: dict[str, deque[tuple[float, messages.State]]] = {}  # for truth, since when
+        self._watch = pubsub.alive_watch(session, keys.alive("*"))
+        self._token = pubsub.alive_token(session, keys.recorder)
+
+    @property
+    def alone(self) -> bool:
+        """Whether no robot is left."""
+        return not self._alive
+
+    def take(self, *, last: bool = False) -> None:
+        """Writes what has arrived; states of protocol twins wait for the truth behind them, but for the `last` time.
+
+        Raises:
+            RecordingError: If it cannot be written.
+        """
+        for sample in network.received(self._watch.handler):
+            robot = str(sample.key_expr)
+            (self._alive.discard if sample.kind == zenoh.SampleKind.DELETE else self._alive.add)(robot)
+        for handler, what in (
+            (self._truths.handler, self._take_truth),
+            (self._states.handler, self._state),
+            (self._poses.handler, self._pose),
+            (self._statuses.handler, self._status),
+            (self._events.handler, self._event),
+            (self._contacts.handler, self._contact),
+            (self._world.handler, self._said_by_world),
+            (self._goals.handler, self._goal),
+            (self._centre.handler, self._said_by_centre),
+            (self._clocks.handler, self._clock),
+        ):
+            for sample in network.received(handler):
+                try:
+                    what(sample)
+                except ValueError as error:  # malformed, or on a key that is nobody's
+                    key = str(sample.key_expr)
+                    self._unread[key] = self._unread.get(key, (0, ""))[0] + 1, str(error)
+
+        now = time.monotonic()
+        for robot, waiting in self._waiting.items():
+            truths = self._truth[robot]
+            while waiting and (last or waiting[0][1].stamp <= truths[-1].stamp or now - waiting[0][0] > PATIENCE_S):
+                self._recording.state(with_truth(waiting.popleft()[1], truths))
+
+    @property
+    def malformed(self) -> int:
+        """Messages that could not be read."""
+        return sum(count for count, _ in self._unread.values())
+
+    def complain(self, *, last: bool = False) -> None:
+        """Says in the recording what could not be read: of each key at once, and at the `last` how much it was.
+
+        Raises:
+            RecordingError: If it cannot be written.
+        """
+        for key, (count, why) in list(self._unread.items())[:NAMED]:
+            before = self._told.get(key, 0)
+            if not before or (last and count != before):
+                self._told[key] = count
+                text = f"could not read {count} {'message' if count == 1 else 'messages'} on {key}: {why}"
+                self._recording.event(messages.Event(self._arrival.utc(), "unread", "recorder", text))
+
+    def _pose(self, sample: zenoh.Sample) -> None:
+        payload = sample.payload.to_bytes()
+        pose = messages.decode(payload, str(sample.encoding), messages.Pose)
+        self._own(sample, pose.robot)
+        self._recording.pose(pose, self._arrival.utc(), len(payload))
+
+    def _state(self, sample: zenoh.Sample) -> None:
+        state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
+        self._own(sample, state.robot)
+        if state.true_position is None and state.robot in self._truth:
+            self._waiting.setdefault(state.robot, deque()).append((time.monotonic(), state))
+        else:
+            self._recording.state(state)
+
+    def _take_truth(self, sample: zenoh.Sample) -> None:
+        """A protocol twin says where its robot really is: its bridge cannot know."""
+        truth = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position)
+        self._own(sample, truth.robot)
+        self._finite(sample, truth.stamp, *truth.position, truth.yaw or 0.0)
+        truths = self._truth.setdefault(truth.robot, deque(maxlen=TRUTHS))
+        if truths and truth.stamp <= truths[-1].stamp:
+            truths.clear()  # its device was started again
+        truths.append(truth)
+
+    def _status(self, sample: zenoh.Sample) -> None:
+        status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
+        self._own(sample, status.robot)
+        self._recording.status(status)
+
+    def _event(self, sample: zenoh.Sample) -> None:
+        self._recording.event(messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Event))
+
+    def _contact(self, sample: zenoh.Sample) -> None:
+        contact = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Contact)
+        self._finite(sample, contact.stamp, contact.impulse, contact.overlap)
+        self._recording.contact(contact)
+
+    def _said_by_world(self, sample: zenoh.Sample) -> None:
+        said = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.WorldState)
+        self._finite(sample, said.stamp, said.time, said.factor, said.load)
+        for standing in said.obstacles:
+            self._finite(sample, *standing.pose)
+        self._recording.world(said)
+
+    def _goal(self, sample: zenoh.Sample) -> None:
+        payload = sample.payload.to_bytes()
+        goal = messages.decode(payload, str(sample.encoding), messages.Goal)
+        self._own(sample, goal.robot)
+        self._finite(sample, goal.stamp, goal.pose)
+        self._recording.goal(goal, self._arrival.utc(), len(payload))
+
+    def _said_by_centre(self, sample: zenoh.Sample) -> None:
+        said = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.CentreState)
+        self._finite(sample, said.stamp, said.load, said.late_s, said.cpu_s, said.rss_mb)
+        self._recording.centre(said)
+
+    def _clock(self, sample: zenoh.Sample) -> None:
+        said = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.HostClock)
+        self._finite(sample, said.stamp, said.offset, said.uncertainty, said.applied or 0.0)
+        self._recording.clock(said)
+
+    @staticmethod
+    def _finite(sample: zenoh.Sample, *numbers: float) -> None:
+        if not all(map(isfinite, numbers)):
+            raise messages.Malformed(f"a number on {sample.key_expr} is not finite")
+
+    def _own(self, sample: zenoh.Sample, robot: str) -> None:
+        if self._keys.robot(str(sample.key_expr)) != robot:
+            raise messages.Malformed(f"a message of '{robot}' on {sample.key_expr}")
+
+
+def with_truth(state: messages.State, truths: Sequence[messages.Position]) -> messages.State:
+    """A state with where its robot really was then: on the line between the truths (in order of time) before and after.
+
+    Where only one is known, that one if it is fresh; unchanged if there is none.
+    """
+    after = next((truth for truth in truths if truth.stamp >= state.stamp), None)
+    before = next((truth for truth in reversed(truths) if truth.stamp <= state.stamp), None)
+    near = [each for each in (before, after) if each is not None and abs(each.stamp - state.stamp) < FRESH_S]
+    if not near:
+        return state
+    one, other = near[0], near[-1]
+    share = (state.stamp - one.stamp) / (other.stamp - one.stamp) if other.stamp > one.stamp else 0.0
+    x, y, z = (a + share * (b - a) for a, b in zip(one.position, other.position, strict=True))
+    yaw = one.yaw
+    if one.yaw is not None and other.yaw is not None:
+        yaw = messages.heading(one.yaw + share * remainder(other.yaw - one.yaw, tau))
+    return msgspec.structs.replace(state, true_position=(x, y, z), true_yaw=yaw)
+
+
+def record(file: str, target: Path, *, case: str, source: Path, connect: Sequence[str]) -> None:
+    """Records one case until its lifeline is lost and the robots are gone, or until SIGTERM.
+
+    Args:
+        file: The resolved case.
+        target: The recording.
+        case: Its name.
+        source: The experiment file as it was written, to be attached.
+        connect: Routers.
+
+    Raises:
+        RecordingError: If the recording cannot be written.
+    """
+    experiment = document.read(file).experiment
+    lost, asked = threading.Event(), threading.Event()
+    Lifeline(lost).start()
+    text = source.read_text("utf-8")
+    with (
+        told_to_end(asked.set),
+        held(network.open_session(connect, name="recorder", stop=asked, rights=mesh.rights(experiment, connect))) as (
+            session,
+            declared,
+        ),
+        Recording(target, experiment, text, case=case, seed=experiment.seed, clock="real") as recording,
+    ):
+        keys = Keys(experiment.network.realm)
+        recorder = Recorder(session, keys, recording)
+        declared.append(recorder)
+        router = network.RouterWatch(session, keys.recorder, connect)
+        flush_at = time.monotonic() + FLUSH_S
+        last = float("inf")
+        while not asked.wait(POLL_S):
+            recorder.take()
+            now = time.monotonic()
+            router.silent_since(now)
+            if now > flush_at:
+                recorder.complain()
+                recording.flush()
+                flush_at = now + FLUSH_S
+            if lost.is_set():
+                last = min(last, now + AFTER_S)
+                if recorder.alone or now > last or not network.connected(session):
+                    break
+        recorder.take(last=True)
+        recorder.complain(last=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line of the process."""
+    parser = argparse.ArgumentParser(prog="zenpark recorder", description="Records one case of an experiment.")
+    parser.add_argument("file", help="the resolved case")
+    parser.add_argument("target", type=Path)
+    parser.add_argument("--case", required=True)
+    parser.add_argument("--source", type=Path, required=True, help="the experiment file to attach")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[])
+    chosen = parser.parse_args(arguments)
+    try:
+        record(chosen.file, chosen.target, case=chosen.case, source=chosen.source, connect=chosen.connect)
+    except (DocumentError, RecordingError, EndpointError, network.Unreachable, OSError) as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    end(main())

@@ -1,0 +1,318 @@
+"""The twin service: `python -m experiments.real_time.processes.world FILE`. One world that carries any number of twins,
+in real time.
+
+Robots reach it by keys only (`docs/external-simulators.md`). What it hears and says is
+`experiments.real_time.processes.world_network`, who is in it and where
+`experiments.real_time.processes.world_population`; this is the clock, the orders, and the process, which is light to
+start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import sys
+import threading
+import time
+from collections.abc import Sequence, Set
+from dataclasses import dataclass
+from typing import Final
+
+import msgspec
+import zenoh
+
+from agents.body.interface import BodyError
+from agents.clock import Clock
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.keys import Keys
+from agents.network.name_ownership import NameTaken, claim
+from agents.network.shutdown import Farewell, end, held
+from agents.plugins import registry
+from agents.runtime.command_line import told_to_end
+from agents.runtime.lifeline import Lifeline
+from experiments.definition import mesh
+from experiments.definition.bodies import WORLD
+from experiments.definition.endpoints import routers
+from experiments.definition.experiment import Experiment
+from experiments.file import document
+from experiments.file.document import chosen_case
+from experiments.file.problems import DocumentError, Problem
+from experiments.real_time.processes.world_network import Exchange
+from experiments.real_time.processes.world_population import Population, Refused
+
+REPORT_S: Final = 1.0
+SLIP_S: Final = 0.05  # what it makes up for when it was late; the rest of the time is lost, and the factor says so
+MOST_STEPS: Final = 1_000_000
+EXPLAINED: Final = (DocumentError, BodyError, registry.PluginError, EndpointError, network.Unreachable)
+
+
+class WorldTaken(RuntimeError):
+    """A world is on the network already."""
+
+
+@dataclass
+class Pace:
+    """How fast it goes: simulated over real time, and the share of it that was worked, over the last second."""
+
+    factor: float = 1.0
+    load: float = 0.0
+    since: float = 0.0
+    ticks: int = 0
+    worked: float = 0.0
+
+    def look(self, now: float, dt: float) -> bool:
+        """Whether a second is over at `now` [s]; the figures are then those of that second."""
+        span = now - self.since
+        if span < REPORT_S:
+            return False
+        self.factor, self.load = self.ticks * dt / span, self.worked / span
+        self.since, self.ticks, self.worked = now, 0, 0.0
+        return True
+
+
+class WorldProcess:
+    """Paces a population, and obeys."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        population: Population,
+        session: zenoh.Session,
+        lost: threading.Event,
+        endpoints: Sequence[str] = (),
+    ) -> None:
+        """`lost` is set when it shall end as soon as its robots are down; `endpoints` are those of the session."""
+        self._population, self._session, self._lost = population, session, lost
+        self._keys = Keys(experiment.network.realm)
+        self._engine = registry.split(experiment.world.engine)[0]
+        self._dt = 1.0 / experiment.rates.body_hz
+        self._exchange = Exchange(experiment, population, session, endpoints)
+        self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
+        self._orders = pubsub.orders(session, self._keys.world_order)
+        self._pace = Pace()
+        self.paused = False
+        self._steps = 0
+        self._enter()
+
+    def find(self, there: Set[str]) -> list[str]:
+        """Puts carried robots of those that are on the network where they say that they are; their names."""
+        return self._exchange.find(there)
+
+    def run(self, over: threading.Event) -> None:
+        """Until told to end at once, or until its starter and then its robots are gone."""
+        exchange, pace, dt = self._exchange, self._pace, self._dt
+        gc.collect()
+        gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
+        zero = time.monotonic()
+        exchange.begin(zero)
+        token = pubsub.alive_token(self._session, self._keys.world_alive)
+        self._report(0.0)
+        due = 0.0
+        while not over.is_set():
+            wait = zero + due - time.monotonic()
+            if wait > 0.0:
+                time.sleep(wait)
+            began = time.monotonic() - zero
+            if began - due > SLIP_S:
+                exchange.slept(began - due, began)
+                due = began - SLIP_S
+            self._tick(due)
+            due += dt
+            pace.worked += time.monotonic() - zero - began
+            if pace.look(began, dt):
+                self._report(due)
+            if self._lost.is_set() and self._farewell.over():
+                break
+        token.undeclare()  # type: ignore[no-untyped-call]
+
+    def _tick(self, t: float) -> None:
+        changed = False
+        for query in network.received(self._orders.handler):
+            changed |= self._obey(query)
+        if self._lost.is_set() and self.paused:
+            self.paused, changed = False, True  # who must land cannot wait
+        self._exchange.listen(t)
+        if not self.paused or self._steps:
+            self._exchange.act(t)
+            self._population.advance()
+            self._pace.ticks += 1
+            if self._steps:
+                self._steps -= 1
+                changed |= not self._steps
+        self._exchange.tell(t)
+        if changed:
+            self._report(t)
+
+    def _enter(self) -> None:
+        """After somebody came or went."""
+        self._exchange.enter()
+        population = self._population
+        carried = [name for name, here in zip(population.names, population.carried.tolist(), strict=True) if here]
+        self._carried = carried
+        self._farewell = Farewell(self._session, self._keys, carried, self._lost)
+
+    # ------------------------------------------------------------------ orders
+
+    def _obey(self, query: zenoh.Query) -> bool:
+        """One order; it always gets a reply. Whether it changed anything."""
+        with query:
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            try:
+                order = messages.decode(payload, str(query.encoding or messages.JSON), messages.WorldOrder)
+            except messages.Malformed as error:
+                self._exchange.malformed += 1
+                query.reply_err(str(error).encode(), encoding="text/plain")
+                return False
+            reason = ""
+            try:
+                self._carry_out(order)
+            except Refused as refusal:
+                reason = str(refusal)
+                self._exchange.refuse("world", f"{order.order}: {reason}")
+            reply = messages.WorldReply(not reason, self.paused, round(self._population.time, 6), reason)
+            query.reply(self._keys.world_order, messages.encode(reply), encoding=messages.JSON)
+            return not reason
+
+    def _carry_out(self, order: messages.WorldOrder) -> None:
+        """Raises Refused."""
+        population, what = self._population, order.order
+        if what == "pause":
+            self.paused, self._steps = True, 0
+        elif what == "resume":
+            self.paused, self._steps = False, 0
+        elif what == "step":
+            if not 1 <= order.steps <= MOST_STEPS:
+                raise Refused(f"{order.steps} steps; step takes 1 to {MOST_STEPS} ticks of {1e3 * self._dt:g} ms")
+            self.paused, self._steps = True, order.steps
+        elif what == "reset":
+            population.reset(order.name)
+            self._exchange.enter()
+        else:
+            if order.name is None:
+                raise Refused(f"{what} needs a name")
+            if what == "remove":
+                population.remove(order.name)
+            elif order.obstacle is not None:
+                population.spawn_obstacle(order.name, order.obstacle)
+            else:
+                population.spawn_robot(order.name, order.kind, order.at, order.yaw)
+            self._enter()
+
+    def _report(self, t: float) -> None:
+        population, exchange = self._population, self._exchange
+        state = messages.WorldState(
+            stamp=exchange.utc + t,
+            engine=self._engine,
+            time=round(population.time, 6),
+            factor=round(self._pace.factor, 4),
+            load=round(self._pace.load, 4),
+            paused=self.paused,
+            robots=self._carried,
+            mirrored=exchange.mirrored(),
+            obstacles=[messages.Standing(name, pose) for name, pose in population.obstacles().items()],
+            contacts=exchange.contacts,
+            refused=exchange.refused,
+            malformed=exchange.malformed,
+            trouble=exchange.trouble,
+        )
+        self._reports.put(messages.encode(state))
+
+
+def serve(
+    file: str,
+    *,
+    case: str | None,
+    connect: Sequence[str],
+    lifeline: bool = False,
+    engine: str | None = None,
+    lab: str | None = None,
+) -> int:
+    """Runs the world of an experiment until it is told to end and its robots are down; returns the exit code.
+
+    Raises:
+        DocumentError: If the file is wrong, has no such case, or no robot for a world.
+        BodyError, PluginError: If the engine cannot be had.
+        WorldTaken: If a world is on the network already.
+        Unreachable: If no router answers.
+    """
+    began = Clock().utc()
+    read = document.read(file)
+    experiment = chosen_case(read, case)
+    robots = experiment.robots.values()
+    if not any(WORLD in (robot.body, robot.ranges) for robot in robots):
+        hint = 'give robots `body = "world"` (or start it all with `zenpark run FILE --bodies world`)'
+        raise DocumentError([Problem(file, 0, 0, "no robot of this experiment lives in a world", hint)])
+    if engine is not None:
+        changed = msgspec.structs.replace(experiment.world, engine=engine)
+        experiment = msgspec.structs.replace(experiment, world=changed)
+    endpoints = routers(experiment, read.path, connect, lab) or [DEFAULT_ENDPOINT]
+    over, lost = threading.Event(), threading.Event()
+
+    def leave() -> None:
+        (over if lost.is_set() else lost).set()  # asked a second time it does not wait for robots to land
+
+    if lifeline:
+        Lifeline(lost).start()
+    with told_to_end(leave):
+        population = Population(experiment)
+        opened = network.open_session(endpoints, name="world", stop=lost, rights=mesh.rights(experiment, endpoints))
+        with held(opened) as (session, declared):
+            keys = Keys(experiment.network.realm)
+            try:
+                declared.append(claim(session, [keys.world_alive], began=began, endpoints=endpoints, stop=lost))
+            except NameTaken:
+                raise WorldTaken(
+                    f"a world runs in the realm '{keys.realm}' already: end it first, choose another router with "
+                    "--connect, or another network.realm in the experiment file"
+                ) from None
+            # before anything watches those tokens: a session that has begun to watch answers from what it has heard
+            there = _alive(session, keys)
+            world = WorldProcess(experiment, population, session, lost, endpoints)
+            declared.append(world)
+            back = world.find(there)
+            print(_ready(experiment, population, endpoints, back), flush=True)
+            world.run(over)
+    return 0
+
+
+def _ready(experiment: Experiment, population: Population, endpoints: Sequence[str], back: Sequence[str]) -> str:
+    parted: tuple[list[str], list[str]] = ([], [])
+    for name, here in zip(population.names, population.carried.tolist(), strict=True):
+        parted[0 if here else 1].append(name)
+    carried, mirrored = (", ".join(names) or "nobody" for names in parted)
+    return (
+        f"world ready: {registry.split(experiment.world.engine)[0]} at {experiment.rates.body_hz:g} Hz "
+        f"carries {carried}; mirrors {mirrored}; realm {experiment.network.realm} at {', '.join(endpoints)}"
+        + (f"; {', '.join(back)} where they were" if back else "")
+    )
+
+
+def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
+    """Robots that are on the network already: another world may have carried them."""
+    replies = session.liveliness().get(keys.alive("*"), timeout=1.0)
+    found = {keys.whose(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
+    return {name for name in found if name is not None}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line of the process."""
+    parser = argparse.ArgumentParser(prog="zenpark world", description="The world of an experiment.")
+    parser.add_argument("file", help="experiment file, or name in the catalogue")
+    parser.add_argument("--case", help="which case of the file; the first if left out")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
+    parser.add_argument("--engine", help="instead of the file's")
+    parser.add_argument("--lifeline", action="store_true", help="end, after its robots, when standard input ends")
+    chosen = parser.parse_args(arguments)
+    try:
+        return serve(
+            chosen.file, case=chosen.case, connect=chosen.connect, lifeline=chosen.lifeline, engine=chosen.engine
+        )
+    except (*EXPLAINED, WorldTaken) as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    end(main())

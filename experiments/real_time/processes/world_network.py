@@ -1,0 +1,384 @@
+"""What a world hears and says: commands in, positions, truths and range readings out, and where mirrored robots are.
+
+One wildcard subscription for all commands; a key is looked up before a payload is decoded. What is heard is checked
+before it is believed.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence, Set
+from math import inf
+from typing import Final
+
+import numpy as np
+import zenoh
+from zenoh.handlers import Handler
+
+from agents.arrays import Array, some
+from agents.body.interface import RangeScan, Rays
+from agents.clock import Clock
+from agents.network import messages, pubsub, validation
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.runtime import range_inbox
+from experiments.definition.assignment import measured
+from experiments.definition.bodies import WORLD
+from experiments.definition.experiment import Experiment
+from experiments.real_time.processes.world_population import Population
+
+DEPTH: Final = 16_384  # commands that may wait: of two hundred robots, those of 0.8 s
+TRUTH_HZ: Final = 50.0
+HOLD_S: Final = 0.5  # a robot that is not told anything for this long holds its place,
+LAND_S: Final = 3.0  # and lands after this
+CLIMB_S: Final = 15.0  # one that climbs, or was found in the air, is given this long until it is first told where to
+GONE_S: Final = 1.0  # a mirrored robot that was not heard of for this long is taken out
+HANG_S: Final = 0.3  # whoever was stopped for longer could not hear: nobody was silent
+ANSWER_S: Final = 1.0  # to say where one is
+STRANGERS: Final = 100  # that are told apart
+IN_AIR_M: Final = 0.05
+UP: Final = ("ready", "airborne", "running", "landing")  # phases in which a robot may be in the air
+UNDER_WAY: Final = ("airborne", "running")
+
+
+class Exchange:
+    """The network of a world. Times `t` are on the world's clock [s].
+
+    Attributes:
+        utc: UTC time at which the world's clock was 0 [s].
+        contacts: That have begun.
+        refused: Commands to robots that are not here, and orders that could not be carried out.
+        malformed: Payloads that were not what their key promises.
+        trouble: The last thing that was wrong; empty if nothing was.
+    """
+
+    def __init__(
+        self, experiment: Experiment, population: Population, session: zenoh.Session, endpoints: Sequence[str] = ()
+    ) -> None:
+        """Listens; `enter` declares the rest. `endpoints` are those of the session."""
+        self._population, self._session = population, session
+        keys = self._keys = Keys(experiment.network.realm)
+        self._encoding = experiment.network.encoding
+        self._mime = messages.MIME[self._encoding]
+        x, y, z = experiment.arena.size
+        self._reach = validation.reach_of((-0.5 * x, -0.5 * y, 0.0), (0.5 * x, 0.5 * y, z))
+        self._truth_every = max(1, round(experiment.rates.body_hz / TRUTH_HZ))
+        # robots with another body have another simulator, or none, to tell things to
+        self._elsewhere = {keys.setpoint(name) for name, robot in experiment.robots.items() if robot.body != WORLD}
+        self._measured = frozenset(measured(experiment))
+        self._clock = Clock()
+        self.utc = self._clock.utc()
+        self.contacts = self.refused = self.malformed = 0
+        self.trouble = ""
+        self._router = network.RouterWatch(session, keys.world_alive, endpoints)
+        self._setpoints = pubsub.subscriber(session, keys.setpoint("*"), DEPTH)
+        self._statuses = pubsub.pose_subscriber(session, keys.status("*"), 1024)
+        self._contacts = pubsub.publisher(session, keys.contact, messages.JSON)
+        self._events = pubsub.publisher(session, keys.event, messages.JSON)
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._mirrors: dict[str, tuple[int, zenoh.Subscriber[Handler[zenoh.Sample]]]] = {}
+        self._done: dict[str, int] = {}  # number of the last command that was carried out
+        self._lives: dict[str, str] = {}  # session that owns the name of a robot: a new one counts its commands anew
+        self._owners = pubsub.alive_watch(session, keys.lives(keys.alive("*")))
+        self._strangers: set[str] = set()
+        self._met: set[frozenset[str]] = set()
+        self._started: dict[str, float] = {}
+        self._begun = inf
+        self._ticks = 0
+        self._names: tuple[str, ...] = ()
+        self._quiet = self._heard = np.zeros(0)
+        self._place, self._velocity, self._yaw = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+        self.enter()
+
+    def begin(self, monotonic: float) -> None:
+        """The world's clock is 0 at this time of the monotonic one [s]."""
+        self.utc = self._clock.at(monotonic)
+
+    def enter(self) -> None:
+        """The rows of the population, as they are now."""
+        population, keys, session = self._population, self._keys, self._session
+        names, rows = population.names, len(population.names)
+        old = {name: row for row, name in enumerate(self._names)}
+        kept = [(row, old[name]) for row, name in enumerate(names) if name in old]
+        now, was = (np.array([pair[k] for pair in kept], dtype=np.intp) for k in (0, 1))
+        # since when each row is told nothing; infinity: nothing needs to be told
+        self._quiet, quiet = np.full(rows, inf), self._quiet
+        # when each mirrored row was heard of last, and where it was
+        self._heard, heard = np.full(rows, -inf), self._heard
+        self._place, place = np.full((rows, 3), np.nan), self._place
+        self._velocity, velocity = np.zeros((rows, 3)), self._velocity
+        self._yaw, yaw = np.zeros(rows), self._yaw
+        self._quiet[now], self._heard[now] = quiet[was], heard[was]
+        self._place[now], self._velocity[now], self._yaw[now] = place[was], velocity[was], yaw[was]
+        self._names = names
+        self._held = np.zeros(rows, dtype=bool)
+        self._given = np.full((rows, 4), np.nan)  # setpoints that have come since the last step
+        self._carried = np.flatnonzero(population.carried)
+        self._row = {keys.setpoint(names[row]): row for row in self._carried.tolist()}
+        for name in old.keys() - set(names):
+            self._done.pop(name, None)
+        self._strangers -= set(names)
+        self._placed = np.array(
+            [row for row in self._carried.tolist() if names[row] not in self._measured], dtype=np.intp
+        )
+        wanted = {keys.position(names[row]) for row in self._placed.tolist()}
+        wanted |= {keys.truth(names[row]) for row in self._carried.tolist()}
+        wanted |= {keys.ranges(names[row]) for row in np.flatnonzero(population.seen).tolist()}
+        for key in self._publishers.keys() - wanted:
+            self._publishers.pop(key).undeclare()  # type: ignore[no-untyped-call]
+        for key in wanted - self._publishers.keys():
+            self._publishers[key] = pubsub.publisher(session, key, self._mime)
+        self._positions = [(names[row], self._publishers[keys.position(names[row])]) for row in self._placed.tolist()]
+        self._truths = [(names[row], self._publishers[keys.truth(names[row])]) for row in self._carried.tolist()]
+        mirrored = np.flatnonzero(~population.carried)
+        self._mirrored = mirrored
+        there = {names[row]: row for row in mirrored.tolist()}
+        for name in self._mirrors.keys() - there.keys():
+            self._mirrors.pop(name)[1].undeclare()  # type: ignore[no-untyped-call]
+        self._mirrors = {
+            name: (
+                row,
+                self._mirrors[name][1] if name in self._mirrors else pubsub.subscriber(session, keys.state(name), 4),
+            )
+            for name, row in there.items()
+        }
+        self._scanned = np.full(rows, -inf)
+        self._rays: Rays | None = None
+        if len(mirrored):
+            self._reflect()
+
+    def find(self, there: Set[str]) -> list[str]:
+        """Puts carried robots of those that are on the network where they say that they are; their names."""
+        waiting = {
+            name: pubsub.subscriber(self._session, self._keys.state(name), 4)
+            for name in (self._names[row] for row in self._carried.tolist())
+            if name in there
+        }
+        found: list[str] = []
+        deadline, pause = time.monotonic() + ANSWER_S, threading.Event()
+        while waiting and time.monotonic() < deadline:
+            pause.wait(0.01)
+            for name, subscriber in list(waiting.items()):
+                state = self._newest(name, subscriber.handler)
+                if state is None or state.position is None:
+                    continue
+                flying = state.position[2] > IN_AIR_M and state.phase in UP
+                self._population.put(name, state.position, state.yaw or 0.0, flying=flying)
+                row = self._names.index(name)
+                self._quiet[row] = CLIMB_S if flying and self._population.flies[row] else inf
+                found.append(name)
+                waiting.pop(name).undeclare()  # type: ignore[no-untyped-call]
+        for subscriber in waiting.values():
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+        return found
+
+    def mirrored(self) -> list[str]:
+        """Names of the mirrored robots that are seen now."""
+        return [self._names[row] for row in self._mirrored.tolist() if np.isfinite(self._place[row, 0])]
+
+    # ------------------------------------------------------------------ what is heard
+
+    def listen(self, t: float) -> None:
+        """Takes in what has arrived."""
+        for sample in network.received(self._owners.handler):
+            self._own(sample)
+        for sample in network.received(self._setpoints.handler):
+            key = str(sample.key_expr)
+            row = self._row.get(key)
+            if row is None:
+                self._wonder(key)
+                continue
+            try:
+                command = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Command)
+                validation.check_command(command, robot=self._names[row])
+            except messages.Malformed as error:
+                self._deplore(error)
+                continue
+            if command.seq > self._done.get(command.robot, 0):
+                self._done[command.robot] = command.seq
+                self._obey(row, command, t)
+        if len(self._mirrored):
+            self._look_around(t)
+        for sample in network.received(self._statuses.handler):
+            self._heed(sample, t)
+
+    def slept(self, seconds: float, t: float) -> None:
+        """The world itself stood still for so long, until `t`."""
+        if seconds > HANG_S:
+            self._quiet = np.where(np.isfinite(self._quiet), np.maximum(self._quiet, t), self._quiet)
+
+    def act(self, t: float) -> None:
+        """Passes on what robots were told; those that are told nothing hold, and land after a while."""
+        population = self._population
+        if self._router.silent_since(t) < inf:  # nobody can be heard: they hold, but need not land for that
+            self._quiet = np.maximum(self._quiet, t - HOLD_S - 1e-3)
+        silent = t - self._quiet > HOLD_S
+        if some(silent):
+            holding = np.flatnonzero(silent & ~self._held)
+            if len(holding):
+                self._held[holding] = True
+                population.drive(population.holding(holding), holding)
+            tired = np.flatnonzero(silent & (t - self._quiet > LAND_S) & population.body.engine.flying)
+            if len(tired):
+                population.land(tired)
+                self._quiet[tired] = inf
+                for row in tired.tolist():
+                    self.say("silent", self._names[row], f"lands: it was told nothing for {LAND_S:g} s")
+        given = np.isfinite(self._given[:, 0])
+        if some(given):
+            population.drive(self._given, np.flatnonzero(given))
+            self._given = np.full_like(self._given, np.nan)
+
+    def _obey(self, row: int, command: messages.Command, t: float) -> None:
+        population, action = self._population, command.action
+        if action == "drive":
+            self._given[row] = command.setpoint
+            self._quiet[row], self._held[row] = t, False
+            return
+        self._given[row], self._held[row] = np.nan, False
+        if action == "takeoff" and command.height is not None:
+            population.takeoff(row, command.height)
+            self._quiet[row] = t + CLIMB_S
+        else:
+            (population.land if action == "land" else population.stop)(np.array([row]))
+            self._quiet[row] = inf
+
+    def _own(self, sample: zenoh.Sample) -> None:
+        """A process owns the name of a robot: its clock, from which its numbers come, may be behind the last one's."""
+        key = str(sample.key_expr)
+        name, life = self._keys.whose(key), Keys.life_of(key)
+        if name is None or life is None or sample.kind == zenoh.SampleKind.DELETE:
+            return
+        if self._lives.get(name, life) != life:
+            self._done.pop(name, None)
+        self._lives[name] = life
+
+    def _wonder(self, key: str) -> None:
+        """A command to a robot that is not here."""
+        if key in self._elsewhere:
+            return
+        try:
+            name = self._keys.robot(key)
+        except ValueError:
+            self.malformed += 1
+            return
+        self.refused += 1
+        if name not in self._strangers and len(self._strangers) < STRANGERS:
+            self._strangers.add(name)
+            self.say(
+                "refused",
+                "world",
+                f"{name} is told what to do, but is not in this world: start the world with the experiment that has "
+                f"it, or put it in with `zenpark world-order spawn {name}`",
+            )
+
+    def _look_around(self, t: float) -> None:
+        """Where the mirrored robots are."""
+        changed = False
+        for name, (row, subscriber) in self._mirrors.items():
+            state = self._newest(name, subscriber.handler)
+            if state is not None and state.position is not None:
+                self._place[row], self._velocity[row] = state.position, state.velocity or messages.STILL
+                self._yaw[row] = state.yaw or 0.0
+                self._heard[row] = t
+                changed = True
+            elif t - self._heard[row] > GONE_S and np.isfinite(self._place[row, 0]):
+                self._place[row] = np.nan
+                changed = True
+        if changed:
+            self._reflect()
+
+    def _reflect(self) -> None:
+        rows = self._mirrored
+        self._population.body.mirror(rows, self._place[rows], self._yaw[rows], self._velocity[rows])
+
+    def _newest(self, name: str, handler: network.Polled[zenoh.Sample]) -> messages.State | None:
+        """The last state with a position that can be believed of those that wait."""
+        found = None
+        for sample in network.received(handler):
+            try:
+                state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
+                validation.check_state(state, robot=name, now=self._clock.utc(), reach=self._reach)
+            except messages.Malformed as error:
+                self._deplore(error)
+                continue
+            if state.position is not None:
+                found = state
+        return found
+
+    def _heed(self, sample: zenoh.Sample, t: float) -> None:
+        """When the run began, for what moves by a plan."""
+        try:
+            status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
+        except messages.Malformed as error:
+            self._deplore(error)
+            return
+        if status.phase in UNDER_WAY and 0.0 < status.started < inf and status.robot in self._names:
+            self._started[status.robot] = status.started
+        else:
+            self._started.pop(status.robot, None)
+        begun = min(self._started.values(), default=self._begun)
+        if begun != self._begun:
+            self._begun = begun
+            self._population.begin(self._population.time + begun - (self.utc + t))
+
+    def _deplore(self, error: messages.Malformed) -> None:
+        self.malformed += 1
+        self.trouble = str(error)
+
+    # ------------------------------------------------------------------ what is said
+
+    def tell(self, t: float) -> None:
+        """Where everybody is, what touched and what sensors see."""
+        state, rows = self._population.state, self._carried
+        stamp = round(self.utc + t, 6)
+        self._publish(self._positions, state.position[self._placed], state.yaw[self._placed], stamp)
+        if self._ticks % self._truth_every == 0:
+            self._publish(self._truths, state.true_position[rows], state.true_yaw[rows], stamp)
+        self._ticks += 1
+        rays = state.rays
+        if rays is not None and rays is not self._rays:
+            self._rays = rays
+            self._sweep(rays, stamp)
+        for meeting in self._population.meetings():
+            self.contacts += 1
+            contact = messages.Contact(stamp, meeting.first, meeting.second, meeting.impulse, meeting.overlap)
+            self._contacts.put(messages.encode(contact))
+            pair = frozenset((meeting.first, meeting.second))
+            if pair not in self._met:
+                self._met.add(pair)
+                self.say("contact", meeting.first, f"touches {meeting.second} ({meeting.impulse:.3g} N s)")
+
+    def say(self, kind: str, source: str, text: str) -> None:
+        """An event, for recorder and viewers."""
+        print(f"{kind} {source}: {text}", flush=True)
+        self._events.put(messages.encode(messages.Event(self._clock.utc(), kind, source, text)))
+
+    def refuse(self, source: str, reason: str) -> None:
+        """Counts and says what was refused."""
+        self.refused += 1
+        self.trouble = reason
+        self.say("refused", source, reason)
+
+    def _publish(
+        self, publishers: list[tuple[str, zenoh.Publisher]], position: Array, yaw: Array, stamp: float
+    ) -> None:
+        encoding = self._encoding
+        for (name, publisher), place, heading in zip(
+            publishers, position.round(6).tolist(), yaw.round(6).tolist(), strict=True
+        ):
+            publisher.put(messages.encode(messages.position(name, stamp, place, heading), encoding))
+
+    def _sweep(self, rays: Rays, stamp: float) -> None:
+        """The readings of rows that measured since they were told last."""
+        begin = np.flatnonzero(np.diff(rays.row, prepend=-1))  # rays of one row follow one another
+        end = np.append(begin[1:], len(rays.row))
+        time = np.maximum.reduceat(rays.time, begin)
+        rows = rays.row[begin]
+        for k in np.flatnonzero(time > self._scanned[rows]).tolist():
+            row, part = int(rows[k]), slice(int(begin[k]), int(end[k]))
+            self._scanned[row] = time[k]
+            scan = RangeScan(0.0, rays.bearing[part], rays.elevation[part], rays.distance[part])
+            message = range_inbox.message(self._names[row], stamp, scan)
+            self._publishers[self._keys.ranges(self._names[row])].put(messages.encode(message, self._encoding))

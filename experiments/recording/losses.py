@@ -1,0 +1,87 @@
+"""What was sent, lost or dropped of poses, by their numbers and by what robots counted."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import Final, Literal
+
+import numpy as np
+
+from agents.arrays import Index
+from agents.network.messages import Status
+from agents.network.validation import missed, said_within
+from experiments.definition import assignment
+from experiments.definition.experiment import Experiment
+from experiments.recording.trace import ROUNDING_S
+from experiments.recording.writer import SentPose
+
+STATUS_S: Final = 1.0  # what happened in the run is counted by a status at most this much after its end
+
+
+def unrecorded(poses: Iterable[tuple[float, int]], rate: float) -> int:
+    """How many poses a robot sent between those that are recorded, by stamp [s] and number, in order of time.
+
+    A robot says at most `rate` poses in a second [1/s]; see `agents.network.validation.missed`.
+    """
+    return sum(missed(last, seq, then - before, rate) for (before, last), (then, seq) in pairwise(poses))
+
+
+def lost(
+    robots: tuple[str, ...],
+    poses: list[list[SentPose]],
+    statuses: list[list[Status]],
+    run: tuple[float, float],
+    rate: float,
+) -> Index:
+    """(N,) what was lost of each robot, as `playback.read` defines it.
+
+    Args:
+        robots: Names.
+        poses: Of each, in order of time.
+        statuses: Of each, in order of time.
+        run: Its beginning and end in UTC [s].
+        rate: Poses that a robot says in a second at most [1/s].
+    """
+    total: Counter[str] = Counter()
+    begin, end = run[0] - ROUNDING_S, run[1] + ROUNDING_S
+    for robot, own, said in zip(robots, poses, statuses, strict=True):
+        mine = [(pose.stamp, pose.seq) for pose in own if begin <= pose.stamp <= end]
+        total[robot] += unrecorded(mine, rate) + _tail(own, said, run, rate)
+        total.update(_by_speaker(said, run, "lost"))
+    return np.array([total[robot] for robot in robots], dtype=np.intp)
+
+
+def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float], rate: float) -> int:
+    said = [status for status in statuses if run[0] < status.stamp <= run[1] + STATUS_S]
+    if not said:
+        return 0
+    last = said[-1]
+    recorded = [(pose.seq, pose.stamp) for pose in poses if pose.stamp <= last.stamp + ROUNDING_S]
+    before = [(status.sent, run[0]) for status in statuses if status.stamp <= run[0] and status.pid == last.pid]
+    number, stamp = max(recorded[-1:] + before[-1:], default=(0, run[0]))
+    return max(0, min(last.sent - number, said_within(last.stamp - stamp, rate)))
+
+
+def dropped(experiment: Experiment, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
+    """(E,) what the modelled network dropped on each of `assign.heard_links`; `statuses` of each robot."""
+    links, robots = assignment.heard_links(experiment), list(experiment.robots)
+    found = [_by_speaker(said, run, "dropped") for said in statuses]
+    ends = zip(links.listener.tolist(), links.speaker.tolist(), strict=True)
+    return np.array([found[i][robots[j]] for i, j in ends], dtype=np.intp)
+
+
+def _by_speaker(statuses: list[Status], run: tuple[float, float], what: Literal["lost", "dropped"]) -> Counter[str]:
+    """What one listener's process, or several after each other, counted in the run, by speaker."""
+    total: Counter[str] = Counter()
+    before: dict[str, int] = {}
+    process = None
+    for status in statuses:
+        if status.pid != process:
+            before, process = {}, status.pid
+        if run[0] < status.stamp <= run[1] + STATUS_S:
+            now: dict[str, int] = getattr(status, what)
+            total.update({speaker: max(0, count - before.get(speaker, 0)) for speaker, count in now.items()})
+        before = getattr(status, what)
+    return total

@@ -1,0 +1,384 @@
+"""Reads a recording back into the arrays of a trace, finished or not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import msgspec
+import numpy as np
+
+from agents.arrays import Array, Index
+from agents.decision.lifecycle import Phase
+from agents.network.messages import CentreState, Contact, Event, HostClock, State, Status, WorldState
+from experiments.definition.assignment import guided
+from experiments.definition.experiment import Experiment
+from experiments.recording.cdr import Undecodable, codec
+from experiments.recording.centre_goals import of_recording
+from experiments.recording.clocks import Correction, Lie
+from experiments.recording.losses import STATUS_S, dropped, lost
+from experiments.recording.reader import RecordingError, Records
+from experiments.recording.resample import HOLE_S, attitude, line, step, turn
+from experiments.recording.trace import ROUNDING_S, HeardPoses, Sent, Trace, looked_for, within
+from experiments.recording.writer import JSON, METADATA, SentGoal, SentPose
+
+HOLD_PERIODS: Final = 2.0  # for so many state periods a robot is where it last said; then nobody knows
+EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the whole run are not that much early
+LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
+NOWHERE: Final = (math.nan, math.nan, math.nan)
+UNKNOWN: Final = (*NOWHERE, math.nan)
+
+S = TypeVar("S", bound=msgspec.Struct)
+M = TypeVar("M", State, SentPose, Status)
+
+
+class NotStarted(RecordingError):
+    """The recording of a run that ended before its common start, so that there is nothing to show."""
+
+
+@dataclass(frozen=True)
+class Playback:
+    """A recording, read.
+
+    Attributes:
+        trace: What happened, until the end of the run.
+        started: The common start, UTC [s]; of a virtual run the one that it pretends.
+        complete: The recorder finished the file and nothing in it is damaged.
+        messages: How many the file holds, those of other programs included.
+    """
+
+    trace: Trace
+    started: float
+    complete: bool
+    messages: int
+
+
+def read(path: Path) -> Playback:
+    """Reads a recording.
+
+    Positions and yaw are interpolated onto the grid, goals and setpoints are the last at or before. A robot that never
+    reported is NaN; one that fell silent is NaN from two state periods after its last sample, and inside holes of more
+    than a second. Attitude is interpolated as well, and where the twins beside the robots were.
+
+    `lost` of a robot adds up what its sequence numbers prove: (1) gaps among its poses recorded in the run, where a
+    number that goes back is a publisher that began anew at 1; (2) what its last status of the run counts as sent beyond
+    the last pose recorded until then; (3) what the last status of each listener counts as lost from it, less what the
+    same process counted before the common start. A pose that two listeners and the recorder missed counts three times:
+    each of them was owed it. What the modelled network dropped is no loss: `dropped` is what the listeners counted.
+
+    The trace of a run that did not last as long as its experiment ends with the run: where the conductor began to land
+    everybody (interrupted by the user, or all robots had come down before), else, when the recorder or the conductor
+    was killed, with the last that is known of the robots while they ran. Nothing of a landing is in the trace.
+
+    What robots on other machines stamped is set right by what their clocks drifted in the run; their offset at its
+    beginning was taken off where the stamps were made.
+
+    Raises:
+        NotStarted: If the run ended before its common start.
+        RecordingError: If the file is no recording of zenpark, or of another version.
+    """
+    content = _Content(Records(path))
+    messages = content.fill()
+    records = content.records
+    about = next((record.metadata for record in records.metadata if record.name == METADATA), {})
+    attached = next((record.data for record in records.attachments if record.name == JSON), b"")
+    try:
+        case, seed, clock = about["case"], int(about["seed"]), about["clock"]
+        announced = float(about["started"]) if "started" in about else None
+        experiment = msgspec.json.decode(attached, type=Experiment)
+    except (KeyError, ValueError, RecursionError) as error:
+        raise RecordingError(f"{path}: holds no experiment that this version of zenpark can read ({error})") from None
+    start = content.start(announced)
+    if start is None:
+        raise NotStarted(f"{path}: no robot had started when the recording ended; there is nothing to show")
+    length = content.length(start, experiment.duration_s)
+    if length * experiment.rates.state_hz < 1.0 - ROUNDING_S:
+        raise NotStarted(f"{path}: the run ended before the common start; there is nothing to show")
+    with np.errstate(all="ignore"):  # numbers that no robot can have are in the file, not of our making
+        trace = _trace(content, experiment, (start, length), (case, seed, clock))
+    return Playback(trace, start, records.complete, messages)
+
+
+@dataclass
+class _Content:
+    """The messages of a recording, by kind."""
+
+    records: Records
+    states: list[State] = field(default_factory=list)
+    poses: list[SentPose] = field(default_factory=list)
+    statuses: list[Status] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    contacts: list[Contact] = field(default_factory=list)
+    world: list[WorldState] = field(default_factory=list)
+    goals: list[SentGoal] = field(default_factory=list)
+    reports: list[CentreState] = field(default_factory=list)
+    clocks: list[HostClock] = field(default_factory=list)
+
+    def fill(self) -> int:
+        """Reads all messages and counts them; those of other types are passed over."""
+        known = dict(
+            [
+                _reader(State, self.states),
+                _reader(SentPose, self.poses),
+                _reader(Status, self.statuses),
+                _reader(Event, self.events),
+                _reader(Contact, self.contacts),
+                _reader(WorldState, self.world),
+                _reader(SentGoal, self.goals),
+                _reader(CentreState, self.reports),
+                _reader(HostClock, self.clocks),
+            ]
+        )
+        readers: dict[int, Callable[[bytes], None] | None] = {}
+        count = 0
+        for message in self.records.messages():
+            count += 1
+            if message.channel not in readers:
+                readers[message.channel] = self._choose(message.channel, known)
+            take = readers[message.channel]
+            if take is not None:
+                try:
+                    take(message.data)
+                except Undecodable as error:
+                    raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
+        right = Correction(self.clocks)
+        if self.clocks:
+            self.states = [right.state(state) for state in self.states]
+            self.poses = [msgspec.structs.replace(p, stamp=right(p.robot, p.stamp)) for p in self.poses]
+            self.statuses = [right.status(status) for status in self.statuses]
+            self.goals = [msgspec.structs.replace(g, pose=right(g.robot, g.pose)) for g in self.goals]
+        return count
+
+    def lies(self) -> tuple[Lie, ...]:
+        """How the clocks of other machines lay to the conductor's."""
+        return Correction(self.clocks).lies()
+
+    def start(self, announced: float | None) -> float | None:
+        """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
+        said = [event.stamp for event in self.events if event.kind == "start" and math.isfinite(event.stamp)]
+        began = [status.started for status in self.statuses if status.started > 0.0]
+        if said or announced is not None:
+            return said[0] if said else announced
+        return min(began, default=None)
+
+    def length(self, start: float, duration: float) -> float:
+        """How long the run lasted from the common start on [s], at most as long as it was to last."""
+        said = [
+            (event.stamp - start, event.text != "landing")
+            for event in self.events
+            if (event.kind, event.source) == ("phase", "conductor")
+            and event.text.startswith("landing")
+            and math.isfinite(event.stamp)
+        ]
+        if said:
+            end, interrupted = min(said)
+            return min(end, duration) if interrupted or end < duration - EARLY_S else duration
+        last: dict[str, float] = {}
+        for state in self.states:
+            if state.phase not in LANDED and math.isfinite(state.stamp):
+                last[state.robot] = max(last.get(state.robot, -math.inf), state.stamp - start)
+        end = max(last.values(), default=duration)
+        # robots that were there until the end are known until the first of them falls silent: some messages of the
+        # others only came later into the file, which is no reason to call them dead
+        end = min((at for at in last.values() if at > end - HOLE_S), default=end)
+        return duration if end > duration - EARLY_S else end
+
+    def _choose(self, channel: int, known: dict[str, _Reader]) -> Callable[[bytes], None] | None:
+        about = self.records.channels[channel]
+        schema = self.records.schemas.get(about.schema_id)
+        if schema is None or schema.name not in known:
+            return None
+        text, take = known[schema.name]
+        if schema.data.decode(errors="replace") != text:
+            raise RecordingError(
+                f"{self.records.path}: {about.topic} was recorded by a version of zenpark with other fields of "
+                f"{schema.name}; read it with that version"
+            )
+        return take
+
+
+_Reader = tuple[str, Callable[[bytes], None]]
+
+
+def _reader(kind: type[S], sink: list[S]) -> tuple[str, _Reader]:
+    made = codec(kind)
+    decode, append = made.decode, sink.append
+    return made.name, (made.schema, lambda data: append(decode(data)))
+
+
+def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], about: tuple[str, int, str]) -> Trace:
+    """The trace of a run by its common start, UTC, and its length [s]."""
+    robots = tuple(experiment.robots)
+    rate, (start, duration) = experiment.rates.state_hz, run
+    time = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
+    states = _by_robot(content.states, robots)
+    poses = [list({(pose.stamp, pose.seq): pose for pose in own}.values()) for own in _by_robot(content.poses, robots)]
+    statuses = _by_robot(content.statuses, robots)
+    last = [_by_the_end(own, start + duration) for own in statuses]
+    sampled = [_Sampled.of(own, start, time, HOLD_PERIODS / rate) for own in states]
+
+    def column(what: str) -> Array:
+        return np.stack([getattr(own, what) for own in sampled], axis=1)
+
+    turned = any(state.attitude is not None for state in content.states)
+    shadowed = any(state.shadow_position is not None for state in content.states)
+    contacts, world = within(content.contacts, start, duration), within(content.world, start, duration)
+    goals = None
+    if guided(experiment):
+        told = dict(zip(robots, states, strict=True))
+        goals = of_recording(content.goals, told, content.reports, start, duration)
+    return Trace(
+        case=about[0],
+        experiment=experiment,
+        seed=about[1],
+        robots=robots,
+        clock=about[2],
+        time=time,
+        position=column("position"),
+        yaw=column("yaw")[:, :, 0],
+        true_position=column("true_position"),
+        goal=column("goal"),
+        setpoint=column("setpoint"),
+        sent=_sent(poses, start, duration),
+        heard=_heard(states, robots, start, duration),
+        lost=lost(robots, poses, statuses, (start, start + duration), experiment.rates.pose_hz)
+        + (0 if goals is None else goals.lost),
+        dropped=dropped(experiment, statuses, (start, start + duration)),
+        missed_deadlines=_counted(last, "missed"),
+        ticks=_counted(last, "ticks"),
+        decisions=_counted(last, "decisions"),
+        events=tuple(
+            msgspec.structs.replace(event, stamp=event.stamp - start)
+            for event in sorted(content.events, key=lambda event: event.stamp)
+        ),
+        interventions=_counted(last, "interventions"),
+        avoided=_counted(last, "avoided"),
+        contacts=contacts if looked_for(contacts, world) else None,
+        world=world,
+        attitude=column("attitude") if turned else None,
+        shadow_position=column("shadow_position") if shadowed else None,
+        shadow_yaw=column("shadow_yaw")[:, :, 0] if shadowed else None,
+        goals=goals,
+        clocks=content.lies(),
+    )
+
+
+def _counted(last: Sequence[Status | None], what: str) -> Index:
+    """A counter of each robot, 0 of those that said nothing."""
+    return np.array([getattr(status, what) if status else 0 for status in last], dtype=np.intp)
+
+
+def _by_the_end(said: list[Status], end: float) -> Status | None:
+    """The last status that counts for the run; the first one after it if there is none."""
+    return next((status for status in reversed(said) if status.stamp <= end + STATUS_S), next(iter(said), None))
+
+
+def _by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:
+    """For each robot its messages in order of time."""
+    found: dict[str, list[M]] = {robot: [] for robot in robots}
+    for message in messages:
+        if message.robot in found and math.isfinite(message.stamp):
+            found[message.robot].append(message)
+    return [sorted(own, key=lambda message: message.stamp) for own in found.values()]
+
+
+@dataclass(frozen=True)
+class _Sampled:
+    """One robot's telemetry on the grid, each (T, k)."""
+
+    position: Array
+    yaw: Array
+    true_position: Array
+    goal: Array
+    setpoint: Array
+    attitude: Array
+    shadow_position: Array
+    shadow_yaw: Array
+
+    @classmethod
+    def of(cls, states: list[State], start: float, time: Array, hold: float) -> _Sampled:
+        t = np.array([state.stamp for state in states]) - start
+        grid = (time, hold)
+
+        def column(values: list[Any], width: int) -> Array:
+            return np.array(values, dtype=float).reshape(-1, width)
+
+        measured = column([state.position or NOWHERE for state in states], 3)
+        truth = column([state.true_position or NOWHERE for state in states], 3)
+        return cls(
+            position=line(t, measured, *grid),
+            yaw=turn(t, column([_number(state.yaw) for state in states], 1), *grid),
+            true_position=line(t, np.where(np.isfinite(truth), truth, measured), *grid),
+            goal=step(t, column([state.goal or NOWHERE for state in states], 3), *grid),
+            setpoint=step(t, column([state.setpoint or UNKNOWN for state in states], 4), *grid),
+            attitude=attitude(t, column([state.attitude or UNKNOWN for state in states], 4), *grid),
+            shadow_position=line(t, column([state.shadow_position or NOWHERE for state in states], 3), *grid),
+            shadow_yaw=turn(t, column([_number(state.shadow_yaw) for state in states], 1), *grid),
+        )
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _sent(poses: list[list[SentPose]], start: float, duration: float) -> Sent:
+    table = _in_run(
+        [
+            (
+                *(pose.stamp, row, pose.seq, *pose.position),
+                *(*(pose.velocity or NOWHERE), _number(pose.yaw), pose.size),
+            )
+            for row, own in enumerate(poses)
+            for pose in own
+        ],
+        (11, start, duration),
+    )
+    return Sent(
+        time=table[:, 0],
+        robot=table[:, 1].astype(np.intp),
+        seq=table[:, 2].astype(np.intp),
+        position=table[:, 3:6],
+        velocity=table[:, 6:9],
+        yaw=table[:, 9],
+        bytes=table[:, 10].astype(np.intp),
+    )
+
+
+def _heard(states: list[list[State]], robots: tuple[str, ...], start: float, duration: float) -> HeardPoses:
+    row = {robot: index for index, robot in enumerate(robots)}
+    table = _in_run(
+        [
+            (
+                *(heard.arrived, listener, row[heard.speaker], heard.seq, heard.stamp - start),
+                *(*heard.position, *heard.velocity),
+            )
+            for listener, own in enumerate(states)
+            for state in own
+            for heard in state.heard
+            if heard.speaker in row
+        ],
+        (11, start, duration),
+    )
+    return HeardPoses(
+        time=table[:, 0],
+        listener=table[:, 1].astype(np.intp),
+        speaker=table[:, 2].astype(np.intp),
+        seq=table[:, 3].astype(np.intp),
+        stamp=table[:, 4],
+        position=table[:, 5:8],
+        velocity=table[:, 8:11],
+    )
+
+
+def _in_run(rows: list[tuple[float, ...]], shape: tuple[int, float, float]) -> Array:
+    """The rows whose first column, a UTC time, lies in the run: in order of time, which then counts from the start."""
+    width, start, duration = shape
+    table = np.array(rows, dtype=np.float64).reshape(-1, width)
+    table[:, 0] -= start
+    # the end belongs to the landing: 50 Hz for 45 s are 2250 messages
+    table = table[(table[:, 0] >= -ROUNDING_S) & (table[:, 0] < duration - ROUNDING_S)]
+    np.maximum(table[:, 0], 0.0, out=table[:, 0])
+    return table[np.argsort(table[:, 0], kind="stable")]

@@ -1,0 +1,1 @@
+"""From numbers to tables, figures, HTML, CSV, MATLAB. Imports metrics."""

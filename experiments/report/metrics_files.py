@@ -1,0 +1,84 @@
+"""The figures of a run as files and for scripts: metrics.csv, metrics.json, and what `zenpark run --json` prints."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from experiments.metrics.results import INDICES, Approach, CaseMetrics, RobotMetrics, ShadowMetrics
+from experiments.metrics.statistics import ratios
+
+
+def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[str, Any]:
+    """The figures of one run for scripts: per case and robot the indices, their means, and ratios to the first case."""
+    return {
+        "run": run_folder,
+        "seed": seed,
+        "cases": {
+            case.case: {
+                "robots": {robot.robot: {index: getattr(robot, index) for index in INDICES} for robot in case.robots},
+                "mean": dict(case.mean),
+                "ratio": {index: next(iter(ratios([case], cases[:1], index))) for index in INDICES},
+                "collisions": len(case.collisions),
+                "network": {
+                    "messages": case.network_messages,
+                    "bytes": case.network_bytes,
+                    "deliveries": case.deliveries,
+                },
+                **({} if case.guidance is None else {"guidance": msgspec.to_builtins(case.guidance)}),
+                "near_m": None if case.near is None else case.near.gap,
+                **({"duration_s": case.duration_s, "interrupted": True} if case.interrupted else {}),
+            }
+            for case in cases
+        },
+    }
+
+
+def write_csv(path: Path, cases: Sequence[CaseMetrics]) -> None:
+    """One row per case and robot, and a row `mean` per case; empty where a value is unknown."""
+    later = max((len(case.starts_s) for case in cases), default=1)
+    parts = ("phases", "near", "near_arena", "shadow")
+    plain = [field for field in RobotMetrics.__struct_fields__ if field not in parts]
+    near = [f"{what}_{part}" for what in ("near", "near_arena") for part in ("gap", "to", "at_s")]
+    shadows = list(_flat_shadow(None)) if any(robot.shadow for case in cases for robot in case.robots) else []
+    phases = [f"phase{k}_{what}" for k in range(2, later + 1) for what in ("acquired_s", "residual", "worst")]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, ["seed", "case", "in_mean", *plain, *phases, *near, *shadows], restval="")
+        table.writeheader()
+        for case in cases:
+            out = {*case.leaders, *case.died}
+            for robot in case.robots:
+                row = {field: getattr(robot, field) for field in plain}
+                for k, phase in enumerate(robot.phases, start=2):
+                    row |= {f"phase{k}_{what}": getattr(phase, what) for what in ("acquired_s", "residual", "worst")}
+                row |= _flat_approach("near", robot.near) | _flat_approach("near_arena", robot.near_arena)
+                row |= _flat_shadow(robot.shadow) if shadows else {}
+                table.writerow({"seed": case.seed, "case": case.case, "in_mean": int(robot.robot not in out), **row})
+            table.writerow({"seed": case.seed, "case": case.case, "robot": "mean", **case.mean})
+
+
+def _flat_approach(what: str, near: Approach | None) -> dict[str, float | str]:
+    if near is None:
+        return {}
+    return {f"{what}_gap": near.gap, f"{what}_to": near.between[1], f"{what}_at_s": near.at_s}
+
+
+def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:
+    """Its fields as columns; those along three axes as three."""
+    flat: dict[str, object] = {}
+    for field in ShadowMetrics.__struct_fields__:
+        value = None if shadow is None else getattr(shadow, field)
+        if field in {"bias", "correlation"}:
+            flat |= {f"shadow_{field}_{axis}": part for axis, part in zip("xyz", value or (None,) * 3, strict=True)}
+        else:
+            flat[f"shadow_{field}"] = value
+    return flat
+
+
+def write_json(path: Path, cases: Sequence[CaseMetrics]) -> None:
+    """Everything that was measured, one object per case."""
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(cases), indent=2) + b"\n")

@@ -1,0 +1,169 @@
+"""A page: findings, tables and pictures in one HTML file that needs nothing else, now or in ten years."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final, Literal
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from matplotlib.figure import Figure
+
+from experiments.metrics.statistics import Spread
+from experiments.report import figures
+
+NONE: Final = "–"
+
+
+Cell = str | tuple[str, str]  # a text, or a text and a smaller one behind it
+
+
+@dataclass(frozen=True)
+class Row:
+    """Cells of a row; `sum` rows are set apart."""
+
+    cells: tuple[Cell, ...]
+    sum: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; `words` aligns to the left."""
+
+    head: tuple[str, ...]
+    rows: tuple[Row, ...]
+    title: str = ""
+    note: str = ""
+    words: bool = False
+
+
+def number(value: float | None, scale: float = 1.0) -> str:
+    """Three digits that count; whole numbers in full, in groups of three; a dash for what is unknown."""
+    if value is None:
+        return NONE
+    size = abs(value * scale)
+    if size < 1e-9 or size >= 1000.0 or isinstance(value, int):
+        text = f"{size:,.0f}".replace(",", "\u202f")
+    elif size < 0.001:
+        text = f"{size:.1e}"
+    else:
+        text = f"{size:.{min(4, 2 - math.floor(math.log10(size)))}f}"
+    return f"−{text}" if value < 0.0 and text != "0" else text
+
+
+def interval(values: Spread, scale: float = 1.0) -> str:
+    """A mean and, if the values differ, its 95 % half-width with as many decimals as its first digit needs."""
+    if values.mean is None or not values.ci95:
+        return number(values.mean, scale)
+    mean, half = values.mean * scale, values.ci95 * scale
+    decimals = min(6, max(0, -math.floor(math.log10(half)), 2 - math.floor(math.log10(max(abs(mean), half)))))
+    return f"{mean:,.{decimals}f} ± {half:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")
+
+
+Mark = Literal["good", "fair", "bad", "plain"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence and how to take it."""
+
+    mark: Mark
+    text: str
+
+
+TEMPLATE: Final = "report.html.jinja"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An SVG drawing to stand in the page, with its number and caption."""
+
+    svg: str
+    number: int
+    caption: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page; whatever it has is shown in this order. `folded` is the text on which to click, if folded."""
+
+    title: str
+    prose: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    listing: str = ""
+    terms: tuple[tuple[str, str], ...] = ()
+    folded: str = ""
+
+
+def render(
+    target: Path,
+    *,
+    title: str,
+    source: str,
+    facts: Sequence[tuple[str, str]],
+    command: str,
+    verdict: Sequence[Finding],
+    sections: Sequence[Section],
+) -> Path:
+    """Writes a page that needs nothing else: facts and findings on top, then the sections."""
+    pages = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = pages.get_template(TEMPLATE).render(
+        title=title, source=source, facts=facts, command=command, findings=verdict, sections=sections
+    )
+    target.write_text(page, encoding="utf-8")
+    return target
+
+
+def numbered(drawn: Iterable[tuple[Figure, str]], first: int = 1) -> tuple[Picture, ...]:
+    """Figures and their captions, to stand in a page."""
+    return tuple(
+        Picture(inline(figures.svg(figure), f"f{number}-", caption), number, caption)
+        for number, (figure, caption) in enumerate(drawn, start=first)
+    )
+
+
+def inline(svg: str, prefix: str, label: str) -> str:
+    """An SVG file as an element of a page: ids of its own, black and white as the page's ink and paper.
+
+    Args:
+        svg: As `figures.svg` gives it.
+        prefix: For every id and every reference to one.
+        label: What it shows, for those who cannot see it; plain words without markup.
+    """
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<style.*?</style>|<metadata.*?</metadata>|<!--.*?-->", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\bid="', f'id="{prefix}', svg)
+    svg = re.sub(r'\b(?:xlink:)?href="#', f'href="#{prefix}', svg)
+    svg = svg.replace("url(#", f"url(#{prefix}")
+    svg = (
+        svg.replace("stroke: #000000", "stroke: currentColor")
+        .replace("#ffffff", "var(--paper)")
+        .replace("#c0c0c0", "var(--line)")
+    )
+    box = re.search(r'viewBox="[^"]*"', svg)
+    words = label.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+    head = f'<svg {box[0] if box else ""} role="img" aria-label="{words}">'
+    return re.sub(r"\n\s*", "\n", head + svg[svg.index(">") + 1 :]).strip()
+
+
+def date_of(at: float) -> str:
+    """A UTC time [s], such as `Playback.started`, as reports show it."""
+    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def seeds_in_words(seeds: Sequence[int]) -> str:
+    """`1 to 50` of many that follow one another, else each."""
+    if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
+        return f"{seeds[0]} to {seeds[-1]}"
+    return ", ".join(str(seed) for seed in seeds)

@@ -1,0 +1,335 @@
+"""The report of a run, and of several runs side by side."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from experiments.metrics.measure import measure
+from experiments.metrics.results import CaseMetrics
+from experiments.metrics.statistics import by_case
+from experiments.recording.trace import Trace
+from experiments.report import figures, scenery
+from experiments.report import figures as shadow_figures
+from experiments.report.feature_tables import (
+    EXPLAINED,
+    architecture_table,
+    clearance_tables,
+    collision_table,
+    network_tables,
+    shadow_tables,
+)
+from experiments.report.feature_tables import PROSE as MODELLED
+from experiments.report.page import Finding, Picture, Section, date_of, numbered, render, seeds_in_words
+from experiments.report.tables import (
+    DEFINITIONS,
+    clocks_table,
+    events_table,
+    gaps_table,
+    links_table,
+    proof_tables,
+    robot_tables,
+    summary_table,
+    whole_table,
+)
+from experiments.report.verdict import findings, interruptions, left_out
+
+PROOF: Final = (
+    "Every pose carries a running number, so a gap proves a loss. Heard is counted over all listeners together; a pose "
+    "sent in the last instant of the run may still be under way."
+)
+CLOCKS: Final = (
+    "What a host's clock read more than the conductor's, by the shortest of many round trips. The offset before the "
+    "run was taken off wherever robots there made a stamp or obeyed the start. What drift added since, they followed; "
+    "the largest error that was left in stamps until they did is taken off here."
+)
+SEEN: Final = "Contacts are those that the world saw begin; distances are between surfaces, on true positions."
+WORKED_OUT: Final = (
+    "Where no world watched for contacts, they are worked out from true positions; distances are between surfaces."
+)
+SHADOWS: Final = (
+    "Robots and the twins beside them: left from above, twins dashed; right the difference, twin less robot, in the "
+    "robot's heading and in height."
+)
+MOST_LINKS: Final = 60  # longer tables are folded
+ORIGIN: Final = "run.json"  # how and when a run was made, for when its report is made again
+
+
+class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the numbers come from.
+
+    Attributes:
+        command: How to do the run again.
+        date: When it was.
+    """
+
+    command: str
+    date: str
+
+
+def write(
+    folder: Path,
+    traces: Sequence[Trace],
+    *,
+    command: str = "",
+    text: str = "",
+    date: str = "",
+    name: str = "report.html",
+    measured: Sequence[CaseMetrics] | None = None,
+    notes: Sequence[str] = (),
+    run: Path | None = None,
+) -> Path:
+    """Writes the report of one run.
+
+    The first time it also writes how and when the run was made into `run.json` in the folder of the run; a report that
+    is made again says the same.
+
+    Args:
+        folder: Where to; made if it does not exist.
+        traces: The cases of the run, the reference first; several seeds of a case become means with 95 % intervals,
+            and the figures of motions show the first seed.
+        command: How to do the run again; not shown if left out.
+        text: The experiment file; the experiment of the first trace as JSON if left out.
+        date: When the run was, see `date_of`; now if left out.
+        name: Of the file.
+        measured: `measure` of each trace, if that was done already.
+        notes: What the reader should know besides: a damaged recording, robots that were lost. That runs were
+            interrupted is seen from the traces.
+        run: Folder of the run; the same as `folder` if left out.
+
+    Raises:
+        ValueError: If there is no trace (no robot had started: there is nothing to report), or one of less than two
+            samples.
+    """
+    if not traces:
+        raise ValueError("there is no case to report: no robot had started")
+    cases = [measure(trace) for trace in traces] if measured is None else measured
+    first = _first_seed(traces)
+    experiment = traces[0].experiment
+    seeds = sorted({trace.seed for trace in traces})
+    folder.mkdir(parents=True, exist_ok=True)
+    made = _origin(folder if run is None else run, Origin(command, date or date_of(time.time())))
+    facts = [
+        ("Date", made.date),
+        ("Clock", _words(trace.clock for trace in traces)),
+        ("Seed" if len(seeds) == 1 else "Seeds", seeds_in_words(seeds)),
+        ("Duration", _words(_length(case) for case in cases)),
+        ("Robots", str(len(traces[0].robots))),
+        ("Cases", ", ".join(by_case(cases))),
+    ]
+    drawn = _pictures(cases, first)
+    listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
+    sections = [
+        Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
+        *_of_architecture(cases),
+        Section("Figures", pictures=drawn),
+        Section("Each robot", tables=robot_tables(cases)),
+        Section(
+            "Was anything lost?",
+            (PROOF,),
+            proof_tables(cases),
+        ),
+        *_modelled(cases),
+        Section(
+            "Time between transmissions",
+            prose=(
+                "Between two transmissions within the run; silence before the first and after the last is not counted.",
+            ),
+            tables=(gaps_table(cases),),
+        ),
+        Section(
+            "What neighbours hold",
+            ("How far the last pose heard on each link, carried on by the prediction, is from where its robot is.",),
+            (links_table(cases),),
+            folded="Show all links" if len(cases[0].belief) > MOST_LINKS else "",
+        ),
+        *_of_worlds(cases, first, len(drawn)),
+        *_of_clocks(first),
+        Section("What happened", tables=(events_table(first),)),
+        Section("The experiment", listing=listing, folded="Show the file"),
+        Section("Definitions", terms=DEFINITIONS),
+    ]
+    cut, verdict = interruptions(cases), findings(cases)
+    return render(
+        folder / name,
+        title=experiment.title,
+        source=experiment.source,
+        facts=facts,
+        command=made.command,
+        verdict=[*cut, *(Finding("fair", note) for note in notes), *verdict[len(cut) :]],
+        sections=sections,
+    )
+
+
+def compare(
+    target: Path,
+    runs: Sequence[tuple[str, Sequence[Trace]]],
+    *,
+    title: str = "Comparison of runs",
+    command: str = "",
+    date: str = "",
+) -> Path:
+    """Writes several runs side by side: a column for each case of each run, the first one as the reference.
+
+    Args:
+        target: The file.
+        runs: Name and traces of each run; several seeds of a case within one run become means with 95 % intervals.
+            Runs of the same name are numbered.
+        title: Of the page.
+        command: How to do it again.
+        date: Now if left out.
+
+    Raises:
+        ValueError: If there is no trace, or one of less than two samples.
+    """
+    names = _distinct([name for name, _ in runs])
+    cases = [
+        msgspec.structs.replace(measure(trace), case=_label(name, trace, traces))
+        for name, (_, traces) in zip(names, runs, strict=True)
+        for trace in traces
+    ]
+    if not cases:
+        raise ValueError("there is no run to compare")
+    drawn = [figures.global_bars(cases), figures.robot_bars(cases)]
+    captions = (_global_caption(cases), _robot_caption(cases))
+    facts = [
+        ("Date", date or date_of(time.time())),
+        ("Runs", ", ".join(names)),
+        ("Reference", cases[0].case),
+    ]
+    experiments = dict.fromkeys(trace.experiment.title for _, traces in runs for trace in traces)
+    sections = [
+        Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
+        *_of_architecture(cases),
+        Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
+        Section("Each robot", tables=robot_tables(cases), folded="Show all tables"),
+        Section("Was anything lost?", tables=proof_tables(cases), folded="Show all tables"),
+        *_modelled(cases),
+        Section("Definitions", terms=DEFINITIONS),
+    ]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    source = "; ".join(experiments)
+    return render(
+        target,
+        title=title,
+        source=source,
+        facts=facts,
+        command=command,
+        verdict=findings(cases),
+        sections=sections,
+    )
+
+
+def _modelled(cases: Sequence[CaseMetrics]) -> list[Section]:
+    """What the modelled network did, where there is one."""
+    tables = network_tables(cases)
+    many = any(len(table.rows) > MOST_LINKS for table in tables)
+    title, folded = "What the modelled network did", "Show all links" if many else ""
+    return [Section(title, (MODELLED,), tables, folded=folded)] if tables else []
+
+
+def _origin(folder: Path, now: Origin) -> Origin:
+    """What is kept of the making of the run in its folder; kept now if nothing was, and there is a command."""
+    file = folder / ORIGIN
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=Origin)
+    except FileNotFoundError:
+        if now.command:
+            file.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
+        return now
+    except (ValueError, RecursionError):  # another file of this name: a case may be called "run"
+        return now
+
+
+def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Picture, ...]:
+    legs = any(len(case.starts_s) > 1 for case in cases)
+    seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
+    shown = [trace.experiment for trace in traces]
+    links = f"links at the start thin, at the end magenta.{scenery.caption(shown, space=True)}{seed}"
+    captions = {
+        "global_bars": _global_caption(cases),
+        "formation_before": f"From the start to {'the first leg of the timeline' if legs else 'the end'}: {links}",
+        "formation_after": f"From the first leg of the timeline to the end: {links}",
+        "robot_bars": _robot_caption(cases),
+        "errors": f"Formation error of each robot{'; legs of the timeline dashed' if legs else ''}.{seed}",
+        "events": f"When each robot transmitted.{seed}",
+        "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
+        "plan_view": f"From above: start hollow, end full, links of the end grey.{scenery.caption(shown)}{seed}",
+    }
+    drawn = figures.every(cases, traces)
+    return numbered((figure, captions[name]) for name, figure in drawn.items())
+
+
+def _of_architecture(cases: Sequence[CaseMetrics]) -> list[Section]:
+    """Who decides, if not every robot for itself."""
+    table = architecture_table(cases)
+    return [] if table is None else [Section("Architecture", (EXPLAINED,), (table,))]
+
+
+def _of_clocks(traces: Sequence[Trace]) -> list[Section]:
+    """How the clocks of other machines lay, where robots ran on any."""
+    if not any(trace.clocks for trace in traces):
+        return []
+    return [Section("Clocks of other machines", (CLOCKS,), (clocks_table(traces),))]
+
+
+def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_before: int) -> list[Section]:
+    """What touched or came near, and the twins beside robots, where there is anything to say."""
+    sections = []
+    if any(case.near or case.near_arena or case.collisions for case in cases):
+        touched = (collision_table(cases),) if any(case.collisions for case in cases) else ()
+        said = SEEN if all(case.watched for case in cases) else WORKED_OUT
+        sections.append(Section("Did anything touch?", (said,), (*touched, *clearance_tables(cases))))
+    if tables := shadow_tables(cases):
+        seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
+        drawn = ((figure, f"{SHADOWS}{seed}") for figure in shadow_figures.shadow_figures(traces).values())
+        pictures = numbered(drawn, figures_before + 1)
+        sections.append(Section("Twins beside robots", tables=tables, pictures=pictures))
+    return sections
+
+
+def _global_caption(cases: Sequence[CaseMetrics]) -> str:
+    return f"Mean transmission rate and errors, relative to {cases[0].case}. {left_out(cases)}{_interval_note(cases)}"
+
+
+def _robot_caption(cases: Sequence[CaseMetrics]) -> str:
+    return f"Each robot; those in brackets are left out of the means.{_interval_note(cases)}"
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names, with a number behind those that were there before."""
+    found: list[str] = []
+    for name in names:
+        tries = (name if k == 1 else f"{name} ({k})" for k in itertools.count(1))
+        found.append(next(each for each in tries if each not in found))
+    return found
+
+
+def _length(case: CaseMetrics) -> str:
+    return f"{case.duration_s:.1f} s of {case.planned_s:g} s" if case.interrupted else f"{case.duration_s:g} s"
+
+
+def _label(name: str, trace: Trace, traces: Sequence[Trace]) -> str:
+    return name if len({each.case for each in traces}) == 1 else f"{name} · {trace.case}"
+
+
+def _interval_note(cases: Sequence[CaseMetrics]) -> str:
+    most = max(len(runs) for runs in by_case(cases).values())
+    return f" Whiskers: 95 % confidence over {most} seeds." if most > 1 else ""
+
+
+def _first_seed(traces: Sequence[Trace]) -> list[Trace]:
+    """The first trace of each case."""
+    found: dict[str, Trace] = {}
+    for trace in traces:
+        found.setdefault(trace.case, trace)
+    return list(found.values())
+
+
+def _words(words: Iterable[str]) -> str:
+    return " and ".join(dict.fromkeys(words))

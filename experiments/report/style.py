@@ -1,0 +1,207 @@
+"""How the figures look, and how they are saved: one column of 3.5 in, 8 pt, colours for colour-blind readers too.
+
+`Figure` is used without pyplot, so that nothing is global; the style is set around drawing and around saving.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any, Final, ParamSpec
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.path import Path as Outline
+
+from agents.arrays import Array
+from experiments.metrics.signals import phase_starts
+from experiments.recording.trace import Trace
+
+P = ParamSpec("P")
+Line = dict[str, Any]  # keyword arguments of a curve
+
+WIDTH: Final = 3.5  # [in] one column
+TALLEST: Final = 8.8  # [in] one page
+SHORTEST_S: Final = 0.1  # of a time axis, which a single sample would not have
+POINTS: Final = 1500  # of a curve; more than a printed column can show
+ALL_POINTS: Final = 40_000  # of all curves of a figure, so that many robots do not make a file of megabytes
+INK: Final = "#000000"
+PAPER: Final = "#ffffff"
+MAGENTA: Final = "#D6007F"
+# Okabe and Ito; yellow is left out because it vanishes on white paper
+CASES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+HATCHES: Final = ("", "////", "....", "xxxx", "\\\\\\\\", "----", "++++")
+ROBOTS: Final = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7")
+KINDS: Final = {"turtlebot3": "#000000", "khepera4": "#009E73", "crazyflie": "#0072B2", "tello": "#D55E00"}
+MANY: Final = 8  # robots that have a colour each; more are coloured by kind
+BARS: Final = (("f_hz", "$f$", "Hz"), ("iae", "IAE", "m s"), ("itae", "ITAE", "m s$^2$"), ("rmse", "RMSE", "m"))
+
+STYLE: Final[Mapping[Any, Any]] = {
+    "font.family": "serif",
+    "font.serif": ["STIXGeneral", "DejaVu Serif"],  # both come with matplotlib: the same picture on every machine
+    "mathtext.fontset": "stix",
+    "font.size": 8,
+    "axes.labelsize": 8,
+    "axes.titlesize": 8,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "legend.handlelength": 1.4,
+    "legend.columnspacing": 1.0,
+    "legend.borderaxespad": 0.2,
+    "legend.handletextpad": 0.5,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "grid.linewidth": 0.4,
+    "grid.color": "#9a9a9a",
+    "grid.alpha": 0.35,
+    "lines.linewidth": 1.0,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "hatch.linewidth": 0.5,
+    "path.simplify_threshold": 0.25,  # of a point: half the thinnest line
+    "figure.dpi": 100,
+    "savefig.dpi": 300,
+    "savefig.transparent": True,
+    "pdf.fonttype": 42,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "zenpark",  # the same figure gives the same bytes
+}
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Draws in the style of this project, whatever the style of the process is."""
+
+    @wraps(draw)
+    def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with mpl.rc_context(dict(STYLE)):
+            return draw(*args, **kwargs)
+
+    return drawn
+
+
+def save(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
+    """Writes `<name>.svg` and `<name>.pdf` into the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    drawing, page = folder / f"{name}.svg", folder / f"{name}.pdf"
+    drawing.write_text(svg(figure), encoding="utf-8")
+    with mpl.rc_context(dict(STYLE)):
+        figure.savefig(page, metadata={"CreationDate": None})
+    return drawing, page
+
+
+def svg(figure: Figure) -> str:
+    """The figure as SVG, without metadata, so that it holds no date and no address; paths to a hundredth of a point."""
+    text = io.StringIO()
+    with mpl.rc_context(dict(STYLE)):
+        figure.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text.getvalue())
+
+
+def panel_height(panels: int, wanted: float) -> float:
+    """Height of one of several stacked panels [in] that together fit a page."""
+    return min(wanted, (TALLEST - 1.0) / max(1, panels))
+
+
+def plain(name: str) -> str:
+    """A name that matplotlib shows as it is: a dollar sign would begin a formula."""
+    return name.replace("$", r"\$")
+
+
+def thinned(trace: Trace, panels: int) -> slice:
+    """Every how many samples of a trace are drawn, given how many panels there are."""
+    points = min(POINTS, ALL_POINTS // max(1, panels * len(trace.robots)))
+    return slice(None, None, max(1, math.ceil(len(trace.time) / max(points, 100))))
+
+
+def robot_lines(trace: Trace) -> list[Line]:
+    """How each robot's curve looks: a colour of its own if there are few robots, else the colour of its kind."""
+    if len(trace.robots) <= MANY:
+        styles = ["-"] * len(ROBOTS) + ["--"] * len(ROBOTS)
+        return [{"color": ROBOTS[i % len(ROBOTS)], "linestyle": styles[i]} for i in range(len(trace.robots))]
+    kinds = [trace.experiment.robots[name].kind for name in trace.robots]
+    return [{"color": KINDS.get(kind, "#7a7a7a"), "linewidth": 0.6, "alpha": 0.7} for kind in kinds]
+
+
+def robot_legend(
+    figure: Figure, traces: Sequence[Trace], more: tuple[Sequence[Artist], Sequence[str]] = ((), ())
+) -> None:
+    """Which robot, or which kind of robots, has which line; and what `more` there is, handles and labels."""
+    trace = max(traces, key=lambda each: len(each.robots))
+    label = trace.robots
+    if len(label) > MANY:
+        label = tuple(trace.experiment.robots[name].kind for name in trace.robots)
+    shown = {name: Line2D([], [], **line) for name, line in zip(label, robot_lines(trace), strict=True)}
+    entries = [*shown.values(), *more[0]], [*shown, *more[1]]
+    legend_above(figure, entries, columns={4: 4, 6: 3, 7: 4, 8: 4}.get(len(entries[1]), 5))
+
+
+def legend_above(figure: Figure, entries: tuple[Sequence[Any], Sequence[str]], columns: int) -> None:
+    """A legend above all panels; nothing if there is nothing to tell apart."""
+    if entries[1]:
+        figure.legend(*entries, loc="outside upper center", ncols=min(columns, len(entries[1])))
+
+
+def name_ticks(axes: Axes, names: Sequence[str]) -> None:
+    """Robots along the x axis, upright if there are many."""
+    crowded = len(names) > MANY
+    axes.set_xticks(
+        range(len(names)),
+        names,
+        rotation=90 if crowded else 0,
+        fontsize=6.5 if len(names) <= 2 * MANY else 5.0,
+    )
+    axes.tick_params(axis="x", length=0)
+
+
+def time_axis(axes: Axes, traces: Sequence[Trace]) -> None:
+    """The x axis as time, as long as the longest trace."""
+    begin, end = min(float(trace.time[0]) for trace in traces), max(float(trace.time[-1]) for trace in traces)
+    axes.set_xlim(begin, max(end, begin + SHORTEST_S))
+    axes.set_xlabel("$t$ [s]")
+
+
+def mark_phases(axes: Axes, trace: Trace) -> None:
+    """A dashed line at each leg of the timeline."""
+    for start in phase_starts(trace)[1:]:
+        axes.axvline(start, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=0.5)
+
+
+def merged(times: Array, pixel: float) -> tuple[Array, Array]:
+    """First and last of each run of times that lie closer together than a pixel."""
+    cut = np.flatnonzero(np.diff(times) > pixel)
+    at = np.arange(len(times))
+    return times[np.concatenate([at[:1], cut + 1])], times[np.concatenate([cut, at[-1:]])]
+
+
+def boxes(begin: Array, end: Array, row: int) -> Outline:
+    """One outline of many boxes: a collection would repeat its style for each of them."""
+    low, high = np.full_like(begin, row - 0.36), np.full_like(begin, row + 0.36)
+    corners = np.array([[begin, low], [end, low], [end, high], [begin, high], [begin, low]])
+    codes = np.tile([Outline.MOVETO, *[Outline.LINETO] * 3, Outline.CLOSEPOLY], len(begin))
+    return Outline(corners.transpose(2, 0, 1).reshape(-1, 2), codes)
+
+
+def last_known(trace: Trace) -> Array:
+    """Where each robot was last known to be (N, 3)."""
+    alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
+    last = len(alive) - 1 - alive[::-1].argmax(axis=0)
+    return np.asarray(trace.true_position[last, np.arange(len(trace.robots))])
+
+
+def edges(listener: Iterable[Any], speaker: Iterable[Any]) -> list[tuple[int, int]]:
+    """Each pair of linked rows once."""
+    return sorted({(min(i, j), max(i, j)) for i, j in zip(listener, speaker, strict=True)})

@@ -1,0 +1,316 @@
+"""What a run came to, in plain words: the sentences at the top of a report, and what the command line prints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from experiments.metrics.results import CaseMetrics, Collision
+from experiments.metrics.statistics import by_case, ratios, same_length, spread
+from experiments.report.feature_tables import sentences, shadowed
+from experiments.report.page import Finding, Mark, interval, number
+
+KEPT_UP = 0.99  # a world that is slower than this share of real time falls behind
+UNFINISHED_M = 0.3  # a robot that is nearer to where its plan wants it merely lags
+NAMED = 3  # so many collisions, or twins, are named; the tables have them all
+
+
+def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """The verdict over all cases, the first one being the reference."""
+    return [
+        *interruptions(cases),
+        *_troubles(cases),
+        *_nothing_lost(cases),
+        *(Finding("plain", text) for text in sentences(cases)),
+        *_deadlines(cases),
+        *_died(cases),
+        *_guided(cases),
+        *_formation(cases),
+        *contacts(cases),
+        *_avoided(cases),
+        *_unfinished(cases),
+        *_room(cases),
+        *_pace(cases),
+        *_shadows(cases),
+    ]
+
+
+def _formation(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """What became of the formation, where there is one."""
+    if not any(case.belief for case in cases):
+        return []
+    return [*_acquired(cases), _worst_link(cases), *_against_the_first(cases)]
+
+
+def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Which runs ended before their time, or were without a network; the first thing that a reader must know."""
+    found, several = [], len(by_case(cases)) > 1
+    for run in cases:
+        if run.interrupted:
+            where = f"{run.case} was interrupted" if several else "Interrupted"
+            text = (
+                f"{where} after {run.duration_s:.1f} s of {run.planned_s:g} s: all {'its ' if several else ''}figures"
+            )
+            found.append(Finding("fair", f"{text} are up to there."))
+        if run.away_s:
+            where = f"In {run.case} the" if several else "The"
+            text = f"{where} network was away for {run.away_s:.1f} s: errors are over the rest of the time."
+            found.append(Finding("fair", text))
+    return found
+
+
+def left_out(cases: Sequence[CaseMetrics]) -> str:
+    """Who is not in the means, and why."""
+    leading = list(dict.fromkeys(name for case in cases for name in case.leaders))
+    died = list(dict.fromkeys(name for case in cases for name in case.died))
+    words = []
+    if leading:
+        words.append(
+            f"{_list(leading)} {'leads' if len(leading) == 1 else 'lead'} and {_is(leading)} left out of the means."
+        )
+    if died:
+        words.append(
+            f"{_list(died)} {_is(died)} left out too where the position is unknown for 5 % of the run or more."
+        )
+    return " ".join(words) or "The means are over all robots."
+
+
+def _nothing_lost(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    sent = sum(robot.messages for case in cases for robot in case.robots)
+    lost = {name: sum(run.lost for run in runs) for name, runs in by_case(cases).items()}
+    if not any(lost.values()):
+        return [Finding("good", f"Nothing was lost: {number(sent)} poses were sent, and no running number is missing.")]
+    where = _list([f"{number(count)} in {name}" for name, count in lost.items() if count])
+    return [Finding("bad", f"Samples were lost: {where}, of {number(sent)} poses sent in all.")]
+
+
+def _troubles(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Robots that began late, and messages that could not be read."""
+    found = []
+    for case in cases:
+        more = len(case.troubles) - NAMED
+        shown = [*case.troubles[:NAMED], *([f"{more} more like this"] if more > 0 else [])]
+        if shown:
+            found.append(Finding("bad", f"In {case.case}: {'; '.join(shown)}."))
+    return found
+
+
+def _deadlines(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    if all(case.clock == "virtual" for case in cases):
+        return []
+    if not any(case.missed_deadlines for case in cases):
+        return [Finding("good", "No deadline was missed.")]
+    worst = max(cases, key=lambda case: case.missed_share or 0.0)
+    share = worst.missed_share or 0.0
+    text = (
+        f"Deadlines were missed: {number(worst.missed_deadlines)} in {worst.case}, {100.0 * share:.2g} % of all ticks."
+    )
+    return [Finding("fair" if share < 0.01 else "bad", text)]
+
+
+def _died(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    found = []
+    for name, runs in by_case(cases).items():
+        gone = list(dict.fromkeys(robot for run in runs for robot in run.died))
+        if gone:
+            found.append(Finding("bad", f"In {name}, {_list(gone)} dropped out; the means leave {_them(gone)} out."))
+    return found
+
+
+def _guided(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """What deciding in one process took."""
+    found = []
+    for name, runs in by_case(cases).items():
+        centres = [run.guidance for run in runs if run.guidance is not None]
+        if not centres:
+            continue
+        delay = spread([centre.delay_mean_s for centre in centres])
+        busy = spread([centre.load for centre in centres])
+        text = f"In {name} a centre decides for {_list(centres[0].guided)}"
+        text += f": {interval(spread([centre.goals_hz for centre in centres]))} goals per second"
+        if delay.mean is not None:
+            text += f", acted on {interval(delay, 1000.0)} ms after the pose on which they rest"
+        if busy.mean is not None:
+            text += f"; its process took {interval(busy, 100.0)} % of a core"
+        found.append(Finding("plain", f"{text}."))
+    return found
+
+
+def _acquired(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    found = []
+    tolerance = f"{100.0 * cases[0].tolerance:g} cm"
+    longest = max(cases, key=lambda case: len(case.starts_s))
+    for k, start in enumerate(longest.starts_s):
+        reached: list[str] = []
+        missing: list[str] = []
+        cut: list[str] = []
+        for name, every in by_case(cases).items():
+            runs = [run for run in every if k < len(run.acquired_s)]  # others ended before this phase
+            when = spread([run.acquired_s[k] for run in runs])
+            if when.n:
+                reached.append(f"{interval(when)} s ({name})")
+            if when.n < len(runs):
+                short = cut if any(run.interrupted for run in runs) else missing
+                short.append(name if len(runs) == 1 else f"{name} ({len(runs) - when.n} of {len(runs)} seeds)")
+        which = (
+            f"The formation was acquired by all to {tolerance}"
+            if k == 0
+            else f"After the leg at {start:g} s it was acquired by all again"
+        )
+        if reached:
+            found.append(Finding("good" if not missing else "fair", f"{which} after {_list(reached)}."))
+        if missing:
+            once = "The formation" if k == 0 else f"After the leg at {start:g} s it"
+            found.append(Finding("bad", f"{once} never stayed within {tolerance} in {_list(missing)}."))
+        if cut:
+            once = "The formation" if k == 0 else f"After the leg at {start:g} s it"
+            text = f"{once} was not within {tolerance} when {_list(cut)} {_was(cut)} interrupted."
+            found.append(Finding("plain", text))
+    return found
+
+
+def _worst_link(cases: Sequence[CaseMetrics]) -> Finding:
+    words, largest = [], 0.0
+    for name, runs in by_case(cases).items():
+        left = [(*robot.by_the_end, robot.robot) for run in runs for robot in run.robots]
+        known = [(error, robot, other) for error, other, robot in left if error is not None]
+        if not known:
+            continue
+        error, robot, other = max(known)
+        largest = max(largest, error)
+        words.append(f"{number(error, 100.0)} cm ({robot}–{other}, {name})")
+    if not words:
+        return Finding("plain", "No link could be measured at the end.")
+    mark: Mark = "good" if largest <= cases[0].tolerance else "bad"
+    if mark == "bad" and any(case.interrupted for case in cases):
+        mark = "plain"  # it may have been on its way
+    return Finding(mark, f"By the end the worst link was off by {_list(words)}.")
+
+
+def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    grouped = by_case(cases)
+    (reference, first), *others = grouped.items()
+    found = []
+    for name, runs in others:
+        rate = spread(ratios(runs, first, "f_hz"))
+        if rate.mean is not None:
+            fewer = 100.0 * (1.0 - rate.mean)
+            how = f"{abs(fewer):.1f} % {'fewer' if fewer >= 0.0 else 'more'} transmissions than {reference}"
+            means = [interval(spread([run.mean["f_hz"] for run in group])) for group in (runs, first)]
+            text = f"{name} needs {how}: {means[0]} rather than {means[1]} per second and robot."
+            found.append(Finding("good" if fewer > 0.0 else "plain", text))
+        errors = [
+            (label, spread(ratios(runs, first, index)))
+            for index, label in (("iae", "IAE"), ("itae", "ITAE"), ("rmse", "RMSE"))
+        ]
+        known = [(label, each) for label, each in errors if each.mean is not None]
+        if not same_length([*runs, *first]):
+            text = f"{name} and {reference} are of different length: their errors are not compared."
+            found.append(Finding("plain", text))
+        elif known:
+            parts = [
+                f"{label} {each.mean:.3f}" + (f" ± {each.ci95:.3f}" if each.ci95 is not None else "")
+                for label, each in known
+            ]
+            worse = max(each.mean for _, each in known if each.mean is not None)
+            text = f"Its errors relative to {reference}: {_list(parts)}."
+            found.append(Finding("good" if worse <= 1.0 else "plain" if worse < 1.25 else "fair", text))
+    return found
+
+
+def contacts(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """What touched; if nothing did, how near it came to that."""
+    found = []
+    for name, runs in by_case(cases).items():
+        touched = [each for run in runs for each in run.collisions]
+        if not touched:
+            continue
+        shown = [_collision(each) for each in touched[:NAMED]]
+        shown += [f"{len(touched) - NAMED} more"] if len(touched) > NAMED else []
+        which = f"{sum(1 for run in runs if run.collisions)} of {len(runs)} seeds of {name}"
+        count = "One collision" if len(touched) == 1 else f"{len(touched)} collisions"
+        found.append(Finding("bad", f"{count} in {name if len(runs) == 1 else which}: {_list(shown)}."))
+    near = [(case.near, case.case) for case in cases if case.near is not None]
+    arena = [(case.near_arena, case.case) for case in cases if case.near_arena is not None]
+    if found or not (near or arena):
+        return found
+    gaps = []
+    for what, known in (("robots", near), ("robot and arena", arena)):
+        if known:
+            closest, case = min(known, key=lambda each: each[0].gap)
+            who = "–".join(closest.between)
+            where = f", {case}" if len(by_case(cases)) > 1 else ""
+            gaps.append(f"{number(closest.gap, 100.0)} cm between {what} ({who} at {closest.at_s:.1f} s{where})")
+    return [Finding("good", f"No robot touched another or the arena; the closest approach was {_list(gaps)}.")]
+
+
+def _collision(each: Collision) -> str:
+    parts = [] if each.impulse is None else [f"{number(each.impulse, 1000.0)} mN s"]
+    parts += [f"{number(each.overlap, 1000.0)} mm deep"] if each.overlap > 0.0 else []
+    return f"{each.first}–{each.second} at {each.time_s:.2f} s" + (f" ({', '.join(parts)})" if parts else "")
+
+
+def _avoided(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    found = []
+    for case in cases:
+        if case.avoided_share:
+            most = max(case.robots, key=lambda robot: robot.avoided)
+            text = f"Avoidance was at work on {number(case.avoided_share, 100.0)} % of all ticks in {case.case}"
+            found.append(Finding("plain", f"{text}, most on those of {most.robot} ({number(most.avoided)})."))
+    return found[:NAMED]
+
+
+def _pace(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    slow = [(case.world_factor, case.case) for case in cases if case.world_factor is not None]
+    if not slow or min(slow)[0] >= KEPT_UP:
+        return []
+    factor, case = min(slow)
+    text = f"The world fell behind: at its slowest it ran at {factor:.2f} of real time, in {case}."
+    return [Finding("fair" if factor >= 0.9 else "bad", text)]
+
+
+def _shadows(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    found = sorted(shadowed(cases), key=lambda each: -each[2].rmse)
+    if not found:
+        return []
+    shown = []
+    for case, robot, shadow in found[:NAMED]:
+        ahead = "over the whole run" if shadow.horizon_s is None else f"up to {shadow.horizon_s:g} s ahead"
+        shown.append(f"{robot.robot} to {number(shadow.rmse, 100.0)} cm RMSE {ahead} ({case.case})")
+    rest = "; the others more closely" if len(found) > NAMED else ""
+    return [Finding("plain", f"Twins beside robots foresaw {_list(shown)}{rest}.")]
+
+
+def _unfinished(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Robots that did not get where their plan wanted them."""
+    found = []
+    for case in cases:
+        short = [each for each in case.robots if each.short is not None and each.short > UNFINISHED_M]
+        if short:
+            who = _list([f"{each.robot} by {number(each.short, 100.0)} cm" for each in short])
+            found.append(Finding("bad", f"Not where the plan wanted them at the end of {case.case}: {who}."))
+    return found
+
+
+def _room(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    found = []
+    far = max(cases, key=lambda case: case.excursion)
+    if far.excursion > 0.0:
+        text = f"{far.excursion_robot} was {number(far.excursion, 100.0)} cm outside the arena in {far.case}."
+        found.append(Finding("fair" if far.excursion < 0.02 else "bad", text))
+    return found
+
+
+def _list(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _was(names: Sequence[str]) -> str:
+    return "was" if len(names) == 1 else "were"
+
+
+def _is(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
+
+
+def _them(names: Sequence[str]) -> str:
+    return "it" if len(names) == 1 else "them"

@@ -1,0 +1,302 @@
+"""Finds the parameters of a trigger that keep the errors within limits with the fewest messages.
+
+The search is CMA-ES (Hansen, "The CMA evolution strategy: a tutorial", arXiv:1604.00772, 2016) by its author's library
+`cma`: it needs no slopes, only compares, so that noise and limits do it no harm; it asks for a generation at a time,
+which all cores or a cluster run side by side; and it depends on numpy alone. A point that breaks a limit is worse than
+any that does not, and the more so the farther. A limit counts as kept when the upper end of the 95 % confidence
+interval over the seeds keeps it.
+
+The best of many was also the luckiest on its seeds. So a third of the tuning seeds serves the search, and the choice
+among the best that it found is made on the others. What was chosen is run on seeds that no choice has seen, and only
+these are reported.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final
+
+from agents.plugins.registry import did_you_mean
+from experiments.file.document import Document, chosen, load
+from experiments.sweep.plan import FIRST_TUNING, Axis, Cell, arguments, combination, compared, seeds_of, wrong
+from experiments.sweep.store import Store
+from experiments.sweep.sweep import Bench, folder_of, origin
+from experiments.sweep.table import MEANS, RATIOS, Row, words_of
+from experiments.sweep.workers import SweepError, workers
+
+Tell = Callable[[str, int, int], None]  # case, evaluations done, of at most so many
+
+FINE: Final = 0.01  # of a range: closer than this the search does not look
+SIGMA: Final = 0.3  # of a range: how far it looks at first
+EVALUATIONS: Final = (20, 20)  # at most so many, and so many more for each parameter
+SEARCH: Final = 1 / 3  # share of the tuning seeds that serves the search
+TUNING: Final = 60  # seeds, if no number is given
+FEWEST: Final = 6
+ROUND: Final = 6  # so many of the best are looked at again at a time, until one keeps the limits
+ROUNDS: Final = 4
+BROKEN: Final = 1e6  # added to what breaks a limit
+
+_LIMIT: Final = re.compile(r"\s*([A-Za-z_]+)\s*<=?\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*")
+
+
+@dataclass(frozen=True)
+class Limit:
+    """An index that must not be larger; a ratio to the reference for those that have one."""
+
+    index: str
+    most: float
+
+    def __str__(self) -> str:
+        return f"{_word(self.index)} <= {self.most:g}"
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is to be least, within which limits."""
+
+    index: str
+    limits: tuple[Limit, ...]
+
+    def rank(self, row: Row) -> float:
+        """The less the better, limits first; more than any other if it cannot be known, or if runs failed."""
+        least = row.value(self.index).mean
+        if least is None or row.failed:
+            return 3.0 * BROKEN
+        excess = 0.0
+        for limit in self.limits:
+            value = row.value(limit.index)
+            if value.mean is None or (limit.index == "acquired_s" and row.acquired != 1.0):
+                return 2.0 * BROKEN
+            excess += max(0.0, value.mean + (value.ci95 or 0.0) - limit.most) / max(abs(limit.most), 1e-9)
+        return BROKEN * (1.0 + min(excess, 1.0)) if excess > 0.0 else least
+
+    def kept(self, row: Row) -> bool:
+        """Whether the means of a row keep all limits."""
+        values = [(row.value(limit.index).mean, limit.most) for limit in self.limits]
+        return all(mean is not None and mean <= most for mean, most in values) and not row.failed
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What the search came to.
+
+    Attributes:
+        read: The experiment.
+        wish: What was wished.
+        tuning: Seeds on which it was sought.
+        seeds: Seeds on which it is reported.
+        rows: The reference, and the best of each case, on `seeds`.
+        tried: Everything that was tried, in that order, on the first third of `tuning`.
+        chosen: Of each case what was chosen, on the other two thirds; its limits may be broken if nothing kept them.
+        folder: Where the runs are kept.
+        notes: What the user should know.
+    """
+
+    read: Document
+    wish: Wish
+    tuning: tuple[int, ...]
+    seeds: tuple[int, ...]
+    rows: tuple[Row, ...]
+    tried: tuple[Row, ...]
+    chosen: tuple[Row, ...]
+    folder: Path
+    notes: tuple[str, ...]
+
+    @property
+    def searched(self) -> tuple[int, ...]:
+        """Seeds of the search, see `tried`."""
+        return searched(self.tuning)
+
+
+def wish_of(text: str) -> Wish:
+    """`messages, iae<=1.01, itae<=1.05`: first what is to be least, then limits.
+
+    Raises:
+        DocumentError: If it cannot be understood.
+    """
+    place = f'--optimize "{text}"'
+    first, *rest = (part.strip() for part in text.split(","))
+    if not first or _LIMIT.fullmatch(first):
+        raise wrong(
+            place, "it does not say what is to be least", 'write, for example, --optimize "messages, iae<=1.01"'
+        )
+    limits = []
+    for part in rest:
+        found = _LIMIT.fullmatch(part)
+        if not found:
+            raise wrong(place, f"'{part}' is no limit", "write one as iae<=1.01")
+        limits.append(Limit(_known(found[1], place), float(found[2])))
+    if not limits:
+        raise wrong(place, "without a limit the best is to say nothing", "add one, such as iae<=1.01")
+    return Wish(_known(first, place), tuple(limits))
+
+
+def searched(tuning: Sequence[int]) -> tuple[int, ...]:
+    """Of the tuning seeds those of the search; the others are those of the choice."""
+    return tuple(tuning[: round(SEARCH * len(tuning))])
+
+
+def tune(
+    file: str | Path,
+    given: Sequence[str],
+    wished: str,
+    *,
+    settings: Sequence[str] = (),
+    cases: Sequence[str] = (),
+    out: str | Path | None = None,
+    scheduler: str | None = None,
+    processes: int | None = None,
+    tell: Tell = lambda _case, _done, _of: None,
+) -> Tuned:
+    """Seeks the parameters of each case that has any of the axes; what was tried before is not run again.
+
+    Args:
+        file: The experiment.
+        given: Ranges, `seeds=` to report on and `tuning=` to seek on, as on the command line.
+        wished: As `wish_of` takes it.
+        settings: As behind `--set`.
+        cases: Which cases; all if none is named.
+        out: Where runs are kept and looked for.
+        scheduler: Address of a dask scheduler; None: on this machine.
+        processes: On this machine; None: one for each core.
+        tell: Told of the case, of evaluations done, and of how many there are at most.
+
+    Raises:
+        DocumentError: If the file or an argument is wrong.
+        SweepError: If the library is not installed, or the workers are gone.
+        KeyboardInterrupt: After Ctrl-C; the same call goes on from there.
+    """
+    wish = wish_of(wished)
+    read = load(file, *settings)
+    axes, words = arguments(given)
+    seeds = seeds_of(words.get("seeds"), read.experiment.seed)
+    tuning = seeds_of(words.get("tuning"), FIRST_TUNING, TUNING)
+    if len(tuning) < FEWEST:
+        raise wrong(words["tuning"], f"{len(tuning)} seeds are too few to tune on", f"give at least {FEWEST}")
+    if both := sorted(set(seeds) & set(tuning)):
+        hint = "name others with tuning=1001:1060: what is tuned on a seed must not be reported on it"
+        raise wrong(words.get("tuning", "seeds="), f"seed {both[0]} is to be tuned and reported on", hint)
+    for axis in axes:
+        if axis.span is None and len(axis.values) > 1:
+            raise wrong(axis.argument, "the search needs a range", f"write {axis.path}=LOW:HIGH:log (or lin)")
+    spans = [axis for axis in axes if axis.span is not None]
+    if not spans:
+        raise wrong("--optimize", "there is nothing to change", "add a range: trigger.threshold=0.002:0.05:log")
+    fixed = [f"{axis.path}={axis.values[0]}" for axis in axes if axis.span is None]
+    read = load(file, *settings, *fixed)
+    reference = compared(read)
+    search = _Search(read, str(file), (*settings, *fixed), wish, tuning)
+    ranges = {
+        name: found for name in chosen(read, cases) if name != reference and (found := search.ranges(name, spans))
+    }
+    if not ranges:
+        hint = "choose a case that has it"
+        raise wrong(spans[0].argument, f"no case that is looked at has it; the reference '{reference}' is not", hint)
+    cma = _library()
+    folder = Path(out) if out is not None else folder_of(read, spans, "optimize")
+    tried: list[Row] = []
+    picked: list[Row] = []
+    plan: dict[tuple[str, str], Cell] = {}
+    with Store(folder) as store:
+        notes = store.changed_since(origin(read, [read.cases()[name] for name in (reference, *ranges)]))
+        with workers(scheduler, processes) as crew:
+            bench = Bench(store, crew)
+            for name, mine in ranges.items():
+                rows = search.run(cma, bench, name, mine, tell)
+                tried += rows
+                best = search.choose(bench, rows, mine)
+                picked.append(best)
+                for cell in search.again(best, mine):
+                    plan.setdefault((cell.case, cell.digest), cell)
+            final = sorted(plan.values(), key=lambda cell: cell.case != reference)
+            if not bench.fill(final, seeds, lambda _done, _of: None):
+                raise KeyboardInterrupt
+            reported = bench.rows(final, seeds)
+    return Tuned(read, wish, tuning, seeds, tuple(reported), tuple(tried), tuple(picked), folder, tuple(notes))
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What all cases have in common."""
+
+    read: Document
+    file: str
+    settings: tuple[str, ...]
+    wish: Wish
+    tuning: tuple[int, ...]
+
+    def ranges(self, case: str, axes: Sequence[Axis]) -> list[Axis]:
+        """The axes that a case has."""
+        lowest = self.cells({axis: axis.at(0.0) for axis in axes}, case)[-1]
+        return [axis for axis in axes if axis.path in lowest.parameters]
+
+    def cells(self, values: Mapping[Axis, str], case: str) -> list[Cell]:
+        """The reference and a case with these values."""
+        return list(combination(self.read, self.file, self.settings, values, (case,)))
+
+    def again(self, row: Row, axes: Sequence[Axis]) -> list[Cell]:
+        """The reference and a case with the values of a row."""
+        return self.cells({axis: words_of(row.parameters[axis.path]) for axis in axes}, row.case)
+
+    def choose(self, bench: Bench, rows: Sequence[Row], axes: Sequence[Axis]) -> Row:
+        """The best of what was tried, on seeds that the search has not seen; raises KeyboardInterrupt on Ctrl-C."""
+        fresh = self.tuning[len(searched(self.tuning)) :]
+        ranked = sorted(rows, key=self.wish.rank)
+        looked_at: list[Row] = []
+        for begin in range(0, min(ROUNDS * ROUND, len(ranked)), ROUND):
+            pairs = [self.again(row, axes) for row in ranked[begin : begin + ROUND]]
+            if not bench.fill([cell for pair in pairs for cell in pair], fresh, lambda _done, _of: None):
+                raise KeyboardInterrupt
+            looked_at += [bench.rows(pair, fresh)[-1] for pair in pairs]
+            if any(self.wish.rank(row) < BROKEN for row in looked_at):
+                break
+        return min(looked_at, key=self.wish.rank)
+
+    def run(self, cma: Any, bench: Bench, case: str, axes: Sequence[Axis], tell: Tell) -> list[Row]:  # noqa: ANN401
+        """Everything that is tried for a case, each once; raises KeyboardInterrupt on Ctrl-C."""
+        first, more = EVALUATIONS
+        most = first + more * len(axes)
+        options = {"bounds": [0.0, 1.0], "seed": 1, "tolx": FINE, "maxfevals": most, "verbose": -9, "verb_log": 0}
+        # the method is not made for one dimension: a second one, that means nothing, does it no harm
+        strategy = cma.CMAEvolutionStrategy([0.5] * max(2, len(axes)), SIGMA, options)
+        known: dict[tuple[str, ...], Row] = {}
+        asked = 0
+        tell(case, 0, most)
+        while not strategy.stop():
+            points = strategy.ask()
+            wanted = [tuple(axis.at(float(x)) for axis, x in zip(axes, point, strict=False)) for point in points]
+            fresh = [values for values in dict.fromkeys(wanted) if values not in known]
+            cells = {values: self.cells(dict(zip(axes, values, strict=True)), case) for values in fresh}
+            plan = [cell for pair in cells.values() for cell in pair]
+            if not bench.fill(plan, searched(self.tuning), lambda _done, _of: None):
+                raise KeyboardInterrupt
+            for values, pair in cells.items():
+                known[values] = bench.rows(pair, searched(self.tuning))[-1]
+            strategy.tell(points, [self.wish.rank(known[values]) for values in wanted])
+            asked += len(points)
+            tell(case, min(asked, most), most)
+        return list(known.values())
+
+
+def _library() -> Any:  # noqa: ANN401 - it has no types
+    try:
+        return import_module("cma")
+    except ImportError:
+        raise SweepError(
+            "--optimize needs a library that is an extra: ./zenpark install cma, or pip install -e '.[optimize]'"
+        ) from None
+
+
+def _known(name: str, place: str) -> str:
+    known = (*MEANS, *(name for name in ("f", "acquired")))
+    if name.lower() not in known:
+        raise wrong(place, f"no index is called '{name}'", did_you_mean(name, known))
+    return {"f": "f_hz", "acquired": "acquired_s"}.get(name.lower(), name.lower())
+
+
+def _word(index: str) -> str:
+    return f"{index.upper() if index in ('iae', 'itae', 'rmse') else index} ratio" if index in RATIOS else index

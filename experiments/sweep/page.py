@@ -1,0 +1,156 @@
+"""The page of a sweep, and of a search for parameters: what stands in the table, and messages against error."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from experiments.file.document import Document
+from experiments.report import style
+from experiments.report.page import Finding, Picture, Section, Table, date_of, numbered, render, seeds_in_words
+from experiments.report.page import Row as Line
+from experiments.sweep.optimise import Tuned
+from experiments.sweep.pareto import front, pareto
+from experiments.sweep.sweep import Found
+from experiments.sweep.table import Row, figure, short, with_interval, words_of
+
+PAGE: Final = "sweep.html"
+NONE: Final = "–"
+MOST_LINES: Final = 40  # of a table that stands open
+LEVELS: Final = (1.01, 1.02, 1.05)  # of IAE: the fewest messages within each are named
+TERMS: Final = (
+    ("Messages", "Transmissions of a robot, mean over all but the leaders; relative to the reference, seed by seed."),
+    ("IAE, ITAE", "Of the formation error of a robot, mean over all but the leaders; likewise."),
+    ("Acquired", "Share of the seeds in which all robots but the leaders acquired before the first leg."),
+    ("Gap", "Shortest time between two transmissions of any robot in any seed."),
+    ("±", "Half-width of the 95 % confidence interval of the mean over seeds (Student's t)."),
+)  # fmt: skip
+CAPTIONS: Final = (
+    "Messages against IAE; towards the lower left is better. Full: no other has fewer messages and no more error (grey "
+    "line). Numbers at the ends of a curve: the first parameter that was changed. Whiskers: 95 % confidence.",
+    "Messages against ITAE, likewise.",
+)
+
+
+def write(found: Found, command: str) -> Path:
+    """Writes `sweep.html` and the figure into the folder of a sweep."""
+    notes = [Finding("fair", note) for note in found.notes]
+    if found.missing:
+        notes.append(Finding("bad", f"interrupted: {found.missing} runs are missing; the same command goes on"))
+    if found.failures:
+        notes.append(Finding("bad", f"{len(found.failures)} runs failed; the first: {found.failures[0]}"))
+    return render(
+        found.folder / PAGE,
+        title=f"Sweep: {found.read.experiment.title}",
+        source=found.read.experiment.source,
+        facts=_facts(found.read, found.seeds, len(found.rows)),
+        command=command,
+        verdict=[*notes, *_fewest(found.rows)],
+        sections=[
+            Section("Messages against error", pictures=_pictures(found.folder, found.rows, joined=True)),
+            Section(
+                "All cells",
+                tables=(table(found.rows),),
+                folded="Show the table" if len(found.rows) > MOST_LINES else "",
+            ),
+            *_ends(found.read),
+        ],
+    )
+
+
+def write_tuned(tuned: Tuned, command: str) -> Path:
+    """Writes `sweep.html` and the figure of a search into its folder."""
+    reference = [row for row in tuned.rows if row.reference]
+    words = seeds_in_words
+    return render(
+        tuned.folder / PAGE,
+        title=f"Tuned: {tuned.read.experiment.title}",
+        source=tuned.read.experiment.source,
+        facts=[*_facts(tuned.read, tuned.seeds, len(tuned.tried)), ("Tuning seeds", words(tuned.tuning))],
+        command=command,
+        verdict=[*(Finding("fair", note) for note in tuned.notes), *verdict(tuned)],
+        sections=[
+            Section("Result", (f"On seeds {words(tuned.seeds)}, which no choice has seen.",), (table(tuned.rows),)),
+            Section(
+                "Everything that was tried",
+                (f"On seeds {words(tuned.searched)}.",),
+                pictures=_pictures(tuned.folder, [*reference, *tuned.tried], joined=False),
+            ),
+            Section("What was tried", tables=(table(tuned.tried),), folded="Show the table"),
+            *_ends(tuned.read),
+        ],
+    )
+
+
+def verdict(tuned: Tuned) -> list[Finding]:
+    """For each case whether the limits were kept on the reporting seeds, and at how many messages."""
+    limits = " and ".join(map(str, tuned.wish.limits))
+    found = []
+    for row in (row for row in tuned.rows if not row.reference):
+        what = f"{row.label}: {_saved(row)}"
+        if tuned.wish.kept(row):
+            found.append(Finding("good", f"{what}, keeps {limits}"))
+        else:
+            found.append(Finding("bad", f"{what}, does not keep {limits}"))
+    return found
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """The cells for people."""
+    paths = list(dict.fromkeys(path for row in rows for path in row.parameters))
+    head = ("Case", *map(short, paths), "f [Hz]", "Messages", "IAE", "ITAE", "Acquired", "Gap", "Lost")
+    lines = []
+    for row in rows:
+        values = [words_of(row.parameters[path]) if path in row.parameters else NONE for path in paths]
+        ratios = [with_interval(row.ratio[index]) for index in ("messages", "iae", "itae")]
+        acquired = NONE if row.acquired is None else f"{100.0 * row.acquired:.0f} %"
+        gap = NONE if row.gap_min_s is None else f"{1e3 * row.gap_min_s:.0f} ms"
+        f, dropped = figure(row.mean["f_hz"].mean), figure(row.mean["dropped"].mean)
+        lines.append(Line((row.case, *values, f, *ratios, acquired, gap, dropped), sum=row.reference))
+    reference = next((row.case for row in rows if row.reference), "the reference")
+    return Table(head, tuple(lines), note=f"Messages, IAE and ITAE are relative to {reference} with the same seed.")
+
+
+def _pictures(folder: Path, rows: Sequence[Row], *, joined: bool) -> tuple[Picture, ...]:
+    """Messages against IAE and against ITAE; also as files."""
+    drawn = {index: pareto(rows, index, joined=joined) for index in ("iae", "itae")}
+    for index, each in drawn.items():
+        style.save(each, folder / "figures", f"pareto_{index}")
+    return numbered((each, caption) for each, caption in zip(drawn.values(), CAPTIONS, strict=True))
+
+
+def _fewest(rows: Sequence[Row]) -> list[Finding]:
+    """Who needs the fewest messages within each level of error."""
+    found: dict[str, Finding] = {}
+    for level in LEVELS:
+        within = [row for row in front(rows) if not row.reference and (row.ratio["iae"].mean or 0.0) <= level]
+        if within:
+            text = f"Fewest messages with an IAE ratio of at most {level:g}: {within[0].label}: {_saved(within[0])}"
+            found.setdefault(within[0].label, Finding("good" if within[0].acquired == 1.0 else "fair", text))
+    return list(found.values())
+
+
+def _saved(row: Row) -> str:
+    messages = row.ratio["messages"].mean
+    less = "?" if messages is None else f"{100.0 * (messages - 1.0):+.1f} %"
+    return f"{less} messages, IAE {with_interval(row.ratio['iae'])}, ITAE {with_interval(row.ratio['itae'])}"
+
+
+def _facts(read: Document, seeds: Sequence[int], count: int) -> list[tuple[str, str]]:
+    return [
+        ("Date", date_of(time.time())),
+        ("Clock", "virtual"),
+        ("Seeds", seeds_in_words(seeds)),
+        ("Duration", f"{read.experiment.duration_s:g} s"),
+        ("Robots", str(len(read.experiment.robots))),
+        ("Cells", str(count)),
+    ]
+
+
+def _ends(read: Document) -> list[Section]:
+    return [
+        Section("The experiment", listing=read.listing, folded="Show the file"),
+        Section("Definitions", terms=TERMS),
+    ]

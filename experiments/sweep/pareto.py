@@ -1,0 +1,133 @@
+"""Messages against error: what each trigger makes of its parameters, and where no other does better in both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from agents.arrays import Array
+from experiments.report.style import CASES, INK, PAPER, WIDTH, legend_above, plain, styled
+from experiments.sweep.table import Row, short, words_of
+
+MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
+MOST_CURVES: Final = 9  # a colour and a marker each; more could not be told apart, and are drawn as clouds
+LONG: Final = 14  # letters of a name of which three do not stand beside each other
+SPAN: Final = 8.0  # a wider range of messages is drawn on a logarithmic axis
+
+
+@styled
+def pareto(rows: Sequence[Row], index: str = "iae", *, joined: bool = True) -> Figure:
+    """Messages against an error, both over the reference with the same seeds; one curve for each trigger.
+
+    Full markers: no other cell has fewer messages and no more error; these are joined by a grey line. Hollow: another
+    one is better. Whiskers are 95 % confidence intervals. The reference is the cross at (1, 1).
+
+    Args:
+        rows: The cells; those whose ratios are unknown are left out.
+        index: Of the error: `iae`, `itae` or `rmse`.
+        joined: Whether cells of a case are joined along a parameter, if these curves are few; else they are a cloud.
+    """
+    known = [row for row in rows if not row.reference and _at(row, index) is not None]
+    best = {id(row) for row in front(known, index)}
+    figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
+    axes = figure.subplots()
+    _draw_front(axes, [row for row in known if id(row) in best], index)
+    found = curves(known)
+    joined = joined and len(found) <= MOST_CURVES
+    if not joined:
+        found = {case: [row for row in known if row.case == case] for case in dict.fromkeys(row.case for row in known)}
+    for k, (name, curve) in enumerate(found.items()):
+        marker = MARKERS[(k + k // len(CASES)) % len(MARKERS)]
+        style = {"color": CASES[k % len(CASES)], "marker": marker, "label": plain(name)}
+        style |= {} if joined else {"linestyle": ""}
+        _draw_curve(axes, curve, index, [id(row) in best for row in curve], style)
+    axes.plot(1.0, 1.0, "+", color=INK, markersize=7, markeredgewidth=1.0, label=_reference(rows), zorder=4)
+    axes.set_xlabel(f"messages relative to {_reference(rows)}")
+    axes.set_ylabel(f"{index.upper()} relative to {_reference(rows)}")
+    low = min((row.ratio["messages"].mean or 1.0 for row in known), default=1.0)
+    if low < 1.0 / SPAN:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid()
+    longest = max(len(name) for name in [*found, _reference(rows)])
+    legend_above(figure, axes.get_legend_handles_labels(), columns=3 if longest <= LONG else 2)
+    return figure
+
+
+def front(rows: Sequence[Row], index: str = "iae") -> list[Row]:
+    """Cells than which none has fewer messages and no more error, or less error and no more messages."""
+    found, least = [], math.inf
+    for row in sorted((row for row in rows if _at(row, index) is not None), key=lambda row: _at(row, index) or ()):
+        if row.ratio[index].mean < least:  # type: ignore[operator]
+            found.append(row)
+            least = row.ratio[index].mean or 0.0
+    return found
+
+
+def curves(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Cells that differ only in the first parameter in which their case varies, by the name of case and others."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        along = _along(rows, row.case)
+        others = [path for path in row.parameters if path != along and _varies(rows, row.case, path)]
+        fixed = [f"{short(path)}={words_of(row.parameters[path])}" for path in others]
+        found.setdefault(", ".join([row.case, *fixed]), []).append(row)
+    return found
+
+
+def _along(rows: Sequence[Row], case: str) -> str | None:
+    paths = dict.fromkeys(path for row in rows if row.case == case for path in row.parameters)
+    return next((path for path in paths if _varies(rows, case, path)), None)
+
+
+def _varies(rows: Sequence[Row], case: str, path: str) -> bool:
+    return len({str(row.parameters.get(path)) for row in rows if row.case == case}) > 1
+
+
+def _at(row: Row, index: str) -> tuple[float, float] | None:
+    messages, error = row.ratio["messages"].mean, row.ratio[index].mean
+    return None if messages is None or error is None else (messages, error)
+
+
+def _reference(rows: Sequence[Row]) -> str:
+    return plain(next((row.case for row in rows if row.reference), "the reference"))
+
+
+def _points(rows: Sequence[Row], index: str) -> Array:
+    """Messages, error, and the half-widths of their intervals (n, 4)."""
+    pairs = [(row.ratio["messages"], row.ratio[index]) for row in rows]
+    found = [(m.mean, e.mean, m.ci95 or 0.0, e.ci95 or 0.0) for m, e in pairs]
+    return np.array(found, dtype=float).reshape(-1, 4)
+
+
+def _draw_front(axes: Axes, rows: Sequence[Row], index: str) -> None:
+    points = _points(rows, index)
+    x, y = points[points[:, 0].argsort(), :2].T
+    axes.plot(x, y, drawstyle="steps-post", color="#9a9a9a", linewidth=2.2, alpha=0.5, zorder=1)
+
+
+def _draw_curve(axes: Axes, rows: Sequence[Row], index: str, best: Sequence[bool], style: dict[str, Any]) -> None:
+    points = _points(rows, index)
+    x, y, dx, dy = points.T
+    marker = {"linewidth": 0.8, "markersize": 3.6, "markeredgewidth": 0.8, "zorder": 3, **style}
+    joined = "linestyle" not in style
+    axes.errorbar(
+        x, y, dy, dx, color=style["color"], linewidth=0.8 if joined else 0.0, elinewidth=0.7 if joined else 0.4,
+        capsize=1.2, capthick=0.6, zorder=2,
+    )  # fmt: skip
+    for full, face in ((True, style["color"]), (False, PAPER)):
+        some = np.array(best) == full
+        axes.plot(x[some], y[some], **{**marker, "linestyle": "", "markerfacecolor": face, "label": None})
+    axes.plot([], [], **marker)
+    along = _along(rows, rows[0].case) if joined else None
+    for row, at in ((rows[0], points[0]), (rows[-1], points[-1])):
+        words = "" if along is None else words_of(row.parameters[along])
+        axes.annotate(words, (at[0], at[1]), (3.0, 4.0), textcoords="offset points", fontsize=6, color=style["color"])

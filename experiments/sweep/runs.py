@@ -1,0 +1,234 @@
+"""What one process of a sweep does: flies a case with some seeds in virtual time, and keeps a few figures of each."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import statistics
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from inspect import getfile
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from agents.body.interface import BodyError
+from agents.plugins import registry
+from experiments.definition.experiment import Experiment
+from experiments.definition.standby import taking_part
+from experiments.file.problems import Path as Keys
+from experiments.file.structure import group_of
+from experiments.metrics.measure import KNOWN, WINDOW_S, bounds_of
+from experiments.metrics.signals import LinkErrors, gaps, integrals, leaders, transmissions
+from experiments.recording.trace import ROUNDING_S, HeardPoses, Sent, Trace
+from experiments.virtual_time.simulation import Log, Stuck, simulate
+
+PACKAGES: Final = ("agents", "twins", "experiments")  # whose code decides what a run comes to
+FAILED: Final = (Stuck, BodyError, registry.PluginError)  # what a run may end with that other runs do not
+
+
+class Figures(msgspec.Struct, frozen=True):
+    """One run in numbers, the same to the bit as `experiments.metrics.measure.measure` makes of its whole trace.
+
+    Attributes:
+        seed: Of the run.
+        f_hz: Transmissions per second; this and the next five are means over robots, without leaders.
+        messages: Transmissions.
+        iae: ∫ e dt [m s]; None where no error is known.
+        itae: ∫ t·e dt [m s²].
+        rmse: √(mean e²) [m].
+        acquired_s: When its links were within the tolerance for good [s]; None if that is missing for any robot.
+        gap_min_s: Shortest time between two transmissions of any robot [s]; None if none sent twice.
+        updates: Times that a goal was computed anew; a mean as those above.
+        dropped: Samples that the modelled network dropped on all links.
+    """
+
+    seed: int
+    f_hz: float | None
+    messages: float | None
+    iae: float | None
+    itae: float | None
+    rmse: float | None
+    acquired_s: float | None
+    gap_min_s: float | None
+    updates: float | None
+    dropped: int
+
+
+class Outcome(msgspec.Struct, frozen=True):
+    """What came of some seeds.
+
+    Attributes:
+        runs: Those that went through.
+        failed: Seeds of the others, and why.
+        stranger: Digest of the code, if it is another than was asked for, or what is missing: nothing was run.
+    """
+
+    runs: list[Figures]
+    failed: dict[int, str] = {}
+    stranger: str = ""
+
+
+def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
+    """Flies a case once for each seed.
+
+    Args:
+        case: An experiment as JSON.
+        seeds: Of the runs; each comes out as it would alone.
+        code: What `code` said where the work was given out; nothing is run with other code.
+
+    Returns:
+        An `Outcome` as JSON, runs in the order of the seeds.
+    """
+    try:
+        experiment = msgspec.json.decode(case, type=Experiment)
+        mine = code_of(experiment)
+    except (msgspec.ValidationError, registry.PluginError) as error:  # on a machine with another version, or no plug-in
+        return msgspec.json.encode(Outcome([], stranger=str(error)))
+    if mine != code:
+        return msgspec.json.encode(Outcome([], stranger=f"{mine}, not {code}"))
+    runs, failed = _flown(taking_part(experiment), tuple(seeds))
+    runs.sort(key=lambda run: seeds.index(run.seed))
+    return msgspec.json.encode(Outcome(runs, failed))
+
+
+def digest(experiment: Experiment) -> str:
+    """The same for experiments that run in the same way: title, source, cases and the file's own seed are left out."""
+    bare = msgspec.structs.replace(experiment, title="", source="", cases={}, seed=0)
+    return hashlib.sha256(msgspec.json.encode(bare, order="sorted")).hexdigest()[:20]
+
+
+def code_of(experiment: Experiment) -> str:
+    """The same wherever runs of this experiment come to the same: our code, that of its plug-ins, and the versions of
+    numpy and of the library of the engine, which has its name.
+
+    Of a plug-in the module counts in which it stands; another module that it imports does not.
+    """
+    chosen = _choices(msgspec.to_builtins(experiment), ())
+    files = {Path(getfile(registry.struct(group, registry.split(choice)[0]))) for group, choice in chosen}
+    engine = registry.split(experiment.world.engine)[0]
+    with suppress(PackageNotFoundError):
+        engine += version(engine)
+    others = sorted(_file_digest(file) for file in files if file.parent.parent != _root())
+    return hashlib.sha256(":".join((_own_digest(), np.__version__, engine, *others)).encode()).hexdigest()[:20]
+
+
+def _choices(value: Any, path: Keys) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
+    """Every plug-in that is chosen in a document: its group, and the choice."""
+    group = group_of(path)
+    if group is not None and value is not None:
+        yield group, value
+    elif isinstance(value, dict):
+        for key, each in value.items():
+            yield from _choices(each, (*path, key))
+    elif isinstance(value, list | tuple):
+        for number, each in enumerate(value):
+            yield from _choices(each, (*path, number))
+
+
+def figures_of(log: Log, experiment: Experiment) -> list[Figures]:
+    """The figures of each repetition in a log, which may be a lean one."""
+    return [_figures(_trace(log, experiment, copy), int(log.lost.reshape(len(log.seeds), -1)[copy].sum()))
+            for copy in range(len(log.seeds))]  # fmt: skip
+
+
+def _flown(experiment: Experiment, seeds: tuple[int, ...]) -> tuple[list[Figures], dict[int, str]]:
+    """Side by side, but for those that others would change: these once more without them."""
+    try:
+        log = simulate(experiment, seeds, lean=True)
+    except FAILED as error:
+        if len(seeds) == 1:
+            return [], {seeds[0]: str(error)}
+        apart = [_flown(experiment, (seed,)) for seed in seeds]
+        return [run for runs, _ in apart for run in runs], {k: why for _, failed in apart for k, why in failed.items()}
+    runs = figures_of(log, experiment)
+    failed: dict[int, str] = {}
+    held_up = tuple(seed for seed, waited in zip(seeds, log.waited, strict=True) if waited)
+    if held_up:
+        again, failed = _flown(experiment, held_up)
+        runs = [run for run in runs if run.seed not in held_up] + again
+    return runs, failed
+
+
+def _trace(log: Log, experiment: Experiment, copy: int) -> Trace:
+    """A repetition as far as its figures need it; what they do not need is empty."""
+    rows, duration = len(log.names), experiment.duration_s
+    mine = slice(copy * rows, (copy + 1) * rows)
+    run = (log.time >= -ROUNDING_S) & (log.time <= duration + ROUNDING_S)
+    at, row, seq, *_ = log.sent
+    own = (row >= mine.start) & (row < mine.stop) & (at >= -ROUNDING_S) & (at < duration - ROUNDING_S)
+    none, nobody, unknown = np.zeros(0), np.zeros(0, dtype=np.intp), np.zeros((0, 0))
+    zeros = np.zeros(rows, dtype=np.intp)
+    return Trace(
+        case="",
+        experiment=experiment,
+        seed=log.seeds[copy],
+        robots=log.names,
+        clock="virtual",
+        time=np.round(log.time[run], 9),
+        position=unknown,
+        yaw=unknown,
+        true_position=log.true_position[run, mine],
+        goal=unknown,
+        setpoint=unknown,
+        sent=Sent(at[own], row[own] - mine.start, seq[own], unknown, unknown, none, nobody),
+        heard=HeardPoses(none, nobody, nobody, nobody, none, unknown, unknown),
+        lost=zeros,
+        missed_deadlines=zeros,
+        ticks=zeros,
+        decisions=log.updates[mine],
+        events=(),
+        interventions=zeros,
+        avoided=zeros,
+    )
+
+
+def _figures(trace: Trace, dropped: int) -> Figures:
+    errors = LinkErrors.of(trace)
+    _, begin, end = bounds_of(trace)[0]
+    window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0])))
+    acquired = errors.part(begin, end).acquired(window, trace.experiment.tolerance)
+    sent = transmissions(trace)[0].astype(float)
+    waits = [float(wait.min()) for wait in gaps(trace) if len(wait)]
+    leading = leaders(trace.experiment)
+    kept = [i for i, name in enumerate(trace.robots) if name not in leading and errors.alive[:, i].mean() >= KNOWN]
+    iae, itae, rmse = (_mean(each[kept].tolist()) for each in integrals(errors.per_robot(), trace.time))
+    arrived = [acquired[i] for i in kept]
+    return Figures(
+        seed=trace.seed,
+        f_hz=_mean((sent[kept] / float(trace.time[-1] - trace.time[0])).tolist()),
+        messages=_mean(sent[kept].tolist()),
+        iae=iae,
+        itae=itae,
+        rmse=rmse,
+        acquired_s=None if None in arrived else _mean([when for when in arrived if when is not None]),
+        gap_min_s=min(waits, default=None),
+        updates=_mean(trace.decisions[kept].astype(float).tolist()),
+        dropped=dropped,
+    )
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    """Of what is known."""
+    known = [value for value in values if math.isfinite(value)]
+    return statistics.fmean(known) if known else None
+
+
+@cache
+def _root() -> Path:
+    return Path(__file__).resolve().parents[2]
+
+
+@cache
+def _own_digest() -> str:
+    files = sorted(file for package in PACKAGES for file in (_root() / package).rglob("*.py"))
+    return hashlib.sha256(":".join([version("zenpark"), *map(_file_digest, files)]).encode()).hexdigest()
+
+
+@cache
+def _file_digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -1,0 +1,142 @@
+"""The runs of a sweep that are done, on disk, so that none is ever repeated.
+
+A line of `runs.jsonl` holds some runs of one cell under the digest of what was run and of the code that ran it: a file
+that was changed, or another zenpark, leads to other digests, and what they no longer fit is left alone. A line that was
+cut off while it was written is as good as none.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+import msgspec
+
+from experiments.file.problems import DocumentError, Problem
+from experiments.sweep.runs import Figures, Outcome
+
+RUNS: Final = "runs.jsonl"
+ORIGIN: Final = "origin.json"
+
+
+class _Line(msgspec.Struct, frozen=True):
+    cell: str
+    code: str
+    runs: list[Figures]
+    failed: dict[int, str] = {}
+
+
+class Origin(msgspec.Struct, frozen=True):
+    """What a folder was begun with: the version, digests of code and of file (with its `--set`)."""
+
+    version: str
+    code: str
+    file: str
+
+
+class Store:
+    """The runs in a folder; a context manager, because two sweeps must not write into one folder.
+
+    Attributes:
+        damaged: Lines that could not be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._path = folder, folder / RUNS
+        self._runs: dict[tuple[str, str], dict[int, Figures]] = {}
+        self._failed: dict[tuple[str, str], dict[int, str]] = {}
+        self.damaged = 0
+
+    def __enter__(self) -> Self:
+        """Opens the folder, and reads what is there.
+
+        Raises:
+            DocumentError: If it cannot be made or written, or another sweep is at work in it.
+        """
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._file = self._path.open("ab")
+        except OSError as error:
+            raise _unusable(self._folder, f"cannot be written: {error.strerror}", "choose a place with --out") from None
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._file.close()
+            raise _unusable(self._folder, "another sweep is at work in it", "wait for it, or choose --out") from None
+        self._read()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def changed_since(self, now: Origin) -> list[str]:
+        """What is not as it was when the folder was last used, in words; from now on it is as `now`."""
+        path = self._folder / ORIGIN
+        try:
+            before = msgspec.json.decode(path.read_bytes(), type=Origin)
+        except (FileNotFoundError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            before = now
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
+        found = []
+        if before.version != now.version:
+            found.append(f"this is zenpark {now.version}, not {before.version}: all runs are made anew")
+        elif before.code != now.code:
+            found.append("the code of zenpark or of a plug-in has changed: what it runs is run anew")
+        if before.file != now.file:
+            found.append("the experiment file has changed: what it changes is run anew")
+        return found
+
+    def runs(self, cell: str, code: str) -> dict[int, Figures]:
+        """What is done of a cell, by seed."""
+        return self._runs.get((cell, code), {})
+
+    def failed(self, cell: str, code: str) -> dict[int, str]:
+        """Seeds that failed, and why."""
+        return self._failed.get((cell, code), {})
+
+    def missing(self, cell: str, code: str, seeds: Sequence[int]) -> list[int]:
+        """Of these seeds those that are neither done nor known to fail."""
+        done, failed = self.runs(cell, code), self.failed(cell, code)
+        return [seed for seed in seeds if seed not in done and seed not in failed]
+
+    def add(self, cell: str, code: str, outcome: Outcome) -> None:
+        """Keeps what came of some seeds; it is on the disk when this returns.
+
+        Raises:
+            DocumentError: If the disk is full.
+        """
+        line = _Line(cell, code, outcome.runs, outcome.failed)
+        try:
+            self._file.write(msgspec.json.encode(line) + b"\n")
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise _unusable(self._path, f"cannot be written: {error.strerror}", "make room, then go on") from None
+        self._keep(line)
+
+    def _read(self) -> None:
+        content = self._path.read_bytes()
+        if content and not content.endswith(b"\n"):
+            self._file.write(b"\n")  # what was cut off must not swallow the next line
+            self._file.flush()
+        for text in content.splitlines():
+            if text:
+                try:
+                    self._keep(msgspec.json.decode(text, type=_Line))
+                except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+                    self.damaged += 1
+
+    def _keep(self, line: _Line) -> None:
+        key = (line.cell, line.code)
+        self._runs.setdefault(key, {}).update({run.seed: run for run in line.runs})
+        self._failed.setdefault(key, {}).update(line.failed)
+
+
+def _unusable(path: Path, message: str, hint: str) -> DocumentError:
+    return DocumentError([Problem(str(path), 0, 0, message, hint)])

@@ -1,0 +1,219 @@
+"""Sweeps: cases × values × seeds in virtual time, on all cores or on a cluster, never repeating what is done.
+
+In a notebook:
+
+    from experiments.sweep.sweep import sweep
+    found = sweep("robotic-park", ["trigger.threshold=0.002:0.05:log12", "seeds=50"])
+    print(found)
+    found.rows[3].ratio["iae"].mean
+    found.pareto().savefig("pareto.pdf")
+
+In a script, what calls `sweep` stands below `if __name__ == "__main__":`, because other processes import the script.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from experiments.definition.experiment import Experiment
+from experiments.file import document
+from experiments.file.document import Document, load
+from experiments.recording.run_folder import RUNS
+from experiments.sweep import table
+from experiments.sweep.plan import Axis, Cell, arguments, cells, seeds_of, wrong
+from experiments.sweep.runs import Figures, code_of
+from experiments.sweep.store import Origin, Store
+from experiments.sweep.table import Row
+from experiments.sweep.workers import Work, Workers, workers
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MOST_SEEDS: Final = 100  # of one cell side by side: more are hardly faster, and progress would come in larger steps
+SHARE: Final = 3  # each worker gets its part in at least so many pieces, so that all end at about the same time
+MOST_BYTES: Final = 2e8  # of positions that one process logs
+AROUND_S: Final = 15.0  # take-off and landing are logged, too
+
+Tell = Callable[[int, int], None]  # runs done, of how many
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a sweep came to.
+
+    Attributes:
+        read: The experiment.
+        axes: What was changed.
+        seeds: Of the runs.
+        rows: The table.
+        failures: Why runs failed, each reason once.
+        missing: Runs that are not done, because the sweep was interrupted.
+        folder: Where the runs are kept.
+        notes: What the user should know.
+    """
+
+    read: Document
+    axes: tuple[Axis, ...]
+    seeds: tuple[int, ...]
+    rows: tuple[Row, ...]
+    failures: tuple[str, ...]
+    missing: int
+    folder: Path
+    notes: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """The table, as the command prints it."""
+        return "\n".join(table.text(self.rows))
+
+    def pareto(self) -> Figure:
+        """Messages against error, see `experiments.sweep.pareto`."""
+        from experiments.sweep.pareto import pareto  # noqa: PLC0415 - matplotlib takes 0.6 s
+
+        return pareto(self.rows)
+
+
+def sweep(
+    file: str | Path,
+    given: Sequence[str],
+    *,
+    settings: Sequence[str] = (),
+    cases: Sequence[str] = (),
+    out: str | Path | None = None,
+    scheduler: str | None = None,
+    processes: int | None = None,
+    tell: Tell = lambda _done, _of: None,
+) -> Found:
+    """Runs a sweep, or what is missing of it; after Ctrl-C it gives what is done.
+
+    Args:
+        file: The experiment.
+        given: Axes and seeds, as on the command line.
+        settings: As behind `--set`, for all cells.
+        cases: Which cases; all if none is named. The first of the file is run in any case: it is the reference.
+        out: Where runs are kept and looked for.
+        scheduler: Address of a dask scheduler; None: on this machine.
+        processes: On this machine; None: one for each core.
+        tell: Told of progress.
+
+    Raises:
+        DocumentError: If the file or an argument is wrong.
+        SweepError: If the workers are gone.
+    """
+    read = load(file, *settings)
+    axes, words = arguments(given)
+    if "tuning" in words:
+        raise wrong(words["tuning"], "there is nothing to tune", 'add --optimize "messages, iae<=1.01"')
+    for axis in axes:
+        if not axis.values:
+            raise wrong(axis.argument, "how many values?", f"write {axis.argument}12; only --optimize needs no number")
+    seeds = seeds_of(words.get("seeds"), read.experiment.seed)
+    plan = cells(read, str(file), settings, axes, cases)
+    folder = Path(out) if out is not None else folder_of(read, axes, "sweep")
+    with Store(folder) as store:
+        notes = store.changed_since(origin(read, [cell.experiment for cell in plan]))
+        with workers(scheduler, processes) as crew:
+            bench = Bench(store, crew)
+            whole = bench.fill(plan, seeds, tell)
+        rows = bench.rows(plan, seeds)
+        failures = bench.failures(plan, seeds)
+        missing = 0 if whole else sum(len(bench.missing(cell, seeds)) for cell in _distinct(plan))
+    return Found(read, tuple(axes), seeds, tuple(rows), failures, missing, folder, tuple(notes))
+
+
+@dataclass
+class Bench:
+    """Runs that are done, and who does others."""
+
+    store: Store
+    crew: Workers
+
+    def fill(self, plan: Sequence[Cell], seeds: Sequence[int], tell: Tell) -> bool:
+        """Does what is missing; False after Ctrl-C, which keeps what is done."""
+        lacking = [(cell, self.missing(cell, seeds)) for cell in _distinct(plan)]
+        total = sum(len(cell_seeds) for _, cell_seeds in lacking)
+        if not total:
+            return True
+        piece = max(1, math.ceil(total / (SHARE * self.crew.count)))
+        works = [
+            Work(
+                cell.digest,
+                document.write_json(cell.experiment),
+                tuple(missing[k : k + size]),
+                code_of(cell.experiment),
+            )
+            for cell, missing in lacking
+            for size in [min(piece, side_by_side(cell.experiment))]
+            for k in range(0, len(missing), size)
+        ]
+        done = 0
+        tell(0, total)
+        try:
+            for work, outcome in self.crew.done(works):
+                self.store.add(work.cell, work.code, outcome)
+                done += len(work.seeds)
+                tell(done, total)
+        except KeyboardInterrupt:
+            return False
+        return True
+
+    def missing(self, cell: Cell, seeds: Sequence[int]) -> list[int]:
+        """Seeds of a cell that are still to be done."""
+        return self.store.missing(cell.digest, code_of(cell.experiment), seeds)
+
+    def rows(self, plan: Sequence[Cell], seeds: Sequence[int]) -> list[Row]:
+        """The cells of which anything is done."""
+        by_digest = {cell.digest: cell for cell in plan}
+        found = []
+        for cell in plan:
+            mine = self._runs(cell, seeds)
+            failed = self.store.failed(cell.digest, code_of(cell.experiment))
+            lost = sum(seed in failed for seed in seeds)
+            if mine or lost:
+                found.append(table.row(cell, mine, self._runs(by_digest[cell.reference], seeds), lost))
+        return found
+
+    def failures(self, plan: Sequence[Cell], seeds: Sequence[int]) -> tuple[str, ...]:
+        """Why runs failed."""
+        return tuple(
+            f"{cell.case} {' '.join(f'{path}={value}' for path, value in cell.parameters.items())}, seed {seed}: {why}"
+            for cell in _distinct(plan)
+            for seed, why in self.store.failed(cell.digest, code_of(cell.experiment)).items()
+            if seed in seeds
+        )
+
+    def _runs(self, cell: Cell, seeds: Sequence[int]) -> dict[int, Figures]:
+        done = self.store.runs(cell.digest, code_of(cell.experiment))
+        return {seed: done[seed] for seed in seeds if seed in done}
+
+
+def side_by_side(experiment: Experiment) -> int:
+    """How many seeds of an experiment one process flies at once."""
+    samples = (experiment.duration_s + AROUND_S) * experiment.rates.state_hz
+    return max(1, min(MOST_SEEDS, int(MOST_BYTES / (48.0 * samples * len(experiment.robots)))))
+
+
+def folder_of(read: Document, axes: Sequence[Axis], what: str) -> Path:
+    """Where the runs of a command go that names no folder: the same for the same file and axes."""
+    return RUNS / "-".join([read.path.stem, what, *(axis.path.replace("/", "_") for axis in axes)])[:200]
+
+
+def origin(read: Document, experiments: Iterable[Experiment]) -> Origin:
+    """What this process would fill a folder with."""
+    codes = sorted({code_of(experiment) for experiment in experiments})
+    text = read.listing + document.write_json(read.experiment).decode()
+    return Origin(version("zenpark"), _digest("".join(codes)), _digest(text))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
+def _distinct(plan: Sequence[Cell]) -> list[Cell]:
+    """Cells that run the same only once."""
+    return list({cell.digest: cell for cell in reversed(plan)}.values())[::-1]

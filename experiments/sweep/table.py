@@ -1,0 +1,171 @@
+"""The table of a sweep: a row for each cell, as structs, as CSV, as JSON and as text."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from experiments.metrics.statistics import Spread, ratio, spread
+from experiments.sweep.plan import Cell
+from experiments.sweep.runs import Figures
+
+MEANS: Final = ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s", "updates", "dropped")
+RATIOS: Final = ("messages", "iae", "itae", "rmse")
+NONE: Final = "-"
+
+
+class Row(msgspec.Struct, frozen=True):
+    """A cell in numbers.
+
+    Attributes:
+        case: Name of the case.
+        parameters: Values of the axes that it has, by path.
+        reference: Whether it is what the ratios of others are taken over.
+        seeds: Runs that went through.
+        failed: Runs that did not.
+        mean: Over the seeds: each of `MEANS`; `acquired_s` over those in which all acquired.
+        ratio: Of each of `RATIOS` over the reference with the same seed, then over the seeds.
+        acquired: Share of the seeds in which every robot but the leaders acquired.
+        gap_min_s: Shortest time between two transmissions of any robot, in all seeds [s].
+    """
+
+    case: str
+    parameters: dict[str, Any]
+    reference: bool
+    seeds: int
+    failed: int
+    mean: dict[str, Spread]
+    ratio: dict[str, Spread]
+    acquired: float | None
+    gap_min_s: float | None
+
+    def value(self, index: str) -> Spread:
+        """The ratio of an index if it has one, else its mean."""
+        return self.ratio[index] if index in self.ratio else self.mean[index]
+
+    @property
+    def words(self) -> str:
+        """The parameters in a few words: `threshold=0.01`."""
+        return ", ".join(f"{short(path)}={words_of(value)}" for path, value in self.parameters.items())
+
+    @property
+    def label(self) -> str:
+        """Case and parameters."""
+        return f"{self.case} {self.words}".strip()
+
+
+def row(cell: Cell, runs: Mapping[int, Figures], reference: Mapping[int, Figures], failed: int = 0) -> Row:
+    """A cell's runs, by seed, and those of its reference."""
+    mine = [runs[seed] for seed in sorted(runs)]
+    paired = [(runs[seed], reference[seed]) for seed in sorted(runs) if seed in reference]
+    acquired = [run.acquired_s is not None for run in mine]
+    gaps = [run.gap_min_s for run in mine if run.gap_min_s is not None]
+    return Row(
+        case=cell.case,
+        parameters=dict(cell.parameters),
+        reference=cell.digest == cell.reference,
+        seeds=len(mine),
+        failed=failed,
+        mean={index: spread([getattr(run, index) for run in mine]) for index in MEANS},
+        ratio={
+            index: spread([ratio(getattr(one, index), getattr(other, index)) for one, other in paired])
+            for index in RATIOS
+        },
+        acquired=sum(acquired) / len(acquired) if acquired else None,
+        gap_min_s=min(gaps, default=None),
+    )
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """One line for each row; empty where a value is unknown, and where a case has no such parameter."""
+    paths = list(dict.fromkeys(path for each in rows for path in each.parameters))
+    columns = [part for index in MEANS for part in (index, f"{index}_ci95")]
+    columns += [part for index in RATIOS for part in (f"{index}_ratio", f"{index}_ratio_ci95")]
+    head = ["case", *paths, "reference", "seeds", "failed", *columns, "acquired_share", "gap_min_s"]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, head, restval="")
+        table.writeheader()
+        for each in rows:
+            found: dict[str, Any] = {"case": each.case, **each.parameters}
+            found |= {"reference": int(each.reference), "seeds": each.seeds, "failed": each.failed}
+            for suffix, group in (("", each.mean), ("_ratio", each.ratio)):
+                for index, value in group.items():
+                    found |= {f"{index}{suffix}": value.mean, f"{index}{suffix}_ci95": value.ci95}
+            table.writerow({**found, "acquired_share": each.acquired, "gap_min_s": each.gap_min_s})
+
+
+def document(title: str, seeds: Sequence[int], rows: Sequence[Row], **more: object) -> dict[str, Any]:
+    """The table for programs."""
+    reference = next((each.case for each in rows if each.reference), None)
+    listed = [msgspec.to_builtins(each) for each in rows]
+    return {"experiment": title, "reference": reference, "seeds": list(seeds), **more, "cells": listed}
+
+
+def write_json(path: Path, table: Mapping[str, Any]) -> None:
+    """What `document` made."""
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=2) + b"\n")
+
+
+def text(rows: Sequence[Row]) -> list[str]:
+    """The main columns, for the terminal."""
+    head = (
+        "case",
+        "parameters",
+        "seeds",
+        "f [Hz]",
+        "messages ratio",
+        "IAE ratio",
+        "ITAE ratio",
+        "acquired",
+        "gap [ms]",
+        "dropped",
+    )
+    lines = [head, *(_cells(each) for each in rows)]
+    width = [max(len(line[k]) for line in lines) for k in range(len(head))]
+    return [
+        "  ".join(cell.ljust(width[k]) if k < 2 else cell.rjust(width[k]) for k, cell in enumerate(line)).rstrip()
+        for line in lines
+    ]
+
+
+def short(path: str) -> str:
+    """The last part of a path."""
+    return path.rpartition(".")[2]
+
+
+def figure(value: float | None, digits: int = 3) -> str:
+    """A number as people read it."""
+    return NONE if value is None else f"{value:.{digits}g}"
+
+
+def with_interval(value: Spread) -> str:
+    """A ratio and its interval, to four places: a per mille of error is what triggers differ by."""
+    if value.mean is None:
+        return NONE
+    return f"{value.mean:.3f}" + ("" if value.ci95 is None else f" ±{value.ci95:.3f}")
+
+
+def _cells(each: Row) -> tuple[str, ...]:
+    acquired = NONE if each.acquired is None else f"{100.0 * each.acquired:.0f} %"
+    seeds = str(each.seeds) + (f" ({each.failed} failed)" if each.failed else "")
+    return (
+        each.case,
+        each.words,
+        seeds,
+        figure(each.mean["f_hz"].mean),
+        with_interval(each.ratio["messages"]),
+        with_interval(each.ratio["iae"]),
+        with_interval(each.ratio["itae"]),
+        acquired,
+        NONE if each.gap_min_s is None else f"{1e3 * each.gap_min_s:.0f}",
+        figure(each.mean["dropped"].mean),
+    )
+
+
+def words_of(value: object) -> str:
+    """The value of a parameter."""
+    return f"{value:g}" if isinstance(value, float) else str(value)

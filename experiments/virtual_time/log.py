@@ -1,0 +1,435 @@
+"""What a virtual run logged, as traces and as recordings: the same that a real run leaves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask
+from agents.decision.lifecycle import Phase
+from agents.formation.graph import Links
+from agents.network import messages
+from agents.plugins import registry
+from agents.safety.hazards import Incident, Outcome
+from experiments.definition import assignment, bodies
+from experiments.definition.experiment import Experiment
+from experiments.recording.trace import (
+    EPOCH,
+    ROUNDING_S,
+    WALL,
+    Goals,
+    HeardPoses,
+    Sent,
+    Trace,
+    _first,
+    finds_contacts,
+    looked_for,
+    within,
+)
+from experiments.recording.writer import Recording
+from experiments.virtual_time.network import Steered
+from experiments.virtual_time.simulation import Log
+
+
+def goal_messages(steered: Steered, names: Sequence[str], first: int) -> Iterator[tuple[float, messages.Goal]]:
+    """Goals of one repetition, and when they were sent since the common start [s].
+
+    Args:
+        steered: Of all repetitions.
+        names: Of the robots.
+        first: Row of the first of them.
+    """
+    time, row, seq, goal, toward, rests = steered.sent
+    own = (row >= first) & (row < first + len(names))
+    columns = (column[own].tolist() for column in (time, row - first, seq, goal.round(6), toward.round(6), rests))
+    for t, robot, number, place, yaw, pose in zip(*columns, strict=True):
+        stamps = round(EPOCH + t, 6), round(EPOCH + pose, 6)
+        yield (
+            t,
+            messages.Goal(names[robot], number, stamps[0], tuple(place), None if math.isnan(yaw) else yaw, stamps[1]),
+        )
+
+
+def centre_receipts(
+    steered: Steered, sample: Array, first: int, rows: int
+) -> dict[tuple[int, int], list[messages.Followed]]:
+    """Goals that reached the robots of one repetition, by the number of the `sample` (T,) that tells of it, and row."""
+    time, row, seq, stamp, pose = steered.followed
+    own = (row >= first) & (row < first + rows)
+    at = np.searchsorted(sample, time[own] - ROUNDING_S)
+    found: dict[tuple[int, int], list[messages.Followed]] = {}
+    columns = (column.tolist() for column in (at, row[own] - first, seq[own], stamp[own], pose[own], time[own]))
+    for k, robot, number, sent, taken, acted in zip(*columns, strict=True):
+        news = messages.Followed(number, EPOCH + sent, EPOCH + taken, EPOCH + acted)
+        found.setdefault((k, robot), []).append(news)
+    return found
+
+
+def centre_report(steered: Steered, names: Sequence[str], first: int, duration: float) -> messages.CentreState:
+    """What the centre of one repetition in virtual time would say of itself at the end of the run."""
+    goals = of_log(steered, names, first, duration, "json")
+    return messages.CentreState(
+        stamp=EPOCH + duration,
+        robots=[name for name, reached in zip(names, goals.reached, strict=True) if reached],
+        missing=[],
+        load=0.0,
+        late_s=0.0,
+        decisions=len(np.unique(goals.time)),
+        missed=0,
+        goals=len(goals.time),
+        heard=dict(zip(names, goals.heard.tolist(), strict=True)),
+        lost=dict.fromkeys(names, 0),
+        dropped=dict(zip(names, goals.dropped.tolist(), strict=True)),
+        malformed=0,
+        pid=0,
+        cpu_s=0.0,
+        rss_mb=0.0,
+    )
+
+
+def of_log(steered: Steered, names: Sequence[str], first: int, duration: float, encoding: messages.Encoding) -> Goals:
+    """Of one repetition in virtual time, whose first row is `first`."""
+    rows = len(names)
+
+    def within(t: Any) -> Any:  # noqa: ANN401 - a number, or many
+        return (t >= -ROUNDING_S) & (t < duration - ROUNDING_S)
+
+    def mine(row: Index) -> Mask:
+        return np.asarray((row >= first) & (row < first + rows))
+
+    sent = within(steered.sent[0]) & mine(steered.sent[1])
+    heard = within(steered.heard[0]) & mine(steered.heard[1])
+    sizes = [len(messages.encode(goal, encoding)) for t, goal in goal_messages(steered, names, first) if within(t)]
+    own = mine(steered.followed[1])
+    time, row, pose = steered.followed[0][own], steered.followed[1][own], steered.followed[4][own]
+    reached, anew = within(time), _first(time, row, pose)
+    anew &= reached
+    return Goals(
+        time=steered.sent[0][sent],
+        robot=steered.sent[1][sent] - first,
+        bytes=np.array(sizes, dtype=np.intp),
+        reached=np.bincount(row[reached] - first, minlength=rows),
+        acted=time[anew],
+        follower=row[anew] - first,
+        delay=(time - pose)[anew],
+        heard=np.bincount(steered.heard[1][heard] - first, minlength=rows),
+        lost=np.zeros(rows, dtype=np.intp),
+        dropped=steered.lost_poses[first : first + rows],
+    )
+
+
+class Logbook:
+    """One repetition of a virtual run."""
+
+    def __init__(self, log: Log, experiment: Experiment, case: str, copy: int = 0) -> None:
+        """The repetition of `log.seeds[copy]`."""
+        rows = len(log.names)
+        self._log, self._experiment, self._case = log, experiment, case
+        self._mine = slice(copy * rows, (copy + 1) * rows)
+        self._seed = log.seeds[copy]
+        self._scene = bodies.scene(experiment)
+        self._links: Links = assignment.heard_links(experiment)
+        time, row, seq, position, velocity, yaw = log.sent
+        own = (row >= copy * rows) & (row < (copy + 1) * rows)
+        self._sent = (time[own], row[own] - copy * rows, seq[own], position[own], velocity[own], yaw[own])
+        per_copy = len(self._links)
+        time, link, seq, stamp, position, velocity = log.heard
+        own = (link >= copy * per_copy) & (link < (copy + 1) * per_copy)
+        self._heard = (time[own], link[own] - copy * per_copy, seq[own], stamp[own], position[own], velocity[own])
+        self._dropped: Index = log.lost[copy * per_copy : (copy + 1) * per_copy]
+        self._goals: Goals | None = None
+        if log.steered is not None:
+            encoding = experiment.network.encoding
+            self._goals = of_log(log.steered, log.names, copy * rows, experiment.duration_s, encoding)
+
+    def trace(self) -> Trace:
+        """The run from the common start on, as arrays."""
+        log, mine, duration = self._log, self._mine, self._experiment.duration_s
+        run = (log.time >= -ROUNDING_S) & (log.time <= duration + ROUNDING_S)
+        sent = self._within(self._sent[0])
+        time, row, seq, position, velocity, yaw = self._sent
+        sizes = np.array([len(messages.encode(pose, self._encoding)) for pose in self._poses(sent)], dtype=np.intp)
+        got = self._within(self._heard[0])
+        heard_time, link, heard_seq, stamp, heard_position, heard_velocity = self._heard
+        link = link[got]
+        rows = len(log.names)
+        contacts, world = within(self._contacts(), EPOCH, duration), within(self._world(), EPOCH, duration)
+        return Trace(
+            case=self._case,
+            experiment=self._experiment,
+            seed=self._seed,
+            robots=log.names,
+            clock="virtual",
+            time=np.round(log.time[run], 9),
+            position=log.position[run, mine],
+            yaw=log.yaw[run, mine],
+            true_position=log.true_position[run, mine],
+            goal=log.goal[run, mine],
+            setpoint=log.setpoint[run, mine],
+            sent=Sent(time[sent], row[sent], seq[sent], position[sent], velocity[sent], yaw[sent], sizes),
+            heard=HeardPoses(
+                heard_time[got],
+                self._links.listener[link],
+                self._links.speaker[link],
+                heard_seq[got],
+                stamp[got],
+                heard_position[got],
+                heard_velocity[got],
+            ),
+            lost=np.zeros(rows, dtype=np.intp),
+            missed_deadlines=np.zeros(rows, dtype=np.intp),
+            ticks=np.full(rows, log.ticks, dtype=np.intp),
+            decisions=log.updates[mine],
+            events=tuple(
+                messages.Event(t, kind, source, text) for t, kind, source, text in self._events() if t <= duration
+            ),
+            interventions=log.interventions[mine],
+            avoided=log.avoided[mine],
+            contacts=contacts if looked_for(contacts, world) else None,
+            world=world,
+            attitude=_part(log.attitude, run, mine),
+            shadow_position=_part(log.shadow_position, run, mine),
+            shadow_yaw=_part(log.shadow_yaw, run, mine),
+            dropped=self._dropped,
+            goals=self._goals,
+        )
+
+    def record(self, path: Path, document: str) -> None:
+        """Writes a recording of the whole run, take-off and landing included.
+
+        Args:
+            path: A file that does not exist yet.
+            document: The experiment file, as it was written.
+
+        Raises:
+            RecordingError: If it cannot be written.
+        """
+        with Recording(
+            path,
+            self._experiment,
+            document,
+            case=self._case,
+            seed=self._seed,
+            clock="virtual",
+            started=EPOCH,
+        ) as recording:
+            for t, kind, source, text in self._events():
+                recording.event(messages.Event(EPOCH + t, kind, source, text))
+            every = np.ones(len(self._sent[0]), dtype=bool)
+            said = zip(self._sent[0].tolist(), self._poses(every), strict=True)
+            pending = next(said, None)
+            for t, states in self._states():
+                while pending is not None and pending[0] <= t + ROUNDING_S:
+                    size = len(messages.encode(pending[1], self._encoding))
+                    recording.pose(pending[1], pending[1].stamp, size)
+                    pending = next(said, None)
+                for state in states:
+                    recording.state(state)
+            for t, goal in self._told():
+                recording.goal(goal, EPOCH + t, len(messages.encode(goal, self._encoding)))
+            if self._log.steered is not None:
+                steered, end = self._log.steered, self._experiment.duration_s
+                recording.centre(centre_report(steered, self._log.names, self._mine.start, end))
+            for status in self._statuses():
+                recording.status(status)
+            for report in self._world():
+                recording.world(report)
+            for contact in self._contacts():
+                recording.contact(contact)
+
+    @property
+    def _encoding(self) -> messages.Encoding:
+        return self._experiment.network.encoding
+
+    def _within(self, time: Array) -> Mask:
+        """The end belongs to the landing: 50 Hz for 45 s are 2250 messages."""
+        return (time >= -ROUNDING_S) & (time < self._experiment.duration_s - ROUNDING_S)
+
+    def _poses(self, which: Mask) -> Iterator[messages.Pose]:
+        names = self._log.names
+        columns = (column[which].tolist() for column in self._sent)
+        for t, row, seq, position, velocity, yaw in zip(*columns, strict=True):
+            yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw)
+
+    def _told(self) -> Iterator[tuple[float, messages.Goal]]:
+        """What the centre told robots, and when."""
+        if self._log.steered is not None:
+            yield from goal_messages(self._log.steered, self._log.names, self._mine.start)
+
+    def _states(self) -> Iterator[tuple[float, list[messages.State]]]:
+        """Telemetry, sample by sample, with the poses that each robot heard since the sample before."""
+        log, mine = self._log, self._mine
+        words = [phase.word for phase in Phase]
+        columns = (log.phase, log.position, log.velocity, log.yaw, log.goal, log.setpoint, log.error)
+        rest = (log.attitude, log.shadow_position, log.shadow_yaw)
+        samples = zip(
+            log.time.tolist(),
+            *(column[:, mine].tolist() for column in (*columns, log.true_position, log.true_yaw)),
+            *(repeat(None, len(log.time)) if column is None else column[:, mine].tolist() for column in rest),
+            strict=True,
+        )
+        heard = self._heard_by_sample()
+        followed: dict[tuple[int, int], list[messages.Followed]] = {}
+        if log.steered is not None:
+            followed = centre_receipts(log.steered, log.time, mine.start, len(log.names))
+        for k, (t, phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw, *more) in enumerate(samples):
+            yield (
+                t,
+                [
+                    messages.State(
+                        name,
+                        k + 1,
+                        EPOCH + t,
+                        words[phase[row]],
+                        messages.vector(position[row]),
+                        messages.vector(velocity[row]),
+                        messages.heading(yaw[row]),
+                        messages.vector(goal[row]),
+                        None if setpoint[row][0] != setpoint[row][0] else tuple(setpoint[row]),
+                        error[row],
+                        messages.vector(truth[row]),
+                        messages.heading(true_yaw[row]),
+                        heard.get((k, row), []),
+                        *_three(more, row),
+                        followed.get((k, row), []),
+                    )
+                    for row, name in enumerate(log.names)
+                ],
+            )
+
+    def _heard_by_sample(self) -> dict[tuple[int, int], list[messages.Heard]]:
+        time, link, seq, stamp, position, velocity = self._heard
+        names = self._log.names
+        sample = np.searchsorted(self._log.time, time - ROUNDING_S)
+        listener, speaker = self._links.listener[link], self._links.speaker[link]
+        found: dict[tuple[int, int], list[messages.Heard]] = {}
+        columns = (sample, listener, speaker, seq, stamp, time, position, velocity)
+        for k, row, whose, number, taken, arrived, where, moves in zip(*(c.tolist() for c in columns), strict=True):
+            news = messages.Heard(names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where), tuple(moves))
+            found.setdefault((k, row), []).append(news)
+        return found
+
+    def _statuses(self) -> Iterator[messages.Status]:
+        """The counters at the end of the run and at the end of everything."""
+        log = self._log
+        sent = self._counts(self._sent[1], self._sent[0])
+        heard = self._counts(self._links.listener[self._heard[1]], self._heard[0])
+        unsafe = {each.row - self._mine.start: each.text for each in self._incidents() if each.outcome >= Outcome.LAND}
+        for end, phase, done in ((self._experiment.duration_s, "landing", 0), (log.ended, "done", 1)):
+            for row, name in enumerate(log.names):
+                mine = self._links.listener == row
+                each = zip(self._links.speaker[mine].tolist(), self._dropped[mine].tolist(), strict=True)
+                yield messages.Status(
+                    robot=name,
+                    stamp=EPOCH + end,
+                    phase=phase,
+                    reason=unsafe.get(row, "finished"),
+                    body="",
+                    battery=None,
+                    sent=int(sent[done][row]),
+                    heard=int(heard[done][row]),
+                    lost={log.names[s]: 0 for s in self._links.speaker[mine].tolist()},
+                    dropped={log.names[s]: n for s, n in each if n},
+                    malformed=0,
+                    refused=0,
+                    ticks=log.ticks,
+                    missed=0,
+                    decisions=int(log.updates[self._mine][row]),
+                    interventions=int(log.interventions[self._mine][row]),
+                    avoided=int(log.avoided[self._mine][row]),
+                    late_s=0.0,
+                    started=EPOCH,
+                    missing=[],
+                    pid=0,
+                    cpu_s=0.0,
+                    rss_mb=0.0,
+                )
+
+    def _contacts(self) -> Iterator[messages.Contact]:
+        """What touched in this repetition, take-off and landing included."""
+        rows, names = len(self._log.names), self._log.names
+        first = self._mine.start
+        for touch in self._log.touches:
+            if first <= touch.first < first + rows:
+                other = names[touch.second - first] if touch.second >= 0 else self._obstacle(-1 - touch.second)
+                yield messages.Contact(
+                    EPOCH + touch.time, names[touch.first - first], other, float(touch.impulse), float(touch.overlap)
+                )
+
+    def _obstacle(self, k: int) -> str:
+        return self._scene.names[k] if k < len(self._scene.names) else WALL
+
+    def _world(self) -> Iterator[messages.WorldState]:
+        """What a world would say of itself at 1 Hz; nothing where robots are alone in an empty place."""
+        log, chosen, scene = self._log, self._experiment.world.engine, self._scene
+        if not (scene.names or log.touches or finds_contacts(chosen)):
+            return
+        touched = np.sort([contact.stamp - EPOCH for contact in self._contacts()])
+        moved = log.obstacles[:, self._mine.start // len(log.names)]
+        whole = np.flatnonzero(np.abs(log.time - np.round(log.time)) < 0.5 / self._experiment.rates.state_hz - 1e-9)
+        for k in whole.tolist():
+            t = float(log.time[k])
+            yield messages.WorldState(
+                stamp=EPOCH + t,
+                engine=registry.split(chosen)[0],
+                time=t - float(log.time[0]),
+                factor=1.0,
+                load=0.0,
+                paused=False,
+                robots=list(log.names),
+                mirrored=[],
+                obstacles=[
+                    messages.Standing(*each) for each in zip(scene.names, map(tuple, moved[k].tolist()), strict=True)
+                ],
+                contacts=int(np.searchsorted(touched, t, side="right")),
+                refused=0,
+                malformed=0,
+            )
+
+    def _counts(self, row: Index, time: Array) -> tuple[Index, Index]:
+        """How often each row occurs until the end of the run, and until the end of everything."""
+        rows = len(self._log.names)
+        within = time <= self._experiment.duration_s + ROUNDING_S
+        return np.bincount(row[within], minlength=rows), np.bincount(row, minlength=rows)
+
+    def _events(self) -> Iterator[tuple[float, str, str, str]]:
+        """What the conductor says, and what went wrong, in order of time."""
+        yield from sorted([*self._conducted(), *self._hazards()], key=lambda event: event[0])
+
+    def _hazards(self) -> Iterator[tuple[float, str, str, str]]:
+        for each in self._incidents():
+            yield each.time, "hazard", self._log.names[each.row - self._mine.start], each.text
+
+    def _incidents(self) -> Iterator[Incident]:
+        """What was wrong with the robots of this repetition."""
+        return (each for each in self._log.incidents if self._mine.start <= each.row < self._mine.stop)
+
+    def _conducted(self) -> Iterator[tuple[float, str, str, str]]:
+        yield self._log.airborne, "phase", "conductor", "airborne"
+        yield 0.0, "start", "conductor", "common start"
+        yield 0.0, "phase", "conductor", "formation"
+        for leg in sorted(self._experiment.timeline, key=lambda leg: leg.at_s):
+            yield leg.at_s, "phase", "conductor", f"{leg.robot} under way"
+        yield self._experiment.duration_s, "phase", "conductor", "landing"
+
+
+def _part(column: Array | None, run: Mask, mine: slice) -> Array | None:
+    return None if column is None else column[run, mine]
+
+
+def _known(value: Any) -> Any:  # noqa: ANN401 - a number or a list of them
+    """For the wire: as a tuple; None if it is NaN."""
+    if isinstance(value, list):
+        return None if math.isnan(value[0]) else tuple(value)
+    return None if math.isnan(value) else value
+
+
+def _three(columns: Sequence[Any], row: int) -> tuple[Any, Any, Any]:
+    """Of a row: attitude, and where its shadow is and looks; None where it has none."""
+    attitude, position, yaw = (None if column is None else _known(column[row]) for column in columns)
+    return attitude, position, yaw

@@ -1,0 +1,284 @@
+"""The centre of a run in virtual time: what it hears, its goals on their way to the robots, and a log of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from agents.agent import Agent
+from agents.arrays import Array, Index
+from agents.body.interface import BodyState
+from agents.decision.centralised import Centre
+from agents.decision.transmission import Said
+from agents.formation.graph import Links, links
+from agents.network import channel_model, messages
+from agents.network.channel_model import Samples
+from experiments.definition import assignment, link_conditions
+from experiments.definition.experiment import Experiment
+from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE
+from experiments.recording.trace import EPOCH
+
+
+class Channel:
+    """Carries what rows say to whoever listens; each repetition has its own luck.
+
+    Attributes:
+        instant: What is said on a tick is known to all, or lost, before they decide on it.
+    """
+
+    def __init__(self, experiment: Experiment, links: Links, seeds: Sequence[int], *, stream: str = "") -> None:
+        """`links` of all repetitions, those of the first seed first; each `stream` has its own luck."""
+        self._channel = channel_model.Channel(link_conditions.virtual(experiment, links, seeds, stream=stream))
+        self.instant = self._channel.instant
+        self._speaker = links.speaker
+        self._names = tuple(experiment.robots)
+        self._encoding: messages.Encoding = experiment.network.encoding
+
+    @property
+    def lost(self) -> Index:
+        """(E,) samples that did not get through; none before the common start."""
+        return self._channel.dropped
+
+    def send(
+        self,
+        t: float,
+        rows: Index,
+        seq: Index,
+        position: Array,
+        velocity: Array,
+        *,
+        yaw: Array,
+        start: float,
+        extra: Array | None = None,
+    ) -> None:
+        """Rows say where they are: pose, `seq` and what goes along of all rows (N, ...), of which `rows` speak.
+
+        `start` is the common start [s]; NaN or infinity as long as it is not known: nothing is lost before.
+        """
+        spoke = np.zeros(len(position), dtype=bool)
+        spoke[rows] = True
+        at = np.flatnonzero(spoke[self._speaker])
+        if not len(at):
+            return
+        who = self._speaker[at]
+        size = None
+        if self._channel.limited:
+            size = self._sizes(EPOCH + (t - start if t >= start else 0.0), rows, (seq, position, velocity, yaw))[who]
+        self._channel.send(
+            at,
+            seq[who],
+            np.full(len(at), t),
+            position[who],
+            velocity[who],
+            start=start,
+            size=size,
+            extra=None if extra is None else extra[who],
+        )
+
+    def due(self, t: float) -> Samples | None:
+        """What has arrived by `t` [s], in order of arrival."""
+        return self._channel.due(t)
+
+    def _sizes(self, stamp: float, rows: Index, said: tuple[Index, Array, Array, Array]) -> Index:
+        """(N,) bytes of the payloads of the rows that speak, as they would stand on the wire."""
+        found = np.zeros(len(said[0]), dtype=np.intp)
+        columns = zip(*(each[rows].tolist() for each in said), strict=True)
+        for row, (number, place, moves, turned) in zip(rows.tolist(), columns, strict=True):
+            pose = messages.pose(self._names[row % len(self._names)], number, stamp, place, moves, turned)
+            found[row] = len(messages.encode(pose, self._encoding))
+        return found
+
+
+@dataclass(frozen=True)
+class Steered:
+    """What went between robots and centre in all repetitions, in the time of the experiment [s].
+
+    Attributes:
+        sent: Goals: time, row, number, goal (K, 3), yaw, time of the pose on which it rests.
+        followed: Goals that reached their robots: time, row, number, time sent, time of the pose.
+        heard: Poses that the centre heard: time, row.
+        lost_poses: (R,) of each row, that did not reach the centre, from the common start to the end of the experiment.
+        lost_goals: (R,) goals that did not reach their rows.
+    """
+
+    sent: tuple[Array, Index, Index, Array, Array, Array]
+    followed: tuple[Array, Index, Index, Array, Array]
+    heard: tuple[Array, Index]
+    lost_poses: Index
+    lost_goals: Index
+
+
+class Steering:
+    """A centre for all repetitions of an experiment. It has one process's share of the network: what robots say to it,
+    and what it says to them, takes as long and is lost as often as what robots say to each other.
+
+    Phases and the common start are the conductor's, and known to everybody at once, as they are to the robots.
+
+    Attributes:
+        centre: The decision.
+    """
+
+    def __init__(self, experiment: Experiment, seeds: Sequence[int]) -> None:
+        self.centre = Centre(assignment.assign_centre(experiment, len(seeds)))
+        self.centre.find(self.centre.listens)  # all robots are there from the beginning
+        self._sent: list[tuple[Any, ...]] = []
+        self._followed: list[tuple[Any, ...]] = []
+        self._heard: list[tuple[Any, ...]] = []
+        rows = len(self.centre.guided)
+        told = np.flatnonzero(self.centre.guided)
+        ends = [[(row, row) for row in group.tolist()] for group in (self.centre.listens, told)]
+        self._poses, self._goals = (
+            Channel(experiment, links(pairs), seeds, stream=stream)
+            for pairs, stream in zip(ends, (TO_CENTRE, FROM_CENTRE), strict=True)
+        )
+        self._poses_of, self._goals_of = (np.array([row for row, _ in pairs], dtype=np.intp) for pairs in ends)
+        self._seq: Index = np.zeros(rows, dtype=np.intp)
+        self._goal, self._still = np.full((rows, 3), np.nan), np.zeros((rows, 3))
+        self._extra = np.full((rows, 2), np.nan)
+
+    def _counted(self, channel: Channel, rows: Index) -> Index:
+        counts = np.zeros(len(self._seq), dtype=np.intp)
+        counts[rows] = channel.lost
+        return counts
+
+    def say(  # noqa: PLR0917 - as `Channel.send`
+        self, t: float, rows: Index, seq: Index, position: Array, velocity: Array, yaw: Array, *, start: float
+    ) -> None:
+        """Robots say where they are, to whoever listens; see `Channel.send`."""
+        self._poses.send(t, rows, seq, position, velocity, yaw=yaw, start=start, extra=yaw[:, None])
+
+    def deliver(self, t: float, agent: Agent) -> None:
+        """Hands out at `t` [s] what has arrived: poses to the centre, goals to the robots."""
+        arrived = self._poses.due(t)
+        if arrived is not None and arrived.extra is not None:
+            rows = self._poses_of[arrived.link]
+            self.centre.hear(
+                rows, arrived.position, arrived.velocity, arrived.extra[:, 0], arrived.stamp, arrived.arrival
+            )
+            self._heard.append((arrived.arrival, rows))
+        arrived = self._goals.due(t)
+        if arrived is not None and arrived.extra is not None:
+            # of several for one robot the newest counts
+            arrived = arrived.take(np.argsort(arrived.stamp, kind="stable"))
+            _, last = np.unique(arrived.link[::-1], return_index=True)
+            arrived = arrived.take(len(arrived.link) - 1 - last)
+            rows = self._goals_of[arrived.link]
+            assert arrived.extra is not None
+            toward, rests = arrived.extra.T
+            news = agent.hear_goal(rows, arrived.position, toward, arrived.stamp)
+            if news.any():
+                now = np.full(int(news.sum()), t)
+                self._followed.append((now, rows[news], arrived.seq[news], arrived.stamp[news], rests[news]))
+
+    def decide(self, t: float, agent: Agent) -> None:
+        """On a tick on which goals are decided: those of the robots that are guided."""
+        told = self.centre.decide(t, agent.life.phase, agent.life.start_at)
+        rows = told.rows
+        if not len(rows):
+            return
+        self._seq[rows] += 1
+        self._goal[rows], self._extra[rows, 0], self._extra[rows, 1] = told.goal, told.toward, told.rests
+        start, yaw = float(agent.life.start_at.min()), self._extra[:, 0]
+        self._goals.send(t, rows, self._seq, self._goal, self._still, yaw=yaw, start=start, extra=self._extra)
+        self._sent.append((np.full(len(rows), t), rows, self._seq[rows], told.goal, told.toward, told.rests))
+
+    def logged(self, begin: float) -> Steered:
+        """All of it, when the common start was at `begin` [s]."""
+        time, row, seq, goal, toward, rests = joined(self._sent, (0,), (0,), (0,), (0, 3), (0,), (0,))
+        at, who, number, stamp, pose = joined(self._followed, (0,), (0,), (0,), (0,), (0,))
+        heard, speaker = joined(self._heard, (0,), (0,))
+        return Steered(
+            sent=(time - begin, row.astype(np.intp), seq.astype(np.intp), goal, toward, rests - begin),
+            followed=(at - begin, who.astype(np.intp), number.astype(np.intp), stamp - begin, pose - begin),
+            heard=(heard - begin, speaker.astype(np.intp)),
+            lost_poses=self._counted(self._poses, self._poses_of),
+            lost_goals=self._counted(self._goals, self._goals_of),
+        )
+
+
+def joined(columns: list[tuple[Any, ...]], *empty: tuple[int, ...]) -> tuple[Any, ...]:
+    """Concatenated; `empty` gives the shapes of columns when nothing was added."""
+    if not columns:
+        return tuple(np.zeros(shape) for shape in empty)
+    return tuple(np.concatenate(column) for column in zip(*columns, strict=True))
+
+
+Heard = tuple[Array, Index, Index, Array, Array, Array]
+
+
+class VirtualNetwork:
+    """Carries poses between robots, and poses and goals between them and their centre, if they have one."""
+
+    def __init__(self, experiment: Experiment, agent: Agent, seeds: Sequence[int], *, lean: bool) -> None:
+        """For all repetitions; `lean` as for `experiments.virtual_time.simulation.simulate`."""
+        assignment, rows = agent.assignment, len(agent.assignment.names)
+        self._agent, self._lean = agent, lean
+        self._channel = Channel(experiment, assignment.links, seeds)
+        self._steering = None if assignment.guided is None else Steering(experiment, seeds)
+        self._seq: Index = np.zeros(rows, dtype=np.intp)
+        self._nothing = np.zeros((rows, 0))
+        agent.find(np.arange(len(assignment.links)))  # all robots are there from the beginning
+        self._sent: list[tuple[Any, ...]] = []
+        self._heard: list[tuple[Any, ...]] = []
+
+    def carry(self, t: float, state: BodyState) -> Said:
+        """The first half of the tick at `t` [s]: what has arrived is heard, and robots speak.
+
+        Without any delay, what they say is known to all before the second half; and so are the goals that follow.
+        """
+        agent, steering, instant = self._agent, self._steering, self._channel.instant
+        self._deliver(t)
+        said = agent.speak(t, state)
+        if len(said.rows):
+            self._say(t, said, state.yaw)
+            if instant:
+                self._deliver(t)
+        if steering is not None and agent.decides:
+            steering.decide(t, agent)
+            if instant:
+                steering.deliver(t, agent)
+        return said
+
+    def _say(self, t: float, said: Said, yaw: Array) -> None:
+        """Robots speak to those who listen. Before the common start nothing is lost."""
+        speak, start = said.rows, float(self._agent.life.start_at.min())
+        self._seq[speak] += 1
+        told = (said.position[speak], said.velocity[speak], yaw[speak])
+        told = (self._nothing[speak],) * 3 if self._lean else told
+        self._sent.append((np.full(len(speak), t), speak, self._seq[speak], *told))
+        self._channel.send(t, speak, self._seq, said.position, said.velocity, yaw=yaw, start=start)
+        if self._steering is not None:
+            self._steering.say(t, speak, self._seq, said.position, said.velocity, yaw, start=start)
+
+    def _deliver(self, t: float) -> None:
+        """What has arrived is heard."""
+        heard = self._channel.due(t)
+        if heard is not None:
+            self._agent.hear(heard.link, heard.position, heard.velocity, heard.stamp, heard.arrival)
+            if not self._lean:
+                news = (heard.arrival, heard.link, heard.seq, heard.stamp, heard.position, heard.velocity)
+                self._heard.append(news)
+        if self._steering is not None:
+            self._steering.deliver(t, self._agent)
+
+    def sent(self, begin: float) -> Heard:
+        """Columns time, row, seq, position, velocity, yaw; times from the common start at `begin` [s]."""
+        at, row, number, position, velocity, yaw = joined(self._sent, (0,), (0,), (0,), (0, 3), (0, 3), (0,))
+        return at - begin, row.astype(np.intp), number.astype(np.intp), position, velocity, yaw
+
+    def heard(self, begin: float) -> Heard:
+        """Columns time, link, seq, stamp, position, velocity; likewise."""
+        at, link, number, stamp, position, velocity = joined(self._heard, (0,), (0,), (0,), (0,), (0, 3), (0, 3))
+        return at - begin, link.astype(np.intp), number.astype(np.intp), stamp - begin, position, velocity
+
+    @property
+    def lost(self) -> Index:
+        """(E,) samples lost on each link, from the common start to the end of the experiment."""
+        return self._channel.lost
+
+    def steered(self, begin: float) -> Steered | None:
+        """What went between robots and centre; None if every robot decides for itself."""
+        return None if self._steering is None else self._steering.logged(begin)

@@ -1,0 +1,146 @@
+"""The floor plan holds: imports go one way, nothing goes round in a circle, and no room is too full or too small."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TOPS = ("agents", "twins", "bridges", "experiments", "tools")
+MOST, LEAST = 12, 60  # modules of a folder; lines of a module that only one other imports
+# Each line imports from lines above it and within each of its own folders.
+ORDER = """
+agents.arrays agents.clock agents.user_folder
+agents.formation agents.network
+agents.plugins
+agents.body
+agents.decision agents.protocols
+agents.safety
+agents.agent
+agents.runtime
+twins.models twins.scene
+twins.engines
+twins.sensing
+twins.body
+bridges twins.devices
+experiments.definition experiments.catalogue
+experiments.file
+experiments.recording
+experiments.metrics
+experiments.virtual_time
+experiments.check
+experiments.authoring experiments.real_time.hosts experiments.real_time.processes
+experiments.report experiments.real_time.conductor
+experiments.run
+experiments.sweep
+tools.reliability
+tools.bench
+tools.commands
+tools.cli
+tools.guard
+"""
+KNOWN = {
+    ("experiments.report.export", "experiments.run"),
+    ("tools.bench.intruders", "tools.commands.authority"),
+}
+FLOORS = [line.split() for line in ORDER.strip().splitlines()]
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Modules of the five top folders, by dotted name, without `__init__`."""
+    files = (file for top in TOPS for file in (ROOT / top).rglob("*.py") if file.name != "__init__.py")
+    return {".".join(file.relative_to(ROOT).with_suffix("").parts): file for file in files}
+
+
+@cache
+def imports() -> dict[str, set[str]]:
+    """Imports of each module, wherever they stand: late ones as well."""
+    return {name: set(imported(file)) - {name} for name, file in modules().items()}
+
+
+def imported(file: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                yield from (name for name in (inner, node.module) if name in modules())
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in modules())
+
+
+def room(name: str) -> str:
+    """The entry of ORDER that a module belongs to."""
+    found = [entry for floor in FLOORS for entry in floor if f"{name}.".startswith(f"{entry}.")]
+    assert len(found) == 1, f"{name} has no place in the order of the folders, or several: {found}"
+    return found[0]
+
+
+def floor_of(entry: str) -> int:
+    return next(number for number, floor in enumerate(FLOORS) if entry in floor)
+
+
+def test_imports_go_one_way():
+    against = [
+        f"{name} imports {other}"
+        for name, others in imports().items()
+        for other in others
+        if room(name) != room(other) and floor_of(room(other)) >= floor_of(room(name))
+        if (name, other) not in KNOWN
+    ]
+    assert not against
+
+
+def test_no_circle():
+    try:
+        TopologicalSorter(imports()).prepare()
+    except CycleError as error:
+        pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def test_no_folder_is_too_full():
+    folders: dict[Path, list[str]] = {}
+    for name, file in modules().items():
+        folders.setdefault(file.parent, []).append(name)
+    assert not {str(folder.relative_to(ROOT)): len(inside) for folder, inside in folders.items() if len(inside) > MOST}
+
+
+def test_no_module_is_a_mere_part_of_another():
+    importers: dict[str, set[str]] = {name: set() for name in modules()}
+    for name, others in imports().items():
+        for other in others:
+            importers[other].add(name)
+    entries = started() | plugged_in()
+    small = [
+        f"{name} belongs into {next(iter(users))}"
+        for name, users in importers.items()
+        if len(users) == 1 and len(modules()[name].read_text("utf-8").splitlines()) < LEAST
+        if name not in entries and not name.startswith(("tools.cli.", "tools.commands."))
+    ]
+    assert not small
+
+
+def started() -> set[str]:
+    """Modules that run as processes: what `python -m` can start."""
+    return {name for name, file in modules().items() if 'if __name__ == "__main__":' in file.read_text("utf-8")}
+
+
+def plugged_in() -> set[str]:
+    """Modules that the entry points of zenpark name."""
+    text = (ROOT / "pyproject.toml").read_text("utf-8")
+    return set(re.findall(r'= "((?:agents|bridges|twins|experiments|tools)[\w.]*):', text))
+
+
+def test_every_folder_says_what_lives_there():
+    silent = []
+    for folder in {file.parent for file in modules().values()}:
+        tree = ast.parse((folder / "__init__.py").read_text("utf-8"))
+        if ast.get_docstring(tree) is None or len(tree.body) > 1:
+            silent.append(str(folder.relative_to(ROOT)))
+    assert not silent, "each __init__.py holds two or three lines of docstring, and nothing else"

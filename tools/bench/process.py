@@ -1,0 +1,156 @@
+"""`zenpark bench process`: CPU and memory of a robot's process, beside a bare Zenoh process with the same messages.
+
+Each robot of the reference experiment has a bare process of its own name, which sends as many poses and receives those
+of the same neighbours, in the same seconds through the same router. The ratio of the CPU times of each pair holds on a
+busy machine as well; it is taken for each pose sent, because a robot that misses ticks sends fewer.
+"""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from tools.bench.bench_figure import Figure
+
+if TYPE_CHECKING:
+    from experiments.real_time.conductor.run_view import Progress
+
+FLIGHT_S: Final = 20.0
+
+
+class Spent(NamedTuple):
+    """CPU time and memory of a process at one moment.
+
+    Attributes:
+        at: [s, monotonic]
+        cpu_s: Since it began [s].
+        rss_mb: Memory that it has [MB].
+    """
+
+    at: float
+    cpu_s: float
+    rss_mb: float
+
+    @classmethod
+    def of(cls, pid: int) -> Spent:
+        """Of another process on this machine, now."""
+        cpu_s = time.clock_gettime(~pid << 3 | 2)  # clock_getcpuclockid(3): exact, where /proc counts in 10 ms
+        pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
+        return cls(time.monotonic(), cpu_s, pages * resource.getpagesize() / 1e6)
+
+
+class Meter:
+    """Measures processes, by the names of their robots, from the first `look` to the last."""
+
+    def __init__(self) -> None:
+        self.first: dict[str, Spent] = {}
+        self.last: dict[str, Spent] = {}
+
+    def look(self, pids: Mapping[str, int]) -> None:
+        """Measures now; processes that have ended are left out."""
+        for name, pid in pids.items():
+            try:
+                spent = Spent.of(pid)
+            except OSError:
+                continue
+            self.first.setdefault(name, spent)
+            self.last[name] = spent
+
+    def shares(self) -> dict[str, float]:
+        """CPU time of each process over wall time [%]."""
+        pairs = ((name, self.first[name], last) for name, last in self.last.items())
+        return {name: 100.0 * (b.cpu_s - a.cpu_s) / (b.at - a.at) for name, a, b in pairs if b.at > a.at}
+
+
+def process() -> Iterator[Figure]:
+    """Robot processes of the reference experiment in flight, each beside a bare process: CPU and memory of both."""
+    from agents.agent import links_by_speaker  # noqa: PLC0415
+    from agents.network import messages  # noqa: PLC0415
+    from agents.network.endpoints import free_endpoint  # noqa: PLC0415
+    from experiments.definition.assignment import assign  # noqa: PLC0415
+    from experiments.file import document  # noqa: PLC0415
+    from experiments.real_time.conductor.conductor import Conductor  # noqa: PLC0415
+    from experiments.real_time.conductor.support import start_router  # noqa: PLC0415
+    from experiments.real_time.hosts.hosts import Hosts  # noqa: PLC0415
+    from experiments.real_time.hosts.launcher import Launcher  # noqa: PLC0415
+    from experiments.recording.run_folder import SOURCE  # noqa: PLC0415
+
+    read = document.load("robotic-park", f"duration_s={FLIGHT_S}", "timeline=[]", "trigger.period_s=0.02")
+    experiment = read.cases()["periodic"]
+    robots, bare = Meter(), Meter()
+    first, last = dict[str, messages.Status](), dict[str, messages.Status]()
+    beside: dict[str, int] = {}
+
+    def look(progress: Progress) -> None:
+        running = {
+            name: seen.status
+            for name, seen in progress.robots.items()
+            if seen.status is not None and seen.status.phase == "running"
+        }
+        for name, status in running.items():
+            first.setdefault(name, status)
+            last[name] = status
+        robots.look({name: status.pid for name, status in running.items()})
+        bare.look({name: beside[name] for name in running})
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / SOURCE).write_text(read.text, encoding="utf-8")
+        file = folder / "periodic.json"
+        file.write_bytes(document.write_json(experiment))
+        with Launcher(folder / "logs") as launcher:
+            endpoints = [free_endpoint()]
+            start_router(launcher, endpoints)
+            for robot in experiment.robots:
+                mine = assign(experiment, [robot])
+                speakers = links_by_speaker(mine.links, mine.speakers)
+                rate = f"{experiment.rates.pose_hz:g}"
+                started = launcher.start(
+                    f"bare-{robot}", "tools.bench.bare_process", robot, rate, *speakers, "--connect", endpoints[0]
+                )
+                beside[robot] = started.handle.pid
+            result = Conductor(
+                experiment,
+                "periodic",
+                file=file,
+                source=folder / SOURCE,
+                folder=folder,
+                endpoints=endpoints,
+                launcher=launcher,
+                hosts=Hosts(launcher, endpoints),
+                show=look,
+                interrupted=lambda: False,
+            ).run()
+    assert result.ready_s is not None
+    yield Figure("process", "seven robots ready after", result.ready_s, "s", result.ready_s / 3.0, "× 3 s")
+    of_robots, of_bare = robots.shares(), bare.shares()
+    yield Figure(
+        "process",
+        "CPU of a bare process (50 Hz pose)",
+        statistics.median(of_bare.values()),
+        "% of a core",
+        1.0,
+        "yardstick",
+    )
+    rates = {name: (last[name].sent - first[name].sent) / (last[name].stamp - first[name].stamp) for name in of_robots}
+    pose_hz = experiment.rates.pose_hz
+    ratio = statistics.median(of_robots[name] / rates[name] * pose_hz / of_bare[name] for name in rates)
+    yield Figure(
+        "process",
+        "CPU of a robot (50 Hz pose, 100 Hz body)",
+        statistics.median(of_robots.values()),
+        "% of a core",
+        ratio,
+        "× bare process, each pose",
+    )
+    memory = max(spent.rss_mb for spent in bare.last.values())
+    yield Figure("process", "largest resident memory of a bare process", memory, "MB", 1.0, "yardstick")
+    larger = max(spent.rss_mb for spent in robots.last.values())
+    yield Figure("process", "largest resident memory of a robot", larger, "MB", larger / memory, "× bare process")
+    missed = 100.0 * sum(s.missed for s in last.values()) / sum(s.ticks for s in last.values())
+    yield Figure("process", "missed deadlines", missed, "%", missed, "× 1 %")

@@ -1,0 +1,1 @@
+"""Signatures and help of every command; imports nothing heavy."""

@@ -1,0 +1,193 @@
+"""`zenpark keys`: alone it shows who is on the network; behind it stand the commands for a lab's certificates."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from tools.cli.options import As, AsJson, Connect, Lab, routers
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from agents.network.lab import Register, Role
+    from experiments.definition.experiment import Experiment
+
+app: Final = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
+
+Folder = Annotated[str, typer.Argument(metavar="LAB", help="Folder of the lab.")]
+Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Identities.")]
+Days = Annotated[float, typer.Option(min=0.01, help="For which a certificate is valid.")]
+Hosts = Annotated[
+    list[str] | None,
+    typer.Option("--host", metavar="HOST", help="Name or address at which it listens; may be repeated."),
+]
+SOON_DAYS: Final = 14.0
+
+
+@app.callback(invoke_without_command=True)
+def _keys(
+    context: typer.Context,
+    connect: Connect = None,
+    as_json: AsJson = False,
+    lab: Lab = None,
+    identity: As = "observer",
+) -> None:
+    """Show who is on the network and which keys they hold; make certificates (init, issue, renew, revoke, show)."""
+    if context.invoked_subcommand is None:
+        from tools.commands.network import keys as show_keys  # noqa: PLC0415
+
+        show_keys(routers(connect, lab), as_json=as_json, identity=identity)
+
+
+@app.command()
+def init(
+    folder: Folder,
+    who: Annotated[
+        list[str] | None, typer.Argument(metavar="[FILE|ROBOT...]", help="Experiments, whose robots; or their names.")
+    ] = None,
+    host: Hosts = None,
+    days: Days = 90.0,
+    authority_days: Annotated[float, typer.Option(min=0.01, help="For which the lab itself is valid.")] = 1826.0,
+) -> None:
+    """Found a lab: its authority, a certificate per robot, and those of router, operator, observer and helpers."""
+    from pathlib import Path  # noqa: PLC0415
+
+    from tools.commands.authority import SERVICES, create  # noqa: PLC0415
+
+    place = Path(folder)
+    identities: dict[str, Role] = {role: role for role in SERVICES}
+    identities |= _robots(who or [], set(SERVICES))
+    known = create(
+        place, identities, hosts=host or [], listening=_listening(who or []), days=days, authority_days=authority_days
+    )
+    _tell(place, known, list(known.identities))
+    typer.echo(
+        f"{place}/ca.key makes new identities: keep it here. A robot's computer needs ca.pem and its own .pem and .key,"
+        f" a router's ca.pem, lab.json and router.*\nNow: zenpark run FILE --lab {place}, or [network] lab in the file"
+    )
+
+
+@app.command()
+def issue(
+    folder: Folder,
+    names: Names,
+    role: Annotated[str, typer.Option(help="robot, operator, observer, router, ...; or by the name itself.")] = "",
+    host: Hosts = None,
+    days: Days = 90.0,
+) -> None:
+    """Make certificates for more robots, people or routers."""
+    from pathlib import Path  # noqa: PLC0415
+
+    from agents.network.lab import ROLES, LabError  # noqa: PLC0415
+    from agents.plugins.registry import did_you_mean  # noqa: PLC0415
+    from tools.commands.authority import issue as made  # noqa: PLC0415
+
+    if role and role not in ROLES:
+        raise LabError(f"no role '{role}' in a lab; {did_you_mean(role, ROLES)}")
+    roles: dict[str, Role] = {each: each for each in ROLES}
+    identities = {name: roles.get(role or name, "robot") for name in names}
+    _tell(Path(folder), made(Path(folder), identities, hosts=host or [], days=days), names)
+
+
+@app.command()
+def renew(
+    folder: Folder,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME...]", help="All, if none is named.")] = None,
+    host: Hosts = None,
+    days: Days = 90.0,
+    authority: Annotated[
+        bool, typer.Option("--authority", help="A new authority too: every file from before is refused.")
+    ] = False,
+) -> None:
+    """Make new certificates for the same names; those before are valid until they end."""
+    from pathlib import Path  # noqa: PLC0415
+
+    from tools.commands.authority import renew as made  # noqa: PLC0415
+
+    known = made(Path(folder), names or [], hosts=host or [], days=days, authority=authority)
+    _tell(Path(folder), known, names or list(known.identities))
+
+
+@app.command()
+def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
+    """Take all rights from certificates that are lost or stolen, and make new ones."""
+    from pathlib import Path  # noqa: PLC0415
+
+    from tools.commands.authority import revoke as made  # noqa: PLC0415
+
+    _tell(Path(folder), made(Path(folder), names, days=days), names)
+    typer.echo(
+        "The old keys have no rights at a `zenpark router` that reads this lab.json: one that runs notices it in a "
+        "second; copy the file to routers elsewhere. Their owners are no longer heard: give them the new files. "
+        "A zenohd notices nothing, and the old keys go on working: print its file again (zenpark router FILE --lab LAB "
+        "--print-config) and restart it"
+    )
+
+
+@app.command()
+def show(folder: Folder, as_json: AsJson = False) -> None:
+    """Show who is in a lab and until when; exit code 1 if a certificate has ended."""
+    from pathlib import Path  # noqa: PLC0415
+
+    import msgspec  # noqa: PLC0415
+
+    from agents.network.lab import register  # noqa: PLC0415
+
+    known = register(Path(folder))
+    if as_json:
+        typer.echo(msgspec.json.format(msgspec.json.encode(known), indent=2).decode())
+    else:
+        _tell(Path(folder), known, list(known.identities))
+    now = datetime.now(UTC)
+    raise typer.Exit(any(datetime.fromisoformat(each.until) < now for each in known.identities.values()))
+
+
+def _cases(each: str) -> list[Experiment] | None:
+    """The cases of an experiment; None if it is a robot that is named."""
+    from difflib import get_close_matches  # noqa: PLC0415
+    from pathlib import Path  # noqa: PLC0415
+
+    from agents.network.lab import LabError  # noqa: PLC0415
+    from experiments.file import catalogue, document  # noqa: PLC0415
+
+    names = [name for name, _ in catalogue.names()]
+    known = each in names or Path(each).suffix or Path(each).exists()
+    if not known and (meant := get_close_matches(each, names, n=1, cutoff=0.8)):
+        raise LabError(f"{each} is neither a file nor in the catalogue; did you mean '{meant[0]}'?")
+    return list(document.read(each).cases().values()) if known else None
+
+
+def _listening(who: list[str]) -> dict[str, list[str]]:
+    """Where identities of experiments listen that are meshes."""
+    from experiments.definition import mesh  # noqa: PLC0415
+
+    return {name: at for each in who for case in _cases(each) or () for name, at in mesh.listeners(case).items()}
+
+
+def _robots(who: list[str], taken: set[str]) -> dict[str, Role]:
+    """Robots of experiments, and those that are named themselves."""
+    from agents.network.lab import LabError  # noqa: PLC0415
+
+    found: dict[str, Role] = {}
+    for each in who:
+        cases = _cases(each)
+        found |= {each: "robot"} if cases is None else {robot: "robot" for case in cases for robot in case.robots}
+    if clash := sorted(set(found) & taken):
+        raise LabError(f"{', '.join(clash)}: every lab has an identity of that name; rename the robot")
+    return found
+
+
+def _tell(folder: Path, known: Register, names: list[str]) -> None:
+    now = datetime.now(UTC)
+    width = max(map(len, names))
+    for name in names:
+        each = known.identities[name]
+        left = (datetime.fromisoformat(each.until) - now).total_seconds() / 86400.0
+        state = "ENDED" if left < 0 else f"{left:.0f} days left" + ("  renew it" if left < SOON_DAYS else "")
+        as_name = "" if each.common_name == name else f"  as {each.common_name}"
+        hosts = f"  listens at {', '.join(each.hosts)}" if each.hosts else ""
+        typer.echo(f"{name:<{width}}  {each.role:<11}  until {each.until[:16]}  {state}{as_name}{hosts}")
+    typer.echo(f"lab: {folder}")

@@ -1,0 +1,74 @@
+"""The command line: signatures and help only. What a command does is imported when it runs, so that help is quick."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Final
+
+import typer
+
+from tools.cli import hosts, keys, network, processes, robot, runs
+
+app: Final = typer.Typer(
+    name="zenpark",
+    help="Distributed experiments with several robots, on Zenoh.",
+    no_args_is_help=True,
+    rich_markup_mode=None,  # rich help costs 100 ms at every start
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for _group in (runs, processes, network):
+    app.add_typer(_group.app)
+app.add_typer(hosts.app, name="hosts")
+app.add_typer(keys.app, name="keys")
+app.add_typer(robot.app, name="robot", help="Change the robots of a run that is under way.")
+
+# The errors that explain themselves, by the module that defines them: one that was raised has its module loaded,
+# so that nothing needs to be imported to recognise it.
+EXPLAINED: Final = (
+    ("agents.network.session", "EndpointError"),
+    ("agents.network.lab", "LabError"),
+    ("agents.network.session", "Unreachable"),
+    ("agents.body.interface", "BodyError"),
+    ("agents.network.name_ownership", "NameTaken"),
+    ("agents.plugins.registry", "PluginError"),
+    ("experiments.file.problems", "DocumentError"),
+    ("experiments.recording.reader", "RecordingError"),
+    ("experiments.report.export", "ExportError"),
+    ("experiments.real_time.conductor.conductor", "RunFailed"),
+    ("experiments.real_time.hosts.hosts", "HostError"),
+    ("experiments.virtual_time.simulation", "Stuck"),
+    ("experiments.sweep.workers", "SweepError"),
+    ("experiments.real_time.conductor.support", "StandInError"),
+    ("experiments.real_time.processes.world", "WorldTaken"),
+    ("experiments.real_time.processes.centre", "CentreTaken"),
+    ("tools.commands.orders", "WorldOrderError"),
+    ("tools.commands.network", "KeyExpressionError"),
+)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version  # noqa: PLC0415
+
+        typer.echo(f"zenpark {version('zenpark')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _zenpark(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")] = False,
+) -> None: ...
+
+
+def _explained() -> tuple[type[BaseException], ...]:
+    return tuple(getattr(sys.modules[module], name) for module, name in EXPLAINED if module in sys.modules)
+
+
+def main() -> None:
+    """Runs a command. Exit codes: its own, 2 for what the user can mend, 130 for Ctrl-C."""
+    try:
+        app()
+    except _explained() as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,52 @@
+"""Arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+File = Annotated[str, typer.Argument(metavar="FILE", help="Experiment file, or the name of a ready-made one.")]
+Connect = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ENDPOINT", help="A router; may be repeated. @FILE: those of a running run. [tcp/127.0.0.1:7447]"
+    ),
+]
+Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`zenpark keys init`).")]
+As = Annotated[str, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="PATH=VALUE", help="Changes a value of the file; may be repeated."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="For programs.")]
+KeyExpression = Annotated[str, typer.Argument(metavar="KEY", help="Key expression, such as park/*/pose.")]
+Seconds = Annotated[float | None, typer.Option(min=0.0, help="End after this time [s].")]
+Realm = Annotated[str, typer.Option(metavar="NAME", help="First chunk of the keys.")]
+Case = Annotated[str | None, typer.Option(metavar="NAME", help="A case of the file. [the first]")]
+Cases = Annotated[list[str] | None, typer.Option("--case", metavar="NAME", help="Only this case; may be repeated.")]
+Lifeline = Annotated[bool, typer.Option("--lifeline", help="End when standard input ends or falls silent.")]
+Out = Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")]
+Bodies = Annotated[
+    str | None,
+    typer.Option(
+        metavar="twin|world|protocol",
+        help="Every robot in a twin of its own, in one world, or behind a protocol twin (real time).",
+    ),
+]
+Report = Annotated[bool, typer.Option(help="Writes the report.")]
+Anyway = Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")]
+OpenReport = Annotated[bool, typer.Option("--open", help="Opens it in the browser.")]
+
+
+def routers(connect: list[str] | None, lab: str | None) -> list[str]:
+    """Endpoints as given on the command line, with the certificates of a lab where one is named.
+
+    Raises:
+        EndpointError: If a file of endpoints cannot be read.
+        LabError: If one of them asks for no certificate.
+    """
+    from agents.network.lab import secured  # noqa: PLC0415
+    from experiments.definition.endpoints import listed  # noqa: PLC0415
+
+    return secured(listed(connect or []), lab)

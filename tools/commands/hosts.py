@@ -1,0 +1,297 @@
+"""The machines of an experiment: can each of them take part, and has it the zenpark that is here."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from msgspec.structs import replace
+
+from agents.network.endpoints import Endpoint, free_endpoint
+from experiments.definition import endpoints
+from experiments.definition.experiment import Experiment, Host
+from experiments.file import document
+from experiments.file.document import Document
+from experiments.file.problems import DocumentError, Problem
+from experiments.real_time.conductor.conduct import enforced
+from experiments.real_time.conductor.support import start_router
+from experiments.real_time.hosts import certificates
+from experiments.real_time.hosts.hosts import HostError, Station
+from experiments.real_time.hosts.launcher import Launcher
+from experiments.real_time.hosts.station import Found, Question
+from experiments.recording import version
+from tools.commands.host_files import deliver, packed, send
+
+YES, NO, DOUBTFUL, NOTHING = "✓", "✗", "!", "–"
+HEADING: Final = ("host", "reachable", "zenpark", "Python", "clock", "devices", "router")
+SECURED: Final = (*HEADING[:-1], "certificates", HEADING[-1])  # in a lab
+SOON_DAYS: Final = 14.0
+VAGUE_S: Final = 0.02  # a clock that cannot be told within this lets robots start apart
+REACH_S: Final = 15.0
+INSTALL_S: Final = 900.0
+FILES: Final = ("zenpark", "pyproject.toml", "README.md", "LICENSE")
+
+# $0 is the folder, the rest is what to put there; a checkout or a folder of something else is not ours to change
+PUT: Final = """set -eu
+folder=$0
+if [ -e "$folder/.git" ]; then
+    echo "$folder is a git checkout: bring it up to date with git, there" >&2; exit 3
+fi
+ours() { grep -q '^name = "zenpark"' "$folder/pyproject.toml" 2>/dev/null; }
+if [ -d "$folder" ] && [ -n "$(ls -A "$folder")" ] && ! ours; then
+    echo "$folder holds something else: say in the file where zenpark may go, such as \\"zenpark/zenpark\\"" >&2; exit 3
+fi
+mkdir -p "$folder"
+rm -rf "$folder/.incoming"
+mkdir "$folder/.incoming"
+tar -xzf - -C "$folder/.incoming"
+for each in "$@"; do
+    rm -rf "$folder/$each"
+    mv "$folder/.incoming/$each" "$folder/$each"
+done
+rmdir "$folder/.incoming"
+exec "$folder/zenpark" --version
+"""
+
+
+@dataclass
+class Row:
+    """What was found on one host: a cell of each column, and what is to be done."""
+
+    cells: list[str]
+    trouble: list[str] = field(default_factory=list)
+
+    @property
+    def well(self) -> bool:
+        """Whether nothing stands in the way of a run."""
+        return not any(cell.startswith(NO) for cell in self.cells)
+
+
+def check(file: str, *, settings: Sequence[str], only: Sequence[str], lab: str | None = None) -> int:
+    """`zenpark hosts check`: a table; returns 1 if something stands in the way of a run, else 0."""
+    read = document.read(file, settings)
+    experiment = read.experiment
+    chosen = choose(experiment.hosts, only)
+    heading = HEADING if endpoints.folder(experiment, read.path, lab) is None else SECURED
+    rows = [looked_at(name, experiment, heading) for name, host in chosen.items() if host.address is None]
+    with stations(read, {name: host for name, host in chosen.items() if host.address is not None}, lab) as found:
+        rows += [_row(each, experiment, heading) for each in found]
+    for line in table(rows, heading):
+        print(line)
+    for row in rows:
+        for each in row.trouble:
+            print(each, file=sys.stderr)
+    return 0 if all(row.well for row in rows) else 1
+
+
+def install(file: str, *, settings: Sequence[str], only: Sequence[str], lab: str | None = None) -> int:
+    """`zenpark hosts install`: puts this zenpark on every host that has another or none; returns 1 if one fails.
+
+    In a lab, puts the certificates of its robots there as well, wherever they are not what counts.
+    """
+    read = document.read(file, settings)
+    experiment = read.experiment
+    folder = endpoints.folder(experiment, read.path, lab)
+    chosen = {name: host for name, host in choose(experiment.hosts, only).items() if host.address is not None}
+    code = 0
+    with stations(read, chosen, lab, routed=False) as found:
+        for (name, host), there in zip(chosen.items(), found, strict=True):
+            same = not isinstance(there, HostError) and there.same_version
+            try:
+                done = f"has it already ({version.digest()[: version.SHOWN]})" if same else put(name, host)
+                print(f"{name}: {done}", flush=True)
+                if folder is not None and host.robots:
+                    robots = certificates.of_host(name, experiment.hosts)
+                    right = not isinstance(there, HostError) and same and _trusted(there, folder, robots)
+                    print(f"{name}: {'has its certificates' if right else send(name, host, folder, robots)}")
+            except HostError as error:
+                print(error, file=sys.stderr)
+                code = 1
+    return code
+
+
+def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:
+    """Hosts by name or tag, all if none is named.
+
+    Raises:
+        DocumentError: If there is none, or a name means none.
+    """
+    known = {*hosts, *(tag for host in hosts.values() for tag in host.tags)}
+    for name in only:
+        if name not in known:
+            hint = f"there are: {', '.join(sorted(known))}"
+            raise DocumentError([Problem(f"--on {name}", 0, 0, "is neither a host nor a tag", hint)])
+    if not hosts:
+        hint = 'add one: [hosts.lab1] with address = "user@machine" and robots = ["..."]'
+        raise DocumentError([Problem("[hosts]", 0, 0, "the experiment has no hosts: all robots run here", hint)])
+    return {name: host for name, host in hosts.items() if not only or {name, *host.tags} & set(only)}
+
+
+def _trusted(there: Station, folder: Path, robots: Sequence[str]) -> bool:
+    """Whether a host holds the certificates of its robots, and no others."""
+    holds = there.holds(robots)
+    return not (holds.others or [*certificates.faults(holds, folder, time.time()), *certificates.ended(folder, robots)])
+
+
+@contextmanager
+def stations(
+    read: Document, hosts: Mapping[str, Host], lab: str | None, *, routed: bool = True
+) -> Iterator[list[Station | HostError]]:
+    """A connection to each host, or why there is none, and, if `routed`, a router as a run would have it.
+
+    Raises:
+        LabError: If a certificate is missing here.
+    """
+    experiment = read.experiment
+    with tempfile.TemporaryDirectory() as folder, Launcher(Path(folder)) as launcher:
+        network, own = experiment.network, []
+        secure = endpoints.folder(experiment, read.path, lab) is not None
+        if not routed:
+            routers = []
+        elif network.connect is None:
+            own = network.listen or [free_endpoint(protocol="tls" if secure else "tcp")]
+            routers = endpoints.routers(experiment, read.path, own, lab)
+            start_router(launcher, routers, enforced(read.cases().values(), routers, Path(folder)))
+        else:
+            routers = endpoints.routers(experiment, read.path, network.connect, lab)
+        begun: list[Station | HostError] = []
+        for name, host in hosts.items():
+            try:
+                begun.append(Station(name, host, launcher=launcher, routers=routers, run="check"))
+            except HostError as error:
+                begun.append(error)
+        found: list[Station | HostError] = []
+        for each in begun:
+            try:
+                if isinstance(each, Station):
+                    each.greet(experiment.network.address)
+                found.append(each)
+            except HostError as error:
+                found.append(error)
+        yield found
+
+
+def looked_at(name: str, experiment: Experiment, heading: Sequence[str] = HEADING) -> Row:
+    """A host that nobody here can reach: its robots come by themselves."""
+    robots = ", ".join(experiment.hosts[name].robots) or "no robots"
+    return Row([name, f"{NOTHING} no address: {robots} started there", *[NOTHING] * (len(heading) - 2)])
+
+
+def _row(there: Station | HostError, experiment: Experiment, heading: Sequence[str]) -> Row:
+    """Everything about one host."""
+    if isinstance(there, HostError):
+        name = str(there).partition(":")[0]
+        return Row([name, NO, *[NOTHING] * (len(heading) - 2)], [str(there)])
+    row = Row([there.name])
+    try:
+        _fill(row, there, experiment)
+    except HostError as error:
+        row.cells += [NO] * (len(heading) - len(row.cells))
+        row.trouble.append(str(error))
+    return row
+
+
+def _fill(row: Row, there: Station, experiment: Experiment) -> None:
+    here = version.digest()[: version.SHOWN]
+    row.cells.append(f"{YES} {there.hello.machine}")
+    if there.same_version:
+        row.cells.append(f"{YES} {here}")
+    else:
+        row.cells.append(f"{NO} {there.hello.zenpark[: version.SHOWN]}, here {here}")
+        row.trouble.append(f"{there.name}: another zenpark is there; `zenpark hosts install FILE` puts this one there")
+    row.cells.append(f"{YES} {there.hello.python}")
+    clock = there.measure()
+    vague = clock.uncertainty > VAGUE_S
+    row.cells.append(f"{DOUBTFUL if vague else YES} {clock.offset * 1e3:+.2f} ± {clock.uncertainty * 1e3:.2f} ms")
+    if vague:
+        row.trouble.append(
+            f"{there.name}: the connection is slow, so robots there may start ± {clock.uncertainty * 1e3:.0f} ms apart "
+            "from the others; use a cable, or a network with less on it"
+        )
+    bodies = [experiment.robots[robot].body for robot in there.host.robots]
+    devices = there.ask(Question("devices", bodies=bodies), REACH_S)[0].found
+    wrong = [each for each in devices if not each.well]
+    words = ", ".join(each.what for each in devices) or "none needed"
+    row.cells.append(f"{NO if wrong else YES} {words}")
+    row.trouble += [f"{there.name}: {each.what} {each.text}" for each in wrong]
+    if there.lab is not None and not _recognised(
+        row, there, there.lab, certificates.of_host(there.name, experiment.hosts)
+    ):
+        row.cells.append(f"{NOTHING} needs its certificates")
+        return
+    shown = Question("reach", endpoints=there.endpoints)
+    if there.lab is not None:
+        shown = replace(shown, lab=there.folder, names=there.host.robots)
+    routers = there.ask(shown, REACH_S)[0].found
+    unreached = [each for each in routers if not each.well]
+    row.cells.append(f"{NO if unreached else YES} {', '.join(each.text for each in routers if each.well)}".rstrip())
+    row.trouble += [
+        f"{there.name}: {each.what} cannot be reached from there; {_mended(there, each, experiment)}"
+        for each in unreached
+    ]
+
+
+def _mended(there: Station, router: Found, experiment: Experiment) -> str:
+    """What to do about a router that a host does not reach."""
+    if "refuses the certificate" in router.text and Endpoint.parse(router.what).is_loopback:
+        return f"ssh carries it, so look at the certificates: `zenpark keys show {there.lab}`"
+    if experiment.network.connect is not None:
+        return "is it on (`zenpark router` starts one)? Else mend connect in [network]"
+    if experiment.network.listen is not None:
+        return "mend address or listen in [network], or leave both out: then ssh carries it; is there a firewall here?"
+    return "ssh carries it: does sshd there allow that (AllowTcpForwarding yes)? Else add listen to [network]"
+
+
+def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -> bool:
+    """Adds what a host holds of the lab's certificates to its row; whether its robots would be let in."""
+    wrong = there.distrusted(there.host.robots)
+    holds = there.holds(robots)
+    strays = [f"{there.name}: {each}" for each in certificates.strays(holds, there.name)]
+    left = certificates.days_left(folder, there.host.robots)
+    soon = not wrong and left < SOON_DAYS
+    mark = NO if wrong or strays else DOUBTFUL if soon else YES
+    row.cells.append(f"{mark} {len(holds.held)}, {left:.0f} days left" if not wrong else mark)
+    row.trouble += [*wrong, *strays]
+    if soon:
+        remedy = f"`zenpark keys renew {folder} {' '.join(there.host.robots)}`, then `zenpark hosts install FILE`"
+        row.trouble.append(f"{there.name}: its certificates end in {left:.0f} days; {remedy}")
+    return not wrong
+
+
+def table(rows: Sequence[Row], heading: Sequence[str] = HEADING) -> list[str]:
+    """The lines of the table, columns as wide as they must be."""
+    lines = [list(heading), *(row.cells for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(heading))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
+
+
+def put(name: str, host: Host) -> str:
+    """Puts this zenpark on a host, and makes it ready; returns what it then says of itself.
+
+    Raises:
+        HostError: If there is no place for it, or it cannot be made ready there.
+    """
+    place = PurePosixPath(host.zenpark.removeprefix("~/"))
+    if place.name != "zenpark" or place.parent in (PurePosixPath(), PurePosixPath("/")):
+        raise HostError(f"{name}: '{host.zenpark}' names no folder of its own; write zenpark = \"zenpark/zenpark\"")
+    if not (version.ROOT / "zenpark").is_file():
+        raise HostError(f"{name}: this zenpark is no checkout, which is what can be copied; start ./zenpark of one")
+    wanted = [*version.PACKAGES, *FILES, *sorted(path.name for path in version.ROOT.glob("requirements*.lock"))]
+    names = [each for each in wanted if (version.ROOT / each).exists()]
+    said = deliver(
+        name,
+        host,
+        PUT,
+        [place.parent, *names],
+        packed(version.ROOT, names),
+        limit_s=INSTALL_S,
+        late=f"not ready after {INSTALL_S / 60:g} minutes; start {place} there by hand",
+        failed="not installed",
+    )
+    return f"{said.strip()} ({version.digest()[: version.SHOWN]}) installed"

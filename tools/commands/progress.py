@@ -1,0 +1,199 @@
+"""What a person sees of a run in the terminal: a live table, or a line now and then where there is no terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from experiments.real_time.conductor.run_view import FROZEN_S, OUTPUT, News, Progress, Seen, Shown
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+REFRESH_S: Final = 0.25
+LINE_S: Final = 5.0
+EVENTS: Final = 5  # the last so many are shown below the table
+QUIET: Final = ("robot",)  # kinds of events that the table shows better
+
+
+class Lines:
+    """A line for each event and every few seconds, on standard error."""
+
+    def __init__(self) -> None:
+        self._news, self._next = News(), 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def __call__(self, progress: Progress) -> None:
+        """Prints what is new."""
+        for event in self._news.of(progress):
+            if event.kind == OUTPUT:
+                print(f"{event.source}| {event.text}", file=sys.stderr)
+            elif event.kind not in QUIET:
+                print(f"{progress.case}: {event.kind} {event.source}: {event.text}", file=sys.stderr)
+        now = time.monotonic()
+        if now >= self._next and progress.elapsed is not None:
+            self._next = now + LINE_S
+            errors = ", ".join(
+                f"{name} {'-' if seen.gone else _metres(seen.error)}" for name, seen in progress.robots.items()
+            )
+            what = _silence(progress) or f"error [m] {errors}"
+            print(f"{progress.case}: {progress.elapsed:5.1f} s, {progress.phase}; {what}", file=sys.stderr)
+
+
+class Table:
+    """A live table of the robots, on standard error."""
+
+    def __init__(self) -> None:
+        from rich.console import Console  # noqa: PLC0415 - 60 ms that only a terminal needs
+        from rich.live import Live  # noqa: PLC0415
+
+        self._live = Live(console=Console(stderr=True), refresh_per_second=4, auto_refresh=False)
+        self._news, self._next = News(), 0.0
+
+    def __enter__(self) -> Self:
+        self._live.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.__exit__(None, None, None)
+
+    def __call__(self, progress: Progress) -> None:
+        """Draws the table anew, four times a second at most."""
+        for event in self._news.of(progress):
+            if event.kind == OUTPUT:
+                self._live.console.print(f"{event.source}| {event.text}", markup=False, highlight=False)
+        now = time.monotonic()
+        if now >= self._next or progress.phase == "done":
+            self._next = now + REFRESH_S
+            self._live.update(_table(progress), refresh=True)
+
+
+def shown(*, quiet: bool) -> Shown:
+    """A table in a terminal, lines elsewhere, and only lines when asked to be quiet."""
+    return Table() if sys.stderr.isatty() and not quiet else Lines()
+
+
+def _table(progress: Progress) -> RenderableType:
+    from rich import box  # noqa: PLC0415
+    from rich.console import Group  # noqa: PLC0415
+    from rich.table import Table as Grid  # noqa: PLC0415
+    from rich.text import Text  # noqa: PLC0415
+
+    elapsed = "" if progress.elapsed is None else f"  {progress.elapsed:5.1f} / {progress.duration:g} s"
+    silence = _silence(progress) and f"; {_silence(progress)}"
+    grid = Grid(title=f"{progress.case}: {progress.phase}{elapsed}{silence}", box=box.SIMPLE_HEAD, title_justify="left")
+    for heading in ("robot", "phase", "error, m", "sent", "1/s", "lost", "late", "CPU", "battery", ""):
+        grid.add_column(heading, justify="left" if heading in ("robot", "phase", "") else "right", no_wrap=True)
+    now = progress.clock.utc()
+    for name, seen in progress.robots.items():
+        grid.add_row(name, *_cells(seen, now))
+    news = [event for event in progress.events if event.kind not in (*QUIET, OUTPUT)][-EVENTS:]
+    return Group(grid, *(Text(f"  {event.kind} {event.source}: {event.text}", style="dim") for event in news))
+
+
+def _silence(progress: Progress) -> str:
+    """That nothing is known of the robots at the moment; empty while a router answers."""
+    silent_s = time.monotonic() - progress.silent_since
+    return f"no router answers for {silent_s:.1f} s" if silent_s > 0.0 else ""
+
+
+def _cells(seen: Seen, now: float) -> tuple[str, ...]:
+    status = seen.status
+    out = f"[{'red' if seen.out == 'lost' else 'dim'}]{seen.out}[/]"
+    if status is None:
+        return (out if seen.gone else "starting", *[""] * 8)
+    silent = now - status.stamp > FROZEN_S
+    phase = out if seen.gone else ("[yellow]silent[/]" if silent else status.phase)
+    note = status.hazard or status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
+    if status.malformed:
+        note += f" {status.malformed} malformed"
+    return (
+        phase,
+        _metres(seen.error),
+        str(status.sent),
+        f"{seen.rate:.1f}",
+        str(sum(status.lost.values())),
+        str(status.missed),
+        f"{status.cpu_s:.1f} s",
+        "" if status.battery is None else f"{100 * status.battery:.0f} %",
+        note,
+    )
+
+
+def _metres(error: float | None) -> str:
+    return "–" if error is None else f"{error:.3f}"
+
+
+BAR_LINE_S: Final = 5.0  # where there is no terminal, progress is a line now and then
+SHORT_S: Final = 2.0  # what is over sooner needs no passing bar
+BAR_REFRESH_S: Final = 0.1
+
+
+class Bar:
+    """A bar in a terminal; elsewhere a line every few seconds."""
+
+    def __init__(self, *, passing: bool = False) -> None:
+        """A passing bar leaves nothing behind: it is for terminals only, and for what takes longer than `SHORT_S`."""
+        self._passing = passing
+        self._terminal = sys.stderr.isatty()
+        self._bar: Any = None
+        self._task: Any = None
+        self._what = ""
+        self._began = time.monotonic()
+        self._next = self._began + SHORT_S * passing
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def show(self, what: str, done: int, of: int) -> None:
+        """So much of so much is done; cheap enough to be called a thousand times a second."""
+        now = time.monotonic()
+        if what != self._what:
+            self._what, self._began = what, now
+        over = done >= of and (self._bar is not None or not self._passing)
+        if now < self._next and not over:
+            return
+        if self._terminal:
+            self._next = now + BAR_REFRESH_S
+            self._draw(what, done, of)
+        elif not self._passing:
+            self._next = now + BAR_LINE_S
+            print(f"{what} {done} of {of}", file=sys.stderr)
+
+    def _draw(self, what: str, done: int, of: int) -> None:
+        if self._bar is None:
+            self._bar = _bar(transient=self._passing)
+            self._bar.start()
+        if self._task is None or self._bar.tasks[-1].description != what:
+            self._task = self._bar.add_task(what, total=of, completed=done)
+            self._bar.tasks[-1].start_time = self._began  # it may have gone on for a while before it is shown
+        self._bar.update(self._task, completed=done)
+
+
+def _bar(*, transient: bool) -> Any:  # noqa: ANN401 - rich is imported only here
+    from rich.console import Console  # noqa: PLC0415 - 60 ms that only a terminal needs
+    from rich.progress import (  # noqa: PLC0415
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    console = Console(stderr=True)
+    return Progress(*columns, TimeRemainingColumn(), console=console, transient=transient, get_time=time.monotonic)

@@ -1,0 +1,1 @@
+"""The fault laboratory and the soak: runs watched from outside."""

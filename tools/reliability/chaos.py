@@ -1,0 +1,148 @@
+"""`zenpark chaos`: draws a script of faults, runs it, and says what did not hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from agents.plugins.registry import did_you_mean
+from agents.runtime.command_line import Interrupts
+from experiments.definition.experiment import Experiment
+from experiments.file.document import chosen, load
+from experiments.file.problems import DocumentError, Problem
+from experiments.recording.run_folder import SOURCE, new_folder
+from tools.reliability import chaos_report
+from tools.reliability.chaos_report import Ended, Outcome, Result
+from tools.reliability.chaos_round import Flight, Say, Setting
+from tools.reliability.fault_script import KINDS, Fault, Round, script
+
+BARREN: Final = 3  # rounds without any fault, and it gives up
+
+
+def run(
+    setting: Setting, rounds: Sequence[Round], *, interrupted: Callable[[], bool], say: Say
+) -> tuple[list[Outcome], list[Ended]]:
+    """All rounds, and as many more as the faults take that had no time in theirs.
+
+    Args:
+        setting: Of all of them.
+        rounds: The script.
+        interrupted: Asked whether the user wants to end.
+        say: Gets a line for each fault and each round.
+    """
+    waiting, left = list(rounds), list[Fault]()
+    outcomes: list[Outcome] = []
+    ends: list[Ended] = []
+    barren = 0
+    while (waiting or left) and not interrupted() and barren < BARREN:
+        if not waiting:
+            waiting, left = again(left), []
+        flight = Flight(setting, waiting.pop(0), len(ends) + 1, interrupted, say)
+        ends.append(flight.fly())
+        outcomes += flight.outcomes
+        left += ends[-1].left
+        barren = 0 if flight.outcomes else barren + 1
+    return outcomes, ends
+
+
+def again(faults: Sequence[Fault]) -> list[Round]:
+    """Faults that had no time, in rounds of their own: those that need a stage of their own on that."""
+    rounds = []
+    for stage in dict.fromkeys(fault.nature.stage for fault in faults):
+        chosen = [fault for fault in faults if fault.nature.stage == stage]
+        rounds.append(Round(sorted(chosen, key=lambda fault: fault.kind == "conductor"), stage))
+    return rounds
+
+
+# it measures contacts; a busy machine is no fault; and rounds are long, for starts take time
+ALWAYS: Final = ('world.engine="pymunk"', "start.deadline_s=60", "duration_s=90")
+# without one, robots cannot keep clear of a dead one that stands in their way, nor of one that lands below them
+AVOIDANCE: Final = 'avoidance={ kind = "barrier", hears = "all", clearance = 1.0 }'
+BODY_HZ: Final = 50.0  # relays, world and robots share one machine: at 100 Hz two cores are full, and ticks are missed
+BODIES: Final = "world"
+SCRIPT: Final = "script.json"
+
+
+def command(
+    file: str,
+    *,
+    faults: int,
+    seed: int,
+    kinds: Sequence[str],
+    case: str | None,
+    out: str | None,
+    settings: Sequence[str],
+    as_json: bool,
+) -> int:
+    """`zenpark chaos`; returns the exit code: 0 if everything held, 1 if not, 130 after Ctrl-C.
+
+    Raises:
+        DocumentError: If the file is wrong, or there is no such kind of fault.
+    """
+    changes = [*defaults(load(file).experiment), *settings]
+    read = load(file, *changes)
+    name = case or list(read.cases())[-1]
+    experiment = chosen(read, [name])[name]
+    rounds = script(list(experiment.robots), experiment.duration_s, faults, seed, _kinds(kinds))
+    folder = new_folder(dataclasses.replace(read, path=Path(f"{read.path.stem}-chaos")), out)
+    read.keep(folder / SOURCE)
+    (folder / SCRIPT).write_bytes(msgspec.json.format(msgspec.json.encode(rounds), indent=1))
+
+    def say(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    say(f"{faults} faults in {len(rounds)} rounds of {experiment.duration_s:g} s; script: {folder / SCRIPT}")
+    setting = Setting(folder / SOURCE, name, experiment, folder, changes, BODIES, seed)
+    with Interrupts() as interrupted:
+        outcomes, ends = run(setting, rounds, interrupted=interrupted, say=say)
+    result = Result(read.experiment.title, seed, rounds, outcomes, ends)
+    words = ["zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
+    words += [part for kind in kinds for part in ("--kinds", kind)]
+    page = chaos_report.write(folder, result, " ".join(words))
+    if as_json:
+        print(msgspec.json.encode(result).decode())
+    else:
+        _tell(result)
+        print(f"report: {page}")
+    if interrupted.asked:
+        return 130
+    return 1 if result.violations or len(outcomes) < faults else 0
+
+
+def defaults(experiment: Experiment) -> list[str]:
+    """Settings of the laboratory, which `--set` overrides."""
+    made = list(ALWAYS)
+    if experiment.avoidance is None:
+        made.append(AVOIDANCE)
+    rates = experiment.rates
+    if rates.body_hz > BODY_HZ and all(
+        (BODY_HZ / rate).is_integer() for rate in (rates.pose_hz, rates.coordination_hz, rates.state_hz)
+    ):
+        made.append(f"rates.body_hz={BODY_HZ:g}")
+    return made
+
+
+def _kinds(given: Sequence[str]) -> list[str]:
+    """The kinds that were asked for, all without any."""
+    words = [word for part in given for word in part.split(",") if word]
+    for word in words:
+        if word not in KINDS:
+            hint = did_you_mean(word, KINDS) or f"there are: {', '.join(KINDS)}"
+            raise DocumentError([Problem(f"--kinds {word}", 0, 0, "no such fault", hint)])
+    return words or list(KINDS)
+
+
+def _tell(result: Result) -> None:
+    made = chaos_report.table(result)
+    rows = [made.head, *(tuple(map(str, row.cells)) for row in made.rows)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(made.head))]
+    for row in rows:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    marks = {"good": "✓", "fair": "!", "bad": "✗", "plain": "·"}
+    for finding in chaos_report.findings(result):
+        print(f"{marks[finding.mark]} {finding.text}")

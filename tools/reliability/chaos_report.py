@@ -1,0 +1,227 @@
+"""What a fault laboratory found: a table of fault kinds, recovery times as a figure, and a page."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import matplotlib.pyplot as plt
+import msgspec
+
+from experiments.file.problems import DocumentError
+from experiments.recording import playback
+from experiments.recording.playback import NotStarted
+from experiments.recording.reader import RecordingError
+from experiments.recording.recover import recover
+from experiments.report import style
+from experiments.report.page import Finding, Section, Table, date_of, numbered, render
+from experiments.report.page import Row as Line
+from tools.reliability.fault_script import KINDS, NATURES, Fault, Round
+
+
+class Outcome(msgspec.Struct, frozen=True):
+    """What a fault did.
+
+    Attributes:
+        round: In which it was done, counted from 1.
+        fault: As in the script.
+        victim: To whom it was done.
+        at_s: When, from the common start [s].
+        note: What there is to say of it.
+        recovered: Whether all healed in time.
+        begin_s: From its begin until then [s].
+        end_s: From its end [s]; 0 if the formation had healed while it lasted.
+        ended: Whether robots came down instead of going on, the dead not counted.
+        violations: What must not have happened.
+    """
+
+    round: int
+    fault: Fault
+    victim: str
+    at_s: float
+    note: str
+    recovered: bool
+    begin_s: float
+    end_s: float
+    ended: bool
+    violations: list[str]
+
+
+class Ended(msgspec.Struct, frozen=True):
+    """How a round ended.
+
+    Attributes:
+        round: Counted from 1.
+        left: Faults that it had no time for.
+        violations: What was wrong that no fault explains.
+        nearest_m: How near robots came to each other, between surfaces [m].
+        gone_s: After its end, how long until all of its processes were gone [s].
+        missed: Share of the ticks that robots missed which were never stopped: how busy the machine was.
+        recording: Its folder, if there is a recording.
+    """
+
+    round: int
+    left: list[Fault]
+    violations: list[str]
+    nearest_m: float
+    gone_s: float
+    missed: float
+    recording: str
+
+
+def line(outcome: Outcome) -> str:
+    """An outcome for people."""
+    whom = f" {outcome.victim}" if outcome.victim else ""
+    how = f"well after {outcome.begin_s:.1f} s" if outcome.recovered else "NOT WELL"
+    how += ", came down" if outcome.ended else ""
+    wrong = "".join(f"; {text}" for text in outcome.violations)
+    note = f" ({outcome.note})" if outcome.note else ""
+    return f"round {outcome.round}, {outcome.at_s:5.1f} s: {outcome.fault.kind}{whom}{note}: {how}{wrong}"
+
+
+def misrecorded(recording: Path, outcomes: Sequence[Outcome], *, disk_full: bool) -> list[str]:
+    """What is wrong with the recording of a round: it must open, and say what happened."""
+    opened = recording
+    try:
+        if disk_full:
+            opened = recording.with_name("mended.mcap")
+            recover(recording, opened)
+        read = playback.read(opened)
+    except (RecordingError, NotStarted, DocumentError, OSError) as error:
+        return [f"the recording does not open: {error}"]
+    wrong = []
+    if not (read.complete or disk_full):
+        wrong.append("the recording has no end")
+    said = {(event.kind, event.source) for event in read.trace.events}
+    kinds = {kind.rstrip("0123456789") for kind, _ in said}
+    if not disk_full:
+        for outcome in outcomes:
+            kind = outcome.fault.kind
+            if kind in ("kill", "read-error", "clock-behind") and ("lost", outcome.victim) not in said:
+                wrong.append(f"the recording does not say that {outcome.victim} was lost")
+            elif kind in ("router", "failover") and "router" not in kinds:
+                wrong.append("the recording does not say that the router ended")
+    return wrong
+
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PAGE: Final = "chaos.html"
+FILE: Final = "chaos.json"
+CAPTION: Final = (
+    "Time from the begin of each fault until all was well again, by kind; the bar is how long the fault itself lasted. "
+    "Crosses: not well in time. Hollow: the victim came down safely instead of coming back."
+)
+BUSY: Final = 0.05  # share of the ticks that a machine may miss which is to be trusted with the rest
+SMALL: Final = 20  # so many rows stand open
+
+
+class Result(msgspec.Struct, frozen=True):
+    """Everything of a laboratory, as `chaos.json` keeps it."""
+
+    experiment: str
+    seed: int
+    script: list[Round]
+    outcomes: list[Outcome]
+    rounds: list[Ended]
+
+    @property
+    def violations(self) -> int:
+        """How many things happened that must not."""
+        return sum(len(each.violations) for each in self.outcomes) + sum(len(each.violations) for each in self.rounds)
+
+
+def table(result: Result) -> Table:
+    """A row for each kind of fault."""
+    lines = []
+    for kind in KINDS:
+        mine = [each for each in result.outcomes if each.fault.kind == kind]
+        if mine:
+            well = [each.begin_s for each in mine if each.recovered]
+            lines.append(
+                Line(
+                    (
+                        kind,
+                        str(len(mine)),
+                        str(len(well)),
+                        str(sum(each.ended for each in mine)),
+                        f"{statistics.median(well):.1f} s" if well else "–",
+                        f"{max(well):.1f} s" if well else "–",
+                        str(sum(len(each.violations) for each in mine)),
+                        "",
+                    )
+                )
+            )
+    head = ("Fault", "Done", "Well again", "Came down", "Median", "Longest", "Violations", "")
+    return Table(head, tuple(lines), note="Times count from the begin of the fault.")
+
+
+def findings(result: Result) -> list[Finding]:
+    """The verdict."""
+    done, rounds = len(result.outcomes), result.rounds
+    wanted = sum(len(each.faults) for each in result.script)
+    found = [Finding("good" if done == wanted else "bad", f"{done} of {wanted} faults in {len(rounds)} rounds")]
+    nearest = min((each.nearest_m for each in rounds), default=float("inf"))
+    found.append(Finding("plain", f"robots came as near as {nearest:.3f} m to each other, surface to surface"))
+    late = max((each.gone_s for each in rounds), default=0.0)
+    found.append(Finding("plain", f"after the end of a round all of its processes were gone within {late:.1f} s"))
+    found += [
+        Finding("fair", f"round {each.round}: the machine was too busy, {100 * each.missed:.0f} % of ticks were missed")
+        for each in rounds
+        if each.missed > BUSY
+    ]
+    wrong = [line(each) for each in result.outcomes if each.violations]
+    wrong += [f"round {each.round}: {text}" for each in rounds for text in each.violations]
+    return [*found, *(Finding("bad", text) for text in wrong)] if wrong else [*found, Finding("good", "0 violations")]
+
+
+def write(folder: Path, result: Result, command: str) -> Path:
+    """Writes `chaos.json`, `chaos.html` and the figure into a folder."""
+    (folder / FILE).write_bytes(msgspec.json.format(msgspec.json.encode(result), indent=1))
+    drawn = figure(result)
+    style.save(drawn, folder / "figures", "recovery")
+    rows = tuple(Line((line(each),)) for each in result.outcomes)
+    return render(
+        folder / PAGE,
+        title=f"Faults: {result.experiment}",
+        source="",
+        facts=[("Date", date_of(time.time())), ("Seed", str(result.seed)), ("Rounds", str(len(result.rounds)))],
+        command=command,
+        verdict=findings(result),
+        sections=[
+            Section("By kind", tables=(table(result),), pictures=numbered([(drawn, CAPTION)])),
+            Section(
+                "Every fault",
+                tables=(Table(("What",), rows, words=True),),
+                folded="Show the list" if len(rows) > SMALL else "",
+            ),
+            Section("Definitions", terms=tuple((kind, nature.meant) for kind, nature in NATURES.items())),
+        ],
+    )
+
+
+@style.styled
+def figure(result: Result) -> Figure:
+    """Recovery times by kind of fault."""
+    kinds = [kind for kind in KINDS if any(each.fault.kind == kind for each in result.outcomes)]
+    drawn, axes = plt.subplots(figsize=(6.3, 0.7 + 0.28 * max(1, len(kinds))), layout="constrained")
+    for place, kind in enumerate(kinds):
+        mine = [each for each in result.outcomes if each.fault.kind == kind]
+        axes.barh(place, max(each.fault.lasts_s for each in mine), height=0.7, color="#dddddd", zorder=0)
+        for number, each in enumerate(mine):
+            y = place + 0.5 * (number / max(1, len(mine) - 1) - 0.5)
+            face = "none" if each.ended else "#0072b2"
+            if each.recovered:
+                axes.plot(each.begin_s, y, "o", markersize=3, color="#0072b2", markerfacecolor=face)
+            else:
+                axes.plot(each.begin_s, y, "x", markersize=4, color="#d55e00")
+    axes.set_yticks(range(len(kinds)), list(kinds))
+    axes.invert_yaxis()
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("recovery [s]")
+    axes.grid(visible=True, axis="x")
+    return drawn

@@ -1,0 +1,545 @@
+"""A round of the fault laboratory: one run, in a process of its own that may be killed.
+
+Robots live in one world, so that the body of a robot whose process is dead, frozen or cut off stays in the room. They
+reach their routers through cables (`tools.reliability.cables`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Sequence, Set
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from agents.arrays import Array
+from agents.body.kinds import KINDS
+from agents.network import messages
+from agents.network import session as network
+from agents.network.endpoints import free_endpoint
+from experiments.definition.experiment import Experiment
+from experiments.definition.links import one_way_links
+from experiments.real_time.hosts.launcher import Launcher
+from tools.reliability.cables import Cables
+from tools.reliability.chaos_report import Ended, Outcome, line, misrecorded
+from tools.reliability.fault_script import Fault, Round
+from tools.reliability.injection import Injector
+from tools.reliability.observer import Eyes
+from tools.reliability.run_process import Watched
+from tools.reliability.spoilt_process import Switch
+
+POLL_S: Final = 0.02
+BEGIN_S: Final = 100.0  # to the common start
+FORM_S: Final = 45.0  # a formation that has not come together by then does not: who avoids others takes its time
+HEAL_S: Final = 30.0  # at the latest so long after a fault is lifted the formation stands again
+SETTLED_S: Final = 0.5  # and stays so
+FRESH_S: Final = 1.6  # a robot that says nothing for longer is not back: statuses come once a second
+HELD_M: Final = 0.25  # a robot that nobody steers goes no farther than this
+NOTICE_S: Final = 1.0  # after which it must have stopped
+FEWEST: Final = 3  # running robots with which a round goes on
+LATEST_S: Final = 4.0  # before the end no fault is begun that could not heal
+LEAD_S: Final = 1.0  # the start is announced not longer before
+CABLES: Final = "cables.json"
+SWITCHES: Final = "switches"
+LEASE_S: Final = 60.0  # of a patient router, as ROS 2 sets it
+DEAF_S: Final = 1.0  # after which whoever listens to a robot that is there again has heard it
+NOTICED_S: Final = 1.0  # a robot that hears no router holds `link_silence_s` and so much later
+SAYS: Final = {"router": "router", "failover": "router", "disk": "recorder"}  # who ends, and is said to
+REFUSED: Final = 2  # exit code of a process whose name is taken
+LANDED_S: Final = 40.0  # after the launcher's death or the end everything is gone
+LAST_BREATH_S: Final = 5.0  # from when a process cannot be found any more to when its exit code is known
+END_S: Final = 60.0  # and no round takes longer than this after its time
+
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all rounds have in common.
+
+    Attributes:
+        file: The experiment.
+        case: Its case.
+        experiment: The same, changes applied.
+        folder: Where each round gets a folder.
+        changes: As behind `--set`.
+        bodies: As behind `--bodies`.
+        seed: Of what the script leaves open: bits, segments, nonsense.
+    """
+
+    file: Path
+    case: str
+    experiment: Experiment
+    folder: Path
+    changes: Sequence[str]
+    bodies: str | None
+    seed: int
+
+
+@dataclass
+class _Running:
+    """A fault that was begun: to whom, when (monotonic [s]), when it was lifted, since when all is well again."""
+
+    fault: Fault
+    victim: str
+    begun: float
+    note: str
+    before: Array
+    lifted: float | None = None
+    well_since: float | None = None
+    why: str = ""  # it was not well last
+    held_at: Array | None = None
+    utc: float = field(default_factory=time.time)
+    there: set[str] = field(default_factory=set)  # who was under way before
+    events: int = 0  # that had happened before
+    told: dict[str, int] = field(default_factory=dict)  # the last incident of each robot before
+    restarted: float | None = None
+    back: float | None = None
+    died: bool = False
+    violations: list[str] = field(default_factory=list)
+
+    def deplore(self, text: str) -> None:
+        """A violation of an invariant, reported once."""
+        if text not in self.violations:
+            self.violations.append(text)
+
+
+class Flight:
+    """One round.
+
+    Attributes:
+        outcomes: Of the faults that were done.
+    """
+
+    def __init__(self, setting: Setting, script: Round, number: int, interrupted: Callable[[], bool], say: Say) -> None:
+        self._setting, self._script, self._number = setting, script, number
+        self._interrupted, self._say = interrupted, say
+        self.outcomes: list[Outcome] = []
+        self._left = list(script.faults)
+        self._wrong: list[str] = []
+        self._events: list[messages.Event] = []
+        self._dead: dict[str, float] = {}  # killed by us, and when
+        self._off: set[str] = set()  # robots whose clock is not that of the others
+        self._conductor_dead = self._disk_full = False
+        self._now: _Running | None = None
+        self._started: float | None = None
+        self._at = 0.0
+        self._well: float | None = None  # since when all is well, before a fault
+        self._formed_since: float | None = None
+        self._hears: dict[str, set[str]] = {name: set() for name in setting.experiment.robots}
+        for link in one_way_links(setting.experiment):
+            self._hears[link.listener].add(link.speaker)
+
+    def fly(self) -> Ended:
+        """Runs the round to its end; leaves no process behind."""
+        setting = self._setting
+        folder = setting.folder / f"round-{self._number:03}"
+        folder.mkdir()
+        random = np.random.default_rng([setting.seed, self._number])
+        experiment = setting.experiment
+        groups = {name: robot.process or name for name, robot in experiment.robots.items()}
+        stage = self._script.stage
+        routers = [free_endpoint(preferred_port=0) for _ in range(2 if stage == "two routers" else 1)]
+        recording = folder / f"{setting.case}.mcap"
+        with ExitStack() as stack:
+            switches = folder / SWITCHES
+            switches.mkdir()
+            Switch(switches / "lease").write(LEASE_S if stage == "patient router" else 0.0)
+            cables = stack.enter_context(Cables(random))
+            laid = {group: {end: cables.lay(group, end) for end in routers} for group in dict.fromkeys(groups.values())}
+            (folder / CABLES).write_bytes(msgspec.json.encode(laid))
+            launcher = stack.enter_context(Launcher(folder / "logs"))
+            own = [*setting.changes, f"network.listen={json.dumps(routers)}"]
+            own.append(f"network.routers={len(routers)}")
+            if stage == "motion capture":
+                flying = [name for name, robot in experiment.robots.items() if KINDS[robot.kind].flies]
+                own += [f'robots.{name}.position="external"' for name in flying or experiment.robots]
+                own.append('positioning="vicon-twin"')
+            watched = Watched(
+                launcher,
+                setting.file,
+                folder,
+                cases=[setting.case],
+                changes=own,
+                bodies=setting.bodies,
+                cables=folder / CABLES,
+                switches=switches,
+            )
+            stack.callback(self._sweep, watched)
+            injector = Injector(watched, launcher, cables, switches, random, groups=groups, recording=recording)
+            nearest, missed = math.inf, 0.0
+            try:
+                with network.open_session(routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
+                    eyes = Eyes(session, experiment)
+                    self._follow(watched, injector, eyes)
+                    nearest, missed = eyes.invariants.nearest, self._missed(eyes)
+            except network.Unreachable as error:
+                self._wrong.append(f"it never began: {error}; {watched.process.tail()}")
+            if self._now is not None:
+                self._unfinished(self._now)
+            injector.release()
+            gone_s = self._finish(watched)
+        if self._started is not None:
+            self._wrong += misrecorded(recording, self.outcomes, disk_full=self._disk_full)
+        for each in self._wrong:
+            self._say(f"round {self._number}: {each}")
+        kept = folder.name if recording.exists() else ""
+        return Ended(self._number, self._left, self._wrong, round(nearest, 4), round(gone_s, 1), missed, kept)
+
+    # ------------------------------------------------------------------ the run
+
+    def _follow(self, watched: Watched, injector: Injector, eyes: Eyes) -> None:
+        """Until the script is through, or the run ends."""
+        duration = self._setting.experiment.duration_s
+        began = time.monotonic()
+        while watched.process.alive and not self._conductor_dead:
+            time.sleep(POLL_S)
+            eyes.look()
+            now = time.monotonic()
+            for event in watched.news():
+                self._events.append(event)
+                if event.kind == "start":
+                    self._started = now + max(0.0, min(LEAD_S, event.stamp - time.time()))
+            if self._started is None:
+                eyes.judge()  # robots are placed
+                if now > began + BEGIN_S:
+                    self._wrong.append(f"no common start within {BEGIN_S:g} s")
+                    return
+                continue
+            t = now - self._started
+            self._judge(eyes, now)
+            if self._now is not None:
+                self._heal(self._now, injector, eyes, t, now)
+            elif self._through(t, duration) or not self._next(injector, eyes, t, now):
+                return
+            if t > duration + END_S:
+                self._wrong.append(f"it does not end {END_S:g} s after its time")
+                return
+
+    def _through(self, t: float, duration: float) -> bool:
+        """Whether nothing more can be done in this round."""
+        if not self._left or self._interrupted():
+            return True
+        nature = self._left[0].nature
+        return t > duration - nature.lasts_s - max(LATEST_S, nature.heals_s)
+
+    def _over(self) -> bool:
+        """Whether the run's time is over: then the conductor lands everybody, and nobody is let in again."""
+        return time.monotonic() - (self._started or 0.0) > self._setting.experiment.duration_s - NOTICE_S
+
+    def _judge(self, eyes: Eyes, now: float) -> None:
+        """Gives what is wrong to the fault that is under way, or to the round."""
+        wrong = eyes.judge()
+        for name, since in self._dead.items():
+            told = eyes.told.get(name)
+            if told is not None and told[1] > since + NOTICE_S and now < told[1] + POLL_S * 5:
+                wrong.append(f"{name} is dead and still commands its body")
+        target = self._wrong if self._now is None else self._now.violations
+        target += [each for each in wrong if each not in target]
+
+    def _next(self, injector: Injector, eyes: Eyes, t: float, now: float) -> bool:
+        """Does the next fault when its time has come; False if there is nothing more to be done in this round."""
+        if self._well is None:
+            live = eyes.running()
+            formed = bool(live) and not self._apart(eyes, live, now - FRESH_S, t)
+            self._formed_since = (self._formed_since or now) if formed else None
+            if self._formed_since is not None and now - self._formed_since >= SETTLED_S:
+                self._well = now
+            elif t > FORM_S:
+                why = self._apart(eyes, live, now - FRESH_S, t)
+                self._wrong.append(f"not in formation {FORM_S:g} s after the start ({why}): no fault was done")
+                return False
+            return True
+        return now < self._well + self._left[0].after_s or self._begin(injector, eyes, t, now)
+
+    def _begin(self, injector: Injector, eyes: Eyes, t: float, now: float) -> bool:
+        """Does the next fault; False if there are too few robots left for it."""
+        running = eyes.running() - self._dead.keys()
+        if len(running) < FEWEST:
+            return False
+        fault = self._left.pop(0)
+        victim = fault.victim
+        if victim:
+            order = [*eyes.invariants.names, *eyes.invariants.names]
+            victim = next(name for name in order[order.index(victim) :] if name in running)
+        before = eyes.invariants.position.copy()
+        note = injector.begin(fault, victim, eyes.session, eyes.keys)
+        if fault.kind == "kill":
+            self._dead[victim] = now
+        self._disk_full |= fault.kind == "disk"
+        self._conductor_dead = fault.kind == "conductor"
+        eyes.orders.clear()
+        told = {name: status.incidents[-1].seq for name, status in eyes.status.items() if status.incidents}
+        self._now = _Running(fault, victim, now, note, before, there=running, events=len(self._events), told=told)
+        self._at = t
+        if fault.kind == "conductor":
+            self._watch_landing(eyes, self._now)
+        return True
+
+    def _heal(self, running: _Running, injector: Injector, eyes: Eyes, t: float, now: float) -> None:
+        """Lifts the fault when its time is over, and waits until all is well."""
+        fault = running.fault
+        if fault.kind in ("freeze", "partition") and running.lifted is None:
+            self._hold(running, eyes, now)
+        if running.lifted is None and now >= running.begun + fault.lasts_s:
+            injector.end(fault)
+            running.lifted = time.monotonic()
+        if running.lifted is None:
+            return
+        why = self._unwell(running, injector, eyes, t, now)
+        running.why = why or running.why
+        running.well_since = None if why else (running.well_since or now)
+        settled = running.well_since is not None and now - running.well_since >= SETTLED_S
+        # who avoids others needs up to 35 s to come up with a leader that drives, without any fault
+        driven = max((leg.at_s for leg in self._setting.experiment.timeline if leg.at_s <= t), default=-math.inf)
+        if not settled and (now < running.lifted + HEAL_S + fault.nature.heals_s or t < driven + FORM_S):
+            return
+        if not settled:
+            running.violations.append(f"not well {now - running.lifted:.0f} s later: {running.why}")
+        self._close(running, running.well_since, eyes)
+
+    def _close(self, running: _Running, well: float | None, eyes: Eyes) -> None:
+        now = time.monotonic()
+        well = now if well is None else well
+        if running.fault.kind == "read-error" or running.died:
+            self._dead[running.victim] = now
+        left = set() if self._conductor_dead or self._over() else running.there - self._dead.keys()
+        down = [name for name in sorted(left) if self._down(name, eyes)]
+        reasons = [f"{name}: {eyes.status[name].reason}" for name in down]
+        outcome = Outcome(
+            self._number,
+            running.fault,
+            running.victim,
+            round(self._at, 2),
+            "; ".join(filter(None, (running.note, *reasons))),
+            not any(text.startswith("not well") for text in running.violations),
+            round(well - running.begun, 3),
+            round(max(0.0, well - (running.lifted or running.begun)), 3),
+            bool(down),
+            list(running.violations),
+        )
+        self.outcomes.append(outcome)
+        self._now, self._well = None, now
+        self._say(line(outcome))
+
+    def _unfinished(self, running: _Running) -> None:
+        """The run has ended before it could be seen whether all was well again: the fault is done once more."""
+        if running.violations:
+            self._wrong += [f"{running.fault.kind} {running.victim}: {text}" for text in running.violations]
+        self._left.insert(0, running.fault)
+        self._now = None
+
+    def _hold(self, running: _Running, eyes: Eyes, now: float) -> None:
+        """Nobody steers the victim: its body stops soon."""
+        if now < running.begun + NOTICE_S or not eyes.connected:
+            return
+        if running.held_at is None:
+            running.held_at = eyes.invariants.where(running.victim)
+        if eyes.moved(running.victim, running.held_at) > HELD_M:
+            running.deplore(f"{running.victim} moved although nobody steered it")
+
+    def _unwell(self, running: _Running, injector: Injector, eyes: Eyes, t: float, now: float) -> str:
+        """Why the run is not yet as it was; empty if it is."""
+        live = eyes.running() - self._dead.keys()
+        check = getattr(self, f"_after_{running.fault.kind.replace('-', '_')}", self._after_any)
+        away = running.there - live - self._dead.keys() - {running.victim}
+        away = {name for name in away if eyes.invariants.up(name) or not self._down(name, eyes)}
+        return (
+            check(running, injector, eyes, live)
+            or (f"{', '.join(sorted(away))}: not back" if away else "")
+            or self._apart(eyes, live, max(running.lifted or now, now - FRESH_S), t)
+        )
+
+    # what of the effect of a fault has still to come, or to pass
+
+    def _after_any(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        kind = running.fault.kind
+        if running.victim:
+            return self._absent(running.victim, eyes, live, running.lifted or running.begun)
+        if kind in SAYS and not any(e.kind.startswith(SAYS[kind]) and "ended" in e.text for e in self._events):
+            return f"nobody has said that the {SAYS[kind]} ended"
+        return ""
+
+    def _after_kill(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        victim = running.victim
+        if victim in eyes.alive:
+            return f"{victim} is dead, and its token still stands"
+        blind = [name for name in live if victim in self._hears[name] and victim not in eyes.status[name].missing]
+        return f"{', '.join(blind)}: not noticed that {victim} is gone" if blind else ""
+
+    def _after_bits(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        """Some wrong bits make Zenoh's client abort its process, which TCP's own checksum would have kept from it."""
+        victim = running.victim
+        if not running.died and "SIGABRT" in self._lost_since(running):
+            running.died, running.note = True, "its process was aborted by Zenoh"
+        if running.died:
+            up = eyes.invariants.up(victim)
+            return f"{victim} has not come down yet" if up else self._after_kill(running, injector, eyes, live)
+        return self._after_any(running, injector, eyes, live)
+
+    def _lost_since(self, running: _Running) -> str:
+        """What the conductor has said since the fault began of the end of the victim's process; empty if nothing."""
+        ends = [e.text for e in self._events[running.events :] if e.kind == "lost" and e.source == running.victim]
+        return "".join(ends[:1])
+
+    def _after_read_error(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        victim = running.victim
+        if not any(order.robot == victim and order.action in ("land", "stop") for order in eyes.orders):
+            return f"the body of {victim} was told neither to land nor to stop"
+        if eyes.invariants.up(victim):
+            return f"{victim} has not come down yet"
+        if not self._lost_since(running):  # it lands for as long as a landing may take, for it sees nothing of it
+            return f"the process of {victim} has not ended yet"
+        return self._after_kill(running, injector, eyes, live)
+
+    def _after_clock_behind(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        victim = running.victim
+        if running.restarted is None:
+            if victim in eyes.alive or not self._lost_since(running):
+                return f"nobody has said that {victim} is lost"
+            self._off.add(victim)
+            running.restarted = time.monotonic()
+            injector.restart(victim, eyes.session, eyes.keys)
+        if (why := injector.answer.reason or injector.answer.refused.get(victim)) and not self._over():
+            running.deplore(f"{victim} is not let in again: {why}")
+            return ""
+        if victim not in eyes.alive:
+            return f"{victim} is not back"
+        running.back = running.back or time.monotonic()
+        deaf = [name for name in live if victim in self._hears[name]]
+        deaf = [name for name in deaf if eyes.listened.get((name, victim), 0.0) < running.restarted]
+        if deaf and time.monotonic() - running.back > DEAF_S:
+            running.deplore(f"{', '.join(deaf)}: heard nothing of {victim} in the first {DEAF_S:g} s of its new life")
+        if deaf or victim not in live:
+            return f"{victim} does not take part yet, or is not heard by {', '.join(deaf) or 'anybody'}"
+        return ""
+
+    def _after_double(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        victim, second = running.victim, injector.second
+        assert second is not None
+        for order in eyes.orders:
+            if order.robot == victim and not self._over():
+                running.deplore(f"the body of {victim} was told to {order.action}")
+        if second.alive:
+            return f"the second process of {victim} is not refused yet"
+        if second.handle.returncode != REFUSED:
+            running.deplore(f"the second process of {victim}: {second.exit}, {second.tail()[-200:]}")
+        return "" if victim in live else f"{victim} is not running any more"
+
+    def _after_frozen_router(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        limit = self._setting.experiment.safety.link_silence_s + NOTICED_S
+        free = []
+        for name in live - self._off:
+            since = [each.stamp - running.utc for each in self._held(name, "router", running, eyes)]
+            if not since:
+                free.append(name)
+            elif min(since) > limit:
+                running.deplore(f"{name} held only {min(since):.1f} s after the router had frozen")
+        return f"{', '.join(free)}: never held while the router was frozen" if free else ""
+
+    def _after_mocap_clock(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+        for name in eyes.status:
+            for incident in self._held(name, "position", running, eyes):
+                running.deplore(f"{name}: {incident.text}")
+        return ""
+
+    _after_clock = _after_mocap_clock
+
+    @staticmethod
+    def _down(name: str, eyes: Eyes) -> bool:
+        """Whether a robot says that it comes down, or is down."""
+        status = eyes.status.get(name)
+        return status is not None and status.phase in ("landing", "done")
+
+    @staticmethod
+    def _held(name: str, what: str, running: _Running, eyes: Eyes) -> list[messages.Incident]:
+        """Since the fault began: what made a robot hold, or worse, of which `what` is part of the words."""
+        told = running.told.get(name, 0)
+        happened = [each for each in eyes.status[name].incidents if each.seq > told and what in each.text]
+        return [each for each in happened if each.text.startswith(("hold", "land", "cut"))]
+
+    @staticmethod
+    def _absent(victim: str, eyes: Eyes, live: Set[str], lifted: float) -> str:
+        """Why a victim that lives is not back, and not down either."""
+        if eyes.heard.get(victim, 0.0) < lifted:
+            return f"{victim} says nothing yet"
+        if Flight._down(victim, eyes):
+            return f"{victim} has not come down yet" if eyes.invariants.up(victim) else ""
+        return "" if victim in live else f"{victim} is not back"
+
+    def _apart(self, eyes: Eyes, live: Set[str], since: float, t: float) -> str:
+        """Why those who live are not in formation: silent since then, missing each other, or elsewhere."""
+        if not live and not self._dead:
+            return "nobody is running"
+        for name in live:
+            if eyes.heard.get(name, 0.0) < since:
+                return f"{name} says nothing yet"
+            absent = [other for other in eyes.status[name].missing if other in live]
+            if absent:
+                return f"{name} misses {', '.join(absent)}"
+        error = eyes.invariants.deformed(live, t)
+        return f"a link is {error:.3f} off" if error > self._setting.experiment.tolerance else ""
+
+    def _watch_landing(self, eyes: Eyes, running: _Running) -> None:
+        """The conductor is dead: robots land by themselves, and everything ends."""
+        running.lifted = running.begun
+        deadline = running.begun + LANDED_S
+        names = set(self._setting.experiment.robots) - self._dead.keys()
+        while time.monotonic() < deadline:
+            time.sleep(POLL_S)
+            eyes.look()
+            running.violations += [each for each in eyes.judge() if each not in running.violations]
+            down = [eyes.status[name].phase == "done" for name in names if name in eyes.status]
+            if all(down) and not any(map(eyes.invariants.up, eyes.invariants.names)):
+                break
+        else:
+            up = [name for name in eyes.invariants.names if eyes.invariants.up(name)]
+            awake = [name for name in names if name in eyes.status and eyes.status[name].phase != "done"]
+            running.violations.append(f"not well {LANDED_S:g} s later: in the air {up}, not done {awake}")
+        self._close(running, time.monotonic(), eyes)
+
+    # ------------------------------------------------------------------ the end
+
+    def _finish(self, watched: Watched) -> float:
+        """Ends the run if it has not ended; how long until all its processes were gone [s]."""
+        began = time.monotonic()
+        if watched.process.alive:
+            watched.close()
+        deadline = began + LANDED_S
+        while (left := watched.processes()) and time.monotonic() < deadline:
+            time.sleep(POLL_S * 5)
+        gone = time.monotonic() - began
+        self._events += watched.news()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            watched.process.handle.wait(LAST_BREATH_S)
+        if left:
+            self._wrong.append(f"left behind after {LANDED_S:g} s: {', '.join(sorted(left.values()))}")
+        code = watched.process.handle.poll()
+        if not self._conductor_dead and code != 0:
+            self._wrong.append(f"the run ended with exit code {code}: {' '.join(watched.said)}")
+        return gone
+
+    def _missed(self, eyes: Eyes) -> float:
+        """Share of the ticks that robots missed which nobody stopped."""
+        stopped = {each.victim for each in self.outcomes} | self._dead.keys()
+        statuses = [status for name, status in eyes.status.items() if name not in stopped and status.ticks]
+        ticks, missed = (sum(getattr(status, what) for status in statuses) for what in ("ticks", "missed"))
+        return round(missed / (ticks + missed), 4) if ticks else 0.0
+
+    @staticmethod
+    def _sweep(watched: Watched) -> None:
+        """Whatever happened: nothing of the run survives the round."""
+        for pid in watched.processes():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)

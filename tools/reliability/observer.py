@@ -1,0 +1,231 @@
+"""What must hold whatever fails: robots inside, apart and in formation. Row-wise over robots; times are the caller's.
+
+seen = Invariants(experiment)
+seen.place("CF01", (0.1, 0.2, 0.8))
+seen.violations()                          # what is wrong now, each once for as long as it lasts
+seen.deformed({"CF01", "KH01"}, t=12.0)    # the largest error of the links that live
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+from contextlib import suppress
+from typing import Final
+
+import numpy as np
+import zenoh
+
+from agents.arrays import Array, norm
+from agents.body.kinds import KINDS
+from agents.formation.graph import BY_DISTANCE, BY_RELATIVE
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.keys import Keys
+from agents.network.messages import Command
+from experiments.definition.experiment import Experiment
+from experiments.definition.links import one_way_links
+from experiments.real_time.conductor.run_view import by_robots
+
+TOUCH_M: Final = 1e-3  # [m] less overlap than this is rounding and the age of what was heard
+OUT_M: Final = 0.01  # [m] so far outside a place is outside
+BELOW_M: Final = 0.05
+DOWN_M: Final = 0.08  # [m] a robot that flies and is lower is on the floor
+SLACK: Final = 1.05  # of limits that a setpoint may not exceed
+STEP_M: Final = 0.6  # [m] outside the arena no goal may be
+
+
+class Invariants:
+    """Robots as solids, and what they want of each other."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        """Nothing is known of anybody yet."""
+        self.names = tuple(experiment.robots)
+        row = {name: number for number, name in enumerate(self.names)}
+        self._row = row
+        kinds = [KINDS[robot.kind] for robot in experiment.robots.values()]
+        self._kinds = dict(zip(self.names, kinds, strict=True))
+        self._radius = np.array([kind.radius for kind in kinds])
+        self._height = np.array([kind.height for kind in kinds])
+        self.flies = np.array([kind.flies for kind in kinds])
+        x, y, z = experiment.arena.size
+        self._low = np.array([-0.5 * x - OUT_M, -0.5 * y - OUT_M, -BELOW_M])
+        self._high = np.array([0.5 * x + OUT_M, 0.5 * y + OUT_M, z + OUT_M])
+        self.position: Array = np.full((len(row), 3), np.nan)
+        links = [link for link in one_way_links(experiment) if np.isinf(link.reach)]
+        self._links = links
+        self._listener = np.array([row[link.listener] for link in links], dtype=np.intp)
+        self._speaker = np.array([row[link.speaker] for link in links], dtype=np.intp)
+        self._distance = np.array([link.wanted.distance for link in links])
+        self._relative = np.array([link.wanted.relative for link in links]).reshape(-1, 3)
+        self._bearing = np.array([link.wanted.bearing for link in links]).reshape(-1, 3)
+        self._wants = np.array([link.wanted.wants for link in links])
+        self._span = np.array([(link.since, link.until) for link in links]).reshape(-1, 2)
+        self.nearest = np.inf  # [m] between surfaces of any two robots, so far
+        self._wrong: set[str] = set()
+
+    def place(self, name: str, position: tuple[float, float, float]) -> None:
+        """Where a robot really is now [m]."""
+        self.position[self._row[name]] = position
+
+    def where(self, name: str) -> Array:
+        """(3,) where it was last [m]; NaN if nobody knows."""
+        return np.asarray(self.position[self._row[name]]).copy()
+
+    def up(self, name: str) -> bool:
+        """Whether a robot is in the air."""
+        row = self._row[name]
+        return bool(self.flies[row] and self.position[row, 2] > DOWN_M)
+
+    def violations(self) -> list[str]:
+        """What has begun to be wrong since the last call."""
+        wrong = {*self._outside(), *self._overlaps()}
+        new = sorted(wrong - self._wrong)
+        self._wrong = wrong
+        return new
+
+    def _outside(self) -> list[str]:
+        p = self.position
+        out = ((p < self._low) | (p > self._high)).any(axis=1)
+        return [f"{self.names[row]} is outside the arena" for row in np.flatnonzero(out).tolist()]
+
+    def _overlaps(self) -> list[str]:
+        p = self.position
+        first, second = np.triu_indices(len(p), 1)
+        level = norm(p[first, :2] - p[second, :2]) - (self._radius[first] + self._radius[second])
+        bottom, top = p[:, 2], p[:, 2] + self._height
+        upright = np.maximum(bottom[first] - top[second], bottom[second] - top[first])
+        outside = np.hypot(np.maximum(level, 0.0), np.maximum(upright, 0.0))
+        if len(outside) and np.isfinite(outside).any():
+            self.nearest = min(self.nearest, float(np.nanmin(outside)))
+        both = (level < -TOUCH_M) & (upright < -TOUCH_M)
+        return [f"{self.names[first[k]]} and {self.names[second[k]]} overlap" for k in np.flatnonzero(both).tolist()]
+
+    def deformed(self, live: Collection[str], t: float) -> float:
+        """The largest error of the links between robots that live [m, or rad of a direction]; 0 without any.
+
+        Args:
+            live: Who is under way.
+            t: Since the common start [s].
+        """
+        here = np.array([name in live for name in self.names])
+        there = here[self._listener] & here[self._speaker] & (self._span[:, 0] <= t) & (t < self._span[:, 1])
+        if not there.any():
+            return 0.0
+        apart = self.position[self._listener] - self.position[self._speaker]
+        by_distance = np.abs(norm(apart) - self._distance)
+        planar = np.where(np.isfinite(self._relative), apart - self._relative, 0.0)
+        known = np.isfinite(self._bearing)
+        direction = np.where(known, apart, 0.0)
+        length = norm(direction)
+        cosine = np.where(known, direction * self._bearing, 0.0).sum(axis=1) / np.where(length > 0.0, length, 1.0)
+        by_bearing = np.arccos(np.clip(cosine, -1.0, 1.0))
+        error = np.where(
+            self._wants == BY_DISTANCE, by_distance, np.where(self._wants == BY_RELATIVE, norm(planar), by_bearing)
+        )
+        error = np.where(np.isnan(error), np.inf, error)
+        return float(error[there].max())
+
+    def insane(self, command: Command) -> str:
+        """What is wrong with a command to a body; empty if nothing is."""
+        if command.action != "drive":
+            return ""
+        setpoint = np.array(command.setpoint or (np.nan,) * 4)
+        kind = self._kinds[command.robot]
+        if not np.isfinite(setpoint).all():
+            return f"{command.robot} is told {command.setpoint}"
+        if kind.takes == "position":
+            low, high = self._low - STEP_M, self._high + STEP_M
+            bad = ((setpoint[:3] < low) | (setpoint[:3] > high)).any()
+        else:
+            axes = slice(0, 3) if kind.takes == "velocity" else slice(0, 1)
+            bad = (np.abs(setpoint[axes]) > SLACK * kind.speed).any()
+        return f"{command.robot} is told {command.setpoint}" if bad else ""
+
+
+class Eyes:
+    """Looks, and keeps what was said last.
+
+    Attributes:
+        session: Of the laboratory.
+        keys: Of the realm.
+        invariants: Fed with where robots really are.
+        status: The last of each robot, and `heard` when it came (monotonic [s]).
+        heard: See `status`.
+        alive: Whose token stands.
+        truth: When the true place of each robot was last heard (monotonic [s]).
+        told: The last command to each body, and when it came.
+        orders: Commands to bodies that were not to drive, since whoever reads it emptied it.
+        listened: When a listener last said that it heard a speaker (monotonic [s]), by both.
+        wrong: Violations that have been seen since the last `judge`.
+        connected: Whether a router is there.
+    """
+
+    def __init__(self, session: zenoh.Session, experiment: Experiment) -> None:
+        keys = self.keys = Keys(experiment.network.realm)
+        self._session = session
+        self.session = session
+        self.invariants = Invariants(experiment)
+        self._statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
+        self._states = pubsub.subscriber(session, keys.state("*"), 8192)
+        self._truths = pubsub.subscriber(session, keys.truth("*"), 8192)
+        self._commands = pubsub.subscriber(session, keys.setpoint("*"), 8192)
+        self._contacts = pubsub.subscriber(session, keys.contact, 1024)
+        self._watch = pubsub.alive_watch(session, keys.alive("*"))
+        self.status: dict[str, messages.Status] = {}
+        self.heard: dict[str, float] = {}
+        self.alive: set[str] = set()
+        self.truth: dict[str, float] = {}
+        self.told: dict[str, tuple[messages.Command, float]] = {}
+        self.orders: list[messages.Command] = []
+        self.listened: dict[tuple[str, str], float] = {}
+        self.wrong: list[str] = []
+        self.connected = True
+
+    def look(self) -> None:
+        """Takes in what was said since the last look."""
+        now, names = time.monotonic(), self.invariants.names
+        self.connected = network.connected(self._session)
+        for status in by_robots(self._statuses.handler, messages.Status, keys=self.keys, robots=names):
+            self.status[status.robot], self.heard[status.robot] = status, now
+        for truth in by_robots(self._truths.handler, messages.Position, keys=self.keys, robots=names):
+            self.invariants.place(truth.robot, truth.position)
+            self.truth[truth.robot] = now
+        for state in by_robots(self._states.handler, messages.State, keys=self.keys, robots=names):
+            self.listened |= {(state.robot, heard.speaker): now for heard in state.heard}
+            if state.true_position is not None:
+                self.invariants.place(state.robot, state.true_position)
+                self.truth[state.robot] = now
+        for command in by_robots(self._commands.handler, messages.Command, keys=self.keys, robots=names):
+            self.told[command.robot] = command, now
+            if command.action != "drive":
+                self.orders.append(command)
+            if insane := self.invariants.insane(command):
+                self.wrong.append(insane)
+        for sample in network.received(self._contacts.handler):
+            with suppress(messages.Malformed):  # of our own making, as often as not
+                contact = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Contact)
+                if sample.kind == zenoh.SampleKind.PUT:
+                    self.wrong.append(f"{contact.first} and {contact.second} touched")
+        for sample in network.received(self._watch.handler):
+            name = self.keys.whose(str(sample.key_expr))
+            if name is not None:
+                (self.alive.discard if sample.kind == zenoh.SampleKind.DELETE else self.alive.add)(name)
+        self.wrong += self.invariants.violations()
+
+    def judge(self) -> list[str]:
+        """Violations since the last call, each once."""
+        found, self.wrong = list(dict.fromkeys(self.wrong)), []
+        return found
+
+    def running(self) -> set[str]:
+        """Robots that say that they run the experiment, and are there."""
+        return {name for name, status in self.status.items() if status.phase == "running" and name in self.alive}
+
+    def where(self) -> dict[str, Array]:
+        """Where everybody is."""
+        return {name: self.invariants.where(name) for name in self.invariants.names}
+
+    def moved(self, name: str, before: Array) -> float:
+        """How far a robot is from where it was, seen from above [m]."""
+        return float(np.linalg.norm((self.invariants.where(name) - before)[:2]))

@@ -1,0 +1,321 @@
+"""What a soak comes to: whether anything grows, is lost, slows down or dies; with its figure and its page."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import matplotlib.pyplot as plt
+import msgspec
+
+from experiments.report import style
+from experiments.report.page import Finding, Section, Table, date_of, numbered, render
+from experiments.report.page import Row as Line
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PAGE: Final = "soak.html"
+WARM_SHARE: Final = 0.1  # of the run that does not count, but not more than
+WARM_S: Final = 300.0
+WINDOW: Final = 0.1  # share of what counts that is compared at both ends
+GROWTH: Final = 0.02  # of the memory
+JUDGED_S: Final = 300.0  # memory of a shorter run says nothing: allocators are still filling their pools
+SLOWER: Final = 2.0  # times the delay at the beginning
+DELAY_S: Final = 0.005  # delays below are the noise of the machine
+CAPTION: Final = (
+    "Resident memory of each process relative to its own after the warm-up (shaded), and the delay of poses from "
+    "speaker to listener, median and largest of each sample. Robots thin, router, recorder and conductor thick."
+)
+THICK: Final = {"router": "#0072b2", "recorder": "#d55e00", "conductor": "#009e73", "world": "#cc79a7"}
+
+
+class Row(msgspec.Struct, frozen=True):
+    """One process at one time; what only robots have is None of the others.
+
+    Attributes:
+        time_s: From the common start [s].
+        process: A robot's name, "router", "recorder", "conductor".
+        rss_mb: Resident memory [MB].
+        threads: How many.
+        files: Open file descriptors.
+        cpu_s: CPU time since its begin [s].
+        recording_mb: Size of the recording, of the recorder.
+        lost: Poses of its neighbours that never came.
+        missed: Ticks that it missed, of `ticks`.
+        ticks: See `missed`.
+        malformed: Payloads that it refused.
+        heard: Poses that it heard since the sample before; `delay_s` is the median from speaker to listener [s].
+        delay_s: See `heard`.
+        longest_s: The largest delay [s].
+    """
+
+    time_s: float
+    process: str
+    rss_mb: float
+    threads: int
+    files: int
+    cpu_s: float
+    recording_mb: float | None = None
+    lost: int | None = None
+    missed: int | None = None
+    ticks: int | None = None
+    malformed: int | None = None
+    heard: int | None = None
+    delay_s: float | None = None
+    longest_s: float | None = None
+
+
+COLUMNS: Final = tuple(each.name for each in msgspec.structs.fields(Row))
+
+
+@dataclass(frozen=True)
+class Soaked:
+    """What was sampled.
+
+    Attributes:
+        title: Of the experiment.
+        robots: That should have lived.
+        duration_s: That it should have lasted from the common start on.
+        rows: In order of time.
+        exit: Of the conductor's process.
+        died: Who ended before the end, and when [s].
+        interrupted: Whether the user ended it.
+    """
+
+    title: str
+    robots: tuple[str, ...]
+    duration_s: float
+    rows: Sequence[Row]
+    exit: int | None
+    died: dict[str, float]
+    interrupted: bool = False
+
+    def of(self) -> dict[str, list[Row]]:
+        """The rows of each process."""
+        found: dict[str, list[Row]] = {}
+        for row in self.rows:
+            found.setdefault(row.process, []).append(row)
+        return found
+
+    @property
+    def warm_s(self) -> float:
+        """From then on it counts [s]."""
+        return min(WARM_SHARE * self.duration_s, WARM_S)
+
+
+@dataclass(frozen=True)
+class Ends:
+    """A process at both ends of what counts.
+
+    Attributes:
+        first: Rows of the first window, and `last` those of the last.
+        last: See `first`.
+    """
+
+    first: Sequence[Row]
+    last: Sequence[Row]
+
+    def growth(self, what: Callable[[Row], float]) -> float:
+        """Of the median, as a share of the first."""
+        first, last = (statistics.median(map(what, rows)) for rows in (self.first, self.last))
+        return last / first - 1.0 if first else 0.0
+
+    def more(self, what: Callable[[Row], int]) -> int:
+        """How many more there are at most."""
+        return max(map(what, self.last)) - max(map(what, self.first))
+
+
+def ends(soaked: Soaked) -> dict[str, Ends]:
+    """Both ends of each process that has enough rows to have them."""
+    found = {}
+    for process, rows in soaked.of().items():
+        counted = [row for row in rows if row.time_s >= soaked.warm_s]
+        size = max(2, round(WINDOW * len(counted)))
+        if len(counted) >= 2 * size:
+            found[process] = Ends(counted[:size], counted[-size:])
+    return found
+
+
+def judge(soaked: Soaked) -> list[Finding]:
+    """The verdict; bad findings fail it."""
+    both = ends(soaked)
+    return [
+        *_alive(soaked),
+        *_memory(soaked, both),
+        *_handles(both),
+        *_losses(soaked),
+        *_delays(soaked, both),
+        *_punctual(soaked),
+    ]
+
+
+def passed(findings: Sequence[Finding]) -> bool:
+    """Whether nothing is bad."""
+    return all(finding.mark != "bad" for finding in findings)
+
+
+def _alive(soaked: Soaked) -> list[Finding]:
+    lasted = max((row.time_s for row in soaked.rows), default=0.0)
+    seen = soaked.of()
+    bad = [f"{name} ended after {at:.0f} s" for name, at in soaked.died.items()]
+    bad += [f"{name} was never seen" for name in soaked.robots if name not in seen and name not in soaked.died]
+    if soaked.exit != 0:
+        bad.append(f"the run ended with exit code {soaked.exit}: see logs/")
+    if soaked.interrupted:
+        bad.append(f"it was interrupted after {lasted:.0f} s of {soaked.duration_s:g} s")
+    if bad:
+        return [Finding("bad", text) for text in bad]
+    return [Finding("good", f"all {len(soaked.robots)} robots lived through {lasted / 60.0:.1f} minutes")]
+
+
+def _memory(soaked: Soaked, both: dict[str, Ends]) -> list[Finding]:
+    if not both:
+        return [Finding("bad", "too few samples to compare beginning and end: let it run longer")]
+    grown = {process: each.growth(lambda row: row.rss_mb) for process, each in both.items()}
+    most = max(grown, key=lambda process: grown[process])
+    text = f"memory: largest growth after {soaked.warm_s:.0f} s is {100 * grown[most]:+.2f} % ({most})"
+    if soaked.duration_s < JUDGED_S:
+        return [Finding("plain", f"{text}; not judged below {JUDGED_S / 60:.0f} minutes")]
+    if grown[most] <= GROWTH:
+        return [Finding("good", f"{text}, within {100 * GROWTH:g} %")]
+    beyond = ", ".join(f"{p} {100 * g:+.2f} %" for p, g in sorted(grown.items()) if g > GROWTH)
+    return [Finding("bad", f"memory grows beyond {100 * GROWTH:g} %: {beyond}")]
+
+
+def _handles(both: dict[str, Ends]) -> list[Finding]:
+    found = []
+    counted: tuple[tuple[str, Callable[[Row], int]], ...] = (
+        ("threads", lambda row: row.threads),
+        ("file descriptors", lambda row: row.files),
+    )
+    for what, count in counted:
+        more = {process: each.more(count) for process, each in both.items()}
+        grown = ", ".join(f"{process} +{extra}" for process, extra in more.items() if extra > 0)
+        found.append(Finding("bad", f"{what} grow: {grown}") if grown else Finding("good", f"{what} do not grow"))
+    return found
+
+
+def _losses(soaked: Soaked) -> list[Finding]:
+    last = {process: rows[-1] for process, rows in soaked.of().items()}
+    lost = {process: row.lost for process, row in last.items() if row.lost}
+    heard = sum(row.heard or 0 for row in soaked.rows)
+    malformed = sum(row.malformed or 0 for row in last.values())
+    found = []
+    if lost:
+        found.append(Finding("bad", "lost poses: " + ", ".join(f"{who} {count}" for who, count in lost.items())))
+    elif not heard:
+        found.append(Finding("bad", "nobody heard a pose: nothing was tested"))
+    else:
+        found.append(Finding("good", f"0 of {heard} poses were lost"))
+    if malformed:
+        found.append(Finding("bad", f"{malformed} payloads were refused as malformed"))
+    return found
+
+
+def _delays(soaked: Soaked, both: dict[str, Ends]) -> list[Finding]:
+    first = [row.delay_s for each in both.values() for row in each.first if row.delay_s is not None]
+    last = [row.delay_s for each in both.values() for row in each.last if row.delay_s is not None]
+    longest = max((row.longest_s or 0.0 for row in soaked.rows), default=0.0)
+    if not (first and last):
+        return []
+    before, after = statistics.median(first), statistics.median(last)
+    text = (
+        f"delay of poses: {1e3 * before:.2f} ms at first, {1e3 * after:.2f} ms at last, {1e3 * longest:.0f} ms at most"
+    )
+    return [Finding("bad" if after > max(SLOWER * before, DELAY_S) else "good", text)]
+
+
+def _punctual(soaked: Soaked) -> list[Finding]:
+    last = [rows[-1] for rows in soaked.of().values() if rows[-1].ticks]
+    ticks, missed = sum(row.ticks or 0 for row in last), sum(row.missed or 0 for row in last)
+    if not ticks:
+        return []
+    share = 100.0 * missed / ticks
+    return [Finding("good" if share < 1.0 else "fair", f"{missed} of {ticks} ticks were missed ({share:.3f} %)")]
+
+
+# ---------------------------------------------------------------------- the page
+
+
+def write(folder: Path, soaked: Soaked, findings: Sequence[Finding], command: str) -> Path:
+    """Writes `soak.html` and its figure into a folder."""
+    drawn = figure(soaked)
+    style.save(drawn, folder / "figures", "soak")
+    return render(
+        folder / PAGE,
+        title=f"Soak: {soaked.title}",
+        source="",
+        facts=[
+            ("Date", date_of(time.time())),
+            ("Duration", f"{soaked.duration_s / 60.0:g} min"),
+            ("Robots", str(len(soaked.robots))),
+            ("Warm-up", f"{soaked.warm_s:g} s"),
+        ],
+        command=command,
+        verdict=findings,
+        sections=[
+            Section("Over time", pictures=numbered([(drawn, CAPTION)])),
+            Section("Processes", tables=(table(soaked),)),
+        ],
+    )
+
+
+def table(soaked: Soaked) -> Table:
+    """Each process after the warm-up and at the end."""
+    lines = []
+    rows = soaked.of()
+    for process, each in sorted(ends(soaked).items()):
+        last, first = each.last[-1], each.first[0]
+        lasted = last.time_s - first.time_s
+        share = 100.0 * (last.cpu_s - first.cpu_s) / lasted if lasted > 0.0 else 0.0
+        delays = [row.delay_s for row in rows[process] if row.delay_s is not None]
+        memory = [statistics.median(row.rss_mb for row in window) for window in (each.first, each.last)]
+        cells = (
+            process,
+            f"{memory[0]:.1f}",
+            f"{memory[1]:.1f}",
+            f"{100 * each.growth(lambda row: row.rss_mb):+.2f} %",
+            str(last.threads),
+            str(last.files),
+            f"{share:.1f} %",
+            "–" if last.lost is None else str(last.lost),
+            "–" if last.missed is None else str(last.missed),
+            f"{1e3 * statistics.median(delays):.2f}" if delays else "–",
+        )
+        lines.append(Line(cells))
+    head = ("Process", "MB first", "MB last", "Growth", "Threads", "Files", "CPU", "Lost", "Missed", "Delay [ms]")
+    return Table(head, tuple(lines), note="CPU is the share of a core after the warm-up; memory is resident.")
+
+
+@style.styled
+def figure(soaked: Soaked) -> Figure:
+    """Memory of each process and delays over time."""
+    drawn, (memory, delay) = plt.subplots(2, 1, figsize=(6.3, 4.0), sharex=True, layout="constrained")
+    both = ends(soaked)
+    for process, rows in soaked.of().items():
+        warm = statistics.median(row.rss_mb for row in (both[process].first if process in both else rows))
+        line = {"color": THICK.get(process, "#7a7a7a"), "linewidth": 1.4 if process in THICK else 0.5}
+        minutes = [row.time_s / 60.0 for row in rows]
+        label = process if process in THICK else None
+        memory.plot(minutes, [100.0 * (row.rss_mb / warm - 1.0) for row in rows], label=label, **line)
+    delays: dict[float, list[tuple[float, float]]] = {}
+    for row in soaked.rows:
+        if row.delay_s is not None and row.longest_s is not None:
+            delays.setdefault(row.time_s, []).append((row.delay_s, row.longest_s))
+    at = [moment / 60.0 for moment in delays]
+    delay.plot(at, [1e3 * statistics.median(m for m, _ in each) for each in delays.values()], color="#000000")
+    delay.plot(at, [1e3 * max(m for _, m in each) for each in delays.values()], color="#d55e00", linewidth=0.5)
+    for axes in (memory, delay):
+        axes.axvspan(0.0, soaked.warm_s / 60.0, color="#dddddd", linewidth=0)
+        axes.grid(visible=True)
+    memory.set_ylabel("memory [%]")
+    memory.legend(ncols=4, loc="upper left")
+    delay.set_yscale("log")
+    delay.set_ylabel("delay [ms]")
+    delay.set_xlabel("$t$ [min]")
+    return drawn

@@ -1,0 +1,91 @@
+"""A process of a run that a fault laboratory can spoil: `python -m tools.reliability.spoilt_process FOLDER MODULE
+ARGUMENT...`.
+
+Runs MODULE as it runs by itself, but for the switches in FOLDER: numbers in files of eight bytes, which the laboratory
+writes and the processes of the run map into memory. Stamps of the network library itself are not reached.
+
+    clock, clock-ROLE   how much more the wall clock of all processes, or of those with that role, reads [s]
+    lease               lease that a router announces [s]; 0: its own
+    read-ROBOT          not 0: reading the body of that robot raises
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import runpy
+import struct
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from agents.clock import READING
+from tools.reliability import processes
+
+MODULE: Final = "tools.reliability.spoilt_process"
+_NUMBER: Final = struct.Struct("d")
+
+
+class Switch:
+    """A number in a file that processes share; 0 at first."""
+
+    def __init__(self, file: Path) -> None:
+        """Makes the file if there is none."""
+        with file.open("a+b") as opened:
+            if not opened.tell():
+                opened.write(bytes(_NUMBER.size))
+                opened.flush()
+            self._shared = mmap.mmap(opened.fileno(), _NUMBER.size)
+
+    def read(self) -> float:
+        """What it says now."""
+        (value,) = _NUMBER.unpack_from(self._shared)
+        return float(value)
+
+    def write(self, value: float) -> None:
+        """What it says from now on."""
+        _NUMBER.pack_into(self._shared, 0, value)
+
+
+def spoil(folder: Path, words: Sequence[str]) -> None:
+    """Puts the switches of a folder between this process and what it will run."""
+    role = processes.role(words)
+    utc, everyone, own = time.time, Switch(folder / "clock"), Switch(folder / f"clock-{role}")
+    time.time = lambda: utc() + everyone.read() + own.read()
+    if own.read():  # a computer of its own
+        time.time = lambda: utc() + own.read()
+        os.environ.pop(READING, None)
+    if role == "router":
+        _announce(Switch(folder / "lease").read())
+    elif processes.ROBOT in words:
+        _break_body([Switch(folder / f"read-{name}") for name in role.split("+")])
+
+
+def _announce(lease_s: float) -> None:
+    from agents.network import zenoh_config  # noqa: PLC0415 - not in every process
+
+    if lease_s > 0.0:
+        zenoh_config.settings = partial(zenoh_config.settings, lease_s=lease_s)
+
+
+def _break_body(broken: Sequence[Switch]) -> None:
+    from agents.body.interface import BodyState  # noqa: PLC0415 - not in every process
+    from bridges.external import ExternalBody  # noqa: PLC0415
+
+    read = ExternalBody.read
+
+    def failing(body: ExternalBody, t: float) -> BodyState:
+        if any(switch.read() for switch in broken):
+            raise OSError("read fails, as the laboratory wants")
+        return read(body, t)
+
+    ExternalBody.read = failing  # type: ignore[assignment, method-assign]
+
+
+if __name__ == "__main__":
+    spoil(Path(sys.argv[1]), sys.argv[2:])
+    sys.argv[:] = sys.argv[2:]
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)

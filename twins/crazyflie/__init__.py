@@ -1,5 +1,0 @@
-"""A Crazyflie 2.x at the far end of a wire: CRTP over UDP, to which an unmodified cflib connects."""
-
-from twins.crazyflie.device import open_device
-
-__all__ = ["open_device"]

@@ -1,0 +1,1 @@
+"""Protocol twins: simulated devices that speak the real wire protocol."""

@@ -1,0 +1,332 @@
+"""One Crazyflie as its link sees it: every packet in, every answer out."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from agents.protocols import crtp
+from agents.protocols.crtp import HighLevel, Location, Misc, Port, Safety, Setpoint, Status, Toc
+from twins.devices.crazyflie.flock import Flock
+from twins.devices.crazyflie.logs import LogBlocks
+from twins.devices.crazyflie.memory import ANCHORS, Memories
+from twins.devices.crazyflie.planner import Plan
+from twins.devices.crazyflie.tables import (
+    EXTENDED,
+    LOG_TABLE,
+    PARAMETER_TABLE,
+    PARAMETER_TYPES,
+    PARAMETERS,
+    READ_ONLY,
+    Table,
+)
+
+Send = Callable[[Port, int, bytes], None]
+HOVER_THRUST: Final = 36000.0  # about what a Crazyflie hovers with
+LARGEST: Final = 2.0**32  # as large as whole parameters get; no length, angle or speed comes near it
+CLIMB_THRUST: Final = 24000.0  # that much more is a metre per second up, about
+
+
+@dataclass
+class Drone:
+    """Row `row` of a flock, at the far end of `send`.
+
+    A packet that is too short for what it claims to be raises `struct.error` or `IndexError`, one with numbers that are
+    none `ValueError`; the link drops it.
+    """
+
+    flock: Flock
+    row: int
+    send: Send
+    values: list[float] = field(default_factory=lambda: [parameter.default for parameter in PARAMETERS])
+    stored: dict[int, float] = field(default_factory=dict)
+    group: int = 0
+
+    def __post_init__(self) -> None:
+        decks = {
+            "deck.bcLighthouse4": self.flock.lighthouse[self.row],
+            "deck.bcLoco": self.flock.loco[self.row],
+            "deck.bcMultiranger": self.flock.multiranger[self.row],
+        }
+        for name, present in decks.items():
+            self.values[PARAMETER_TABLE.number[name]] = int(present)
+        self.logs = LogBlocks(self.flock, self.row, self.value)
+        self._answer: dict[int, Callable[[int, bytes], None]] = {
+            Port.LINK: self._link,
+            Port.PLATFORM: self._platform,
+            Port.SUPERVISOR: self._supervisor,
+            Port.PARAM: self._param,
+            Port.LOG: self._log,
+            Port.MEMORY: self._memory,
+            Port.COMMANDER: self._thrust,
+            Port.SETPOINT: self._setpoint,
+            Port.HIGH_LEVEL: self._high_level,
+            Port.LOCATION: self._location,
+        }
+
+    def value(self, name: str) -> float:
+        """The value of a parameter."""
+        return self.values[PARAMETER_TABLE.number[name]]
+
+    def receive(self, port: int, channel: int, data: bytes) -> None:
+        """One packet."""
+        answer = self._answer.get(port)
+        if answer is not None:
+            answer(channel, data)
+
+    def console(self, text: str) -> None:
+        """Says something on the console."""
+        encoded = text.encode()
+        for begin in range(0, len(encoded), crtp.MTU):
+            self.send(Port.CONSOLE, 0, encoded[begin : begin + crtp.MTU])
+
+    def send_logs(self, t: float) -> None:
+        """Sends the log blocks that are due at `t` [s]."""
+        for packet in self.logs.due(t):
+            self.send(Port.LOG, 2, packet)
+
+    # ------------------------------------------------------------------ connection
+
+    def _link(self, channel: int, data: bytes) -> None:
+        if channel == 0:  # echo
+            self.send(Port.LINK, 0, data)
+        elif channel == 1:
+            self.send(Port.LINK, 1, crtp.GREETING)
+
+    def _platform(self, channel: int, data: bytes) -> None:
+        if channel == 1 and data[0] == 0:
+            self.send(Port.PLATFORM, 1, b"\0" + struct.pack("<I", crtp.VERSION))
+        elif channel == 1 and data[0] == 1:
+            self.send(Port.PLATFORM, 1, b"\1twin")
+
+    def _supervisor(self, channel: int, data: bytes) -> None:
+        command, answer = data[0], bytes((data[0] | Safety.ANSWER,))
+        supervisor = self.flock.supervisor
+        if channel == 0 and command == Safety.ASK:
+            self.send(Port.SUPERVISOR, 0, answer + struct.pack("<H", self.flock.info(self.row)))
+        elif channel == 1 and command == Safety.ARM:
+            done = self.flock.arm(self.row, on=bool(data[1]))
+            self.send(Port.SUPERVISOR, 1, answer + bytes((done, supervisor.armed(self.row))))
+        elif channel == 1 and command == Safety.RECOVER:
+            self.send(Port.SUPERVISOR, 1, answer + b"\1\1")
+        elif channel == 1 and command == Safety.STOP:
+            supervisor.stop(self.row)
+        elif channel == 1 and command == Safety.WATCHDOG:
+            supervisor.feed(self.row, self.flock.t)
+
+    # ------------------------------------------------------------------ parameters, logs, memories
+
+    def _table(self, port: Port, table: Table, data: bytes, limits: bytes = b"") -> None:
+        if data[0] == Toc.INFO:
+            self.send(port, 0, crtp.TOC_INFO.pack(Toc.INFO, len(table.items), table.crc) + limits)
+        elif data[0] == Toc.ITEM:
+            (number,) = crtp.IDENT.unpack_from(data, 1)
+            self.send(port, 0, data[:3] + table.items[number] if number < len(table.items) else data[:1])
+
+    def _param(self, channel: int, data: bytes) -> None:
+        if channel == 0:
+            self._table(Port.PARAM, PARAMETER_TABLE, data)
+            return
+        if channel == 3:
+            self._param_misc(data)
+            return
+        (number,) = crtp.IDENT.unpack_from(data)
+        if number >= len(PARAMETERS):
+            self.send(Port.PARAM, channel, data[:2] + bytes((Status.UNKNOWN,)))
+        elif channel == 1:
+            self.send(Port.PARAM, 1, data[:2] + b"\0" + PARAMETERS[number].packing.pack(self._stored_as(number)))
+        elif not PARAMETERS[number].flags & READ_ONLY:  # a write to a constant is never answered
+            (value,) = _numbers(PARAMETERS[number].packing, data[2:])
+            self.send(Port.PARAM, 2, data)
+            self._set(number, value)
+
+    def _param_misc(self, data: bytes) -> None:
+        if data[0] == Misc.SET_BY_NAME:
+            group, name, rest = data[1:].split(b"\0", 2)
+            number = PARAMETER_TABLE.number.get(f"{group.decode()}.{name.decode()}")
+            status = Status.UNKNOWN
+            if number is not None and PARAMETER_TYPES[PARAMETERS[number].type][0] == rest[0]:
+                status = Status.OK
+                self._set(number, _numbers(PARAMETERS[number].packing, rest[1:])[0])
+            self.send(Port.PARAM, 3, data[: len(group) + len(name) + 3] + bytes((status,)))
+            return
+        command, number = crtp.ITEM.unpack_from(data)
+        known = data[: crtp.ITEM.size]
+        if number >= len(PARAMETERS):
+            self.send(Port.PARAM, 3, known + bytes((Status.UNKNOWN,)))
+            return
+        parameter = PARAMETERS[number]
+        packing = parameter.packing
+        extended = bytes((1 if parameter.flags & EXTENDED else 0,))
+        default = packing.pack(_typed(parameter.type, parameter.default))
+        if command == Misc.EXTENDED:
+            self.send(Port.PARAM, 3, known + extended)
+        elif command == Misc.EXTENDED_2:
+            self.send(Port.PARAM, 3, known + b"\0" + extended)
+        elif command == Misc.DEFAULT_2:
+            self.send(Port.PARAM, 3, known + b"\0" + default)
+        elif command == Misc.STORE:
+            self.stored[number] = self.values[number]
+            self.send(Port.PARAM, 3, known + b"\0")
+        elif command == Misc.CLEAR:
+            self.stored.pop(number, None)
+            self.send(Port.PARAM, 3, known + b"\0")
+        elif command == Misc.STORED:
+            kept = self.stored.get(number)
+            tail = b"\0" + default if kept is None else b"\1" + default + packing.pack(_typed(parameter.type, kept))
+            self.send(Port.PARAM, 3, known + tail)
+
+    def _stored_as(self, number: int) -> float:
+        return _typed(PARAMETERS[number].type, self.values[number])
+
+    def _set(self, number: int, value: float) -> None:
+        """A parameter changes, and what hangs on it."""
+        before, self.values[number] = self.values[number], value
+        name, flock = PARAMETERS[number].name, self.flock
+        if name == "kalman.resetEstimation" and value:
+            place = np.array([self.value(f"kalman.initial{axis}") for axis in "XYZ"])
+            flock.estimator.reset(self.row, place - flock.place[self.row])
+        elif name == "lighthouse.systemType" and value != before:
+            flock.memories[self.row].forget_stations()
+        elif name == "stabilizer.stop" and value:
+            flock.supervisor.stop(self.row)
+
+    def _log(self, channel: int, data: bytes) -> None:
+        if channel == 0:
+            self._table(Port.LOG, LOG_TABLE, data, bytes((crtp.LOG_BLOCKS, crtp.LOG_VARIABLES)))
+        elif channel == 1:
+            block = data[1] if len(data) > 1 else 0
+            status = self.logs.obey(data[0], block, data[2:], self.flock.t)
+            self.send(Port.LOG, 1, bytes((data[0], block, status)))
+
+    def _memory(self, channel: int, data: bytes) -> None:
+        kinds, memories = Memories.kinds, self.flock.memories[self.row]
+        if channel == 0:
+            if data[0] == 1:
+                self.send(Port.MEMORY, 0, bytes((1, len(kinds))))
+            elif data[0] == 2 and data[1] < len(kinds):
+                kind = kinds[data[1]]
+                self.send(Port.MEMORY, 0, crtp.MEMORY_INFO.pack(2, data[1], kind, memories.size(kind)))
+            return
+        number, address = crtp.MEMORY.unpack_from(data)
+        head, rest = data[: crtp.MEMORY.size], data[crtp.MEMORY.size :]
+        read: bytes | None = b""
+        if number >= len(kinds):
+            read = None
+        elif channel == 1:
+            read = memories.read(kinds[number], address, rest[0])
+        elif not memories.write(kinds[number], address, rest):
+            read = None
+        self.send(Port.MEMORY, channel, head + bytes((Status.IO if read is None else Status.OK,)) + (read or b""))
+
+    # ------------------------------------------------------------------ motion
+
+    def _command(self, **setpoint: object) -> None:
+        self.flock.planner.stop(self.row)
+        self.flock.commander.command(self.row, self.flock.t, **setpoint)  # type: ignore[arg-type]
+
+    def _thrust(self, _channel: int, data: bytes) -> None:
+        _, _, turn, thrust = _numbers(crtp.THRUST, data)
+        climb = (thrust - HOVER_THRUST) / CLIMB_THRUST
+        self._command(on=thrust > 0, velocity=(math.nan, math.nan, climb), turn=math.radians(turn))
+
+    def _setpoint(self, channel: int, data: bytes) -> None:
+        if channel == 1:
+            if data[0] == 0:
+                self.flock.commander.release(self.row)
+            return
+        kind, rest, free = data[0], data[1:], math.nan
+        if kind == Setpoint.STOP:
+            self._command(on=False)
+        elif kind == Setpoint.POSITION:
+            x, y, z, yaw = _numbers(crtp.FOUR, rest)
+            self._command(target=(x, y, z), heading=math.radians(yaw))
+        elif kind == Setpoint.VELOCITY:
+            vx, vy, vz, turn = _numbers(crtp.FOUR, rest)
+            self._command(velocity=(vx, vy, vz), turn=math.radians(turn))
+        elif kind == Setpoint.HOVER:
+            vx, vy, turn, z = _numbers(crtp.FOUR, rest)
+            self._command(velocity=(vx, vy, free), target=(free, free, z), turn=math.radians(turn), body=True)
+        elif kind == Setpoint.HEIGHT:
+            _, _, turn, z = _numbers(crtp.FOUR, rest)
+            self._command(target=(free, free, z), turn=math.radians(turn))
+        elif kind == Setpoint.FULL_STATE:
+            values = crtp.FULL_STATE.unpack_from(rest)
+            x, y, z = (crtp.MM * value for value in values[:3])
+            self._command(target=(x, y, z), heading=crtp.yaw_of(values[9]))
+
+    def _high_level(self, _channel: int, data: bytes) -> None:
+        self.send(Port.HIGH_LEVEL, 0, data[:3].ljust(3, b"\0") + bytes((self._plan(data[0], data[1], data[2:]),)))
+
+    def _plan(self, command: int, group: int, data: bytes) -> Status:
+        flock, row, t = self.flock, self.row, self.flock.t
+        meant = not group or bool(group & self.group)
+        if command == HighLevel.GROUP:
+            self.group = group
+        elif command == HighLevel.STOP and meant:
+            flock.planner.stop(row)
+        if command in (HighLevel.GROUP, HighLevel.STOP) or not meant:
+            return Status.OK
+        if not flock.supervisor.may_fly[row]:
+            return Status.BUSY
+        pose = flock.pose(row)
+        if command in (HighLevel.TAKEOFF, HighLevel.LAND):
+            height, yaw, keep, span = _numbers(crtp.CLIMB, data)
+            yaw = float(pose[3]) if keep else yaw
+            climb = flock.planner.takeoff if command == HighLevel.TAKEOFF else flock.planner.land
+            return climb(row, t, pose, height=height, yaw=yaw, span=span)
+        if command == HighLevel.GO_TO:
+            relative, linear, x, y, z, yaw, span = _numbers(crtp.GO_TO, data)
+            goal, velocity = np.array([x, y, z, yaw]), flock.quadrotor.velocity[row]
+            return flock.planner.go_to(row, t, pose, velocity, goal=goal, span=span, relative=relative, linear=linear)
+        return Status.NO_COMMAND
+
+    # ------------------------------------------------------------------ position
+
+    def _location(self, channel: int, data: bytes) -> None:
+        flock, row = self.flock, self.row
+        if channel == 0:
+            flock.estimator.hear(row, flock.t, _numbers(crtp.VECTOR, data))
+            return
+        kind, rest = data[0], data[1:]
+        if kind == Location.POSE:
+            x, y, z, *_ = _numbers(crtp.POSE, rest)
+            flock.estimator.hear(row, flock.t, (x, y, z))
+        elif kind == Location.LPP and flock.loco[row]:
+            if rest[1] == crtp.ANCHOR_POSITION and rest[0] < ANCHORS:
+                flock.memories[row].place(rest[0], *_numbers(crtp.VECTOR, rest[2:]))
+        elif kind == Location.STORE_LIGHTHOUSE:
+            flock.memories[row].stored = struct.unpack_from("<HH", rest)
+            self.send(Port.LOCATION, 1, bytes((Location.STORE_LIGHTHOUSE, 1)))
+        elif kind == Location.STOP:
+            flock.supervisor.stop(row)
+        elif kind == Location.WATCHDOG:
+            flock.supervisor.feed(row, flock.t)
+
+    @property
+    def planned(self) -> Plan:
+        """What the planner is at."""
+        return Plan(self.flock.planner.plan[self.row])
+
+
+def _typed(kind: str, value: float) -> float:
+    """A value as its type wants it for packing."""
+    return value if kind == "float" else int(value)
+
+
+def _numbers(packing: struct.Struct, data: bytes) -> tuple[Any, ...]:
+    """What is packed at the beginning of `data`.
+
+    Raises:
+        struct.error: If it is too short.
+        ValueError: If a number is not finite, or absurdly large.
+    """
+    values = packing.unpack_from(data)
+    if not all(abs(value) <= LARGEST for value in values):  # NaN fails too
+        raise ValueError(f"{values} are no numbers for a robot")
+    return values

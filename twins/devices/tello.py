@@ -1,0 +1,385 @@
+"""Protocol twin of DJI Tellos: the SDK 2.0 text protocol, each drone on a loopback address of its own."""
+
+from __future__ import annotations
+
+import errno
+import math
+import socket
+import zlib
+from collections import deque
+from collections.abc import Sequence
+from enum import Enum
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array
+from agents.body.interface import BodyError, settings
+from agents.protocols import tello as protocol
+from twins.body import CATCH_UP_S, ENDURANCE_S, FULL_WOBBLE
+from twins.devices.device import DeviceRequest, Faults
+from twins.models.disturbance import HoverJitter, Latency
+from twins.models.noise import Noise
+from twins.models.quadrotor import Quadrotor
+
+PORT: Final = 18889  # not the drone's own 8889: djitellopy binds that on every address of this host
+HOSTS: Final = range(2, 255)  # of 127.0.0.x: djitellopy tells drones apart by address alone
+REFUSES: Final = 0.10  # charge below which it does not take off
+GIVES_UP: Final = 0.05  # charge at which it lands by itself
+NEAR: Final = 0.03  # [m] a move that is nearer than this to its goal is over
+AIMED: Final = 0.01  # [rad] likewise a turn
+MOVES: Final = {
+    "forward": (1.0, 0.0, 0.0),
+    "back": (-1.0, 0.0, 0.0),
+    "left": (0.0, 1.0, 0.0),
+    "right": (0.0, -1.0, 0.0),
+    "up": (0.0, 0.0, 1.0),
+    "down": (0.0, 0.0, -1.0),
+}
+
+
+class Mode(Enum):
+    """What a drone is doing."""
+
+    GROUND = "on the ground"
+    CLIMB = "taking off"
+    STICKS = "hovering, or as the sticks say"
+    MOVE = "on the way to a point"
+    TURN = "turning"
+    LAND = "landing"
+    FALL = "motors off in the air"
+
+
+class _Drone:
+    """One drone's side of the conversation, and what it is told to do."""
+
+    def __init__(self, wire: socket.socket, faults: Faults, chance: np.random.Generator) -> None:
+        self.wire, self.faults, self._chance = wire, faults, chance
+        self.mode = Mode.GROUND
+        self.sdk = False
+        self.peer: tuple[str, int] | None = None  # who spoke last
+        self.waits: tuple[str, int] | None = None  # who gets the answer when the manoeuvre is over
+        self.heard = 0.0
+        self.sticks = (0, 0, 0, 0)
+        self.goal = np.zeros(3)
+        self.heading = 0.0
+        self.pace = protocol.STICK_SPEED  # [m/s] of moves
+        self.motors_s = 0.0
+        self.charge = faults.battery
+        self.state_due = 0.0
+        self._outbox: deque[tuple[float, bytes, tuple[str, int]]] = deque()
+
+    @property
+    def aloft(self) -> bool:
+        """Whether it can be steered."""
+        return self.mode in (Mode.STICKS, Mode.MOVE, Mode.TURN)
+
+    def hover(self) -> None:
+        """Stays where it is, if it can be steered."""
+        if self.aloft:
+            self.mode, self.sticks = Mode.STICKS, (0, 0, 0, 0)
+
+    def lost(self) -> bool:
+        """Whether the air swallows this packet."""
+        return self.faults.loss > 0.0 and float(self._chance.random()) < self.faults.loss
+
+    def send(self, text: str, to: tuple[str, int], t: float) -> None:
+        """Queues a packet; it leaves at once, or after the delay that it was given."""
+        if not self.lost():
+            self._outbox.append((t + self.faults.delay_s, text.encode("ascii", "replace"), to))
+            self.flush(t)
+
+    def flush(self, t: float) -> None:
+        """Sends what is due."""
+        while self._outbox and self._outbox[0][0] <= t:
+            _, packet, to = self._outbox.popleft()
+            try:
+                self.wire.sendto(packet, to)
+            except OSError:
+                continue  # nobody there: the drone does not know
+
+    def finish(self, text: str, t: float) -> None:
+        """The manoeuvre is over: its sender gets the answer."""
+        if self.waits is not None:
+            self.send(text, self.waits, t)
+        self.waits = None
+
+
+class TelloDevice:
+    """Rows of Tellos; implements `twins.devices.device.Device`."""
+
+    def __init__(self, request: DeviceRequest) -> None:
+        body = request.body
+        count = len(body.names)
+        for name, table in zip(body.names, body.device, strict=True):
+            settings(protocol.Settings, name, table)
+        self._dt = 1.0 / body.rate_hz
+        self._t = 0.0
+        self._model = Quadrotor(body.kinds, body.start, body.yaw, self._dt)
+        self._jitter = HoverJitter(body.disturbance, Noise(body.names, body.seeds, "hover jitter", 2), self._dt)
+        self._latency = Latency(body.disturbance, self._dt)
+        self._start_yaw = body.yaw.copy()
+        self._truth = np.array(body.start, dtype=float)
+        self._setpoint = np.full((count, 4), np.nan)
+        self._drones: list[_Drone] = []
+        try:
+            for row, name in enumerate(body.names):
+                chance = np.random.default_rng([body.seeds[row], zlib.crc32(name.encode()), zlib.crc32(b"loss")])
+                self._drones.append(_Drone(_listen(name, body.addresses[row]), request.faults, chance))
+        except BodyError:
+            self.close()
+            raise
+        places = (drone.wire.getsockname() for drone in self._drones)
+        self.addresses = tuple(f"tello://{host}:{port}" for host, port in places)
+
+    def sockets(self) -> Sequence[socket.socket]:
+        """See `Device.sockets`."""
+        return [drone.wire for drone in self._drones]
+
+    def serve(self, ready: socket.socket, t: float) -> None:
+        """See `Device.serve`."""
+        for row, drone in enumerate(self._drones):
+            if drone.wire is ready:
+                try:
+                    packet, sender = drone.wire.recvfrom(1024)
+                except OSError:
+                    return
+                if not (drone.faults.silent(t) or drone.lost()):
+                    self._hear(row, packet, sender, t)
+
+    def advance(self, t: float) -> None:
+        """See `Device.advance`."""
+        steps = round((t - self._t) / self._dt)
+        if steps * self._dt > CATCH_UP_S:
+            steps = 1
+        for _ in range(steps):
+            self._step(t)
+        self._t = t
+        for row, drone in enumerate(self._drones):
+            if drone.sdk and drone.peer is not None and t >= drone.state_due - 0.5 * self._dt:
+                late = t - drone.state_due
+                period = 1.0 / protocol.STATE_HZ
+                drone.state_due += period if late < period else late + period  # what was missed is not made up for
+                if not drone.faults.silent(t):
+                    drone.send(self._state(row), (drone.peer[0], protocol.STATE_PORT), t)
+            drone.flush(t)
+
+    def truth(self) -> tuple[Array, Array]:
+        """See `Device.truth`."""
+        return self._truth.copy(), self._model.yaw.copy()
+
+    def close(self) -> None:
+        """See `Device.close`."""
+        for drone in self._drones:
+            drone.wire.close()
+
+    # ------------------------------------------------------------------ the protocol
+
+    def _hear(self, row: int, packet: bytes, sender: tuple[str, int], t: float) -> None:
+        words = packet.decode("ascii", "replace").split()
+        if not words:
+            return
+        drone, word = self._drones[row], words[0]
+        if word == "command":
+            drone.sdk = True
+        if not drone.sdk:
+            return  # until then it is the phone's
+        drone.peer, drone.heard = sender, t
+        answer = self._answer(row, word) if word.endswith("?") else self._obey(row, word, words[1:], sender)
+        if answer:
+            drone.send(answer, sender, t)
+
+    def _answer(self, row: int, question: str) -> str:
+        drone = self._drones[row]
+        height = float(self._truth[row, 2])
+        answers = {
+            "battery?": f"{round(100.0 * drone.charge)}\r\n",
+            "speed?": f"{100.0 * drone.pace:.1f}\r\n",
+            "time?": f"{int(drone.motors_s)}s\r\n",
+            "height?": f"{int(10.0 * height)}dm\r\n",
+            "temp?": "63~66C\r\n",
+            "attitude?": f"pitch:0;roll:0;yaw:{self._yaw(row)};\r\n",
+            "baro?": f"{170.0 + height:.6f}\r\n",
+            "acceleration?": "agx:-6.00;agy:1.00;agz:-999.00;\r\n",
+            "tof?": f"{max(100, round(1000.0 * height))}mm\r\n",
+            "wifi?": "90\r\n",
+            "sdk?": "20\r\n",
+            "sn?": f"0TQTWIN{row:04d}\r\n",
+        }
+        return answers.get(question, f"unknown command: {question}")
+
+    def _obey(self, row: int, word: str, arguments: list[str], sender: tuple[str, int]) -> str:
+        """Does what a command says; its answer, or nothing if there is none yet, or none at all."""
+        drone = self._drones[row]
+        try:
+            values = [int(argument) for argument in arguments]
+        except ValueError:
+            return "error"
+        if word in (*MOVES, "go", "cw", "ccw"):
+            return self._manoeuvre(row, word, values, sender) if drone.aloft else "error Motor stop"
+        if word in ("takeoff", "land", "emergency"):
+            return self._by_itself(row, word, sender)
+        if word == "rc" and len(values) == 4:
+            right, forward, up, clockwise = (max(-protocol.STICK, min(protocol.STICK, value)) for value in values)
+            drone.sticks = (right, forward, up, clockwise)
+            return ""
+        if word == "stop":
+            answer = "ok" if drone.aloft else "error Motor stop"
+            drone.hover()
+        elif word == "speed":
+            answer = "ok" if len(values) == 1 and 10 <= values[0] <= 100 else "out of range"
+            drone.pace = 0.01 * values[0] if answer == "ok" else drone.pace
+        else:
+            known = ("command", "streamon", "streamoff", "mon", "moff", "mdirection")
+            answer = "ok" if word in known else "error" if word == "rc" else f"unknown command: {word}"
+        return answer
+
+    def _by_itself(self, row: int, word: str, sender: tuple[str, int]) -> str:
+        """What the drone does without sticks, and answers when it is done."""
+        drone, rows = self._drones[row], np.array([row])
+        if word == "emergency":
+            self._model.stop(rows)
+            drone.mode, drone.waits, drone.sticks = Mode.FALL, None, (0, 0, 0, 0)
+            return "ok"
+        if word == "takeoff":
+            if drone.mode is not Mode.GROUND or drone.charge < REFUSES:
+                return "error"
+            self._model.takeoff(rows, np.array([protocol.TAKEOFF_HEIGHT]))
+            drone.mode, drone.waits, drone.sticks = Mode.CLIMB, sender, (0, 0, 0, 0)
+            return ""
+        if drone.mode in (Mode.GROUND, Mode.FALL):
+            return "error"
+        if drone.mode is not Mode.LAND:  # told again, it goes on as it was
+            self._model.land(rows)
+        drone.mode, drone.waits = Mode.LAND, sender
+        return ""
+
+    def _manoeuvre(self, row: int, word: str, values: list[int], sender: tuple[str, int]) -> str:
+        drone, yaw = self._drones[row], float(self._model.yaw[row])
+        if word in ("cw", "ccw"):
+            if len(values) != 1 or not 1 <= values[0] <= 360:
+                return "out of range"
+            drone.heading = yaw + math.radians(values[0]) * (-1.0 if word == "cw" else 1.0)
+            drone.mode, drone.waits = Mode.TURN, sender
+            return ""
+        if word == "go":
+            if len(values) != 4 or max(map(abs, values[:3])) > 500 or not 10 <= values[3] <= 100:
+                return "out of range"
+            if max(map(abs, values[:3])) < 20:
+                return "error"
+            way, drone.pace = 0.01 * np.array(values[:3]), 0.01 * values[3]
+        else:
+            if len(values) != 1 or not 20 <= values[0] <= 500:
+                return "out of range"
+            way = 0.01 * values[0] * np.array(MOVES[word])
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        turned = np.array([cos * way[0] - sin * way[1], sin * way[0] + cos * way[1], way[2]])
+        drone.goal = self._model.position[row] + turned
+        drone.mode, drone.waits = Mode.MOVE, sender
+        return ""
+
+    def _yaw(self, row: int) -> int:
+        """As the drone says it: degrees clockwise from where it was switched on, -180 to 179."""
+        return (round(-math.degrees(float(self._model.yaw[row] - self._start_yaw[row]))) + 180) % 360 - 180
+
+    def _state(self, row: int) -> str:
+        drone, yaw, height = self._drones[row], float(self._model.yaw[row]), float(self._truth[row, 2])
+        right, forward, up, _ = protocol.sticks(tuple(self._model.velocity[row].tolist()), 0.0, yaw)
+        return (
+            f"mid:-1;x:-100;y:-100;z:-100;mpry:0,0,0;pitch:0;roll:0;yaw:{self._yaw(row)};"
+            f"vgx:{int(forward / 10)};vgy:{int(right / 10)};vgz:{int(-up / 10)};templ:63;temph:66;"
+            f"tof:{max(10, round(100.0 * height))};h:{10 * int(10.0 * height + 1e-6)};"
+            f"bat:{round(100.0 * drone.charge)};baro:{170.0 + height:.2f};time:{int(drone.motors_s)};"
+            "agx:-6.00;agy:1.00;agz:-999.00;\r\n"
+        )
+
+    # ------------------------------------------------------------------ the model
+
+    def _step(self, t: float) -> None:
+        self._setpoint[:] = np.nan
+        for row, drone in enumerate(self._drones):
+            self._setpoint[row] = self._wanted(row, drone)
+        setpoint = self._latency.pass_on(self._setpoint) if self._latency.present else self._setpoint
+        self._model.command(setpoint)
+        self._model.advance()
+        self._truth[:] = self._model.position
+        if self._jitter.present:
+            self._jitter.advance()
+            share = np.minimum(self._model.position[:, 2] / FULL_WOBBLE, 1.0)
+            self._truth[:, :2] += share[:, None] * self._jitter.displacement
+        for row, drone in enumerate(self._drones):
+            self._live(row, drone, t)
+
+    def _wanted(self, row: int, drone: _Drone) -> tuple[float, float, float, float]:
+        yaw = float(self._model.yaw[row])
+        if drone.mode is Mode.STICKS:
+            return protocol.motion(drone.sticks, yaw)
+        if drone.mode is Mode.TURN:
+            rate = max(-protocol.STICK_TURN, min(protocol.STICK_TURN, 4.0 * (drone.heading - yaw)))
+            return 0.0, 0.0, 0.0, rate
+        if drone.mode is Mode.MOVE:
+            way = drone.goal - self._model.position[row]
+            far = float(np.sqrt(way @ way))
+            x, y, z = (way * min(drone.pace / max(far, 1e-9), 1.5)).tolist()
+            return x, y, z, 0.0
+        return math.nan, math.nan, math.nan, math.nan
+
+    def _live(self, row: int, drone: _Drone, t: float) -> None:
+        """What happens to a drone in a step: manoeuvres end, the battery drains, patience runs out."""
+        model = self._model
+        z = float(model.position[row, 2])
+        flying = bool(model.flying[row])
+        if drone.mode is Mode.CLIMB and abs(z - protocol.TAKEOFF_HEIGHT) < NEAR:
+            drone.mode = Mode.STICKS
+            drone.finish("ok", t)
+        elif drone.mode is Mode.LAND and not flying:
+            drone.mode = Mode.GROUND
+            drone.finish("ok", t)
+        elif drone.mode is Mode.FALL and z <= 0.0:
+            drone.mode = Mode.GROUND
+        elif drone.mode in (Mode.MOVE, Mode.TURN) and self._arrived(row, drone):
+            drone.hover()
+            drone.finish("ok", t)
+        if not flying:
+            return
+        drone.motors_s += self._dt
+        drone.charge = max(0.0, drone.charge - drone.faults.drain * self._dt / ENDURANCE_S["tello"])
+        alone = t - drone.heard > protocol.AUTO_LAND_S
+        if drone.mode is not Mode.LAND and (alone or drone.charge <= GIVES_UP):
+            model.land(np.array([row]))
+            drone.finish("error Auto land", t)
+            drone.mode = Mode.LAND
+
+    def _arrived(self, row: int, drone: _Drone) -> bool:
+        if drone.mode is Mode.TURN:
+            return abs(drone.heading - float(self._model.yaw[row])) < AIMED
+        return float(np.abs(drone.goal - self._model.position[row]).max()) < NEAR
+
+
+def _listen(name: str, address: str) -> socket.socket:
+    """A socket where the address says, else on the first loopback host that has no Tello yet."""
+    _, named, place = address.partition("://")
+    if named:
+        host, port = protocol.endpoint(name, f"tello://{place}")
+        if not host.startswith("127."):
+            raise BodyError(f"{name}: {address}: a twin lives on a loopback address, such as tello-twin://127.0.0.2")
+        hosts, port = [host], port if ":" in place else PORT
+    else:
+        hosts, port = [f"127.0.0.{number}" for number in HOSTS], PORT
+    for host in hosts:
+        wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            wire.bind((host, port))
+        except OSError as error:
+            wire.close()
+            if error.errno != errno.EADDRINUSE:
+                raise BodyError(f"{name}: no Tello twin at {host}:{port}: {error.strerror}") from error
+            continue
+        wire.setblocking(False)
+        return wire
+    raise BodyError(f"{name}: {address}: in use; end the twin that holds {hosts[0]}:{port}, or name another address")
+
+
+def open_device(request: DeviceRequest) -> TelloDevice:
+    """The entry point `tello-twin` of the group `zenpark.devices`."""
+    return TelloDevice(request)

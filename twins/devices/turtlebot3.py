@@ -1,0 +1,314 @@
+"""Protocol twin of the TurtleBot3 Burger: the topics of turtlebot3_node on Zenoh, moved by the model of `twins`.
+
+It polls its session, so it has no sockets to wait on. As on the robot, a command holds until the next one: OpenCR stops
+the wheels when its ROS node falls silent (500 ms without heartbeat), and turtlebot3_node lets cmd_vel be silent as long
+as it likes. `watchdog_s` in the robot's settings adds what careful people run on theirs.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import cos, inf, nan, pi, sin
+from typing import Final
+
+import numpy as np
+import zenoh
+
+from agents.arrays import Array, clamp
+from agents.body.interface import BodyError, settings
+from agents.body.kinds import TURTLEBOT3
+from agents.network import session as network
+from agents.protocols import ros2, turtlebot3
+from agents.protocols.ros2 import Message
+from agents.protocols.ros2_node import Participant, Publisher, Subscriber
+from agents.protocols.turtlebot3 import Address, Settings
+from twins.body import ENDURANCE_S
+from twins.devices.device import Device, DeviceRequest, Faults
+from twins.models.differential import Differential
+from twins.models.disturbance import Drift, Measurement
+from twins.models.noise import Noise
+
+CATCH_UP_S: Final = 1.0  # as for the twin in the robot's process: time it could not see did not pass
+JOIN_S: Final = 5.0  # to find the router
+
+Sight = Callable[[Array, float, Array], Array]
+"""What surrounds a robot: position (3,) [m], yaw and world bearings (360,) [rad] to distances (360,) [m], inf: none."""
+
+
+def nothing(position: Array, yaw: float, bearing: Array) -> Array:
+    """An empty world."""
+    return np.full(len(bearing), inf)
+
+
+@dataclass
+class _Row:
+    """The ROS side of one robot."""
+
+    types: ros2.Types
+    command: Subscriber
+    stamped: bool
+    odometry: Publisher
+    scan: Publisher
+    battery: Publisher
+    start: tuple[float, float, float]
+    watchdog: float
+    commanded: float = -inf
+
+
+class TurtleBot3Twin:
+    """Rows of TurtleBot3 behind ROS topics; implements `twins.devices.device.Device`.
+
+    Attributes:
+        addresses: One per row.
+        heard: Commands that were obeyed, per row.
+        sight: What the laser scanners see.
+
+    Raises:
+        BodyError: If a setting is wrong.
+        Unreachable: If no router answers.
+    """
+
+    def __init__(self, request: DeviceRequest) -> None:
+        body = request.body
+        self._dt = 1.0 / body.rate_hz
+        self._faults: Faults = request.faults
+        self._t = 0.0
+        self._ticks = 0
+        self._model = Differential(body.kinds, body.start, body.yaw, self._dt)
+        rows = len(body.names)
+        self._twist = np.zeros((rows, 2))
+        self._top: Array = np.array([TURTLEBOT3.speed, TURTLEBOT3.turn_rate])  # the maker's limits
+        self._told = self._model.yaw.copy()
+        self._used = 0.0
+        self._measurement = Measurement(
+            body.disturbance, np.tile([1.0, 1.0, 0.0], (rows, 1)), Noise(body.names, body.seeds, "measurement", 4)
+        )
+        self._drift = Drift(body.disturbance, Noise(body.names, body.seeds, "odometry", 2))
+        self._chance = np.random.default_rng([body.seeds[0], 0x7B3])
+        self._late: deque[tuple[float, Publisher, bytes]] = deque()
+        self._bearing: Array = np.arange(turtlebot3.RAYS, dtype=float) * (2.0 * pi / turtlebot3.RAYS)
+        self.sight: Sight = nothing
+        self.heard = [0] * rows
+        self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
+        self._rows: list[_Row] = []
+        addresses = []
+        self._clock = body.clock
+        participants: dict[tuple[object, ...], Participant] = {}
+        try:
+            for row, name in enumerate(body.names):
+                if body.kinds[row].name != "turtlebot3":
+                    raise BodyError(f"{name} is a {body.kinds[row].name}, this is the twin of a turtlebot3")
+                chosen = settings(Settings, name, body.device[row])
+                where = turtlebot3.twin(name, chosen)
+                endpoints = (chosen.endpoint,) if chosen.endpoint else body.endpoints
+                which = (endpoints, where.style, where.distro, where.domain)
+                if which not in participants:
+                    participants[which] = self._participant(endpoints, where)
+                x, y = body.start[row, :2].tolist()
+                self._rows.append(_row(participants[which], where, chosen, (x, y, float(body.yaw[row]))))
+                addresses.append(str(where))
+        except BaseException:
+            self.close()
+            raise
+        self.addresses = tuple(addresses)
+
+    def _participant(self, endpoints: tuple[str, ...], where: Address) -> Participant:
+        if endpoints not in self._sessions:
+            session = network.open_session(endpoints, name="turtlebot3-twin", wait_s=JOIN_S, identity="twin")
+            self._sessions[endpoints] = session
+        return Participant(
+            self._sessions[endpoints],
+            ros2.types(where.distro),
+            style=where.style,
+            domain=where.domain,
+            announces=True,  # with ros2dds it stands for the bridge on the robot as well
+        )
+
+    def sockets(self) -> Sequence[socket.socket]:
+        """None: Zenoh is polled in `advance`."""
+        return ()
+
+    def serve(self, ready: socket.socket, t: float) -> None:
+        """Never called."""
+
+    def advance(self, t: float) -> None:
+        """See `Device.advance`."""
+        steps = round((t - self._t) / self._dt)
+        if steps * self._dt > CATCH_UP_S:
+            steps = 1
+        self._t = t
+        silent = self._faults.silent(t)
+        self._listen(t, silent)
+        for _ in range(steps):
+            self._model.command(self._twist)  # held: the model's own patience is not this robot's
+            before = self._model.position[:, :2].copy()
+            self._model.advance()
+            if self._drift.present:
+                self._drift.advance(self._model.position[:, :2] - before)
+            self._used += self._dt
+            self._ticks += 1
+            for rate, say in (
+                (turtlebot3.ODOMETRY_HZ, self._odometry),
+                (turtlebot3.SCAN_HZ, self._scan),
+                (turtlebot3.BATTERY_HZ, self._battery),
+            ):
+                if self._ticks % max(1, round(1.0 / (rate * self._dt))) == 0 and not silent:
+                    say(t)
+        while self._late and self._late[0][0] <= t:
+            _, publisher, payload = self._late.popleft()
+            if not silent:
+                publisher.send(payload)
+
+    def truth(self) -> tuple[Array, Array]:
+        """See `Device.truth`."""
+        return self._model.position.copy(), self._model.yaw.copy()
+
+    def close(self) -> None:
+        """Leaves the network."""
+        for session in self._sessions.values():
+            session.close()  # type: ignore[no-untyped-call]
+        self._sessions.clear()
+
+    # ------------------------------------------------------------------ what it hears
+
+    def _listen(self, t: float, silent: bool) -> None:
+        for index, row in enumerate(self._rows):
+            for message in row.command.received():
+                if silent or self._lost():
+                    continue
+                said = message.twist if row.stamped else message
+                v, w = said.linear.x, said.angular.z
+                if not (np.isfinite(v) and np.isfinite(w) and max(abs(v), abs(w)) < 1e6):
+                    continue
+                twist: Array = np.array([turtlebot3.cut(v), turtlebot3.cut(w)])
+                self._twist[index] = clamp(twist, -self._top, self._top)
+                row.commanded = t
+                self.heard[index] += 1
+            if t - row.commanded > row.watchdog:
+                self._twist[index] = 0.0
+
+    def _lost(self) -> bool:
+        return self._faults.loss > 0.0 and bool(self._chance.random() < self._faults.loss)
+
+    # ------------------------------------------------------------------ what it says
+
+    def _say(self, publisher: Publisher, types: ros2.Types, message: Message, t: float) -> None:
+        if self._lost():
+            return
+        payload = types.encode(message, publisher.kind)
+        if self._faults.delay_s > 0.0:
+            self._late.append((t + self._faults.delay_s, publisher, payload))
+        else:
+            publisher.send(payload)
+
+    def _odometry(self, t: float) -> None:
+        position, yaw = self._model.position[:, :2].copy(), self._model.yaw.copy()
+        if self._measurement.present:
+            noise = self._measurement.draw()
+            position, yaw = position + noise[:, :2], yaw + noise[:, 3]
+        if self._drift.present:
+            position = position + self._drift.error
+        # as the node does it: speeds are what happened since the last odometry
+        turn = (self._model.yaw - self._told) * turtlebot3.ODOMETRY_HZ
+        self._told = self._model.yaw.copy()
+        velocity = self._model.velocity
+        speed = velocity[:, 0] * np.cos(self._model.yaw) + velocity[:, 1] * np.sin(self._model.yaw)
+        now = self._clock.utc()
+        for index, row in enumerate(self._rows):
+            make = row.types.make
+            x0, y0, yaw0 = row.start
+            x, y = position[index, 0] - x0, position[index, 1] - y0
+            turned = float(yaw[index]) - yaw0
+            place = make(
+                "geometry_msgs/msg/Point",
+                x=float(cos(yaw0) * x + sin(yaw0) * y),
+                y=float(cos(yaw0) * y - sin(yaw0) * x),
+                z=0.0,
+            )
+            toward = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin(0.5 * turned), w=cos(0.5 * turned))
+            pose = make("geometry_msgs/msg/Pose", position=place, orientation=toward)
+            twist = row.types.twist((float(speed[index]), 0.0, 0.0), (0.0, 0.0, float(turn[index])))
+            message = make(
+                ros2.ODOMETRY,
+                header=row.types.header(now, "odom"),
+                child_frame_id="base_footprint",
+                pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+                twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+            )
+            self._say(row.odometry, row.types, message, t)
+
+    def _scan(self, t: float) -> None:
+        now = self._clock.utc()
+        for index, row in enumerate(self._rows):
+            yaw = float(self._model.yaw[index])
+            distance = self.sight(self._model.position[index], yaw, self._bearing + yaw)
+            seen = (distance >= turtlebot3.NEAREST) & (distance <= turtlebot3.FARTHEST)
+            message = row.types.make(
+                ros2.LASER_SCAN,
+                header=row.types.header(now, "base_scan"),
+                angle_min=0.0,
+                angle_max=float(self._bearing[-1]),
+                angle_increment=float(self._bearing[1]),
+                time_increment=1.0 / (turtlebot3.SCAN_HZ * turtlebot3.RAYS),
+                scan_time=1.0 / turtlebot3.SCAN_HZ,
+                range_min=turtlebot3.NEAREST,
+                range_max=turtlebot3.FARTHEST,
+                ranges=np.where(seen, distance, inf).astype(np.float32),
+                intensities=np.zeros(turtlebot3.RAYS, np.float32),
+            )
+            self._say(row.scan, row.types, message, t)
+
+    def _battery(self, t: float) -> None:
+        spent = self._used * self._faults.drain / ENDURANCE_S["turtlebot3"]
+        charge = max(0.0, self._faults.battery - spent)
+        voltage = turtlebot3.EMPTY_V + charge * (turtlebot3.FULL_V - turtlebot3.EMPTY_V)
+        now = self._clock.utc()
+        for row in self._rows:
+            message = row.types.make(
+                ros2.BATTERY_STATE,
+                header=row.types.header(now, ""),
+                voltage=voltage,
+                temperature=nan,
+                current=nan,
+                charge=nan,
+                capacity=nan,
+                design_capacity=1.8,
+                percentage=100.0 * charge,  # not what ROS asks for, but what the robot says
+                power_supply_status=0,
+                power_supply_health=0,
+                power_supply_technology=0,
+                present=voltage > turtlebot3.ABSENT_V,
+                cell_voltage=np.zeros(0, np.float32),
+                cell_temperature=np.zeros(0, np.float32),
+                location="",
+                serial_number="",
+            )
+            self._say(row.battery, row.types, message, t)
+
+
+def _row(participant: Participant, where: Address, chosen: Settings, start: tuple[float, float, float]) -> _Row:
+    """The node of one robot."""
+    kind = turtlebot3.command_type(where.distro, chosen.stamped)
+    node = participant.node("turtlebot3_node", where.namespace)
+    return _Row(
+        types=participant.types,
+        command=node.subscriber(chosen.command_topic, kind, depth=10),
+        stamped=kind == ros2.TWIST_STAMPED,
+        odometry=node.publisher(turtlebot3.ODOMETRY, ros2.ODOMETRY),
+        scan=node.publisher(turtlebot3.SCAN, ros2.LASER_SCAN, ros2.SENSOR_DATA),
+        battery=node.publisher(turtlebot3.BATTERY, ros2.BATTERY_STATE),
+        start=start,
+        watchdog=chosen.watchdog_s or inf,
+    )
+
+
+def open_device(request: DeviceRequest) -> Device:
+    """The entry point `turtlebot3-twin` of the group `zenpark.devices`.
+
+    Raises:
+        BodyError, Unreachable: As `TurtleBot3Twin`.
+    """
+    return TurtleBot3Twin(request)

@@ -1,0 +1,1 @@
+"""What moves a world: point masses, pymunk, MuJoCo. One small interface."""

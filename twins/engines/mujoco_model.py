@@ -1,0 +1,134 @@
+"""Rigid quadrotors: their figures, and the place that one of them flies in, as MuJoCo reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array
+from twins.scene import Scene
+
+WALL: Final = 0.005  # [m] half the thickness of thin walls
+STIFF: Final = 0.004  # [s] time constant of a contact: what stands sinks in by a tenth of a millimetre
+# front right, back right, back left, front left: where along x and y, and the torque's sign: neighbours turn opposite
+MOTORS: Final = ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1))
+
+
+@dataclass(frozen=True)
+class Airframe:
+    """A quadrotor, its motors at 45° to its nose.
+
+    Attributes:
+        mass: [kg]
+        inertia: About its own x, y, z [kg m²].
+        arm: From the middle to a motor [m].
+        thrust: Of a motor at full command [N].
+        torque: Of a motor about its axis, as a share of its thrust [m].
+        size: Of the box that touches things [m].
+    """
+
+    mass: float
+    inertia: tuple[float, float, float]
+    arm: float
+    thrust: float
+    torque: float
+    size: tuple[float, float, float]
+
+
+def _scaled(frame: Airframe, mass: float, arm: float, size: tuple[float, float, float]) -> Airframe:
+    """The same design, larger: thrust with the mass, inertia with mass and arm squared, torque with the arm."""
+    heavier, longer = mass / frame.mass, arm / frame.arm
+    x, y, z = (each * heavier * longer**2 for each in frame.inertia)
+    return Airframe(mass, (x, y, z), arm, frame.thrust * heavier, frame.torque * longer, size)
+
+
+CRAZYFLIE: Final = Airframe(
+    mass=0.027,
+    inertia=(1.657e-5, 1.657e-5, 2.926e-5),
+    arm=0.046,
+    thrust=0.12,
+    torque=0.00596,  # Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", 2015
+    size=(0.092, 0.092, 0.029),
+)
+AIRFRAMES: Final[dict[str, Airframe]] = {
+    "crazyflie": CRAZYFLIE,
+    # a choice: the maker publishes mass and size only
+    "tello": _scaled(CRAZYFLIE, 0.080, 0.060, (0.098, 0.0925, 0.041)),
+}
+
+
+def mjcf(frame: Airframe, scene: Scene, step: float, motor_lag: float) -> str:
+    """One quadrotor in a scene, in MuJoCo's format; heights are counted from that of one that stands on the floor.
+
+    Its state is place, quaternion, velocity in the room, angular velocity in its own frame, and the motors' thrusts.
+
+    Args:
+        frame: The quadrotor.
+        scene: Of which what stands fast is taken.
+        step: Of the simulation [s].
+        motor_lag: Time constant of a motor's thrust [s].
+    """
+    along = frame.arm / np.sqrt(2.0)
+    rotors = [f'<site name="m{k}" pos="{x * along} {y * along} 0"/>' for k, (x, y, _) in enumerate(MOTORS)]
+    motors = [
+        f'<general site="m{k}" gear="0 0 1 0 0 {sign * frame.torque}" dyntype="filterexact" dynprm="{motor_lag}" '
+        f'ctrlrange="0 {frame.thrust}"/>'
+        for k, (_, _, sign) in enumerate(MOTORS)
+    ]
+    floor = -0.5 * frame.size[2]
+    return f"""<mujoco>
+<compiler angle="radian"/>
+<option timestep="{step}"><flag autoreset="disable"/></option>
+<default><geom solref="{STIFF} 1"/></default>
+<worldbody>
+<geom type="plane" pos="0 0 {floor}" size="0 0 1"/>
+{"".join(_walls(scene))}{"".join(_obstacles(scene, floor))}
+<body><freejoint/>
+<inertial pos="0 0 0" mass="{frame.mass}" diaginertia="{_text(frame.inertia)}"/>
+<geom type="box" size="{_text(0.5 * np.array(frame.size))}"/>
+{"".join(rotors)}
+</body>
+</worldbody>
+<actuator>{"".join(motors)}</actuator>
+</mujoco>"""
+
+
+def _walls(scene: Scene) -> list[str]:
+    if not scene.walled:
+        return []
+    (x0, y0), (x1, y1) = scene.low[:2], scene.high[:2]
+    sides = ((x0, 0.0, "1 0 0"), (x1, 0.0, "-1 0 0"), (0.0, y0, "0 1 0"), (0.0, y1, "0 -1 0"))
+    return [f'<geom type="plane" pos="{x} {y} 0" zaxis="{inward}" size="0 0 1"/>' for x, y, inward in sides]
+
+
+def _obstacles(scene: Scene, floor: float) -> list[str]:
+    """Those that nothing moves: boxes, cylinders, and the pieces of walls."""
+    geoms = []
+    for k, (outline, closed) in enumerate(zip(scene.outline, scene.closed, strict=True)):
+        if scene.plans[k] is not None:
+            continue
+        x, y, yaw = scene.pose[k]
+        tall = 0.5 * (scene.top[k] - scene.bottom[k])
+        middle = floor + 0.5 * (scene.top[k] + scene.bottom[k])
+        if outline is None:
+            geoms.append(f'<geom type="cylinder" pos="{x} {y} {middle}" size="{scene.radius[k]} {tall}"/>')
+        elif closed:
+            size = _text((*outline.max(axis=0), tall))
+            geoms.append(f'<geom type="box" pos="{x} {y} {middle}" euler="0 0 {yaw}" size="{size}"/>')
+        else:
+            turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+            points = outline @ turn.T + (x, y)
+            for one, other in pairwise(points):
+                way, at = other - one, 0.5 * (one + other)
+                size = _text((0.5 * np.hypot(*way), WALL, tall))
+                along = np.arctan2(way[1], way[0])
+                geoms.append(f'<geom type="box" pos="{_text((*at, middle))}" euler="0 0 {along}" size="{size}"/>')
+    return geoms
+
+
+def _text(numbers: Sequence[float] | Array) -> str:
+    return " ".join(repr(float(number)) for number in numbers)

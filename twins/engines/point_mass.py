@@ -1,0 +1,177 @@
+"""The point-mass engine: every row moves by its own model and nothing is in anything's way. For thousands of robots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Annotated, ClassVar, Protocol
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from agents.arrays import Array, Index, Mask, span
+from agents.body.interface import BodyError
+from agents.body.kinds import Kind
+from twins.engines.engine import Stage, Touch
+from twins.models.differential import DRIVES, Differential
+from twins.models.quadrotor import RESPONSES, Quadrotor
+
+
+class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Its parameters."""
+
+    leaning: Annotated[
+        bool, Meta(description="quadrotors must lean before they accelerate: truer, and formation gains must be lower")
+    ] = False
+
+    contacts: ClassVar[bool] = False
+
+    def build(self, stage: Stage) -> PointMassEngine:
+        """See `EngineFactory.build`."""
+        return PointMassEngine(stage, partial(Quadrotor, leaning=True) if self.leaning else Quadrotor)
+
+
+class Flight(Protocol):
+    """What moves rows that fly; methods as of `twins.models.quadrotor.Quadrotor`."""
+
+    position: Array
+    velocity: Array
+    yaw: Array
+    flying: Mask
+
+    def command(self, setpoint: Array) -> None: ...
+    def takeoff(self, rows: Index, height: Array) -> None: ...
+    def land(self, rows: Index) -> None: ...
+    def stop(self, rows: Index) -> None: ...
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None: ...
+    def advance(self) -> None: ...
+
+
+Flights = Callable[[Sequence[Kind], Array, Array, float], Flight]  # kinds, start, yaw, dt
+
+
+class Models:
+    """The models of rows of any kinds: quadrotors for those that fly, differential drives for the others.
+
+    Attributes:
+        air: Rows that fly.
+        floor: Rows that drive.
+        quadrotor: Of the rows `air`.
+        differential: Of the rows `floor`.
+    """
+
+    def __init__(self, stage: Stage, flights: Flights = Quadrotor) -> None:
+        kinds = stage.kinds
+        unknown = sorted({kind.name for kind in kinds} - DRIVES.keys() - RESPONSES.keys())
+        if unknown:
+            raise BodyError(f"there is no twin of a {', '.join(unknown)}; name another body")
+        flies = np.array([kind.flies for kind in kinds])
+        air, floor = np.flatnonzero(flies), np.flatnonzero(~flies)
+        self.in_air, self.on_floor = air, floor
+        self.air, self.floor = span(air), span(floor)
+        self.quadrotor: Flight = flights([kinds[i] for i in air], stage.start[air], stage.yaw[air], stage.dt)
+        self.differential = Differential([kinds[i] for i in floor], stage.start[floor], stage.yaw[floor], stage.dt)
+
+    def command(self, setpoint: Array) -> None:
+        """See `Engine.command`."""
+        if len(self.in_air):
+            self.quadrotor.command(setpoint[self.air])
+        if len(self.on_floor):
+            self.differential.command(setpoint[self.floor, :2])
+
+    def takeoff(self, rows: Index, height: Array) -> None:
+        """See `Engine.takeoff`."""
+        flies = np.isin(rows, self.in_air)
+        self.quadrotor.takeoff(np.searchsorted(self.in_air, rows[flies]), height[flies])
+
+    def land(self, rows: Index) -> None:
+        """See `Engine.land`."""
+        self.quadrotor.land(self._among(self.in_air, rows))
+        self.differential.halt(self._among(self.on_floor, rows))
+
+    def stop(self, rows: Index) -> None:
+        """See `Engine.stop`."""
+        self.quadrotor.stop(self._among(self.in_air, rows))
+        self.differential.halt(self._among(self.on_floor, rows))
+
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
+        """See `Engine.place`."""
+        for part, model in ((self.in_air, self.quadrotor), (self.on_floor, self.differential)):
+            which = np.isin(rows, part)
+            at = np.searchsorted(part, rows[which])
+            model.place(at, position[which], yaw[which], flying[which])
+
+    def push(self, rows: Index, velocity: Array) -> None:
+        """Gives rows a velocity (len(rows), 3) [m/s]; drives the part of it that is along their heading."""
+        flies = np.isin(rows, self.in_air)
+        self.quadrotor.velocity[np.searchsorted(self.in_air, rows[flies])] = velocity[flies]
+        self.differential.roll(np.searchsorted(self.on_floor, rows[~flies]), velocity[~flies])
+
+    @staticmethod
+    def _among(part: Index, rows: Index) -> Index:
+        """Where in `part` those of `rows` stand that belong to it."""
+        return np.searchsorted(part, rows[np.isin(rows, part)])
+
+
+class PointMassEngine(Models):
+    """Implements `twins.engines.engine.Engine`."""
+
+    attitude: Array | None = None
+
+    def __init__(self, stage: Stage, flights: Flights = Quadrotor) -> None:
+        """Raises BodyError for a kind without a twin."""
+        super().__init__(stage, flights)
+        rows = len(stage.kinds)
+        self._scene, self._copies = stage.scene, int(stage.copy.max(initial=0)) + 1
+        self._moves = len(stage.scene.moving) > 0
+        self._mirrored = np.flatnonzero(stage.mirrored)
+        count = len(self._mirrored)
+        self._seen = np.full((count, 3), np.nan), np.zeros((count, 3)), np.zeros(count)
+        self.position = np.array(stage.start, dtype=float)
+        self.velocity, self.yaw = np.zeros((rows, 3)), np.array(stage.yaw, dtype=float)
+        self.flying = np.zeros(rows, dtype=bool)
+        self.obstacles = np.tile(stage.scene.pose, (self._copies, 1, 1))
+        if len(self._mirrored):
+            self.position[self._mirrored] = np.nan
+
+    def advance(self, t: float, wobble: Array) -> None:
+        """See `Engine.advance`."""
+        if len(self.on_floor):
+            drive = self.differential
+            drive.advance()
+            floor = self.floor
+            self.position[floor], self.velocity[floor], self.yaw[floor] = drive.position, drive.velocity, drive.yaw
+        if len(self.in_air):
+            self._fly(wobble)
+        if len(self._mirrored):
+            rows = self._mirrored
+            self.position[rows], self.velocity[rows], self.yaw[rows] = self._seen
+        if self._moves:
+            self.obstacles = np.tile(self._scene.at(t), (self._copies, 1, 1))
+
+    def _fly(self, wobble: Array) -> None:
+        """A step of the rows that fly; the wobble is no motion of theirs, it is added to where they are."""
+        self.quadrotor.advance()
+        self._adopt()
+        self.position[self.air, :2] += wobble[self.air]
+
+    def _adopt(self) -> None:
+        """Takes over where the rows that fly are."""
+        flight, air = self.quadrotor, self.air
+        self.position[air], self.velocity[air], self.yaw[air] = flight.position, flight.velocity, flight.yaw
+        self.flying[air] = flight.flying
+
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
+        """See `Engine.place`."""
+        super().place(rows, position, yaw, flying)
+        self.position[rows], self.yaw[rows], self.velocity[rows], self.flying[rows] = position, yaw, 0.0, flying
+
+    def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
+        """See `Engine.mirror`."""
+        at = np.searchsorted(self._mirrored, rows)
+        self._seen[0][at], self._seen[1][at], self._seen[2][at] = position, velocity, yaw
+
+    def touches(self) -> list[Touch]:
+        """See `Engine.touches`: nothing touches."""
+        return []

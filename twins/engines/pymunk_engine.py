@@ -1,0 +1,315 @@
+"""The pymunk engine: rigid bodies in the plane, in layers by height, that push each other and stop at walls."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar, Final
+
+import msgspec
+import numpy as np
+import pymunk
+import pymunk.batch
+from msgspec import Meta
+
+from agents.arrays import Array, Index, Mask, clamp, every, norm, some, span
+from twins.engines.engine import Stage, Touch
+from twins.engines.point_mass import Models
+from twins.engines.pymunk_contacts import Contacts, Layers
+from twins.engines.pymunk_space import MASSES, Place, Surfaces
+from twins.models.onboard_flight import TOUCHDOWN
+from twins.models.quadrotor import GRAVITY
+
+FIELDS: Final = (
+    pymunk.batch.BodyFields.POSITION
+    | pymunk.batch.BodyFields.ANGLE
+    | pymunk.batch.BodyFields.VELOCITY
+    | pymunk.batch.BodyFields.ANGULAR_VELOCITY
+    | pymunk.batch.BodyFields.FORCE
+)
+PLACE, YAW, MOVE, TURN, PUSH = slice(0, 2), 2, slice(3, 5), 5, slice(6, 8)  # columns of a batch with these fields
+WIDTH: Final = 8
+POSE: Final = slice(0, 3)
+RATE: Final = slice(3, 6)
+AWAY: Final = 1e6  # [m] where mirrored robots are that are not there
+UNFELT: Final = 1e-12  # [m/s] change of speed that is only rounding
+LEAP: Final = 10.0  # [m/s] what a plan moves faster than this, it puts there
+
+Share = Annotated[float, Meta(ge=0, le=1)]
+Friction = Annotated[float, Meta(ge=0, le=10)]
+
+
+class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Parameters of the pymunk engine; all are choices, of hulls of plastic and wheels of rubber."""
+
+    step_s: Annotated[float, Meta(gt=0, le=0.05, description="longest internal step [s]")] = 0.005
+    friction: Annotated[Friction, Meta(description="coefficient between robots")] = 0.3
+    wall_friction: Annotated[Friction, Meta(description="coefficient between robots and walls or obstacles")] = 0.3
+    restitution: Annotated[Share, Meta(description="speed after a blow, as a share of the speed before")] = 0.1
+    traction: Annotated[Friction, Meta(description="coefficient of wheels, and of landed robots, on the floor")] = 0.7
+    tilt: Annotated[float, Meta(gt=0, le=1.2, description="largest tilt of flying robots [rad]")] = math.radians(20.0)
+    slide: Annotated[float, Meta(gt=0, le=2, description="speed at which what came from above slides aside [m/s]")] = (
+        0.5
+    )
+    approach: Annotated[float, Meta(gt=0, le=20, description="closing speed up to which nothing overlaps [m/s]")] = 3.0
+    iterations: Annotated[int, Meta(ge=1, le=200, description="of the contact solver in each step")] = 10
+
+    contacts: ClassVar[bool] = True
+
+    def build(self, stage: Stage) -> PlanarEngine:
+        """See `EngineFactory.build`."""
+        return PlanarEngine(stage, self)
+
+
+class PlanarEngine(Models):
+    """Implements `twins.engines.engine.Engine`.
+
+    The models say how fast a row would move after this tick; wheels pull it there with what grip they have, a tilted
+    quadrotor with what its thrust allows, and pymunk's solver weighs that against the contacts. Where nothing touches,
+    the tick is the one of the point-mass engine. Pymunk moves bodies at the beginning of a step and finds their
+    velocities at its end; a position here is therefore one step ahead of pymunk's: where the next step begins.
+
+    Each copy of the place has a space of its own: the order in which contacts are solved, and so the last digits of
+    a crowd, would otherwise depend on what happens in other copies.
+    """
+
+    attitude = None
+
+    def __init__(self, stage: Stage, choice: Planar) -> None:
+        """Raises BodyError for a kind without a twin."""
+        super().__init__(stage)
+        self._dt, self._steps = stage.dt, max(1, math.ceil(stage.dt / choice.step_s - 1e-9))
+        self._step = stage.dt / self._steps
+        self._ticks = 0
+        self._fastest = GRAVITY * math.tan(choice.tilt) * stage.dt  # change of speed in a tick [m/s]
+        self._found: list[Touch] = []
+        rows = len(stage.kinds)
+        self._layers = _layers(stage)
+        self._tall = np.array([stage.kinds[row].height for row in self.in_air])
+        mass = np.array([MASSES[stage.kinds[row].name] for row in self.in_air])
+        self._force = (mass / self._step)[:, None]  # that changes the speed by 1 m/s in one step
+        self._settle(stage, choice)
+        self._wobble = np.zeros((rows, 2))
+        self._scene = stage.scene
+        self._pose = stage.scene.pose.copy()
+        self._mirrored = np.flatnonzero(stage.mirrored)
+        seen = len(self._mirrored)
+        self._seen = np.full((seen, 3), np.nan), np.zeros((seen, 3)), np.zeros(seen)
+        self.position = np.array(stage.start, dtype=float)
+        self.velocity, self.yaw = np.zeros((rows, 3)), np.array(stage.yaw, dtype=float)
+        self.flying = np.zeros(rows, dtype=bool)
+        self.obstacles = np.tile(stage.scene.pose, (len(self._copies), 1, 1))
+        self.place(np.arange(rows), self.position, self.yaw, self.flying)
+        self.position[self._mirrored] = np.nan
+
+    def _settle(self, stage: Stage, choice: Planar) -> None:
+        """Builds the copies, and notes where in the state each body stands."""
+        skin = 0.5 * choice.approach * self._step
+        surfaces = Surfaces(choice.friction, choice.wall_friction, choice.traction, skin)
+        self._copies: list[_Copy] = []
+        bodies, wheels = np.zeros(len(stage.kinds), dtype=np.intp), np.zeros(len(stage.kinds), dtype=np.intp)
+        movable: list[int] = []
+        things: list[list[int]] = []
+        feet: dict[int, tuple[pymunk.PivotJoint, float]] = {}
+        begin = 0
+        for number in range(int(stage.copy.max(initial=0)) + 1):
+            place = Place(surfaces, -1 - len(stage.scene.names))
+            for row in np.flatnonzero(stage.copy == number).tolist():
+                place.add_robot(row, stage.kinds[row], mirrored=bool(stage.mirrored[row]))
+            place.furnish(stage.scene)
+            contacts = Contacts(
+                place.numbers, self._layers, self._step, skin, choice.restitution, choice.slide, self._found
+            )
+            copy = _Copy(place.space, contacts, choice.iterations, begin)
+            for row, body in place.rows.items():
+                bodies[row] = copy.slot(body)
+            for row, body in place.wheels.items():
+                wheels[row] = copy.slot(body)
+            movable = list(place.obstacles)  # the same in every copy
+            things.append([copy.slot(body) for body in place.obstacles.values()])
+            feet |= place.feet
+            self._copies.append(copy)
+            begin = copy.block.stop
+        # one copy's state is pymunk's own memory: nothing needs to be carried to and fro
+        alone = len(self._copies) == 1
+        self._state = self._copies[0].state if alone else np.concatenate([copy.state for copy in self._copies])
+        self._bodies = span(bodies)
+        self._bodies_in_air, self._bodies_on_floor = span(bodies[self.in_air]), span(bodies[self.on_floor])
+        self._wheels = span(wheels[self.on_floor])
+        self._movable = np.array(movable, dtype=np.intp)
+        self._things = np.array(things, dtype=np.intp).reshape(len(self._copies), -1)
+        planned = np.isin(self._movable, stage.scene.moving)
+        self._planned, self._carried = self._movable[planned], self._things[:, planned]
+        self._slots = bodies
+        self._feet = [feet[row] for row in sorted(feet)]
+        self._footed = np.searchsorted(self.in_air, sorted(feet))
+        self._stands = np.ones(len(feet), dtype=bool)
+
+    def advance(self, t: float, wobble: Array) -> None:
+        """See `Engine.advance`."""
+        state, step, dt = self._state, self._step, self._dt
+        if len(self.on_floor):
+            drive, wheels = self.differential, self._wheels
+            drive.advance()
+            state[wheels, MOVE] = drive.velocity[:, :2]
+            state[wheels, TURN] = (drive.yaw - self.yaw[self.floor]) / dt
+        if len(self.in_air):
+            target, drift = self._thrust(wobble)
+        if len(self._mirrored):
+            self._reflect()
+        if len(self._planned):
+            self._carry(t)
+        for copy in self._copies:
+            copy.advance(state, self._ticks * dt, step, self._steps)
+        self._ticks += 1
+        bodies = self._bodies
+        position, velocity = np.zeros_like(self.position), np.zeros_like(self.velocity)
+        moves = state[bodies, MOVE]
+        position[:, :2], velocity[:, :2] = state[bodies, PLACE] + step * moves, moves
+        yaw = state[bodies, YAW] + step * state[bodies, TURN]
+        if len(self.on_floor):
+            floor = self.floor
+            drive.position[:, :2], drive.yaw[:] = position[floor, :2], yaw[floor]
+            position[floor, 2] = drive.position[:, 2]
+        if len(self.in_air):
+            air, flight = self.air, self.quadrotor
+            blow = velocity[air, :2] - (target + drift)
+            felt = np.abs(blow) > UNFELT
+            if some(felt):
+                # it stops first what nature did, which the robot does not know of
+                known = blow - clamp(blow, np.minimum(-drift, 0.0), np.maximum(-drift, 0.0))
+                target += np.where(felt, known, 0.0)
+            flight.velocity[:, :2] = target
+            flight.position[:, :2] = position[air, :2] - wobble[air]
+            position[air, 2], velocity[air], yaw[air] = flight.position[:, 2], flight.velocity, flight.yaw
+            self.flying[air] = flight.flying
+            self._wobble[air] = wobble[air]
+        if len(self._mirrored):
+            rows = self._mirrored
+            position[rows], velocity[rows], yaw[rows] = self._seen
+        self.position, self.velocity, self.yaw = position, velocity, yaw
+        if len(self._movable):
+            self.obstacles = self.obstacles.copy()
+            self.obstacles[:, self._movable] = state[self._things, POSE] + step * state[self._things, RATE]
+
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
+        """See `Engine.place`."""
+        super().place(rows, position, yaw, flying)
+        self.position[rows], self.yaw[rows], self.velocity[rows], self.flying[rows] = position, yaw, 0.0, flying
+        slots = self._slots[rows]
+        self._state[slots, PLACE], self._state[slots, YAW] = position[:, :2], yaw
+        self._state[slots, RATE] = 0.0
+        self._wobble[rows] = 0.0
+        for copy in self._copies:
+            copy.contacts.forget(rows.tolist())
+
+    def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
+        """See `Engine.mirror`."""
+        at = np.searchsorted(self._mirrored, rows)
+        self._seen[0][at], self._seen[1][at], self._seen[2][at] = position, velocity, yaw
+
+    def touches(self) -> list[Touch]:
+        """See `Engine.touches`."""
+        found = sorted(self._found, key=lambda touch: (touch.time, touch.first, touch.second))
+        self._found.clear()
+        return found
+
+    def _thrust(self, wobble: Array) -> tuple[Array, Array]:
+        """Pushes flying rows to the speeds (n_air, 2) that their controllers want and that nature adds [m/s]."""
+        flight, air = self.quadrotor, self.air
+        before = flight.velocity[:, :2].copy()
+        flight.advance()
+        change = flight.velocity[:, :2] - before
+        size = norm(change)
+        if some(size > self._fastest):
+            change *= (self._fastest / np.maximum(size, self._fastest))[:, None]
+        aloft = every(flight.flying)
+        if not aloft:
+            change *= flight.flying[:, None]
+        drift = (wobble[air] - self._wobble[air]) / self._dt
+        target, height = before + change, flight.position[:, 2]
+        # all in the first step of the tick: then the tick is one of the point-mass engine, whose steps are ticks
+        bodies = self._bodies_in_air
+        self._state[bodies, PUSH] = (target + drift - self._state[bodies, MOVE]) * self._force
+        self._layers.bottom[air], self._layers.top[air] = height, height + self._tall
+        if not aloft or some(self._stands):
+            self._stand(~flight.flying & (height <= TOUCHDOWN) & (drift == 0.0).all(axis=1))
+        return target, drift
+
+    def _stand(self, stands: Mask) -> None:
+        """Lets the floor hold flying rows (n_air,) that stand on it, and no others."""
+        stands = stands[self._footed]
+        for k in np.flatnonzero(stands != self._stands).tolist():
+            joint, force = self._feet[k]
+            joint.max_force = force if stands[k] else 0.0
+        self._stands = stands
+
+    def _reflect(self) -> None:
+        """Puts mirrored rows where they are in reality; the solver then sees them move from there."""
+        position, velocity, yaw = self._seen
+        here = np.isfinite(position[:, :2]).all(axis=1)
+        moves = np.where(here[:, None], np.nan_to_num(velocity[:, :2]), 0.0)
+        slots, state = self._slots[self._mirrored], self._state
+        state[slots, MOVE], state[slots, TURN] = moves, 0.0
+        state[slots, PLACE] = np.where(here[:, None], position[:, :2], AWAY) - self._step * moves
+        state[slots, YAW] = np.nan_to_num(yaw)
+        aloft = np.isin(self._mirrored, self.in_air)
+        rows, height = self._mirrored[aloft], position[aloft, 2]
+        tall = self._tall[np.searchsorted(self.in_air, rows)]
+        self._layers.bottom[rows], self._layers.top[rows] = height, height + tall
+
+    def _carry(self, t: float) -> None:
+        """Moves obstacles by their plans, with the speed that takes them there in this tick."""
+        pose = self._scene.at(t)
+        before, now = self._pose[self._planned], pose[self._planned]
+        rate = now - before
+        rate[:, 2] = np.remainder(rate[:, 2] + math.pi, 2.0 * math.pi) - math.pi
+        rate /= self._dt
+        jumps = norm(rate[:, :2]) > LEAP
+        before[jumps], rate[jumps] = now[jumps], 0.0
+        self._state[self._carried, POSE] = before - self._step * rate
+        self._state[self._carried, RATE] = rate
+        self._pose = pose
+
+
+class _Copy:
+    """The space of one copy, and the rows `block` of the engine's state that are its bodies'."""
+
+    def __init__(self, space: pymunk.Space, contacts: Contacts, iterations: int, begin: int) -> None:
+        self._space, self.contacts = space, contacts
+        space.iterations = iterations
+        contacts.watch(space)
+        identities = pymunk.batch.Buffer()
+        pymunk.batch.get_space_bodies(space, pymunk.batch.BodyFields.BODY_ID, identities)
+        order = np.frombuffer(identities.int_buf(), dtype=np.uintp).tolist()
+        self._slots = {identity: begin + k for k, identity in enumerate(order)}
+        self.block = slice(begin, begin + len(order))
+        self._buffer = pymunk.batch.Buffer()
+        pymunk.batch.get_space_bodies(space, FIELDS, self._buffer)
+        # pymunk fills the same memory at every call, because nothing is added or removed any more
+        self.state: Array = np.frombuffer(self._buffer.float_buf()).reshape(-1, WIDTH)
+
+    def slot(self, body: pymunk.Body) -> int:
+        """Where in the engine's state a body stands."""
+        return self._slots[body.id]
+
+    def advance(self, state: Array, begin: float, step: float, steps: int) -> None:
+        """Moves the bodies from what `state` says, and says there what came of it."""
+        alone = state is self.state
+        if not alone:
+            self.state[:] = state[self.block]
+        pymunk.batch.set_space_bodies(self._space, FIELDS, self._buffer)
+        for k in range(steps):
+            self.contacts.time = begin + k * step
+            self._space.step(step)
+        self._buffer.clear()
+        pymunk.batch.get_space_bodies(self._space, FIELDS, self._buffer)
+        if not alone:
+            state[self.block] = self.state
+
+
+def _layers(stage: Stage) -> Layers:
+    scene, rows = stage.scene, len(stage.kinds)
+    # negative numbers count from the end: obstacle 0 stands last, and before all of them the arena's walls
+    bottom = np.concatenate([np.zeros(rows), [-np.inf], scene.bottom[::-1]])
+    top = np.concatenate([[kind.height for kind in stage.kinds], [np.inf], scene.top[::-1]])
+    return Layers(bottom, top)

@@ -1,0 +1,179 @@
+"""One copy of a place as pymunk sees it: discs of robots, wheels that grip the floor, obstacles, walls."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+import pymunk
+
+from agents.arrays import Array
+from agents.body.kinds import Kind
+from twins.models.differential import DRIVES
+from twins.models.quadrotor import GRAVITY
+from twins.scene import Scene
+
+MASSES: Final = {"crazyflie": 0.027, "tello": 0.080, "khepera4": 0.540, "turtlebot3": 1.0}  # [kg], makers' figures
+WALL_DEPTH: Final = 1.0  # [m] of the arena's walls, outwards: nothing gets through
+GRAIN: Final = 32  # points per side for the mean lever of the friction under a box
+
+# What can be pushed has two shapes: one with a skin (see `twins.engines.pymunk_contacts`) for robots, which come fast,
+# and a bare one for everything else, so that a box comes to lie flush against a wall.
+ROBOT, FIXED, FIXED_BARE, LOOSE, LOOSE_BARE = (1 << k for k in range(5))
+MEETS: Final = {
+    ROBOT: ROBOT | FIXED | LOOSE,
+    FIXED: ROBOT,
+    FIXED_BARE: LOOSE_BARE,
+    LOOSE: ROBOT,
+    LOOSE_BARE: FIXED_BARE | LOOSE_BARE,
+}
+UNMOVED: Final = 1  # group of all that nothing moves: its members do not touch each other
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Coefficients of friction, and the thickness of the skin [m]."""
+
+    robots: float
+    walls: float
+    traction: float
+    skin: float
+
+
+@dataclass
+class Place:
+    """One copy of the place, and which body is what.
+
+    Attributes:
+        surfaces: Of everything in it.
+        walls: The number of the arena's walls, −1 − M.
+        space: With everything in it.
+        numbers: Row of each shape, or −1 − k of obstacle k, or `walls`.
+        rows: Bodies of rows.
+        wheels: Of rows on the floor: a body without shape that moves as their wheels want.
+        feet: Grip of flying rows on the floor, and its force while they stand [N].
+        obstacles: Bodies of obstacles that move or can be pushed.
+    """
+
+    surfaces: Surfaces
+    walls: int
+    space: pymunk.Space = field(default_factory=pymunk.Space)
+    numbers: dict[pymunk.Shape, int] = field(default_factory=dict)
+    rows: dict[int, pymunk.Body] = field(default_factory=dict)
+    wheels: dict[int, pymunk.Body] = field(default_factory=dict)
+    feet: dict[int, tuple[pymunk.PivotJoint, float]] = field(default_factory=dict)
+    obstacles: dict[int, pymunk.Body] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._floor = self.space.static_body  # first of all bodies: those of one sort then follow one another
+
+    def add_robot(self, row: int, kind: Kind, *, mirrored: bool) -> None:
+        """A robot; a mirrored one pushes and cannot be pushed."""
+        mass = MASSES[kind.name]
+        if mirrored:
+            body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+        else:
+            # no blow turns a flying robot: its yaw is its model's
+            body = pymunk.Body(mass, math.inf if kind.flies else pymunk.moment_for_circle(mass, 0.0, kind.radius))
+        self.space.add(body)
+        self.rows[row] = body
+        self._cover(body, row, [pymunk.Circle(body, kind.radius + self.surfaces.skin)], ROBOT, mirrored)
+        force = self.surfaces.traction * mass * GRAVITY
+        if not kind.flies:
+            wheels = self.wheels[row] = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+            self.space.add(wheels)
+            if not mirrored:
+                self._grip(wheels, body, force, 0.5 * DRIVES[kind.name].base * force)
+        elif not mirrored:
+            self.feet[row] = self._grip(self._floor, body, force, 0.0), force
+
+    def furnish(self, scene: Scene) -> None:
+        """Obstacles and walls."""
+        loose = bool(np.isfinite(scene.mass).any())
+        for k, outline in enumerate(scene.outline):
+            x, y, yaw = scene.pose[k].tolist()
+            mass = float(scene.mass[k])
+            if math.isfinite(mass):
+                body = pymunk.Body(mass, _moment(mass, scene, k))
+            elif scene.plans[k] is not None:
+                body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+            else:
+                body = pymunk.Body(body_type=pymunk.Body.STATIC)
+            body.position, body.angle = (x, y), yaw
+            self.space.add(body)
+            if body.body_type != pymunk.Body.STATIC:
+                self.obstacles[k] = body
+            pushed = math.isfinite(mass)
+            if pushed:
+                force = float(scene.friction[k]) * mass * GRAVITY
+                self._grip(self._floor, body, force, force * _lever(scene, k))
+            parts = ((LOOSE, LOOSE_BARE) if pushed else (FIXED, FIXED_BARE))[: 2 if loose else 1]
+            for part in parts:
+                skin = self.surfaces.skin if part in (FIXED, LOOSE) else 0.0
+                shapes = _shapes(body, outline, scene.closed[k], float(scene.radius[k]), skin)
+                self._cover(body, -1 - k, shapes, part, not pushed)
+        if scene.walled:
+            self._wall_in(scene, loose)
+
+    def _wall_in(self, scene: Scene, loose: bool) -> None:
+        body = self._floor
+        (x0, y0), (x1, y1) = scene.low[:2].tolist(), scene.high[:2].tolist()
+        d = WALL_DEPTH
+        sides = [(x0 - d, y0 - d, x0, y1 + d), (x1, y0 - d, x1 + d, y1 + d)]
+        sides += [(x0 - d, y0 - d, x1 + d, y0), (x0 - d, y1, x1 + d, y1 + d)]
+        for part in (FIXED, FIXED_BARE)[: 2 if loose else 1]:
+            skin = self.surfaces.skin if part == FIXED else 0.0
+            corners = [[(a, b), (c, b), (c, e), (a, e)] for a, b, c, e in sides]
+            self._cover(body, self.walls, [pymunk.Poly(body, each, radius=skin) for each in corners], part, True)
+
+    def _cover(self, body: pymunk.Body, number: int, shapes: list[pymunk.Shape], part: int, unmoved: bool) -> None:
+        # pymunk multiplies the coefficients of the two that touch
+        robots = math.sqrt(self.surfaces.robots)
+        against = self.surfaces.walls / robots if robots > 0.0 else 0.0
+        for shape in shapes:
+            shape.friction = robots if part == ROBOT else against
+            shape.filter = pymunk.ShapeFilter(UNMOVED if unmoved else 0, part, MEETS[part])
+            self.numbers[shape] = number
+            self.space.add(shape)
+
+    def _grip(self, on: pymunk.Body, body: pymunk.Body, force: float, torque: float) -> pymunk.PivotJoint:
+        """Friction with the floor: draws a body toward the velocity of `on`, within its limits [N], [N m]."""
+        hold = pymunk.PivotJoint(on, body, (0.0, 0.0), (0.0, 0.0))
+        joints: list[pymunk.Constraint] = [hold]
+        hold.max_force = force
+        if torque > 0.0:
+            joints.append(pymunk.GearJoint(on, body, 0.0, 1.0))
+            joints[1].max_force = torque
+        for joint in joints:
+            joint.max_bias = 0.0  # velocities only: where it was does not matter
+        self.space.add(*joints)
+        return hold
+
+
+def _shapes(body: pymunk.Body, outline: Array | None, closed: bool, radius: float, skin: float) -> list[pymunk.Shape]:
+    if outline is None:
+        return [pymunk.Circle(body, radius + skin)]
+    points = [(float(x), float(y)) for x, y in outline]
+    if closed:
+        return [pymunk.Poly(body, points, radius=skin)]
+    return [pymunk.Segment(body, a, b, skin) for a, b in pairwise(points)]
+
+
+def _moment(mass: float, scene: Scene, k: int) -> float:
+    outline = scene.outline[k]
+    if outline is None:
+        return pymunk.moment_for_circle(mass, 0.0, float(scene.radius[k]))
+    return pymunk.moment_for_poly(mass, outline.tolist())
+
+
+def _lever(scene: Scene, k: int) -> float:
+    """Mean distance of the floor under an obstacle from its middle [m]: friction brakes its turning with that lever."""
+    outline = scene.outline[k]
+    if outline is None:
+        return 2.0 / 3.0 * float(scene.radius[k])
+    middles = (np.arange(GRAIN) + 0.5) / GRAIN * 2.0 - 1.0
+    x, y = np.abs(outline).max(axis=0)
+    return float(np.hypot(*np.meshgrid(x * middles, y * middles)).mean())

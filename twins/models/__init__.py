@@ -1,0 +1,1 @@
+"""How robots move: rows of differential and flying robots, disturbances, noise."""

@@ -1,0 +1,102 @@
+"""Differential robots: a unicycle on two wheels with limits of speed and acceleration.
+
+Without a new command the wheels stop after `FRESH_S`, for this model stands for a robot together with its bridge: the
+bridges of Khepera IV and TurtleBot3 do that. The robots themselves do not: when the process of the bridge is frozen or
+dead they drive on (docs/hanging.md). Their protocol twins show that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask, clamp, every
+from agents.body.interface import FRESH_S
+from agents.body.kinds import Kind
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A pair of driven wheels: distance between them [m], largest rim speed [m/s] and acceleration [m/s²]."""
+
+    base: float
+    speed: float
+    acceleration: float
+
+
+DRIVES: Final[dict[str, Drive]] = {
+    "khepera4": Drive(base=0.1054, speed=0.8137, acceleration=130.0 * 0.021),  # 130 rad/s² on a wheel of 42 mm
+    "turtlebot3": Drive(base=0.160, speed=0.22 + 2.84 * 0.080, acceleration=2.0),  # acceleration: our choice
+}
+
+
+class Differential:
+    """Rows of differential robots.
+
+    Attributes:
+        position: (n, 3) [m]; z stays 0.
+        yaw: (n,) [rad].
+        velocity: (n, 3) [m/s].
+    """
+
+    def __init__(self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float) -> None:
+        drives = [DRIVES[kind.name] for kind in kinds]
+        self._dt = dt
+        self._half_base = np.array([0.5 * d.base for d in drives])
+        self._turn = np.array([dt / d.base for d in drives])  # yaw of a step, per difference of the rim speeds
+        self._limit = np.array([d.speed for d in drives])
+        self._change = np.array([d.acceleration * dt for d in drives])
+        self._least = -self._change
+        self._wheels = np.zeros((2, len(drives)))  # rim speeds, left and right [m/s]
+        self._wanted = np.zeros((2, len(drives)))
+        self._patience = np.full(len(drives), np.inf)
+        self.position = np.array(start, dtype=float)
+        self.yaw = np.array(yaw, dtype=float)
+        self.velocity = np.zeros_like(self.position)
+
+    def command(self, twist: Array) -> None:
+        """Sets v [m/s] and ω [rad/s], (n, 2); rows of NaN keep theirs."""
+        v, half = twist[:, 0], self._half_base * twist[:, 1]
+        wanted = np.empty((2, len(half)))
+        wanted[0], wanted[1] = v - half, v + half
+        given = np.isfinite(wanted[0])
+        if every(given):
+            self._wanted = wanted
+            self._patience[:] = FRESH_S
+        else:
+            np.copyto(self._wanted, wanted, where=given)
+            self._patience[given] = FRESH_S
+
+    def halt(self, rows: Index) -> None:
+        """Wheels to zero speed."""
+        self._wanted[:, rows] = 0.0
+
+    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
+        """Puts rows at (len(rows), 3) [m] with yaw [rad], at rest."""
+        self.position[rows], self.yaw[rows], self.velocity[rows] = position, yaw, 0.0
+        self._wanted[:, rows] = self._wheels[:, rows] = 0.0
+
+    def roll(self, rows: Index, velocity: Array) -> None:
+        """Lets rows go straight ahead, with what of a velocity (len(rows), 3) [m/s] is along their heading."""
+        speed = velocity[:, 0] * np.cos(self.yaw[rows]) + velocity[:, 1] * np.sin(self.yaw[rows])
+        self._wanted[:, rows] = self._wheels[:, rows] = speed
+
+    def advance(self) -> None:
+        """One step of dt, along an arc: no side-slip (paper, eq. (1))."""
+        self._patience -= self._dt
+        wanted = self._wanted * (self._patience >= 0.0)
+        # both wheels are slowed by the same factor, so that a curve stays that curve
+        speed = np.abs(wanted)
+        over = np.maximum(speed[0], speed[1]) / self._limit
+        wanted /= np.maximum(over, 1.0)
+        self._wheels += clamp(wanted - self._wheels, self._least, self._change)
+        left, right = self._wheels
+        v = 0.5 * (left + right)
+        turn = (right - left) * self._turn
+        middle = self.yaw + 0.5 * turn
+        self.velocity[:, 0], self.velocity[:, 1] = v * np.cos(middle), v * np.sin(middle)
+        self.position += self._dt * self.velocity
+        self.yaw += turn

@@ -1,0 +1,77 @@
+"""What nature adds to a model: wobble, measurement noise, drift of odometry, and the time from command to effect."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from agents.arrays import Array, norm
+from agents.body.interface import Disturbance
+from twins.models.noise import Noise
+
+
+class HoverJitter:
+    """Ornstein-Uhlenbeck displacement of each horizontal axis about the place that the robot's own controller holds."""
+
+    def __init__(self, disturbance: Sequence[Disturbance], noise: Noise, dt: float) -> None:
+        jitter = [d.hover_jitter for d in disturbance]
+        sigma = np.array([0.0 if j is None else j.sigma for j in jitter])
+        keep = np.array([1.0 if j is None else math.exp(-dt / j.correlation_s) for j in jitter])
+        self._keep = np.repeat(keep[:, None], 2, axis=1)
+        self._push = np.repeat((sigma * np.sqrt(1.0 - keep**2))[:, None], 2, axis=1)
+        self._noise = noise
+        self.present = bool(sigma.any())
+        self.displacement = np.zeros((len(disturbance), 2))
+
+    def advance(self) -> None:
+        """One step of dt; exact for any dt."""
+        self.displacement = self._keep * self.displacement + self._push * self._noise.draw()
+
+
+class Measurement:
+    """White noise on the measured position and yaw."""
+
+    def __init__(self, disturbance: Sequence[Disturbance], spatial: Array, noise: Noise) -> None:
+        """`spatial` (n, 3) says on which axes a row's position is measured at all."""
+        sigma = np.array([d.position_sigma or 0.0 for d in disturbance])
+        yaw = np.array([d.yaw_sigma or 0.0 for d in disturbance])
+        self._sigma = np.concatenate([sigma[:, None] * spatial, yaw[:, None]], axis=1)
+        self._noise = noise
+        self.present = bool(self._sigma.any())
+
+    def draw(self) -> Array:
+        """(n, 4): x, y, z [m], yaw [rad]."""
+        return self._sigma * self._noise.draw()
+
+
+class Drift:
+    """Error of odometry: a random walk of the measured position whose variance grows with the way driven."""
+
+    def __init__(self, disturbance: Sequence[Disturbance], noise: Noise) -> None:
+        self._rate = np.array([d.odometry_drift or 0.0 for d in disturbance])
+        self._noise = noise
+        self.present = bool(self._rate.any())
+        self.error = np.zeros((len(disturbance), 2))
+
+    def advance(self, moved: Array) -> None:
+        """One step in which each row moved by (n, 2) [m]."""
+        self.error += (self._rate * np.sqrt(norm(moved)))[:, None] * self._noise.draw()
+
+
+class Latency:
+    """Commands (n, 4) take effect some ticks later."""
+
+    def __init__(self, disturbance: Sequence[Disturbance], dt: float) -> None:
+        self._ticks = np.array([round((d.latency_s or 0.0) / dt) for d in disturbance])
+        self._past = np.full((int(self._ticks.max(initial=0)) + 1, len(disturbance), 4), np.nan)
+        self._rows = np.arange(len(disturbance))
+        self._now = 0
+        self.present = bool(self._ticks.any())
+
+    def pass_on(self, command: Array) -> Array:
+        """Takes this tick's command in, gives the one that takes effect."""
+        self._now = (self._now + 1) % len(self._past)
+        self._past[self._now] = command
+        return np.asarray(self._past[(self._now - self._ticks) % len(self._past), self._rows])

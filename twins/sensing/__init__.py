@@ -1,0 +1,1 @@
+"""Range sensors: which there are, and ray casting."""

@@ -1,0 +1,225 @@
+"""Range sensors of twins: where each looks, how far, how often and how well.
+
+A new sensor is a new entry of `SENSORS`: a `Sensor` with its rays and figures. A robot carries it when its `sensors` in
+the experiment file names it, or, for all robots of a kind, when `OF_KIND` does. Nothing else knows of sensors by name.
+
+Accuracies that makers give as limits (±) are read as two standard deviations of white noise: 95 % within them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf
+from statistics import NormalDist
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Index
+from agents.body.interface import BodyError, BodyRequest, Rays
+from agents.protocols.khepera4 import LIGHT_BEARING, RIM, SOUND_BEARING
+from twins.engines.engine import Engine
+from twins.models.noise import Noise
+from twins.scene import World
+from twins.sensing.ray_casting import Beams, Caster, Fan
+
+DRAWN_AHEAD: Final = 512  # numbers per robot and sensor
+ON_TIME: Final = 1e-6  # [s] ticks are multiples of a period, but for rounding
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sensor:
+    """One kind of range sensor; ranges count from the sensor itself.
+
+    Attributes:
+        bearing: (m,) of its rays from the robot's nose, to the left [rad].
+        elevation: (m,) 0 or ±π/2 [rad].
+        mount: From the robot's centre out to the sensor, along each ray [m].
+        height: Over the robot's position, which is the lowest point of its body [m].
+        nearest: Range below which it reports nothing [m]; where that is 0, what touches it is at 0.
+        farthest: Range beyond which it reports nothing [m].
+        rate_hz: How often it measures.
+        sigma: Standard deviation of a reading [m],
+        relative: and as a share of the range, from `relative_from` on.
+        relative_from: [m]
+        dropout: Probability that a ray reports nothing whatever there is.
+        resolution: Step of its readings [m]; 0: none.
+    """
+
+    bearing: Array
+    elevation: Array
+    mount: float = 0.0
+    height: float
+    nearest: float = 0.0
+    farthest: float
+    rate_hz: float
+    sigma: float
+    relative: float = 0.0
+    relative_from: float = inf
+    dropout: float = 0.0
+    resolution: float = 0.0
+
+    @property
+    def fan(self) -> Fan:
+        """Its rays, from the robot's centre."""
+        return Fan(self.bearing, self.elevation, self.height, self.mount + self.farthest)
+
+
+SENSORS: Final[dict[str, Sensor]] = {
+    # Khepera IV; the maker gives no accuracy, and rates depend on the program on the robot: 10 Hz, sigmas, heights
+    # (lower than a landed Crazyflie is high) and dropouts are choices
+    "infrared": Sensor(
+        bearing=LIGHT_BEARING,
+        elevation=np.zeros(len(LIGHT_BEARING)),
+        mount=RIM,
+        height=0.025,
+        farthest=0.25,
+        rate_hz=10.0,
+        sigma=0.005,
+    ),
+    "ultrasonic": Sensor(
+        bearing=SOUND_BEARING,
+        elevation=np.zeros(len(SOUND_BEARING)),
+        mount=RIM,
+        height=0.025,
+        nearest=0.25,
+        farthest=2.0,
+        rate_hz=10.0,
+        sigma=0.005,
+        dropout=0.01,  # an echo that is lost
+        resolution=0.01,  # its protocols count in centimetres
+    ),
+    # TurtleBot3: ±15 mm below 0.5 m, ±5 % beyond; the dropout is a choice
+    "lds01": Sensor(
+        bearing=np.radians(np.arange(360.0)),
+        elevation=np.zeros(360),
+        height=0.182,  # it stands on top: lower robots pass under its plane
+        nearest=0.12,
+        farthest=3.5,
+        rate_hz=5.0,
+        sigma=0.0075,
+        relative=0.025,
+        relative_from=0.5,
+        dropout=0.005,
+        resolution=0.001,
+    ),
+    # Crazyflie's Multi-ranger, in the order of its bridge: front, back, left, right, up. Rate, sigma and height (half
+    # that of the robot) are choices; its beams are lines here, and cones in reality
+    "multiranger": Sensor(
+        bearing=np.radians([0.0, 180.0, 90.0, -90.0, 0.0]),
+        elevation=np.radians([0.0, 0.0, 0.0, 0.0, 90.0]),
+        height=0.0145,
+        farthest=4.0,
+        rate_hz=20.0,
+        sigma=0.010,
+        resolution=0.001,
+    ),
+}
+OF_KIND: Final[dict[str, tuple[str, ...]]] = {
+    "khepera4": ("infrared", "ultrasonic"),
+    "turtlebot3": ("lds01",),
+    "crazyflie": (),
+    "tello": (),
+}
+
+
+class RangeSensors:
+    """The range sensors of all rows of a world. Rays of a row stand together, in the order of its sensors.
+
+    Attributes:
+        rays: What they saw last, each ray at the time of its own sensor; None before the first sweep.
+    """
+
+    def __init__(self, request: BodyRequest, world: World) -> None:
+        """Raises BodyError for a sensor that is not known."""
+        self.rays: Rays | None = None
+        carried = [tuple(dict.fromkeys(own)) for own in world.sensors]
+        for robot, own in zip(request.names, carried, strict=True):
+            for name in own:
+                if name not in SENSORS:
+                    raise BodyError(f"{robot}: there is no sensor {name}; there are {', '.join(SENSORS)}")
+        self._caster = Caster(world.scene, request.kinds, world.copy)
+        fans = [(row, name) for row, own in enumerate(carried) for name in own]
+        count = np.array([len(SENSORS[name].bearing) for _, name in fans], dtype=np.intp)
+        first = np.cumsum(count) - count
+        self._mounted = []
+        for name in dict.fromkeys(name for _, name in fans):
+            mine = [k for k, (_, other) in enumerate(fans) if other == name]
+            rows = np.array([fans[k][0] for k in mine])
+            self._mounted.append(_Mounted(name, rows, first[mine], request, world.sensor_noise))
+        self._row = np.repeat(np.array([row for row, _ in fans], dtype=np.intp), count)
+        self._bearing, self._elevation = np.zeros((2, len(self._row)))
+        for each in self._mounted:
+            self._bearing[each.rays], self._elevation[each.rays] = each.sensor.bearing, each.sensor.elevation
+        self._time = self._distance = np.full(len(self._row), np.nan)
+        self._due = [-inf] * len(self._mounted)
+        self._next = -inf if self._mounted else inf
+        self._beams: dict[tuple[int, ...], Beams] = {}
+
+    def sweep(self, t: float, engine: Engine) -> None:
+        """Measures what is due at `t` [s]; everything the first time. What a sensor missed it does not make up for."""
+        if t < self._next:
+            return
+        due = tuple(k for k, when in enumerate(self._due) if when <= t)
+        beams = self._beams.get(due)
+        if beams is None:
+            beams = self._beams[due] = _laid_out([self._mounted[k] for k in due])
+        truth = self._caster.cast(beams, engine.position, engine.yaw, engine.obstacles)
+        time, distance = self._time.copy(), self._distance.copy()
+        begin = 0
+        for k in due:
+            one = self._mounted[k]
+            end = begin + one.rays.size
+            distance[one.rays] = one.read(truth[begin:end].reshape(one.rays.shape))
+            time[one.rays] = t
+            begin = end
+            period = 1.0 / one.sensor.rate_hz
+            following = self._due[k] + period
+            self._due[k] = following if following > t - period else t - ON_TIME + period
+        self._time, self._distance = time, distance
+        self.rays = Rays(self._row, time, self._bearing, self._elevation, distance)
+        self._next = min(self._due)
+
+
+def _laid_out(mounted: Sequence[_Mounted]) -> Beams:
+    """Rays of these sensors, sensor after sensor."""
+    rows = [one.rows for one in mounted]
+    which = np.repeat(np.arange(len(mounted)), [len(each) for each in rows])
+    return Beams([one.sensor.fan for one in mounted], np.concatenate(rows), which)
+
+
+class _Mounted:
+    """One kind of sensor on the rows that carry it.
+
+    Attributes:
+        rows: (k,)
+        rays: (k, m) numbers of their rays among all.
+    """
+
+    def __init__(self, name: str, rows: Index, first: Index, request: BodyRequest, scale: float) -> None:
+        sensor = self.sensor = SENSORS[name]
+        width = len(sensor.bearing)
+        self.rows = rows
+        self.rays = first[:, None] + np.arange(width)
+        self._scale = scale
+        share = min(sensor.dropout * scale, 1.0)
+        self._lost = NormalDist().inv_cdf(share) if 0.0 < share < 1.0 else inf
+        names, seeds = [request.names[row] for row in rows], [request.seeds[row] for row in rows]
+        ahead = max(DRAWN_AHEAD // width, 1)
+        self._noise = Noise(names, seeds, f"{name} noise", width, ahead) if scale > 0.0 else None
+        self._dropouts = Noise(names, seeds, f"{name} dropouts", width, ahead) if share > 0.0 else None
+
+    def read(self, truth: Array) -> Array:
+        """What it reports, from the robots' centres (k, m), where that is the truth; NaN where it sees nothing."""
+        sensor = self.sensor
+        reading = np.maximum(truth - sensor.mount, 0.0)  # what has been run into touches the rim
+        if self._noise is not None:
+            sigma = np.where(reading < sensor.relative_from, sensor.sigma, sensor.relative * reading)
+            reading = np.maximum(reading + self._scale * sigma * self._noise.draw(), 0.0)
+            if sensor.resolution > 0.0:
+                reading = sensor.resolution * np.round(reading / sensor.resolution)
+            if self._dropouts is not None:
+                reading[self._dropouts.draw() < self._lost] = np.nan
+        outside = (reading < sensor.nearest) | (reading > sensor.farthest)
+        return np.where(outside, np.nan, sensor.mount + reading)
