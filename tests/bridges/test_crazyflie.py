@@ -40,7 +40,6 @@ def lighthouse_file(folder: Path, *numbers: int) -> str:
     return str(path)
 
 
-@pytest.mark.mechanism("Crazyflie bridge: flight")
 def test_flight_and_next_session():
     """Take-off, a goal by streamed positions, landing; and again by another client, which the first must not hinder."""
     begin = time.monotonic()

@@ -50,7 +50,6 @@ def test_who_comes_too_near_holds_and_the_run_says_so(tmp_path: Path) -> None:
     assert [incident.text[:5] for incident in status.incidents] == ["hold:"]
 
 
-@pytest.mark.mechanism("hazard: battery")
 def test_a_drone_whose_battery_is_low_lands_and_the_others_go_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     low = ("--set", "safety.battery_low=0.985", "--set", "duration_s=8")  # it flies for 7 minutes on a charge

@@ -88,7 +88,6 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
     made.close()
 
 
-@pytest.mark.mechanism("hot change: restart")
 def test_a_killed_robot_is_started_again_and_takes_part(lab: Lab) -> None:
     lab.fly()
     first = lab.watcher.status["CF01"].pid

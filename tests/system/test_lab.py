@@ -23,7 +23,6 @@ pytestmark = pytest.mark.system
 KEYS = Keys()
 
 
-@pytest.mark.mechanism("run in a lab")
 def test_one_command_runs_it_and_others_look_and_stop_it(tmp_path: Path) -> None:
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")

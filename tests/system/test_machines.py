@@ -162,7 +162,6 @@ def said(logs: Path, robot: str) -> str:
     return file.read_text() if file.exists() else ""
 
 
-@pytest.mark.mechanism("hosts: cut off")
 def test_a_machine_that_is_cut_off_lands_its_robots_and_the_others_go_on(lab: Machines, tmp_path: Path) -> None:
     file, folder = triangle(lab, tmp_path, 8.0), tmp_path / "run"
     flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--anyway", "--no-report")

@@ -88,28 +88,27 @@ def test_real_robots_that_stand_in_the_way_of_twins_are_seen_and_avoided(tmp_pat
         listening = [pubsub.subscriber(session, Keys(realm).ranges(twin), 4096) for realm, _, _, twin, *_ in RUNS]
         for flight in flights:
             flight.until_said(r"phase conductor: formation", 60.0)
-        for subscriber in listening:
-            list(network.received(subscriber.handler))  # those of the climb
-        readings: list[list[float]] = [[], []]
+        scans: list[list[messages.Ranges]] = [[], []]
 
-        def enough() -> bool:
-            for seen, subscriber in zip(readings, listening, strict=True):
+        def ended() -> bool:
+            for seen, subscriber in zip(scans, listening, strict=True):
                 for sample in network.received(subscriber.handler):
-                    seen.append(
-                        ahead(messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Ranges))
-                    )
-            return all(len(seen) >= 12 for seen in readings)
+                    seen.append(messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Ranges))
+            return all(flight.process.poll() is not None for flight in flights)
 
-        until(enough, "range readings")
-    for flight, seen, (realm, _, _, twin, real, kind) in zip(flights, readings, RUNS, strict=True):
-        code, said = flight.finish(60.0)
+        until(ended, "both runs are over", 60.0)
+    for flight, seen, (realm, _, _, twin, real, kind) in zip(flights, scans, RUNS, strict=True):
+        code, said = flight.finish()
         assert code == 0, said
-        trace = playback.read(tmp_path / realm / "default.mcap").trace
+        played = playback.read(tmp_path / realm / "default.mcap")
+        trace = played.trace
         at = {name: row for row, name in enumerate(trace.robots)}
         truth, measured = trace.true_position[:, :, :2], trace.position[:, :, :2]
         still = (trace.time > 0.5) & (trace.time < 2.5)
         away = np.median(np.linalg.norm(measured[still, at[real]] - truth[still, at[twin]], axis=1))
-        assert np.nanmedian(seen) == pytest.approx(away - kind.radius, abs=0.001), twin
+        readings = [ahead(scan) for scan in seen if 0.5 < scan.stamp - played.started < 2.5]
+        assert len(readings) >= 12
+        assert np.nanmedian(readings) == pytest.approx(away - kind.radius, abs=0.001), twin
         apart = np.linalg.norm(truth[:, at[twin]] - truth[:, at[real]], axis=1)
         mine = KINDS[trace.experiment.robots[twin].kind].radius
         assert np.nanmin(apart) > mine + kind.radius + 0.01, twin

@@ -17,7 +17,6 @@ from tests.system.lab import NEAR, ROOT, Flight, gone, until
 pytestmark = pytest.mark.system
 
 
-@pytest.mark.mechanism("protocol twins")
 @pytest.mark.timeout(180)
 def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> None:
     folder = tmp_path / "run"

@@ -37,7 +37,6 @@ def routers(flight: Flight) -> list[tuple[psutil.Process, str]]:
     return sorted(found, key=lambda pair: endpoints.index(pair[1]))
 
 
-@pytest.mark.mechanism("two routers: one killed")
 def test_a_killed_router_holds_nobody_up(tmp_path: Path) -> None:
     changes = ("--set", "network.routers=2", "--set", "duration_s=8", "--case", "periodic", "--no-report")
     flight = Flight(tmp_path / "run", "triangle", *changes)

@@ -111,7 +111,6 @@ def test_ctrl_c_lands_everybody_and_leaves_a_valid_recording(tmp_path: Path) -> 
     assert typed(folder / "event.mcap", "/CF01/status")[-1].phase == "done"
 
 
-@pytest.mark.mechanism("robot killed")
 def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", "--json", "--no-report", *SHORT)
@@ -132,7 +131,6 @@ def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> Non
     assert list(typed(folder / "event.mcap", "/KH01/status")[-1].missing) == ["KH02"]
 
 
-@pytest.mark.mechanism("router killed")
 def test_a_killed_router_comes_back_and_the_formation_holds(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", "--json", "--no-report", "--set", "duration_s=8")

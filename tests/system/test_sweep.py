@@ -67,7 +67,6 @@ def whole(tmp_path_factory):
     return tables(folder)
 
 
-@pytest.mark.mechanism("sweep: Ctrl-C")
 def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, whole):
     with zenpark(tmp_path, "--processes", "2") as process:
         until(lambda: seeds_done(tmp_path), "a cell is done")
@@ -90,6 +89,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, whole)
     assert tables(tmp_path) == whole
 
 
+@pytest.mark.mechanism("sweep: killed")
 def test_a_sweep_that_is_killed_leaves_no_process_and_goes_on(tmp_path, whole):
     with zenpark(tmp_path, "--processes", "2") as process:
         until(lambda: seeds_done(tmp_path), "a cell is done")

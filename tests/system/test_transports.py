@@ -28,7 +28,7 @@ def found(folder: Path, *hosts: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    "protocol", ["unixsock-stream", "tls", pytest.param("quic", marks=pytest.mark.mechanism("transport"))]
+    "protocol", ["unixsock-stream", "tls", pytest.param("quic", marks=pytest.mark.mechanism("run in a lab over QUIC"))]
 )
 def test_an_experiment_over_each_transport(tmp_path: Path, protocol: str) -> None:
     secure = protocol in ("tls", "quic")

@@ -307,7 +307,6 @@ def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
 # ---------------------------------------------------------------------- robots
 
 
-@pytest.mark.mechanism("world: no more setpoints")
 def test_robots_that_are_told_nothing_hold_and_then_land(world: WorldProcess, desk: Desk) -> None:
     for name in ("CF01", "TE01"):
         desk.tell(name, "takeoff", height=0.6)
