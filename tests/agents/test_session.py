@@ -422,7 +422,8 @@ def test_telemetry_keeps_the_newest(router, eventually):
 
 ROBOT = """
 import sys
-from agents.network.session import alive_token, open_session, orders, pose_publisher, pose_subscriber
+from agents.network.pubsub import alive_token, orders, pose_publisher, pose_subscriber
+from agents.network.session import open_session
 session = open_session([sys.argv[1]], name="CF01")
 held = [
     alive_token(session, "park/CF01/alive"),
