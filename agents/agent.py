@@ -17,22 +17,22 @@ from agents.arrays import Array, Index, Mask, some
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
 from agents.decision.centralised import Guidance
-from agents.decision.goals import Deciding, Holding
-from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, Duties, Lifecycle, Phase
-from agents.decision.neighbours import Heard, Hearing
-from agents.decision.perception import Sight
-from agents.decision.position_control import Individual
-from agents.decision.transmission import Said, Voice
+from agents.decision.goals import GoalComputer, StationKeeping
+from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, BodyCommands, Lifecycle, Phase
+from agents.decision.neighbours import Heard, NeighbourStates
+from agents.decision.perception import Perception
+from agents.decision.position_control import PositionController
+from agents.decision.transmission import Transmission, Transmitter
 from agents.formation.graph import Links
 from agents.network.messages import Setpoint
 from agents.plugins.avoidance import Avoidance, Nearby, Self
 from agents.plugins.registry import FAILURES, PluginError
-from agents.plugins.triggers import Told, Trigger
-from agents.safety.detection import Detector, Outside, Standing
+from agents.plugins.triggers import LastEvent, Trigger
+from agents.safety.detection import Detector, ProcessHealth, RowStatus
 from agents.safety.hazards import Hazards, Outcome
 from agents.safety.landing import Landing
 from agents.safety.preflight import Preflight
-from agents.safety.setpoint_filter import Safety, Whereabouts
+from agents.safety.setpoint_filter import PoseValidity, Safety
 
 
 class Actions(msgspec.Struct, frozen=True):
@@ -50,7 +50,7 @@ class Actions(msgspec.Struct, frozen=True):
 
     speak: Index
     setpoint: Array
-    duties: Duties | None
+    duties: BodyCommands | None
     changed: Mask
     avoided: Mask
     position: Array
@@ -97,19 +97,19 @@ class Agent:
         self.guidance = None
         if some(self._guided):
             self.guidance = Guidance(self._guided, flies, assignment.limits.link_silence_s)
-        self.deciding = Deciding(assignment, ~self._guided)
+        self.deciding = GoalComputer(assignment, ~self._guided)
         self.all_guided = bool(self._guided.all())
-        self._holding = Holding(self.deciding.ground)
+        self._holding = StationKeeping(self.deciding.ground)
         self.life = Lifecycle(flies, assignment.hover, assignment.duration)
-        self._voice = Voice(assignment.trigger, rows, assignment.predictor, kinds=assignment.kinds)
+        self._voice = Transmitter(assignment.trigger, rows, assignment.predictor, kinds=assignment.kinds)
         self._setpoint = np.full((rows, 4), np.nan)
-        self.outside, self.hazards = Outside(), Hazards(flies, assignment.limits)
+        self.outside, self.hazards = ProcessHealth(), Hazards(flies, assignment.limits)
         self._detector, self._preflight = Detector(assignment), Preflight(assignment)
         self.begun = False
         self._decided = self._asked = -1
-        self._duties: Duties | None = None
+        self._duties: BodyCommands | None = None
         self._ordered = np.zeros(rows, dtype=bool)
-        self._individual = Individual(assignment.kinds)
+        self._individual = PositionController(assignment.kinds)
         self._safety = Safety(assignment.kinds, assignment.limits)
         self._sight = _sight(assignment)
         self._landing = Landing(assignment)
@@ -117,7 +117,7 @@ class Agent:
         self._nobody: Mask = np.zeros(rows, dtype=bool)
         self._everybody: Mask = np.ones(rows, dtype=bool)
         self._wild = self._nobody
-        self._where: Whereabouts
+        self._where: PoseValidity
         self._age: Array
 
     # ------------------------------------------------------------------ what the outside tells
@@ -132,12 +132,12 @@ class Agent:
         self._voice.trigger = trigger
 
     @property
-    def told(self) -> Told:
+    def told(self) -> LastEvent:
         """What the neighbours were told."""
         return self._voice.told
 
     @property
-    def hearing(self) -> Hearing:
+    def hearing(self) -> NeighbourStates:
         """What was heard on each link, and who takes part in the law."""
         return self.deciding.hearing
 
@@ -147,19 +147,19 @@ class Agent:
         return self.hearing.heard
 
     def hear(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
-        """See `Hearing.hear`."""
+        """See `NeighbourStates.hear`."""
         self.hearing.hear(at, position, velocity, stamp, arrived)
 
     def lose(self, at: Index, t: float) -> None:
-        """See `Hearing.lose`."""
+        """See `NeighbourStates.lose`."""
         self.hearing.lose(at, t)
 
     def find(self, at: Index) -> None:
-        """See `Hearing.find`."""
+        """See `NeighbourStates.find`."""
         self.hearing.find(at)
 
     def forget(self, at: Index) -> None:
-        """See `Hearing.forget`."""
+        """See `NeighbourStates.forget`."""
         self.hearing.forget(at)
 
     def hear_goal(self, rows: Index, goal: Array, toward: Array, stamp: Array) -> Mask:
@@ -230,7 +230,7 @@ class Agent:
         """One tick at time `t` [s] of the process's clock."""
         return self.act(t, state, self.speak(t, state))
 
-    def speak(self, t: float, state: BodyState) -> Said:
+    def speak(self, t: float, state: BodyState) -> Transmission:
         """The first half of a tick: phases move on, and it is decided who speaks. What is said was measured."""
         self.deciding.settle(t)
         life = self.life
@@ -249,7 +249,7 @@ class Agent:
         decision, question = self.tick // assignment.decide_every, self.tick // assignment.pose_every
         self.decides, self._decided = decision != self._decided, decision
         if question == self._asked:
-            return Said(NOBODY, state.position, state.velocity)
+            return Transmission(NOBODY, state.position, state.velocity)
         self._asked = question
         self.error, energy = self.deciding.errors(t, state.position)
         return self._voice.speak(
@@ -258,7 +258,7 @@ class Agent:
             setpoint=self._setpoint,
         )  # fmt: skip
 
-    def act(self, t: float, state: BodyState, said: Said) -> Actions:
+    def act(self, t: float, state: BodyState, said: Transmission) -> Actions:
         """The second half: goals, and what bodies do."""
         held = self.hazards.held
         self._heed(t, state)
@@ -328,7 +328,7 @@ class Agent:
         else:
             running, landing, active = life.phase == RUNNING, life.phase == LANDING, life.active
             cruising = running | (life.phase == AIRBORNE)
-        rows = Standing(
+        rows = RowStatus(
             self._ordered,
             cruising,
             landing,
@@ -407,12 +407,12 @@ def _what(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _sight(assignment: Assignment) -> Sight | None:
+def _sight(assignment: Assignment) -> Perception | None:
     avoidance = assignment.avoidance
     if avoidance is None:
         return None
     kinds, speakers, limits = assignment.kinds, assignment.speaker_kinds, assignment.limits
-    return Sight(kinds, speakers, assignment.links, limits, avoidance.clearance, assignment.avoids)
+    return Perception(kinds, speakers, assignment.links, limits, avoidance.clearance, assignment.avoids)
 
 
 def links_by_speaker(links: Links, speakers: Sequence[str]) -> dict[str, Index]:

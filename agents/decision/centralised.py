@@ -12,7 +12,7 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, some
 from agents.decision.assignment import Assignment
-from agents.decision.goals import Deciding, Holding
+from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, RUNNING
 from agents.decision.neighbours import Heard
 
@@ -20,7 +20,7 @@ ROUNDING_S = 1e-6  # instants of decisions are multiples of a period that binary
 
 
 @dataclass(frozen=True)
-class Told:
+class CentreGoals:
     """Goals to be sent (K).
 
     Attributes:
@@ -53,9 +53,9 @@ class Centre:
         assert assignment.guided is not None
         rows = len(assignment.names)
         self.assignment, self.guided = assignment, assignment.guided
-        self.deciding = Deciding(assignment, self.guided)
+        self.deciding = GoalComputer(assignment, self.guided)
         self.poses, self.yaw = Heard.nothing(rows), np.zeros(rows)
-        self._holding = Holding(self.deciding.ground)
+        self._holding = StationKeeping(self.deciding.ground)
         self.goal, self.toward = np.full((rows, 3), np.nan), np.full(rows, np.nan)
         self._rests, self._sent = np.full(rows, -np.inf), np.full(rows, -np.inf)
         self.decisions = 0
@@ -107,7 +107,7 @@ class Centre:
         poses, rows = self.poses, self.listens
         return rows[~np.isfinite(poses.stamp[rows]) | (poses.gone[rows] < np.inf)]
 
-    def decide(self, t: float, phase: Index, start: Array) -> Told:
+    def decide(self, t: float, phase: Index, start: Array) -> CentreGoals:
         """Goals at `t` [s].
 
         Who runs gets one whenever it was decided anew, and again when the last one would soon be too old. Who still
@@ -141,7 +141,7 @@ class Centre:
         again = running & (t - self._sent >= 0.5 * limits.link_silence_s)
         rows = np.flatnonzero((anew | again) & np.isfinite(self.goal).all(axis=1))
         self._sent[rows] = t
-        return Told(rows, self.goal[rows], self.toward[rows], self._rests[rows])
+        return CentreGoals(rows, self.goal[rows], self.toward[rows], self._rests[rows])
 
     def _complete(self, t: float) -> Mask:
         """Rows (N,) whose neighbours were all heard once, or waited for long enough."""

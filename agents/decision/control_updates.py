@@ -11,7 +11,7 @@ from agents.arrays import Array, Index, Mask, norm, some
 from agents.decision.transmission import asked
 from agents.formation.graph import Links
 from agents.plugins.predictors import HOLD
-from agents.plugins.triggers import Told, Trigger, View
+from agents.plugins.triggers import LastEvent, Trigger, View
 
 
 class Input(View):
@@ -27,7 +27,7 @@ class Input(View):
         t: float,
         position: Array,
         velocity: Array,
-        told: Told,
+        told: LastEvent,
         start: Array,
         links: Links,
         kept: tuple[Array, Array],
@@ -100,7 +100,7 @@ class Updating:
 
     def __init__(self, trigger: Trigger, rows: int, links: Links) -> None:
         """With all `links` (E) on which the rows listen."""
-        self.told = Told.nothing(rows)
+        self.told = LastEvent.nothing(rows)
         self._trigger, self._state = trigger, trigger.state(rows)
         self._apart, self._rate = np.zeros((2, len(links), 3))
         self._live: Index = np.zeros(0, dtype=np.intp)

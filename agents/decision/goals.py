@@ -12,7 +12,7 @@ import numpy as np
 from agents.arrays import Array, Index, Mask, some
 from agents.decision.assignment import Assignment
 from agents.decision.control_updates import Input, Updating
-from agents.decision.neighbours import Hearing
+from agents.decision.neighbours import NeighbourStates
 from agents.formation.changes import Reshaping
 from agents.plugins import laws
 from agents.plugins.planners import Itinerary
@@ -35,7 +35,7 @@ class Decided(msgspec.Struct, frozen=True):
     toward: Array
 
 
-class Deciding:
+class GoalComputer:
     """Goals of some of N rows.
 
     Attributes:
@@ -49,7 +49,7 @@ class Deciding:
         """Of the rows `mine` (N,); links, anchors and plans of the others are none of its business."""
         rows = len(assignment.names)
         self._assignment, links = assignment, assignment.links
-        self.hearing = Hearing(links, assignment.watched, assignment.limits.link_silence_s)
+        self.hearing = NeighbourStates(links, assignment.watched, assignment.limits.link_silence_s)
         self.clamp, self.tracking_gain = assignment.clamp, assignment.tracking_gain
         self._updating = None if assignment.update is None else Updating(assignment.update, rows, links)
         self._flies = np.array([kind.flies for kind in assignment.kinds])
@@ -199,7 +199,7 @@ class Deciding:
             self.forget(rows)
 
 
-class Holding:
+class StationKeeping:
     """Rows that stay where they were when that began.
 
     Attributes:

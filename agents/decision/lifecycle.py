@@ -1,6 +1,6 @@
 """The life of a robot in an experiment: idle, ready, airborne, running, landing, done. Pure and row-wise.
 
-Orders and facts go in, phases come out; what a body must do because of a change is collected in `Duties`.
+Orders and facts go in, phases come out; what a body must do because of a change is collected in `BodyCommands`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SETTLED = 0.1  # [m/s] slower than this it has stopped climbing, or rolling
 
 
 @dataclass(frozen=True)
-class Duties:
+class BodyCommands:
     """What the body must do now: rows that take off, land, and cut their motors."""
 
     takeoff: Index
@@ -125,7 +125,7 @@ class Lifecycle:
         """Whether every row runs the experiment."""
         return self._settled_until > -np.inf or bool((self.phase == RUNNING).all())
 
-    def advance(self, t: float, ready: Mask, position: Array, velocity: Array, flying: Mask) -> Duties | None:
+    def advance(self, t: float, ready: Mask, position: Array, velocity: Array, flying: Mask) -> BodyCommands | None:
         """Moves every row on as far as the facts allow.
 
         Args:
@@ -169,10 +169,10 @@ class Lifecycle:
             self._settled_until = float(self.start_at.min()) + self._duration - 1e-6
         return self._duties()
 
-    def _duties(self) -> Duties | None:
+    def _duties(self) -> BodyCommands | None:
         if not any(self._due.values()):
             return None
-        duties = Duties(*(np.array(self._due[what], dtype=np.intp) for what in ("takeoff", "land", "stop")))
+        duties = BodyCommands(*(np.array(self._due[what], dtype=np.intp) for what in ("takeoff", "land", "stop")))
         for rows in self._due.values():
             rows.clear()
         return duties

@@ -45,7 +45,7 @@ class Heard:
         return predictor.velocity(self.velocity[which], t - self.stamp[which])
 
 
-class Hearing:
+class NeighbourStates:
     """The links on which rows listen.
 
     Attributes:

@@ -30,7 +30,7 @@ OUTLINE_SHARE: Final = 0.05  # and this share of its length, as long ones are me
 STEEP: Final = 0.5  # cosine of the elevation above which a ray looks up or down, not around
 
 
-class Sight:
+class Perception:
     """Puts together what `Avoidance` decides on."""
 
     def __init__(  # noqa: PLR0917

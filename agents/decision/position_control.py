@@ -21,7 +21,7 @@ def wrap(angle: Array) -> Array:
     return np.asarray(math.pi - np.mod(math.pi - angle, 2.0 * math.pi))
 
 
-class Individual:
+class PositionController:
     """Position controllers of rows of any kinds."""
 
     def __init__(self, kinds: Sequence[Kind]) -> None:

@@ -13,10 +13,10 @@ from agents.body.kinds import Kind
 from agents.network.validation import MAX_SPEED
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.registry import FAILURES, PluginError
-from agents.plugins.triggers import Told, Trigger, View
+from agents.plugins.triggers import LastEvent, Trigger, View
 
 
-class Said(msgspec.Struct, frozen=True):
+class Transmission(msgspec.Struct, frozen=True):
     """A moment of speaking: `rows` that speak, and of all rows the position and velocity (N, 3) to be said."""
 
     rows: Index
@@ -24,7 +24,7 @@ class Said(msgspec.Struct, frozen=True):
     velocity: Array
 
 
-class Voice:
+class Transmitter:
     """Of N rows.
 
     Attributes:
@@ -36,7 +36,7 @@ class Voice:
         self, trigger: Trigger, rows: int, predictor: Predictor = HOLD, *, kinds: Sequence[Kind] | None = None
     ) -> None:
         """Without `kinds` rows are smoothed as robots on wheels are."""
-        self.trigger, self.told = trigger, Told.nothing(rows)
+        self.trigger, self.told = trigger, LastEvent.nothing(rows)
         self._kinds = kinds
         self._predictor, self._state = predictor, trigger.state(rows)
         self._smoothed: LowPass | None = None
@@ -52,7 +52,7 @@ class Voice:
         start: Array,
         offset: Array,
         setpoint: Array | None = None,
-    ) -> Said:
+    ) -> Transmission:
         """Who speaks at `t` [s], and what; rows that do not know where they are stay silent. See `View`.
 
         `setpoint` (N, 4) is what the bodies were commanded last, NaN for rows that their bodies drive by themselves; it
@@ -86,7 +86,7 @@ class Voice:
         if unknown is not None:
             velocity = velocity.copy()  # what neighbours were told of stays with them
             velocity[unknown] = np.nan
-        return Said(rows, position, velocity)
+        return Transmission(rows, position, velocity)
 
 
 def asked(trigger: Trigger, view: View, state: Array) -> Index:

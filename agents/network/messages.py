@@ -59,7 +59,7 @@ class Heard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     velocity: Vector
 
 
-class Followed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class GoalReceipt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A goal that reached its robot: when it was sent, when the pose was taken on which it rests, and when it was acted
     on (UTC [s])."""
 
@@ -97,7 +97,7 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     attitude: Setpoint | None = None
     shadow_position: Vector | None = None
     shadow_yaw: float | None = None
-    followed: list[Followed] = []
+    followed: list[GoalReceipt] = []
 
 
 class Incident(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -236,7 +236,7 @@ class Contact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     overlap: float
 
 
-class Standing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ObstaclePose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An obstacle by name, with x, y [m] and yaw [rad]."""
 
     name: str
@@ -258,7 +258,7 @@ class WorldState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     paused: bool
     robots: list[str]
     mirrored: list[str]
-    obstacles: list[Standing]
+    obstacles: list[ObstaclePose]
     contacts: int
     refused: int
     malformed: int

@@ -21,7 +21,7 @@ from agents.network import pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 
-GHOST_S: Final = 2.5  # limit for the tokens of a killed owner to vanish
+OWNER_VANISH_S: Final = 2.5  # limit for the tokens of a killed owner to vanish
 ANSWER_S: Final = 10.0  # limit for the routers to answer
 SETTLE_S: Final = 0.2  # limit for a token to travel from one router to the next, and for a lost link to be noticed
 
@@ -52,7 +52,7 @@ def claim(
 
     Raises:
         NameTaken: If another process owns one of the names, or claimed it earlier; the tokens of a killed process are
-            given `GHOST_S` to vanish.
+            given `OWNER_VANISH_S` to vanish.
         network.Unreachable: If no router answers within `ANSWER_S`, or `stop` was set.
     """
     pause = stop or threading.Event()
@@ -77,7 +77,7 @@ def claim(
 
 def _first_round(session: zenoh.Session, alive: Sequence[str], mine: str, rank: str, pause: threading.Event) -> None:
     """Waits until no other process owns a name or has an earlier claim."""
-    deadline = time.monotonic() + GHOST_S
+    deadline = time.monotonic() + OWNER_VANISH_S
     while others := _others(session, alive, mine, rank, pause, owners=True):
         if time.monotonic() > deadline:
             raise NameTaken(", ".join(others))
@@ -115,7 +115,7 @@ def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -
 
     One answer is not enough: a link that is lost ends its questions as an answer does, and a process that takes the
     name may be between its two rounds. No other owner must be seen for `SETTLE_S`. One that is seen may still give way
-    to the claim of this process, for `GHOST_S`.
+    to the claim of this process, for `OWNER_VANISH_S`.
 
     Args:
         session: Of the process, whose tokens are declared, and declared anew by Zenoh when it was cut off.
@@ -140,7 +140,7 @@ def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -
             if any(Keys.life_of(token) not in (None, mine) for token in tokens or ())
         ]:
             free, taken = inf, min(taken, now)
-            if now - taken > GHOST_S:
+            if now - taken > OWNER_VANISH_S:
                 raise NameTaken(", ".join(others))
         else:
             free, taken = min(free, now), inf

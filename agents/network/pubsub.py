@@ -89,7 +89,7 @@ def subscriber(session: zenoh.Session, key: str, depth: int = 256) -> zenoh.Subs
     return session.declare_subscriber(key, RingChannel(depth))
 
 
-class Alarm:
+class ImmediateSubscriber:
     """Emergency stops, obeyed as they come, without waiting for a control loop that may hang; it polls them later.
 
     Everything that is put on the key is a stop (`wire.read_stop`). A DELETE is none, and takes none back: it is what

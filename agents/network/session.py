@@ -118,7 +118,7 @@ T_co = TypeVar("T_co", covariant=True)
 RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
 GATHER_S: Final = 1.0
 LINK_S: Final = 0.01
-FREED_S: Final = 3.0  # so long may an endpoint of a mesh stay taken by a robot that is started again
+ENDPOINT_FREE_S: Final = 3.0  # so long may an endpoint of a mesh stay taken by a robot that is started again
 ROBOT_LEASE_S: Final = 1.2  # of robots: neighbours of one that hangs must know within 1.5 s
 ASK_EVERY_S: Final = 0.4  # between two questions whether the router still answers
 ANSWER_S: Final = 0.3  # a question without an answer for so long begins a silence
@@ -182,7 +182,7 @@ def open_session(
         )
     )
     gone = stop or threading.Event()
-    deadline = time.monotonic() + (min(wait_s, FREED_S) if ends.listen else wait_s)
+    deadline = time.monotonic() + (min(wait_s, ENDPOINT_FREE_S) if ends.listen else wait_s)
     while True:
         try:
             with prompt_threads():

@@ -28,7 +28,7 @@ ROUNDING_S = 1e-6  # ticks are multiples of a period that binary fractions miss 
 
 
 @dataclass
-class Told:
+class LastEvent:
     """What was so at the last event of each row: when it last spoke, or the law was last computed.
 
     Rows without an event have an infinite position and a time of minus infinity.
@@ -48,7 +48,7 @@ class Told:
     energy: Array
 
     @classmethod
-    def nothing(cls, rows: int) -> Told:
+    def nothing(cls, rows: int) -> LastEvent:
         """Before any event."""
         zeros = np.zeros((rows, 3))
         return cls(np.full((rows, 3), np.inf), zeros, np.full(rows, -np.inf), zeros.copy(), np.zeros(rows))
@@ -82,7 +82,7 @@ class View:
         t: float,
         position: Array,
         velocity: Array,
-        told: Told,
+        told: LastEvent,
         *,
         error: Array,
         energy: Array,

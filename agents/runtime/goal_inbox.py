@@ -50,7 +50,7 @@ class HeardGoals:
         self._rows = np.array(rows, dtype=np.intp)
         self._channel = Channel(conditions or Conditions.ideal(len(rows)))
         self.malformed = 0
-        self.news = [deque[messages.Followed](maxlen=NEWS) for _ in self._names]
+        self.news = [deque[messages.GoalReceipt](maxlen=NEWS) for _ in self._names]
 
     def take(self, t: float, utc: float) -> None:
         """Takes in what has come by `t` [s] of a clock that was 0 at `utc`."""
@@ -71,7 +71,7 @@ class HeardGoals:
                 which = self._rows[[link]]
                 news = self._agent.hear_goal(which, position[None], np.array([toward]), np.array([stamp]))
                 if news.any():
-                    self.news[which[0]].append(messages.Followed(seq, utc + sent, utc + pose, utc + t))
+                    self.news[which[0]].append(messages.GoalReceipt(seq, utc + sent, utc + pose, utc + t))
 
     def _begin(self, life: str | None, *, there: bool) -> None:
         """A centre of another session counts its goals anew; its clock may be behind that of the last one."""

@@ -25,7 +25,7 @@ from agents.body.interface import Body, call_all
 from agents.body.measured_positions import MeasuredPositions
 from agents.decision.assignment import Assignment
 from agents.decision.lifecycle import Phase
-from agents.decision.transmission import Said
+from agents.decision.transmission import Transmission
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.name_ownership import ANSWER_S, Doubt, NameTaken, claim
@@ -41,7 +41,7 @@ from agents.runtime.setup import Setup
 from agents.runtime.telemetry import Counts, Telemetry
 from agents.runtime.watchdog import AGAIN_S, Watchdog
 
-HUSH_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
+STOP_YIELD_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
 ROUTER_S: Final = 0.045  # between two looks at the router
 STOOD_S: Final = 0.5 * network.ROBOT_LEASE_S  # a process that stood still for longer may have lost its name
 _CLOCK: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # goes on while the machine sleeps
@@ -244,7 +244,7 @@ class Runtime:
         self._poses = [pubsub.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [pubsub.last_value(session, keys.pose(name), self._mime) for name in names]
         self._orders = [pubsub.orders(session, keys.order(name)) for name in names]
-        self._estop = pubsub.Alarm(session, keys.estop, self._cut)
+        self._estop = pubsub.ImmediateSubscriber(session, keys.estop, self._cut)
         self._conductor = pubsub.alive_watch(session, keys.conductor)
         located = np.flatnonzero(self._setup.located).tolist()
         self._located = MeasuredPositions(session, keys, names, located, self._reach) if located else None
@@ -433,10 +433,10 @@ class Runtime:
 
     def _rest(self) -> None:
         """Leaves the processor to those whose motors still run."""
-        ticks = ceil(HUSH_S / self._dt)
+        ticks = ceil(STOP_YIELD_S / self._dt)
         self._next += ticks * self._dt
         self.agent.tick += ticks
-        time.sleep(HUSH_S)
+        time.sleep(STOP_YIELD_S)
 
     def _tick(self, t: float) -> None:
         begun = self.agent.decisions > 0
@@ -507,7 +507,7 @@ class Runtime:
         if not overruled and not stale:
             self._body.command(actions.setpoint)
 
-    def _say(self, row: int, said: Said, yaw: float, t: float) -> None:
+    def _say(self, row: int, said: Transmission, yaw: float, t: float) -> None:
         """Sends a row's pose to its neighbours."""
         self._counts.sent[row] += 1
         pose = messages.pose(

@@ -30,7 +30,7 @@ class Coming(Enum):
     ANEW = 3  # its process is another one than before
 
 
-class Said(NamedTuple):
+class ReceivedPose(NamedTuple):
     """A pose that is news.
 
     Attributes:
@@ -49,7 +49,7 @@ class Said(NamedTuple):
     anew: bool
 
 
-class Speaker:
+class NeighbourSubscription:
     """Listens to one robot.
 
     Attributes:
@@ -98,7 +98,7 @@ class Speaker:
         self.lost = self.stale = self.malformed = 0
         self.behind = 0.0
 
-    def news(self, now: float) -> Iterator[Said]:
+    def news(self, now: float) -> Iterator[ReceivedPose]:
         """Poses that have come until `now` (UTC [s]), oldest first: what cannot be true is refused, what is known left
         out.
 
@@ -132,7 +132,7 @@ class Speaker:
             slow = self.behind or (pose.stamp < before and now - pose.stamp > LATE_S)
             measured = now - LATE_S if slow else validation.taken(pose.stamp, now)
             self._heard_at = now
-            yield Said(pose, len(payload), missed, measured, anew)
+            yield ReceivedPose(pose, len(payload), missed, measured, anew)
 
     def comings(self) -> Iterator[Coming]:
         """Changes of its liveliness, oldest first."""
@@ -216,7 +216,8 @@ class Neighbours:
         by_speaker = links_by_speaker(assignment.links, assignment.speakers)
         rate = assignment.body_hz / assignment.pose_every
         self.speakers = [
-            Speaker(session, keys, name, links, reach=reach, rate=rate) for name, links in by_speaker.items()
+            NeighbourSubscription(session, keys, name, links, reach=reach, rate=rate)
+            for name, links in by_speaker.items()
         ]
         self.news = [deque[messages.Heard](maxlen=NEWS) for _ in assignment.names]
         self.heard = [0] * len(assignment.names)
@@ -241,7 +242,7 @@ class Neighbours:
                 else:
                     self._channel.forget(speaker.links)
                     self._agent.lose(speaker.links, t)
-        arrived: list[tuple[int, Said]] = []
+        arrived: list[tuple[int, ReceivedPose]] = []
         for speaker in self.speakers:
             behind = speaker.behind
             for said in speaker.news(utc + t):
@@ -258,12 +259,12 @@ class Neighbours:
         if (got := self._channel.due(t)) is not None:
             self._believe(got, utc)
 
-    def _begin(self, speaker: Speaker) -> None:
+    def _begin(self, speaker: NeighbourSubscription) -> None:
         """A neighbour begins a new life."""
         self._channel.forget(speaker.links)
         self._agent.forget(speaker.links)
 
-    def _send(self, arrived: list[tuple[int, Said]], t: float, utc: float) -> None:
+    def _send(self, arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> None:
         """Gives poses, each with the link on which it arrived, to the modelled network, all of a tick at once."""
         poses = [heard.pose for _, heard in arrived]
         measured = np.array([[heard.measured - utc] for _, heard in arrived])

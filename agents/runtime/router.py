@@ -27,7 +27,7 @@ from agents.runtime.lifeline import Lifeline
 
 EMPTY_S: Final = 1.0  # nobody connected for this long: whoever lost its connection would have it again
 LOOK_S: Final = 0.1
-FREED_S: Final = 10.0  # so long may the port of a router that begins anew stay taken by what it was before
+PORT_FREE_S: Final = 10.0  # so long may the port of a router that begins anew stay taken by what it was before
 AGAIN_S: Final = 0.1
 # How often it looks whether somebody's certificate has been revoked, and whether it was told to end: a signal that the
 # kernel gives to another thread, as after a SIGCONT, does not wake the one that waits.
@@ -121,7 +121,7 @@ def serve_router(
     while True:
         with held(_routing(chosen, endpoints, patience_s, stop)) as (session, _):
             ready(session)
-            patience_s = FREED_S
+            patience_s = PORT_FREE_S
             while not stop.wait(LOOK_AGAIN_S):
                 if (now := _stamp(register)) == seen:
                     continue

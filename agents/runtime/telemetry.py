@@ -86,7 +86,7 @@ class Telemetry:
         neighbours: Neighbours,
         counts: Counts,
         ranged: Sequence[bool],
-        followed: Sequence[deque[messages.Followed]] | None = None,
+        followed: Sequence[deque[messages.GoalReceipt]] | None = None,
     ) -> None:
         """Declares the publishers.
 
@@ -112,7 +112,7 @@ class Telemetry:
             for name, own in zip(names, ranged, strict=True)
         ]
         self.utc = self.due = 0.0
-        self._followed = [deque[messages.Followed]() for _ in names] if followed is None else followed
+        self._followed = [deque[messages.GoalReceipt]() for _ in names] if followed is None else followed
         self._told = 0
         self._scanned = [-inf] * len(names)
         self._origin: list[messages.Setpoint | None] = [None] * len(names)

@@ -14,10 +14,10 @@ import numpy as np
 from agents.arrays import Array, Index, Mask, every, norm, some
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
-from agents.decision.neighbours import Hearing
+from agents.decision.neighbours import NeighbourStates
 from agents.safety.hazards import Cause, Sighting
 from agents.safety.landing import Landing
-from agents.safety.setpoint_filter import ESCAPED, Whereabouts
+from agents.safety.setpoint_filter import ESCAPED, PoseValidity
 
 
 class Separation:
@@ -34,7 +34,7 @@ class Separation:
         theirs = np.array([kind.radius for kind in assignment.speaker_kinds])
         self.touching = own[links.listener] + (theirs[links.speaker] if len(theirs) else 0.0)
 
-    def distances(self, t: float, position: Array, hearing: Hearing) -> Array:
+    def distances(self, t: float, position: Array, hearing: NeighbourStates) -> Array:
         """From rows at `position` (N, 3) to where others are believed to be at `t` [s]: (E,) [m].
 
         Infinite where nothing was heard, the own position is unknown, or the other is gone for long.
@@ -71,7 +71,7 @@ LATE_SHARE: Final = 0.9  # and with a larger share of them a control loop is non
 
 
 @dataclass
-class Outside:
+class ProcessHealth:
     """What the process around a decision knows and the decision cannot see.
 
     Attributes:
@@ -115,7 +115,7 @@ class Outside:
                 self.late = 0.0
 
 
-class Standing(msgspec.Struct, frozen=True):
+class RowStatus(msgspec.Struct, frozen=True):
     """How rows (N,) stand in the experiment on a tick, for `Detector.look`.
 
     Attributes:
@@ -160,8 +160,14 @@ class Detector:
         self._separation = Separation(assignment)
 
     def look(  # noqa: PLR0917 - what there is to look at
-        self, t: float, state: BodyState, where: Whereabouts, hearing: Hearing, rows: Standing, outside: Outside
-    ) -> list[Sighting]:  # fmt: skip
+        self,
+        t: float,
+        state: BodyState,
+        where: PoseValidity,
+        hearing: NeighbourStates,
+        rows: RowStatus,
+        outside: ProcessHealth,
+    ) -> list[Sighting]:
         """What is wrong at `t` [s]."""
         seen: list[Sighting] = []
         if not where.sure:
@@ -184,7 +190,9 @@ class Detector:
         self._surroundings(t, outside, seen)
         return seen
 
-    def _forgotten(self, hearing: Hearing, rows: Standing, outside: Outside, seen: list[Sighting]) -> None:
+    def _forgotten(
+        self, hearing: NeighbourStates, rows: RowStatus, outside: ProcessHealth, seen: list[Sighting]
+    ) -> None:
         """Rows that have not heard all who are there, or their centre, since the process stood still."""
         heard, links = hearing.heard, self._assignment.links
         silent = (heard.stamp < outside.woke) & np.isfinite(heard.stamp) & np.isinf(heard.gone)
@@ -197,7 +205,7 @@ class Detector:
                 Sighting(Cause.STANDSTILL, waits, lambda _: f"for {outside.slept:.1f} s; it waits for its neighbours")
             )
 
-    def _lost(self, t: float, state: BodyState, where: Whereabouts, seen: list[Sighting]) -> None:
+    def _lost(self, t: float, state: BodyState, where: PoseValidity, seen: list[Sighting]) -> None:
         """Position, and the arena."""
 
         def age(row: int) -> str:
@@ -214,7 +222,7 @@ class Detector:
             Sighting(Cause.FAR_OUTSIDE, where.flown & self._flies, lambda row: out(cut, row)),
         ]
 
-    def _measured(self, state: BodyState, rows: Standing, seen: list[Sighting]) -> None:
+    def _measured(self, state: BodyState, rows: RowStatus, seen: list[Sighting]) -> None:
         """What the body itself says."""
         limits = self._limits
         squared = np.vecdot(state.velocity, state.velocity)
@@ -259,7 +267,7 @@ class Detector:
             if some(rows.places.aside):
                 seen.append(Sighting(Cause.BELOW, rows.places.aside, rows.places.below))
 
-    def _near(self, t: float, state: BodyState, hearing: Hearing, seen: list[Sighting]) -> None:
+    def _near(self, t: float, state: BodyState, hearing: NeighbourStates, seen: list[Sighting]) -> None:
         """Other robots, where they are believed to be."""
         limit = self._limits.separation
         assert limit is not None
@@ -276,7 +284,7 @@ class Detector:
         seen.append(Sighting(Cause.SEPARATION, self._separation.rows(near), say))
         seen.append(Sighting(Cause.TOUCHING, self._separation.rows(inner), say))
 
-    def _missed(self, t: float, hearing: Hearing, rows: Standing, seen: list[Sighting]) -> None:
+    def _missed(self, t: float, hearing: NeighbourStates, rows: RowStatus, seen: list[Sighting]) -> None:
         """Neighbours that are gone."""
         links, assignment = self._assignment.links, self._assignment
         since = hearing.heard.gone
@@ -292,7 +300,7 @@ class Detector:
         if rows.alone is not None and some(rows.alone):
             seen.append(Sighting(Cause.ALONE, rows.alone & rows.cruising, lambda row: names(row) or "none was heard"))
 
-    def _behind(self, hearing: Hearing, behind: Array, seen: list[Sighting]) -> None:
+    def _behind(self, hearing: NeighbourStates, behind: Array, seen: list[Sighting]) -> None:
         """Neighbours whose clocks are behind."""
         links = self._assignment.links
         late = (behind > 0.0) & (hearing.heard.gone == np.inf)
@@ -310,7 +318,7 @@ class Detector:
             rows[links.listener[late]] = True
             seen.append(Sighting(Cause.BEHIND, rows, names))
 
-    def _surroundings(self, t: float, outside: Outside, seen: list[Sighting]) -> None:
+    def _surroundings(self, t: float, outside: ProcessHealth, seen: list[Sighting]) -> None:
         """The process, and who is on the network."""
         everybody = self._everybody
         if outside.offline_since < np.inf:

@@ -14,9 +14,9 @@ import numpy as np
 from agents.arrays import Array, Index, Mask, norm, some
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
-from agents.decision.lifecycle import LANDING, Duties
-from agents.decision.neighbours import Hearing
-from agents.safety.setpoint_filter import Whereabouts
+from agents.decision.lifecycle import LANDING, BodyCommands
+from agents.decision.neighbours import NeighbourStates
+from agents.safety.setpoint_filter import PoseValidity
 
 NEAR: Final = 0.05  # [m] between surfaces, seen from above: with less a row does not come down where it is,
 ROOM: Final = 0.12  # and the place that it goes to has this much
@@ -58,14 +58,14 @@ class Landing:
     def direct(
         self,
         t: float,
-        duties: Duties | None,
+        duties: BodyCommands | None,
         state: BodyState,
-        where: Whereabouts,
+        where: PoseValidity,
         *,
-        hearing: Hearing,
+        hearing: NeighbourStates,
         late: bool,
         phase: Index,
-    ) -> Duties | None:
+    ) -> BodyCommands | None:
         """The duties of this tick, without the landings that have to wait, and with those that need not any more.
 
         Args:
@@ -96,7 +96,7 @@ class Landing:
         lands = np.flatnonzero(due & ~self.aside)
         if duties is None:
             nobody = lands[:0]
-            return Duties(nobody, lands, nobody) if len(lands) else None
+            return BodyCommands(nobody, lands, nobody) if len(lands) else None
         return replace(duties, land=lands)
 
     def hurry(self) -> None:

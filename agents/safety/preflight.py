@@ -12,9 +12,9 @@ import numpy as np
 from agents.arrays import Array, Index, Mask, some
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
-from agents.decision.neighbours import Hearing
-from agents.safety.detection import Outside, Separation, lean, leaning, misstamped, stamped
-from agents.safety.setpoint_filter import Whereabouts
+from agents.decision.neighbours import NeighbourStates
+from agents.safety.detection import ProcessHealth, Separation, lean, leaning, misstamped, stamped
+from agents.safety.setpoint_filter import PoseValidity
 
 LOST_S: Final = 0.5  # a robot that was ready is so no more when a check has failed for this long
 FLOOR_M: Final = 0.5  # a drone that stands has at most this height: positioning systems differ about the floor
@@ -39,9 +39,9 @@ class Preflight:
         self,
         t: float,
         state: BodyState,
-        where: Whereabouts,
-        hearing: Hearing,
-        outside: Outside,
+        where: PoseValidity,
+        hearing: NeighbourStates,
+        outside: ProcessHealth,
         lacking: tuple[Mask, Callable[[int], Sequence[str]]],
     ) -> dict[int, str]:
         """Rows that must not take off at `t` [s], each with the first thing that is wrong with it.
@@ -75,8 +75,8 @@ class Preflight:
         self,
         t: float,
         state: BodyState,
-        where: Whereabouts,
-        outside: Outside,
+        where: PoseValidity,
+        outside: ProcessHealth,
         lacking: tuple[Mask, Callable[[int], Sequence[str]]],
     ) -> Iterator[Failing]:
         """Where it is, and who else is there."""
@@ -110,7 +110,7 @@ class Preflight:
         low = state.battery < least
         yield low, lambda row: f"its battery is at {state.battery[row]:.0%}, less than {least:.0%}"
 
-    def _near(self, t: float, position: Array, hearing: Hearing, limit: float) -> Iterator[Failing]:
+    def _near(self, t: float, position: Array, hearing: NeighbourStates, limit: float) -> Iterator[Failing]:
         apart = self._separation.distances(t, position, hearing)
         near = apart < limit
         if some(near):

@@ -20,7 +20,7 @@ ROUNDING = 1e-9  # smaller differences are arithmetic, not interventions
 
 
 @dataclass(frozen=True)
-class Whereabouts:
+class PoseValidity:
     """What the measured poses of N rows are worth.
 
     Attributes:
@@ -40,7 +40,7 @@ class Whereabouts:
     outside: Array
 
 
-class Verdict(msgspec.Struct, frozen=True):
+class FilteredSetpoint(msgspec.Struct, frozen=True):
     """What may be sent, and what else must happen.
 
     Attributes:
@@ -81,9 +81,9 @@ class Safety:
         self._centre = 0.5 * (limits.low + limits.high)
         self._half = 0.5 * (limits.high - limits.low)
         self._nobody: Mask = np.zeros(len(kinds), dtype=bool)
-        self._sure = Whereabouts(True, *(self._nobody,) * 4, np.zeros(len(kinds)))
+        self._sure = PoseValidity(True, *(self._nobody,) * 4, np.zeros(len(kinds)))
 
-    def where(self, position: Array, yaw: Array, age: Array) -> Whereabouts:
+    def where(self, position: Array, yaw: Array, age: Array) -> PoseValidity:
         """What poses are worth: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s]."""
         off = np.abs(position - self._centre)
         known = (np.abs(yaw) < ABSURD) & (age <= self.limits.own_silence_s)
@@ -94,7 +94,7 @@ class Safety:
         outside = np.maximum((off - self._half).max(axis=1), 0.0)
         walls = (off[:, :2] > self._half[:2]).any(axis=1) | (~blind & (position[:, 2] > self.limits.high[2]))
         escaped = np.asarray((off > self._half + ESCAPED).any(axis=1))
-        return Whereabouts(False, blind, np.asarray(walls), escaped, outside > self.limits.cut_outside, outside)
+        return PoseValidity(False, blind, np.asarray(walls), escaped, outside > self.limits.cut_outside, outside)
 
     def check(  # noqa: PLR0917 - the four that always are, and those of avoidance
         self,
@@ -105,8 +105,8 @@ class Safety:
         avoidance: Avoidance | None = None,
         own: Self | None = None,
         nearby: Nearby | None = None,
-        where: Whereabouts | None = None,
-    ) -> Verdict:
+        where: PoseValidity | None = None,
+    ) -> FilteredSetpoint:
         """The last word.
 
         Args:
@@ -146,7 +146,7 @@ class Safety:
             changed = (changed | wild) & ~blind
             # a body that controls its position on board keeps its last setpoint while the position is not known here
             safe[blind & self._takes_position] = np.nan
-        return Verdict(safe, changed, blind, wild, avoided)
+        return FilteredSetpoint(safe, changed, blind, wild, avoided)
 
     def _limit(self, setpoint: Array, here: Array, yaw: Array, age: Array) -> None:
         """Brings setpoints (N, 4) within all limits, in place; rows were `here` (N, 3) [m] `age` (N,) [s] ago."""

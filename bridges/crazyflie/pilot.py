@@ -17,7 +17,7 @@ from bridges.crazyflie.telemetry import Telemetry
 
 NOBODY_S: Final = 2.4  # without any answer there is no Crazyflie
 LOST_S: Final = 1.0  # without a packet the link is lost; the firmware gives up after two seconds without setpoints
-DOUBT_S: Final = 2.0  # so long after the link was lost, a Crazyflie that streamed setpoints held up is down
+LINK_GAP_S: Final = 2.0  # so long after the link was lost, a Crazyflie that streamed setpoints held up is down
 STATUS_S: Final = 2.0  # to the first status
 RETRY_S: Final = 0.5
 HOME_S: Final = 12.0  # `close` waits so long for a landing
@@ -112,7 +112,7 @@ class Pilot:
             except LinkError as error:
                 self._news = str(error)
                 self._fail(error)
-                if time.monotonic() - lost > DOUBT_S or self._ending.is_set():
+                if time.monotonic() - lost > LINK_GAP_S or self._ending.is_set():
                     self._flight.doubt()
                 self._ending.wait(RETRY_S)
                 continue

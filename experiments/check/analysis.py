@@ -33,7 +33,7 @@ from experiments.check.stability import Modes, modes
 from experiments.definition import assignment as assign
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
-from experiments.definition.formation import Pattern, errors
+from experiments.definition.formation import FormationArrays, errors
 from experiments.definition.links import pairs
 from experiments.file.problems import Path
 from experiments.metrics.measure import WINDOW_S
@@ -79,7 +79,7 @@ class Analysis:
     start: Array
     parts: int
     fiedler: float
-    pattern: Pattern
+    pattern: FormationArrays
     asked: Links
     standing: Mask
     shapes: tuple[Shape, ...]
@@ -200,7 +200,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     names = tuple(experiment.robots)
     bare = msgspec.structs.replace(experiment, avoidance=None, architecture="distributed")
     assignment = assign.assign(bare, names)
-    pattern = Pattern.of(experiment, names)
+    pattern = FormationArrays.of(experiment, names)
     links, rows, hz = assignment.links, len(names), experiment.rates.coordination_hz
     start, _ = bodies.start(experiment, names)
     aloft = start.copy()
@@ -248,7 +248,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     )
 
 
-def link_errors(law: Law, pattern: Pattern, prediction: Prediction) -> Array:
+def link_errors(law: Law, pattern: FormationArrays, prediction: Prediction) -> Array:
     """Error of each link (T, E) along the motion [m]; 0 while it is not there."""
     return np.nan_to_num(errors(law, pattern, prediction.time, prediction.position))
 

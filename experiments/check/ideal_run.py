@@ -19,7 +19,7 @@ from agents.arrays import Array, norm
 from agents.body.external_pose import velocity_after
 from agents.body.interface import Disturbance
 from agents.body.kinds import Kind
-from agents.decision.transmission import Voice
+from agents.decision.transmission import Transmitter
 from agents.formation.graph import Links
 from agents.plugins.laws import Law
 from agents.plugins.predictors import Predictor
@@ -191,7 +191,7 @@ def message_rate(
     setpoint[..., :3] = _asked(position, time, kinds)
     position[..., :2] += _wobble(nature, (count, rows, 2), 1.0 / hz, rng)
     velocity, still = np.zeros((rows, 3)), np.zeros((rows, 3))
-    voice = Voice(trigger, rows, predictor, kinds=kinds)
+    voice = Transmitter(trigger, rows, predictor, kinds=kinds)
     heard = position[:, links.speaker]
     spoken = 0
     for tick in range(count):

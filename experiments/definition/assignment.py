@@ -16,13 +16,13 @@ from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, hover, kinds
 from experiments.definition.experiment import Experiment, Hybrid
-from experiments.definition.formation import Pattern, anchors_of
+from experiments.definition.formation import FormationArrays, anchors_of
 from experiments.definition.links import parse_links
 
 
 def all_links(experiment: Experiment) -> Links:
     """Every link that the formation may have, with the targets of the beginning; rows in the order of the file."""
-    return Pattern.of(experiment, tuple(experiment.robots)).links
+    return FormationArrays.of(experiment, tuple(experiment.robots)).links
 
 
 def measured(experiment: Experiment) -> list[str]:
@@ -49,7 +49,7 @@ def guided(experiment: Experiment) -> tuple[str, ...]:
 def heard_links(experiment: Experiment) -> Links:
     """Every link on which robots hear each other: those for the formation, then those that only avoidance needs."""
     names = tuple(experiment.robots)
-    pattern = Pattern.of(experiment, names).without_listeners(_rows(experiment, guided(experiment)))
+    pattern = FormationArrays.of(experiment, names).without_listeners(_rows(experiment, guided(experiment)))
     return pattern.links.and_then(watch_links(experiment))
 
 
@@ -177,7 +177,7 @@ def _assign(experiment: Experiment, names: Sequence[str], copies: int, *, centra
     rows, steered = _rows(experiment, names), guided(experiment)
     others = [name for name in everyone if (name in steered) != centrally]
     mine = [name for name in names if name not in others]
-    pattern = Pattern.of(experiment, everyone).without_listeners(_rows(experiment, others)).heard_by(rows)
+    pattern = FormationArrays.of(experiment, everyone).without_listeners(_rows(experiment, others)).heard_by(rows)
     watched = links([], [], []) if centrally else watch_links(experiment).of(rows)
     anchors = anchors_of(experiment, names, only=mine)
     only_watched = np.repeat([False, True], [len(pattern.links), len(watched)])

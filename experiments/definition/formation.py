@@ -22,7 +22,7 @@ AT_ONCE: Final = 200_000  # errors of links that are held in memory at once
 
 
 @dataclass(frozen=True)
-class Pattern:
+class FormationArrays:
     """The links that there may be, with their targets of the beginning; what becomes of them, and when they are there.
 
     Attributes:
@@ -36,7 +36,7 @@ class Pattern:
     presence: Presence | None
 
     @classmethod
-    def of(cls, experiment: Experiment, names: Sequence[str]) -> Pattern:
+    def of(cls, experiment: Experiment, names: Sequence[str]) -> FormationArrays:
         """The links between robots; `names` are the rows, and links with an end elsewhere are left out."""
         row = {name: number for number, name in enumerate(names)}
         there = [link for link in one_way_links(experiment) if link.listener in row and link.speaker in row]
@@ -54,28 +54,30 @@ class Pattern:
         )
         return cls(links, _changes_of(experiment, there), _presence_of(there))
 
-    def take(self, which: Index) -> Pattern:
+    def take(self, which: Index) -> FormationArrays:
         """Some of the links, or the same in another order."""
         changes = tuple(change.take(which) for change in self.changes)
-        return Pattern(self.links.take(which), changes, None if self.presence is None else self.presence.take(which))
+        return FormationArrays(
+            self.links.take(which), changes, None if self.presence is None else self.presence.take(which)
+        )
 
-    def heard_by(self, rows: Index) -> Pattern:
+    def heard_by(self, rows: Index) -> FormationArrays:
         """The links on which these rows listen, as `Links.of` gives them."""
         at, listener = self.links.heard_by(rows)
         mine = self.take(at)
         return replace(mine, links=replace(mine.links, listener=listener))
 
-    def without_listeners(self, rows: Index) -> Pattern:
+    def without_listeners(self, rows: Index) -> FormationArrays:
         """The links on which others than these rows listen."""
         return self.take(np.flatnonzero(~np.isin(self.links.listener, rows))) if len(rows) else self
 
-    def and_then(self, others: Links) -> Pattern:
+    def and_then(self, others: Links) -> FormationArrays:
         """With other links behind them, which do not change and are always there."""
         changes = tuple(change.padded(len(others)) for change in self.changes)
         presence = None if self.presence is None else self.presence.padded(len(others))
-        return Pattern(self.links.and_then(others), changes, presence)
+        return FormationArrays(self.links.and_then(others), changes, presence)
 
-    def repeated(self, times: int, rows: int) -> Pattern:
+    def repeated(self, times: int, rows: int) -> FormationArrays:
         """The same in `times` copies of an experiment of `rows` robots, one copy behind the other."""
         many = self.take(np.tile(np.arange(len(self.links)), times))
         return replace(many, links=self.links.repeated(times, rows))
@@ -98,7 +100,7 @@ class Pattern:
         return there
 
 
-def errors(law: Law, pattern: Pattern, time: Array, position: Array) -> Array:
+def errors(law: Law, pattern: FormationArrays, time: Array, position: Array) -> Array:
     """Error of each link (T, E) as the law measures it; NaN where the link is not there or an end is unknown.
 
     Args:
@@ -119,7 +121,7 @@ def errors(law: Law, pattern: Pattern, time: Array, position: Array) -> Array:
     return error if there is None else np.where(there, error, np.nan)
 
 
-def _errors(law: Law, pattern: Pattern, time: Array, position: Array) -> Array:
+def _errors(law: Law, pattern: FormationArrays, time: Array, position: Array) -> Array:
     links, (count, rows) = pattern.links, position.shape[:2]
     many = links.repeated(count, rows)
     if pattern.changes:

@@ -19,7 +19,7 @@ RELEASE: Final = 1.1  # of the range: what separates coming from going, so that 
 
 
 @dataclass(frozen=True)
-class Wanted:
+class LinkTarget:
     """What a one-way link asks for: see `agents.formation.graph.Links`."""
 
     wants: int
@@ -46,7 +46,7 @@ class OneWay:
 
     listener: str
     speaker: str
-    wanted: Wanted
+    wanted: LinkTarget
     gain: float
     since: float = 0.0
     until: float = math.inf
@@ -88,7 +88,7 @@ def one_way_links(experiment: Experiment) -> list[OneWay]:
             found.append(OneWay(listener, speaker, wanted, gain, given.from_s, until, reach, release, text))
     if near is not None and near.distance is not None:
         there = {(link.listener, link.speaker) for link in found}
-        wanted = Wanted(BY_DISTANCE, near.distance)
+        wanted = LinkTarget(BY_DISTANCE, near.distance)
         gain = _gain(experiment, BY_DISTANCE)
         found += [
             OneWay(a, b, wanted, gain, reach=reach, release=release)
@@ -112,7 +112,7 @@ def parse_links(experiment: Experiment) -> list[tuple[str, str, float, float]]:
     return [(link.listener, link.speaker, link.wanted.distance, link.gain) for link in one_way_links(experiment)]
 
 
-def target(experiment: Experiment, text: str, given: Target | float, listener: str) -> Wanted:
+def target(experiment: Experiment, text: str, given: Target | float, listener: str) -> LinkTarget:
     """What a link asks of one of its ends, each way that it can be told.
 
     Args:
@@ -123,19 +123,19 @@ def target(experiment: Experiment, text: str, given: Target | float, listener: s
     """
     given = given if isinstance(given, Target) else Target(distance=given)
     if given.distance is not None:
-        return Wanted(BY_DISTANCE, given.distance)
+        return LinkTarget(BY_DISTANCE, given.distance)
     second, first = pairs(text)[0]
     sign = 1.0 if listener == second else -1.0
     if given.bearing is not None:
         length = math.hypot(*given.bearing)
         toward = [sign * value / length for value in given.bearing]
-        return Wanted(BY_BEARING, math.nan, UNKNOWN, (*toward, math.nan)[:3])  # type: ignore[arg-type]
+        return LinkTarget(BY_BEARING, math.nan, UNKNOWN, (*toward, math.nan)[:3])  # type: ignore[arg-type]
     offset = list(given.offset or ())
     rise = height(experiment, second) - height(experiment, first)
     x, y, z = (sign * value for value in (offset if len(offset) == 3 else [*offset, rise]))
     length = math.hypot(x, y, z)
     bearing = (x / length, y / length, z / length) if length > 0.0 else UNKNOWN
-    return Wanted(BY_RELATIVE, length, (x, y, z), bearing)
+    return LinkTarget(BY_RELATIVE, length, (x, y, z), bearing)
 
 
 def height(experiment: Experiment, name: str) -> float:

@@ -18,7 +18,7 @@ from agents.formation.graph import Links
 from agents.plugins import registry
 from experiments.definition import assignment
 from experiments.definition.experiment import Experiment
-from experiments.definition.formation import Pattern, errors
+from experiments.definition.formation import FormationArrays, errors
 from experiments.metrics.results import Passage
 from experiments.recording.losses import unrecorded
 from experiments.recording.trace import Trace
@@ -28,7 +28,7 @@ RETURN_S: Final = 3.0  # robots come back one after the other when the network d
 
 def links_of(trace: Trace) -> Links:
     """The links of the experiment in the row numbers of the trace."""
-    return Pattern.of(trace.experiment, trace.robots).links
+    return FormationArrays.of(trace.experiment, trace.robots).links
 
 
 def phase_starts(trace: Trace) -> tuple[float, ...]:
@@ -78,7 +78,7 @@ class LinkErrors:
     @classmethod
     def of(cls, trace: Trace) -> LinkErrors:
         """The errors of a whole trace."""
-        pattern = Pattern.of(trace.experiment, trace.robots)
+        pattern = FormationArrays.of(trace.experiment, trace.robots)
         law = registry.build(registry.LAWS, trace.experiment.formation.law)
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
         error = errors(law, pattern, trace.time, trace.true_position)

@@ -34,7 +34,7 @@ def offset(samples: Sequence[Sample]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Lie:
+class ClockOffset:
     """How one host's clock lay to ours over a run.
 
     Attributes:
@@ -116,10 +116,10 @@ class Correction:
         """A status with its stamp and its start set right."""
         return replace(said, stamp=self(said.robot, said.stamp), started=self(said.robot, said.started))
 
-    def lies(self) -> tuple[Lie, ...]:
+    def lies(self) -> tuple[ClockOffset, ...]:
         """What there is to tell of each host."""
         return tuple(
-            Lie(
+            ClockOffset(
                 host,
                 tuple(measured[-1].robots),
                 measured[0].offset,

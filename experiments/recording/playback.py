@@ -18,7 +18,7 @@ from experiments.definition.assignment import guided
 from experiments.definition.experiment import Experiment
 from experiments.recording.cdr import Undecodable, codec
 from experiments.recording.centre_goals import of_recording
-from experiments.recording.clocks import Correction, Lie
+from experiments.recording.clocks import ClockOffset, Correction
 from experiments.recording.losses import STATUS_S, dropped, lost
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
@@ -152,7 +152,7 @@ class _Content:
             self.goals = [msgspec.structs.replace(g, pose=right(g.robot, g.pose)) for g in self.goals]
         return count
 
-    def lies(self) -> tuple[Lie, ...]:
+    def lies(self) -> tuple[ClockOffset, ...]:
         """How the clocks of other machines lay to the conductor's."""
         return Correction(self.clocks).lies()
 

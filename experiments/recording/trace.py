@@ -14,7 +14,7 @@ from agents.network import messages
 from agents.network.messages import Contact, Event, WorldState
 from agents.plugins import registry
 from experiments.definition.experiment import Experiment
-from experiments.recording.clocks import Lie
+from experiments.recording.clocks import ClockOffset
 
 EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
 
@@ -206,4 +206,4 @@ class Trace:
     shadow_yaw: Array | None = None
     dropped: Index | None = None
     goals: Goals | None = None
-    clocks: tuple[Lie, ...] = ()
+    clocks: tuple[ClockOffset, ...] = ()

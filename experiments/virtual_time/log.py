@@ -57,15 +57,15 @@ def goal_messages(steered: Steered, names: Sequence[str], first: int) -> Iterato
 
 def centre_receipts(
     steered: Steered, sample: Array, first: int, rows: int
-) -> dict[tuple[int, int], list[messages.Followed]]:
+) -> dict[tuple[int, int], list[messages.GoalReceipt]]:
     """Goals that reached the robots of one repetition, by the number of the `sample` (T,) that tells of it, and row."""
     time, row, seq, stamp, pose = steered.followed
     own = (row >= first) & (row < first + rows)
     at = np.searchsorted(sample, time[own] - ROUNDING_S)
-    found: dict[tuple[int, int], list[messages.Followed]] = {}
+    found: dict[tuple[int, int], list[messages.GoalReceipt]] = {}
     columns = (column.tolist() for column in (at, row[own] - first, seq[own], stamp[own], pose[own], time[own]))
     for k, robot, number, sent, taken, acted in zip(*columns, strict=True):
-        news = messages.Followed(number, EPOCH + sent, EPOCH + taken, EPOCH + acted)
+        news = messages.GoalReceipt(number, EPOCH + sent, EPOCH + taken, EPOCH + acted)
         found.setdefault((k, robot), []).append(news)
     return found
 
@@ -274,7 +274,7 @@ class Logbook:
             strict=True,
         )
         heard = self._heard_by_sample()
-        followed: dict[tuple[int, int], list[messages.Followed]] = {}
+        followed: dict[tuple[int, int], list[messages.GoalReceipt]] = {}
         if log.steered is not None:
             followed = centre_receipts(log.steered, log.time, mine.start, len(log.names))
         for k, (t, phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw, *more) in enumerate(samples):
@@ -384,7 +384,8 @@ class Logbook:
                 robots=list(log.names),
                 mirrored=[],
                 obstacles=[
-                    messages.Standing(*each) for each in zip(scene.names, map(tuple, moved[k].tolist()), strict=True)
+                    messages.ObstaclePose(*each)
+                    for each in zip(scene.names, map(tuple, moved[k].tolist()), strict=True)
                 ],
                 contacts=int(np.searchsorted(touched, t, side="right")),
                 refused=0,

@@ -12,7 +12,7 @@ from agents.agent import Agent
 from agents.arrays import Array, Index
 from agents.body.interface import BodyState
 from agents.decision.centralised import Centre
-from agents.decision.transmission import Said
+from agents.decision.transmission import Transmission
 from agents.formation.graph import Links, links
 from agents.network import channel_model, messages
 from agents.network.channel_model import Samples
@@ -224,7 +224,7 @@ class VirtualNetwork:
         self._sent: list[tuple[Any, ...]] = []
         self._heard: list[tuple[Any, ...]] = []
 
-    def carry(self, t: float, state: BodyState) -> Said:
+    def carry(self, t: float, state: BodyState) -> Transmission:
         """The first half of the tick at `t` [s]: what has arrived is heard, and robots speak.
 
         Without any delay, what they say is known to all before the second half; and so are the goals that follow.
@@ -242,7 +242,7 @@ class VirtualNetwork:
                 steering.deliver(t, agent)
         return said
 
-    def _say(self, t: float, said: Said, yaw: Array) -> None:
+    def _say(self, t: float, said: Transmission, yaw: Array) -> None:
         """Robots speak to those who listen. Before the common start nothing is lost."""
         speak, start = said.rows, float(self._agent.life.start_at.min())
         self._seq[speak] += 1

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from agents.arrays import norm
-from agents.decision.transmission import Voice
+from agents.decision.transmission import Transmitter
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
 
@@ -58,7 +58,7 @@ class Play:
 
     def __init__(self, trigger: Trigger, signal: Signal, *, predictor: Predictor = HOLD, dt: float = DT) -> None:
         rows = signal.position.shape[1]
-        voice = Voice(trigger, rows, predictor)
+        voice = Transmitter(trigger, rows, predictor)
         fired, before, after = [], [], []
         for k in range(len(signal.position)):
             t = k * dt

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.clock import SLEW, STEP_S, Clock, said
-from agents.decision.neighbours import Hearing
+from agents.decision.neighbours import NeighbourStates
 from agents.formation.graph import links
 from agents.plugins.predictors import HOLD, ConstantVelocity, Predictor
 from experiments.real_time.hosts.launcher import Launcher
@@ -27,7 +27,7 @@ def misbelieved(stamp: float, predictor: Predictor) -> float:
 
 def believed(stamp: float, predictor: Predictor) -> float:
     """Where along x the listener believes the neighbour to be [m]."""
-    hearing = Hearing(links([(0, 1)], [0.5], [1.0]), None, 1.0)
+    hearing = NeighbourStates(links([(0, 1)], [0.5], [1.0]), None, 1.0)
     where = np.array([[SPEED * T, 0.0, 0.0]])
     at = np.array([0])
     hearing.hear(at, where, np.array([[SPEED, 0.0, 0.0]]), np.array([stamp]), np.array([T]))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from agents.body.limits import Limits
 from agents.decision.lifecycle import AIRBORNE, DONE, LANDING, READY, RUNNING
-from agents.safety.detection import LATE_SHARE, SILENT_S, Outside, lean, leaning
+from agents.safety.detection import LATE_SHARE, SILENT_S, ProcessHealth, lean, leaning
 from agents.safety.hazards import RULES, Cause, Hazards, Outcome, Sighting, rules
 from agents.safety.landing import PATIENCE_S
 from experiments.definition.experiment import Formation, Robot, Safety
@@ -335,7 +335,7 @@ def test_without_a_conductor(choice, phase):
 
 
 def test_a_control_loop_that_hardly_runs_holds_and_then_lands():
-    outside = Outside()
+    outside = ProcessHealth()
     for _ in range(500):
         outside.ticked(4, DT)
     assert outside.late == pytest.approx(0.8)  # 20 Hz is slow, not hopeless

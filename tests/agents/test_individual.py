@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from agents.arrays import every, some, span
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
-from agents.decision.position_control import REACHED, TURNED, Individual, drive, wrap
+from agents.decision.position_control import REACHED, TURNED, PositionController, drive, wrap
 from twins.models.differential import Differential
 
 FEW = settings(max_examples=25)
@@ -20,7 +20,7 @@ NOWHERE = np.full((1, 3), np.nan)
 
 def run(kinds, start, yaw, *, goal, toward, seconds, dt=0.01):
     """Drives twins to their goals: positions (T, n, 3), yaws (T, n), setpoints (T, n, 4)."""
-    twin, control = Differential(kinds, start, yaw, dt), Individual(kinds)
+    twin, control = Differential(kinds, start, yaw, dt), PositionController(kinds)
     positions, yaws, setpoints = [], [], []
     for _ in range(round(seconds / dt)):
         setpoint = control.setpoint(goal, toward, twin.position, twin.yaw)
@@ -91,7 +91,7 @@ def test_they_choose_one_end_and_arrive_wherever_the_goal_lies(late):
     kinds, (yaw, bearing, distance) = tuple(way[0] for way in ways), np.array([way[1:] for way in ways]).T
     goal = distance[:, None] * np.stack([np.cos(yaw + bearing), np.sin(yaw + bearing), np.zeros(len(ways))], axis=1)
     goal[(yaw == 0.0) & (np.abs(goal[:, 0]) < 1e-12), 0] = 0.0
-    twin, control = Differential(kinds, np.zeros_like(goal), yaw, 0.02), Individual(kinds)
+    twin, control = Differential(kinds, np.zeros_like(goal), yaw, 0.02), PositionController(kinds)
     last, changes = np.zeros(len(ways)), np.zeros(len(ways))
     seen = [(twin.position.copy(), twin.yaw.copy())] * late
     for _ in range(800):
@@ -116,7 +116,7 @@ def test_farias_law():
 
 
 def test_position_and_velocity_robots():
-    control = Individual((CRAZYFLIE, TELLO, TELLO))
+    control = PositionController((CRAZYFLIE, TELLO, TELLO))
     goal = np.array([[1.0, 2.0, 0.8], [0.3, -0.1, 0.9], [9.0, -9.0, 0.8]])
     toward = np.array([0.4, math.pi - 0.1, np.nan])
     position, yaw = np.array([[0, 0, 0.8], [0, 0, 0.8], [0, 0, 0.8]]), np.array([0.0, -math.pi + 0.1, 1.0])
@@ -137,10 +137,10 @@ def test_rows_are_controlled_as_if_each_were_alone(seed):
     yaw, toward = rng.uniform(-4, 4, (2, 6))
     toward[rng.random(6) < 0.3] = np.nan
     goal[rng.random(6) < 0.1] = np.nan
-    whole = Individual(kinds).setpoint(goal, toward, position, yaw)
+    whole = PositionController(kinds).setpoint(goal, toward, position, yaw)
     for row in range(6):
         one = slice(row, row + 1)
-        alone = Individual(kinds[one]).setpoint(goal[one], toward[one], position[one], yaw[one])
+        alone = PositionController(kinds[one]).setpoint(goal[one], toward[one], position[one], yaw[one])
         np.testing.assert_array_equal(alone[0], whole[row])
     broken = np.isnan(goal).any(axis=1)
     assert np.isfinite(whole[~broken]).all()
@@ -153,7 +153,7 @@ def test_what_is_not_known_gives_no_number_and_no_warning(kind, missing):
     given_ = {"goal": np.ones((1, 3)), "position": np.zeros((1, 3)), "yaw": np.zeros(1)}
     given_[missing] = np.full_like(given_[missing], np.nan)
     toward = np.array([0.3])
-    setpoint = Individual((kind,)).setpoint(given_["goal"], toward, given_["position"], given_["yaw"])
+    setpoint = PositionController((kind,)).setpoint(given_["goal"], toward, given_["position"], given_["yaw"])
     if kind.takes == "position" and missing != "goal":
         np.testing.assert_array_equal(setpoint, [[1.0, 1.0, 1.0, 0.3]])
     elif kind.takes == "velocity" and missing == "yaw":

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from agents.body.interface import BodyState
-from agents.decision.lifecycle import DONE, LANDING, Duties
-from agents.decision.neighbours import Hearing
+from agents.decision.lifecycle import DONE, LANDING, BodyCommands
+from agents.decision.neighbours import NeighbourStates
 from agents.safety.hazards import Cause
 from agents.safety.landing import NEAR, PATIENCE_S, ROOM, Landing
 from agents.safety.setpoint_filter import Safety
@@ -41,7 +41,7 @@ class Bench:
         )
         self.assignment = assignment = assign.assign(experiment, tuple(robots))
         self.landing = Landing(assignment)
-        self.hearing = Hearing(assignment.links, None, 1.0)
+        self.hearing = NeighbourStates(assignment.links, None, 1.0)
         self.hearing.find(np.arange(len(assignment.links)))
         self.safety = Safety(assignment.kinds, assignment.limits)
         self.position = np.array(position, dtype=float)
@@ -66,7 +66,7 @@ class Bench:
             self.position, np.zeros(len(every)), np.ones(len(every)), self.flies & (self.phase != DONE),
         )  # fmt: skip
         where = self.safety.where(state.position, state.yaw, self.t - state.time)
-        duties = Duties(NOBODY, np.flatnonzero(self.asked), NOBODY) if self.asked.any() else None
+        duties = BodyCommands(NOBODY, np.flatnonzero(self.asked), NOBODY) if self.asked.any() else None
         self.asked[:] = False
         out = self.landing.direct(self.t, duties, state, where, hearing=self.hearing, late=self.late, phase=self.phase)
         if out is not None:

@@ -16,7 +16,7 @@ import zenoh
 from agents.network.endpoints import EndpointError, free_endpoint
 from agents.network.messages import JSON, MSGPACK, Stop
 from agents.network.pubsub import (
-    Alarm,
+    ImmediateSubscriber,
     alive_token,
     alive_watch,
     last_value,
@@ -509,7 +509,7 @@ def test_an_alarm_is_obeyed_at_once_and_keeps_what_came(router, eventually):
     ]
     with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
         obeyed = []
-        alarm = Alarm(robot, "park/estop", obeyed.append, depth=2)
+        alarm = ImmediateSubscriber(robot, "park/estop", obeyed.append, depth=2)
         speaker = publisher(ui, "park/estop", JSON)
         eventually(lambda: speaker.matching_status.matching)
         ui.delete("park/estop")  # no stop
@@ -530,7 +530,7 @@ def test_a_stop_waits_for_the_loop_only_after_it_was_obeyed():
     """A loop that polls in between would think that its motors are off, and then they are cut for ever."""
     seen = []
     net = Net()
-    alarm = Alarm(net.session, "park/estop", lambda _stop: seen.append(alarm.try_recv()))
+    alarm = ImmediateSubscriber(net.session, "park/estop", lambda _stop: seen.append(alarm.try_recv()))
     net.deliver(b"park/estop\0text/plain\0stop")
     assert seen == [None]
     assert alarm.try_recv() == Stop("an unknown sender", "stop")
@@ -538,7 +538,7 @@ def test_a_stop_waits_for_the_loop_only_after_it_was_obeyed():
     def fails(_stop):
         raise OSError("a body that cannot be told")
 
-    alarm = Alarm(net.session, "park/estop", fails)
+    alarm = ImmediateSubscriber(net.session, "park/estop", fails)
     with pytest.raises(OSError, match="cannot be told"):
         net.deliver(b"park/estop\0text/plain\0stop")
     assert alarm.try_recv() == Stop("an unknown sender", "stop")

@@ -9,7 +9,7 @@ from agents.body.interface import BodyState, Rays
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.body.limits import Limits
 from agents.decision.neighbours import Heard
-from agents.decision.perception import AHEAD_S, DESCENT_S, REACH, SCAN_S, Sight
+from agents.decision.perception import AHEAD_S, DESCENT_S, REACH, SCAN_S, Perception
 from agents.formation.graph import links
 
 LIMITS = Limits(np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 2.5]), speed=0.5)
@@ -41,11 +41,11 @@ def rays(row, bearing, distance, *, elevation=0.0, time=0.0):
 
 def pair(kind=KHEPERA4, other=TURTLEBOT3, clearance=0.1, **parts):
     """One row, that hears another robot."""
-    return Sight((kind,), (kind, other), links([(0, 1)], [1.0], [1.0]), LIMITS, clearance, **parts)
+    return Perception((kind,), (kind, other), links([(0, 1)], [1.0], [1.0]), LIMITS, clearance, **parts)
 
 
 def alone(kind=KHEPERA4):
-    return Sight((kind,), (kind,), links([], [], []), LIMITS, 0.1)
+    return Perception((kind,), (kind,), links([], [], []), LIMITS, 0.1)
 
 
 def placed(sight, t, now, told=None):
@@ -63,7 +63,7 @@ def test_a_velocity_that_no_robot_has_is_not_known(absurd):
 
 
 def test_a_row_knows_its_kind_its_pose_and_the_lower_of_two_limits():
-    sight = Sight((KHEPERA4, TELLO, CRAZYFLIE), (KHEPERA4,), links([], [], []), LIMITS, 0.1)
+    sight = Perception((KHEPERA4, TELLO, CRAZYFLIE), (KHEPERA4,), links([], [], []), LIMITS, 0.1)
     now = state([[0, 0, 0], [1, 0, 1], [2, 0, 1]], yaw=[1, 2, 3], velocity=[[0.1, 0, 0], [np.nan] * 3, [0, 0.2, 0]])
     own, near = sight.see(0.0, now, Heard.nothing(0))
     assert own.speed.tolist() == [KHEPERA4.speed, 0.5, 0.5]
@@ -235,7 +235,7 @@ def test_rows_see_for_themselves_whatever_the_order_of_their_rays():
 
     def seen(order):
         scan = rays(np.array(row)[order], np.array(bearing)[order], np.array(distance)[order])
-        _, near = Sight(kinds, kinds, net, LIMITS, 0.1).see(0.0, state(place, rays=scan), told)
+        _, near = Perception(kinds, kinds, net, LIMITS, 0.1).see(0.0, state(place, rays=scan), told)
         return sorted(zip(near.row.tolist(), near.position.round(9).tolist(), near.heard.tolist(), strict=True))
 
     first = seen([0, 1, 2, 3, 4])

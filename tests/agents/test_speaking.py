@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.body.kinds import CRAZYFLIE, TELLO
-from agents.decision.transmission import LowPass, Voice
+from agents.decision.transmission import LowPass, Transmitter
 from agents.plugins.predictors import ConstantVelocity
 from agents.plugins.registry import PluginError
 from agents.plugins.triggers import SendOnDelta, Trigger
@@ -86,7 +86,7 @@ def test_who_was_lost_begins_anew_where_it_is():
 
 
 def test_what_is_judged_is_what_is_said():
-    voice = Voice(SendOnDelta(threshold=0.01, smoothing_s=0.5), 1)
+    voice = Transmitter(SendOnDelta(threshold=0.01, smoothing_s=0.5), 1)
     assert say(voice, 0.0, np.zeros((1, 3))).rows.tolist() == [0]
     aside = np.array([[0.1, 0.0, 0.0]])
     quiet = 0
@@ -98,7 +98,7 @@ def test_what_is_judged_is_what_is_said():
 
 
 def test_who_does_not_know_where_it_is_says_nothing():
-    voice = Voice(SendOnDelta(), 2)
+    voice = Transmitter(SendOnDelta(), 2)
     said = say(voice, 0.0, np.array([[np.nan] * 3, [0.0] * 3]))
     assert said.rows.tolist() == [1]
     assert voice.told.time.tolist() == [-np.inf, 0.0]
@@ -110,13 +110,13 @@ def test_a_trigger_that_fails_is_named():
             return view.nothing
 
     with pytest.raises(PluginError, match="the trigger Broken failed: AttributeError"):
-        say(Voice(Broken(), 1), 0.0, np.zeros((1, 3)))
+        say(Transmitter(Broken(), 1), 0.0, np.zeros((1, 3)))
 
 
 def test_an_unknown_velocity_is_said_as_unknown_and_counts_as_standing():
     position, velocity = np.zeros((2, 3)), np.array([[np.nan] * 3, [0.1, 0.0, 0.0]])
     for trigger in (SendOnDelta(threshold=0.01), SendOnDelta(threshold=0.01, smoothing_s=0.5)):
-        voice = Voice(trigger, 2, ConstantVelocity())
+        voice = Transmitter(trigger, 2, ConstantVelocity())
         said = say(voice, 0.0, position, velocity)
         assert said.rows.tolist() == [0, 1]
         np.testing.assert_array_equal(said.velocity, velocity)

@@ -235,7 +235,7 @@ def test_telemetry_that_is_too_long_for_a_payload_goes_in_several(encoding, hear
     state = State(
         "A", 7, 1000.0, "running", (0.1, 0.2, 0.3),
         heard=[Heard("KH01", k, 1000.0 + k, 1000.1 + k, (0.123456,) * 3, (0.0,) * 3) for k in range(heard)],
-        followed=[wire.Followed(k, 1000.0 + k, 1000.1 + k, 1000.2 + k) for k in range(followed)],
+        followed=[wire.GoalReceipt(k, 1000.0 + k, 1000.1 + k, 1000.2 + k) for k in range(followed)],
     )  # fmt: skip
     payloads = list(wire.payloads(state, encoding))
     parts = [wire.decode(payload, wire.MIME[encoding], State) for payload in payloads]

@@ -14,7 +14,7 @@ import types
 import numpy as np
 
 from agents.body.interface import BodyError
-from agents.decision.position_control import Individual
+from agents.decision.position_control import PositionController
 from bridges.tello import body as bridge
 from bridges.tello.body import open_tello
 from tests.twins.loopback import Served, reached, request
@@ -29,7 +29,7 @@ class Flight:
 
     def __init__(self, body, twins, rows):
         self.body, self.twins = body, twins  # (device, row of the device) per row of the body
-        self.individual = Individual([rows.kinds[0]] * len(rows.names))
+        self.individual = PositionController([rows.kinds[0]] * len(rows.names))
         self.located = np.ones(len(rows.names), dtype=bool)
         self.goal = np.full((len(rows.names), 3), np.nan)
         self.toward = np.zeros(len(rows.names))

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from agents.body.interface import BodyError
 from agents.body.kinds import KHEPERA4
-from agents.decision.position_control import Individual
+from agents.decision.position_control import PositionController
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import body as khepera4
 from bridges.khepera4.body import OPEN_S, open_khepera4
@@ -51,7 +51,7 @@ class Drive:
         begin = time.monotonic()
         self.state = self.body.read(t)
         if self.goal is not None:
-            law = Individual([KHEPERA4] * len(self.goal))
+            law = PositionController([KHEPERA4] * len(self.goal))
             free = np.full(len(self.goal), np.nan)
             self.body.command(law.setpoint(self.goal, free, self.state.position, self.state.yaw))
         self.slowest = max(self.slowest, time.monotonic() - begin)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from agents.network.messages import Contact, Event, Heard, HostClock, Pose, Standing, State, Status, WorldState
+from agents.network.messages import Contact, Event, Heard, HostClock, ObstaclePose, Pose, State, Status, WorldState
 from experiments.definition.experiment import Experiment, Rates, Robot
 from experiments.recording.writer import Recording
 
@@ -118,7 +118,7 @@ def world(at, engine="pymunk", **more):
         "paused": False,
         "robots": ["TB01"],
         "mirrored": ["CF01"],
-        "obstacles": [Standing("box", (1.0, 0.5 * at, 0.1)), Standing("post", (0.0, 0.0, 0.0))],
+        "obstacles": [ObstaclePose("box", (1.0, 0.5 * at, 0.1)), ObstaclePose("post", (0.0, 0.0, 0.0))],
         "contacts": 2,
         "refused": 0,
         "malformed": 1,

@@ -17,7 +17,7 @@ from experiments.definition.experiment import Experiment, Robot
 from experiments.file import document
 from experiments.real_time.conductor import hot_changes
 from experiments.real_time.conductor.hot_changes import HotChanges
-from experiments.real_time.conductor.run_view import Seen
+from experiments.real_time.conductor.run_view import RobotView
 
 KEYS = Keys()
 START = 1000.0
@@ -144,7 +144,7 @@ class Stage:
         spare = Robot(kind="crazyflie", start=[0.8, 0.8], hover=0.5)
         experiment = msgspec.structs.replace(document.read("triangle").experiment, spares={"S1": spare}, **more)
         self.experiment: Experiment = experiment
-        self.robots = {name: Seen(place=(*robot.start[:2], 0.0)) for name, robot in experiment.robots.items()}  # type: ignore[arg-type]
+        self.robots = {name: RobotView(place=(*robot.start[:2], 0.0)) for name, robot in experiment.robots.items()}  # type: ignore[arg-type]
         self.hung: set[str] = set()
         self._pid = 1
         self.view = View(self)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.network.messages import Followed, HostClock, State
+from agents.network.messages import GoalReceipt, HostClock, State
 from experiments.recording.clocks import Correction, Sample, offset
 
 SMALL = st.floats(0.0, 0.5)
@@ -50,7 +50,7 @@ def test_goals_on_the_way_are_as_late_as_they_were():
     drift, true = 50e-6, 300.0
     right = Correction([measured("lab2", 0.0, 0.2), measured("lab2", 600.0, 0.23)])
     pose, acted = true * (1 + drift), (true + 0.1) * (1 + drift)
-    followed, rest = [Followed(7, 300.05, pose, acted)], (0.0, 0.0, 0.0)
+    followed, rest = [GoalReceipt(7, 300.05, pose, acted)], (0.0, 0.0, 0.0)
     said = State("CF01", 1, acted, "running", rest, rest, 0.0, None, None, 0.0, followed=followed)
     goal = right.state(said).followed[0]
     assert goal.stamp == 300.05, "the centre runs where the conductor does"

@@ -9,7 +9,7 @@ from agents.plugins import registry
 from experiments.check import check
 from experiments.check.realisation import contradictions
 from experiments.definition.experiment import Start
-from experiments.definition.formation import Pattern, anchors_of, errors
+from experiments.definition.formation import FormationArrays, anchors_of, errors
 from experiments.definition.links import one_way_links
 from experiments.file import document
 from experiments.metrics.signals import net_rotation
@@ -89,7 +89,7 @@ def flown(experiment, seeds=(1,)):
     running = (log.time >= 0.0) & (log.time < experiment.duration_s)
     time, position = log.time[running], log.true_position[running][:, : len(log.names)]
     law = registry.build(registry.LAWS, experiment.formation.law)
-    return time, position, errors(law, Pattern.of(experiment, log.names), time, position)
+    return time, position, errors(law, FormationArrays.of(experiment, log.names), time, position)
 
 
 def codes(given):
@@ -119,7 +119,7 @@ def test_each_link_has_the_gain_of_what_it_asks_for(written):
 
 def test_a_law_of_distances_takes_offsets_for_distances(written):
     given = written(SQUARE.replace('"displacement"', '"distance"'))
-    links = Pattern.of(given.experiment, "ABCD").links
+    links = FormationArrays.of(given.experiment, "ABCD").links
     assert links.distance[:2].tolist() == pytest.approx([0.6, np.hypot(0.6, 0.6)])
     assert "realisable" in codes(given)
 
@@ -301,9 +301,9 @@ def test_offsets_that_do_not_add_up(written):
     found = codes(given)["offsets-contradict"]
     assert (found.severity, found.where.rsplit(":", 2)[1]) == ("error", "24")
     assert "100.0 mm" in found.message
-    (first, *_) = contradictions(Pattern.of(given.experiment, "ABCD").links)
+    (first, *_) = contradictions(FormationArrays.of(given.experiment, "ABCD").links)
     assert sorted(first.rows) == [0, 1, 2, 3]
-    assert contradictions(Pattern.of(written(SQUARE).experiment, "ABCD").links) == []
+    assert contradictions(FormationArrays.of(written(SQUARE).experiment, "ABCD").links) == []
 
 
 def test_what_check_says_of_formations(written):

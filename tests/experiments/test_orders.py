@@ -11,7 +11,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
-from experiments.real_time.conductor.run_view import Overview, Progress, Seen
+from experiments.real_time.conductor.run_view import Overview, Progress, RobotView
 from tests.conftest import RouterProcess
 from tests.experiments.recordings import START, status
 
@@ -58,7 +58,7 @@ def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProc
 def test_when_a_robot_began_is_its_first_status_of_the_experiment() -> None:
     view = Overview.__new__(Overview)
     view.clock = Clock()
-    view._progress = Progress("case", "running", None, 1.0, {"TB01": Seen()})
+    view._progress = Progress("case", "running", None, 1.0, {"TB01": RobotView()})
     view.robots = view._progress.robots
     view.say = lambda *_, **__: None  # type: ignore[method-assign]
     for phase, at in (("airborne", -0.1), ("running", 0.28), ("running", 1.28), ("landing", 2.0)):

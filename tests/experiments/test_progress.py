@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from experiments.real_time.conductor.run_view import Progress, Seen
+from experiments.real_time.conductor.run_view import Progress, RobotView
 from tools.commands.progress import Lines, Table
 
 
@@ -14,7 +14,7 @@ from tools.commands.progress import Lines, Table
 def test_errors_from_before_the_router_fell_silent_are_not_printed_as_news(
     kind: type[Lines | Table], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    progress = Progress("event", "formation", 4.0, 15.0, {"KH01": Seen(error=0.123)})
+    progress = Progress("event", "formation", 4.0, 15.0, {"KH01": RobotView(error=0.123)})
     with kind() as show:
         show(progress)
     assert "0.123" in capsys.readouterr().err or kind is Table

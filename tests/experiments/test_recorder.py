@@ -50,7 +50,10 @@ def test_what_the_world_says_is_taken_down_if_it_can_be_true(
         (KEYS.contact, msgspec.structs.replace(touched(0.1), impulse=math.nan)),
         (KEYS.contact, msgspec.structs.replace(touched(0.1), stamp=math.inf)),
         (KEYS.contact, world(0.1)),
-        (KEYS.world, msgspec.structs.replace(world(0.1), obstacles=[messages.Standing("box", (0.0, math.nan, 0.0))])),
+        (
+            KEYS.world,
+            msgspec.structs.replace(world(0.1), obstacles=[messages.ObstaclePose("box", (0.0, math.nan, 0.0))]),
+        ),
         (KEYS.world, touched(0.1)),
         (KEYS.world, world(0.2)),
         (KEYS.contact, touched(0.3)),

@@ -32,7 +32,7 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
         "pose": [messages.Pose(robot, seq + k, now + 0.01 * k, place, rest, 0.1) for k in range(2)],
         "state": [
             messages.State(robot, seq, now, "running", place, rest, 0.1, place, (0.1, 0.2, 0.0, 0.0), 0.1, place,
-            0.1, [heard], followed=[messages.Followed(seq, now, now, now)]),
+            0.1, [heard], followed=[messages.GoalReceipt(seq, now, now, now)]),
             messages.State(robot, seq, now, "idle", place, rest, 0.1, None, None, 0.1, attitude=(1.0, 0.0, 0.0, 0.0)),
         ],
         "status": [status],
@@ -56,7 +56,7 @@ def of_all() -> dict[str, list[object]]:
     now = time.time()
     world = messages.WorldState(
         now, "pymunk", 1.0, 1.0, 0.1, False, ["KH01"], ["CF01"],
-        [messages.Standing("box", (0.1, 0.2, 0.3))], 1, 0, 0, "",
+        [messages.ObstaclePose("box", (0.1, 0.2, 0.3))], 1, 0, 0, "",
     )  # fmt: skip
     centre = messages.CentreState(
         stamp=now, robots=["KH01"], missing=["KH02"], load=0.1, late_s=0.001, decisions=5, missed=1, goals=5,

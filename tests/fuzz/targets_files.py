@@ -177,7 +177,7 @@ def recording_bytes(*, plain: bool) -> list[bytes]:
                     False,
                     ["KH01"],
                     [],
-                    [wire.Standing("b", (0.0, 0.0, 0.0))],
+                    [wire.ObstaclePose("b", (0.0, 0.0, 0.0))],
                     1,
                     0,
                     0,

@@ -278,8 +278,8 @@ def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
     assert desk.world is not None
     assert desk.world.robots == ["KH01", "CF01", "TE01", "KH02"]
     assert desk.world.obstacles == [
-        messages.Standing("post", (1.5, 1.5, 0.0)),
-        messages.Standing("box", (-1.0, -1.0, 0.0)),
+        messages.ObstaclePose("post", (1.5, 1.5, 0.0)),
+        messages.ObstaclePose("box", (-1.0, -1.0, 0.0)),
     ]
 
     assert desk.give("remove", name="CF01").ok

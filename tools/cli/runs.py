@@ -35,13 +35,13 @@ def run(
     identity: As = "operator",
 ) -> None:
     """Run an experiment: one process per robot, or in virtual time."""
-    from experiments.real_time.conductor.conduct import Staging  # noqa: PLC0415
+    from experiments.real_time.conductor.conduct import RunOptions  # noqa: PLC0415
     from tools.commands.run import run as command  # noqa: PLC0415
 
     raise typer.Exit(
         command(
             file,
-            Staging(case or [], bodies, here, lab, identity),
+            RunOptions(case or [], bodies, here, lab, identity),
             virtual=virtual,
             out=out,
             seed=seed,

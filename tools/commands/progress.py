@@ -7,7 +7,7 @@ import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from experiments.real_time.conductor.run_view import FROZEN_S, OUTPUT, News, Progress, Seen, Shown
+from experiments.real_time.conductor.run_view import FROZEN_S, OUTPUT, News, Progress, RobotView, Shown
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -104,7 +104,7 @@ def _silence(progress: Progress) -> str:
     return f"no router answers for {silent_s:.1f} s" if silent_s > 0.0 else ""
 
 
-def _cells(seen: Seen, now: float) -> tuple[str, ...]:
+def _cells(seen: RobotView, now: float) -> tuple[str, ...]:
     status = seen.status
     out = f"[{'red' if seen.out == 'lost' else 'dim'}]{seen.out}[/]"
     if status is None:

@@ -17,7 +17,7 @@ from experiments.file import catalogue, document
 from experiments.file.document import chosen, load
 from experiments.file.problems import DocumentError, Problem
 from experiments.metrics.statistics import across_seeds
-from experiments.real_time.conductor.conduct import Staging, conduct
+from experiments.real_time.conductor.conduct import RunOptions, conduct
 from experiments.real_time.conductor.run_view import Emergency
 from experiments.recording.reader import RecordingError
 from experiments.recording.run_folder import SOURCE, new_folder, remove_unused
@@ -30,7 +30,7 @@ STOPPED: Final = 1  # exit code of a run that an emergency stop has ended
 
 def run(
     file: str,
-    staging: Staging,
+    staging: RunOptions,
     *,
     virtual: bool,
     out: str | None,
@@ -71,7 +71,7 @@ class _Way:
     again: str
 
 
-def _fly(read: document.Document, folder: Path, staging: Staging, way: _Way) -> int:
+def _fly(read: document.Document, folder: Path, staging: RunOptions, way: _Way) -> int:
     """Runs, writes and tells; returns the exit code."""
     virtual, seeds, as_json = way.virtual, way.seeds, way.as_json
     read.keep(folder / SOURCE)
@@ -123,7 +123,7 @@ def _warn(lines: Sequence[str]) -> None:
         print(f"zenpark: {line}", file=sys.stderr)
 
 
-def _refuse(staging: Staging, *, virtual: bool, seeds: int) -> None:
+def _refuse(staging: RunOptions, *, virtual: bool, seeds: int) -> None:
     """Raises DocumentError for options that do not go together."""
     if seeds > 1 and not virtual:
         raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
@@ -198,7 +198,7 @@ def list_all() -> int:
     return 0
 
 
-def _command(file: str, staging: Staging, *, virtual: bool, changes: Sequence[str], seeds: int, anyway: bool) -> str:
+def _command(file: str, staging: RunOptions, *, virtual: bool, changes: Sequence[str], seeds: int, anyway: bool) -> str:
     """What to type for the same run again."""
     parts = ["zenpark", "run", file, *(["--virtual"] if virtual else [])]
     parts += [part for case in staging.cases for part in ("--case", case)]

@@ -24,7 +24,7 @@ from agents.runtime.lifeline import Lifeline
 from experiments.definition.bodies import BODIES
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
-from experiments.real_time.conductor.conduct import Staging, conduct
+from experiments.real_time.conductor.conduct import RunOptions, conduct
 from experiments.real_time.conductor.conductor import RunFailed
 from experiments.real_time.conductor.run_view import Emergency, News, Progress
 from experiments.real_time.conductor.support import StandInError
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             conduct(
                 read,
                 chosen.folder,
-                Staging(cases=chosen.case, bodies=chosen.bodies, here=True),
+                RunOptions(cases=chosen.case, bodies=chosen.bodies, here=True),
                 show=Told(),
                 interrupted=over.is_set,
                 emergency=Emergency(),

@@ -38,7 +38,7 @@ from experiments.recording.run_folder import SOURCE
 
 
 @dataclass(frozen=True)
-class Staging:
+class RunOptions:
     """How an experiment is put on, as far as its file leaves that open.
 
     Attributes:
@@ -60,7 +60,7 @@ class Staging:
 def conduct(
     read: Document,
     folder: Path,
-    staging: Staging,
+    staging: RunOptions,
     *,
     show: Shown,
     interrupted: Callable[[], bool],

@@ -17,10 +17,10 @@ from agents.network import messages
 from agents.network.keys import Keys
 from experiments.definition.assignment import guided
 from experiments.definition.experiment import Experiment
-from experiments.real_time.conductor.crew import Crew
+from experiments.real_time.conductor.crew import CaseProcesses
 from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
 from experiments.real_time.conductor.orders import lead
-from experiments.real_time.conductor.run_view import OUTPUT, Emergency, Overview, Progress, Seen, Show
+from experiments.real_time.conductor.run_view import OUTPUT, Emergency, Overview, Progress, RobotView, Show
 from experiments.real_time.hosts.clock_drift import Drift
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import LAND_S, Launcher
@@ -99,12 +99,12 @@ class Conductor:
         self._clock = launcher.clock = Clock()  # of each case, for all its processes here, however late they start
         steered = guided(experiment)
         self._robots = {
-            name: Seen(error=None if name in steered else 0.0, out="standby" if robot.standby else "")
+            name: RobotView(error=None if name in steered else 0.0, out="standby" if robot.standby else "")
             for name, robot in experiment.robots.items()
         }
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots, clock=self._clock)
         self._starting: set[str] = set()
-        self._crew = Crew(
+        self._crew = CaseProcesses(
             experiment,
             case,
             file=file,
@@ -371,7 +371,7 @@ class Conductor:
             self._view.say("lost", name, "is not on the network any more")
             self._changes.lose(name)
 
-    def _come_back(self, name: str, seen: Seen) -> None:
+    def _come_back(self, name: str, seen: RobotView) -> None:
         """It was only away, or somebody started it again."""
         if name in self._changes.under_way:
             return

@@ -40,7 +40,7 @@ class Death:
     text: str
 
 
-class Crew:
+class CaseProcesses:
     """Starts, watches and ends the processes of one case.
 
     Attributes:

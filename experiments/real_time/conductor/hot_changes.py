@@ -19,7 +19,7 @@ from agents.network.keys import Keys
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.real_time.conductor import replacement
-from experiments.real_time.conductor.crew import Crew
+from experiments.real_time.conductor.crew import CaseProcesses
 from experiments.real_time.conductor.replacement import Refused, in_the_way
 from experiments.real_time.conductor.run_view import FROZEN_S, Overview
 from experiments.real_time.hosts.launcher import LAND_S
@@ -57,7 +57,7 @@ class _Change:
 class HotChanges:
     """Changes of the robots of one case."""
 
-    def __init__(self, experiment: Experiment, crew: Crew, view: Overview, keys: Keys) -> None:
+    def __init__(self, experiment: Experiment, crew: CaseProcesses, view: Overview, keys: Keys) -> None:
         """Refuses everything until `begin`.
 
         Args:

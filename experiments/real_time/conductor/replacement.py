@@ -14,7 +14,7 @@ from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment, Robot
-from experiments.real_time.conductor.run_view import Seen
+from experiments.real_time.conductor.run_view import RobotView
 
 TWIN: Final = "twin"  # a body that is there as long as its process
 OF_BODY: Final = ("body", "start", "hover", "position", "device", "sensors", "ranges")  # what a spare brings along
@@ -101,7 +101,7 @@ MARGIN_M: Final = 0.1  # free space around a robot that begins to move
 
 
 def in_the_way(
-    name: str, place: Sequence[float], robots: Mapping[str, Robot], seen: Mapping[str, Seen], *, body_stays: bool
+    name: str, place: Sequence[float], robots: Mapping[str, Robot], seen: Mapping[str, RobotView], *, body_stays: bool
 ) -> str:
     """Who is too near to a place for a robot to begin there, however high; empty if nobody is.
 

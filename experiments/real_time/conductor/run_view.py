@@ -49,7 +49,7 @@ Out = Literal["", "lost", "removed", "standby"]
 
 
 @dataclass
-class Seen:
+class RobotView:
     """What the conductor knows of a robot.
 
     Attributes:
@@ -111,7 +111,7 @@ class Progress:
     phase: str
     elapsed: float | None
     duration: float
-    robots: dict[str, Seen]
+    robots: dict[str, RobotView]
     events: list[messages.Event] = field(default_factory=list)
     silent_since: float = inf
     clock: Clock = field(default_factory=Clock)
@@ -318,9 +318,9 @@ class Emergency:
         """Who stopped the run, and why; empty if nobody has."""
         return "" if self.said is None else self.said.words
 
-    def listen(self, session: zenoh.Session, keys: Keys) -> pubsub.Alarm:
+    def listen(self, session: zenoh.Session, keys: Keys) -> pubsub.ImmediateSubscriber:
         """Hears stops in a realm, for as long as what is returned is kept."""
-        return pubsub.Alarm(session, keys.estop, self._heed)
+        return pubsub.ImmediateSubscriber(session, keys.estop, self._heed)
 
     @contextmanager
     def throughout(

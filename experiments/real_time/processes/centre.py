@@ -24,7 +24,7 @@ import zenoh
 
 from agents.arrays import Index
 from agents.clock import Clock
-from agents.decision.centralised import Centre, Told
+from agents.decision.centralised import Centre, CentreGoals
 from agents.decision.lifecycle import IDLE, Phase
 from agents.network import messages, pubsub
 from agents.network import session as network
@@ -37,7 +37,7 @@ from agents.network.validation import reach_of
 from agents.plugins import registry
 from agents.runtime.command_line import told_to_end
 from agents.runtime.lifeline import Lifeline
-from agents.runtime.pose_inbox import Coming, Said, Speaker
+from agents.runtime.pose_inbox import Coming, NeighbourSubscription, ReceivedPose
 from agents.runtime.telemetry import resident_mb
 from experiments.definition import link_conditions, mesh
 from experiments.definition.assignment import assign_centre, guided
@@ -76,7 +76,7 @@ class CentreProcess:
         names, rows = self._names, centre.listens.tolist()
         reach, rate = reach_of(assignment.limits.low, assignment.limits.high), experiment.rates.pose_hz
         self._speakers = [
-            Speaker(session, keys, names[row], np.array([link]), reach=reach, rate=rate, depth=DEPTH)
+            NeighbourSubscription(session, keys, names[row], np.array([link]), reach=reach, rate=rate, depth=DEPTH)
             for link, row in enumerate(rows)
         ]
         self._heard: Index = np.zeros(len(rows), dtype=np.intp)
@@ -142,12 +142,12 @@ class CentreProcess:
             self._begun = begun
             self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
 
-    def _begin(self, speaker: Speaker) -> None:
+    def _begin(self, speaker: NeighbourSubscription) -> None:
         """A robot begins a new life."""
         self._channel.forget(speaker.links)
         self.centre.forget(self.centre.listens[speaker.links])
 
-    def _send(self, speaker: Speaker, said: Said, t: float) -> None:
+    def _send(self, speaker: NeighbourSubscription, said: ReceivedPose, t: float) -> None:
         """One pose has come: it is given to the modelled network."""
         pose = said.pose
         start = float(self._start[self._guided].min())
@@ -192,7 +192,7 @@ class CentreProcess:
             self.centre.begin(row, status.origin)
         self._start[row] = status.started - self._utc if status.started > 0.0 else np.inf
 
-    def _tell(self, told: Told, t: float) -> None:
+    def _tell(self, told: CentreGoals, t: float) -> None:
         """Sends goals, rounded as poses are."""
         self._seq += 1
         for k, row in enumerate(told.rows.tolist()):

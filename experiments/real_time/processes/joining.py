@@ -50,7 +50,7 @@ def offered(session: zenoh.Session, keys: Keys, names: Sequence[str]) -> Documen
         pause.wait(LOOK_S)
 
 
-class Tether:
+class ConductorWatch:
     """Ends this process, as SIGTERM does, when the conductor is gone: its robots land first.
 
     Without a router every token is gone: then nobody knows, and the robots do what they do without a router.

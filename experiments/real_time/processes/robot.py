@@ -91,7 +91,7 @@ def fly(
             endpoints = joining.reached(connect or [DEFAULT_ENDPOINT], lab)
             session = stack.enter_context(network.open_session(endpoints, name=f"{names[0]} joins", identity=names[0]))
             read = joining.offered(session, Keys(realm), names)
-            stack.callback(joining.Tether(session, Keys(realm)).close)
+            stack.callback(joining.ConductorWatch(session, Keys(realm)).close)
         elif file == STDIN:
             print(f"{', '.join(names)}: on {socket.gethostname()}, process {os.getpid()}", flush=True)
             read = document.received(told(), "standard input")

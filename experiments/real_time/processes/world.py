@@ -211,7 +211,7 @@ class WorldProcess:
             paused=self.paused,
             robots=self._carried,
             mirrored=exchange.mirrored(),
-            obstacles=[messages.Standing(name, pose) for name, pose in population.obstacles().items()],
+            obstacles=[messages.ObstaclePose(name, pose) for name, pose in population.obstacles().items()],
             contacts=exchange.contacts,
             refused=exchange.refused,
             malformed=exchange.malformed,
