@@ -79,7 +79,7 @@ class Agent:
         life: Phases.
         hazards: What is wrong with the rows, and what is done about it.
         origins: Where rows that came back were told that they began.
-        outside: What only the process around the decision knows: told by it.
+        health: What only the process around the decision knows: told by it.
     """
 
     def __init__(self, assignment: Assignment) -> None:
@@ -103,7 +103,7 @@ class Agent:
         self.life = Lifecycle(flies, assignment.hover, assignment.duration)
         self._voice = Transmitter(assignment.trigger, rows, assignment.predictor, kinds=assignment.kinds)
         self._setpoint = np.full((rows, 4), np.nan)
-        self.outside, self.hazards = ProcessHealth(), Hazards(flies, assignment.limits)
+        self.health, self.hazards = ProcessHealth(), Hazards(flies, assignment.limits)
         self._detector, self._preflight = Detector(assignment), Preflight(assignment)
         self.begun = False
         self._decided = self._asked = -1
@@ -137,35 +137,37 @@ class Agent:
         return self._voice.told
 
     @property
-    def hearing(self) -> NeighbourStates:
+    def neighbours(self) -> NeighbourStates:
         """What was heard on each link, and who takes part in the law."""
         return self.deciding.hearing
 
     @property
     def heard(self) -> Heard:
         """What was heard on each link."""
-        return self.hearing.heard
+        return self.neighbours.heard
 
-    def hear(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
+    def receive(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
         """See `NeighbourStates.hear`."""
-        self.hearing.hear(at, position, velocity, stamp, arrived)
+        self.neighbours.receive(at, position, velocity, stamp, arrived)
 
-    def lose(self, at: Index, t: float) -> None:
+    def mark_lost(self, at: Index, t: float) -> None:
         """See `NeighbourStates.lose`."""
-        self.hearing.lose(at, t)
+        self.neighbours.mark_lost(at, t)
 
-    def find(self, at: Index) -> None:
+    def mark_alive(self, at: Index) -> None:
         """See `NeighbourStates.find`."""
-        self.hearing.find(at)
+        self.neighbours.mark_alive(at)
 
     def forget(self, at: Index) -> None:
         """See `NeighbourStates.forget`."""
-        self.hearing.forget(at)
+        self.neighbours.forget(at)
 
     def hear_goal(self, rows: Index, goal: Array, toward: Array, stamp: Array) -> Mask:
         """See `Guidance.hear`; rows that nobody guides take no goals."""
         return (
-            np.zeros(len(rows), dtype=bool) if self.guidance is None else self.guidance.hear(rows, goal, toward, stamp)
+            np.zeros(len(rows), dtype=bool)
+            if self.guidance is None
+            else self.guidance.receive(rows, goal, toward, stamp)
         )
 
     def hold(self, row: int) -> str:
@@ -204,7 +206,7 @@ class Agent:
 
     def missing(self, row: int) -> list[str]:
         """Neighbours that a row has never heard, or that are gone; likewise its centre."""
-        names = [self.assignment.speakers[s] for s in self.hearing.missing(row)]
+        names = [self.assignment.speakers[s] for s in self.neighbours.missing(row)]
         guidance = self.guidance
         if guidance is not None and self._guided[row] and (guidance.gone < np.inf or guidance.unheard()[row]):
             names.append(CENTRE)
@@ -213,7 +215,7 @@ class Agent:
     def skip(self, ticks: int) -> None:
         """So many ticks come too late to be made: called before each tick, mostly with 0."""
         self.tick += ticks
-        self.outside.ticked(ticks, 1.0 / self.assignment.body_hz)
+        self.health.ticked(ticks, 1.0 / self.assignment.body_hz)
 
     @property
     def sinking(self) -> Mask:
@@ -232,13 +234,13 @@ class Agent:
 
     def speak(self, t: float, state: BodyState) -> Transmission:
         """The first half of a tick: phases move on, and it is decided who speaks. What is said was measured."""
-        self.deciding.settle(t)
+        self.deciding.update_links(t)
         life = self.life
         self._age = t - state.time
         self._where = self._safety.where(state.position, state.yaw, self._age)
         duties = life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
         self._duties = self._landing.direct(
-            t, duties, state, self._where, hearing=self.hearing, late=self.outside.failing, phase=life.phase
+            t, duties, state, self._where, hearing=self.neighbours, late=self.health.failing, phase=life.phase
         )
         assignment = self.assignment
         if life.moved and not self.begun and (life.phase == RUNNING).any():
@@ -280,14 +282,14 @@ class Agent:
             setpoint = self._individual.setpoint(goal, self.toward, state.position, state.yaw)
             verdict = self._safety.check(setpoint, state.position, state.yaw, age, where=where)
         else:
-            own, near = self._sight.see(t, state, self.heard)
+            own, near = self._sight.sense(t, state, self.heard)
             wanted, goal = goal, self._deviate(avoidance, goal, own, near)
             setpoint = self._individual.setpoint(goal, self.toward, state.position, state.yaw)
             verdict = self._safety.check(setpoint, state.position, state.yaw, age, avoidance, own, near, where)
             avoided = verdict.avoided
             if goal is not wanted:
                 avoided = avoided | (np.abs(goal - wanted) > 0.0).any(axis=1)
-        setpoint, changed, self._wild = verdict.setpoint, verdict.changed, verdict.wild
+        setpoint, changed, self._wild = verdict.setpoint, verdict.changed, verdict.not_finite
         if not self.life.all_running:
             phase = self.life.phase
             passive = ((phase < AIRBORNE) | (phase > RUNNING)) & ~aside
@@ -302,10 +304,10 @@ class Agent:
             return self._nobody  # nobody asks any more
         lacks = np.zeros(len(life.phase), dtype=bool)
         if assignment.patience_s is None or t <= assignment.patience_s:
-            lacks[assignment.links.listener[assignment.lacking(self.hearing.greeted)]] = True
+            lacks[assignment.links.listener[assignment.lacking(self.neighbours.greeted)]] = True
             if self.guidance is not None:
                 lacks |= self.guidance.unheard()
-        failing = self._preflight.check(t, state, self._where, self.hearing, self.outside, (lacks, self.missing))
+        failing = self._preflight.check(t, state, self._where, self.neighbours, self.health, (lacks, self.missing))
         lost = self._preflight.lost(t, failing)
         ready = np.ones(len(lacks), dtype=bool)
         for row, reason in failing.items():
@@ -321,7 +323,7 @@ class Agent:
 
     def _heed(self, t: float, state: BodyState) -> None:
         """What is wrong is noticed, and has its consequences: rows hold, land, or have their motors cut."""
-        life, hearing, guidance = self.life, self.hearing, self.guidance
+        life, hearing, guidance = self.life, self.neighbours, self.guidance
         if life.all_running:
             active = cruising = running = self._everybody
             landing = self._nobody
@@ -339,7 +341,7 @@ class Agent:
             self._wild,
             self._landing,
         )
-        seen = self._detector.look(t, state, self._where, hearing, rows, self.outside)
+        seen = self._detector.look(t, state, self._where, hearing, rows, self.health)
         for incident in self.hazards.assess(t, seen, active, landing):
             end = life.stop if incident.outcome == Outcome.CUT else life.land
             end(incident.row, self.hazards.words(incident.cause))
@@ -352,7 +354,7 @@ class Agent:
             self.decisions += 1
             if not self.all_guided:
                 own = running if self.guidance is None else running & ~self._guided
-                own = own if self._where.sure else own & ~self._where.blind
+                own = own if self._where.all_valid else own & ~self._where.invalid
                 new = self.deciding.decide(
                     t, state.position, state.velocity, state.yaw, start=self.life.start_at, running=own
                 )
@@ -371,7 +373,7 @@ class Agent:
     def _holds(self, running: Mask) -> Mask:
         """Which running rows must stay: for their safety, or because no link is there that the law could listen to."""
         held = running & self.hazards.held
-        if len(self.hearing.live) < len(self.assignment.links):
+        if len(self.neighbours.live) < len(self.assignment.links):
             held = held | (running & self.deciding.alone())
         return held
 

@@ -26,14 +26,14 @@ class CentreGoals:
     Attributes:
         rows: Whose.
         goal: (K, 3) [m].
-        toward: (K,) yaw wanted there [rad], NaN for any.
-        rests: (K,) when the pose of that robot was taken on which its goal rests [s].
+        yaw: (K,) yaw wanted there [rad], NaN for any.
+        pose_stamp: (K,) when the pose of that robot was taken on which its goal rests [s].
     """
 
     rows: Index
     goal: Array
-    toward: Array
-    rests: Array
+    yaw: Array
+    pose_stamp: Array
 
 
 class Centre:
@@ -64,7 +64,7 @@ class Centre:
         speaks[assignment.links.speaker] = True
         self.listens: Index = np.flatnonzero(self.guided | speaks)
 
-    def hear(  # noqa: PLR0917 - as `Hearing.hear`
+    def receive(  # noqa: PLR0917 - as `Hearing.hear`
         self, rows: Index, position: Array, velocity: Array, yaw: Array, stamp: Array, arrived: Array
     ) -> None:
         """Poses of `rows` (H,) that arrived, in order of arrival; older samples than known are left out."""
@@ -76,7 +76,7 @@ class Centre:
         poses.stamp[mine], poses.arrived[mine] = stamp[order], arrived[order]
         links = self._links(mine)
         who = self.assignment.links.speaker[links]
-        self.deciding.hearing.hear(
+        self.deciding.hearing.receive(
             links, poses.position[who], poses.velocity[who], poses.stamp[who], poses.arrived[who]
         )
 
@@ -85,15 +85,15 @@ class Centre:
         x, y, z, yaw = origin
         self.deciding.begin(np.array([row]), np.array([[x, y, z]]), np.array([yaw]))
 
-    def lose(self, rows: Index, t: float) -> None:
+    def mark_lost(self, rows: Index, t: float) -> None:
         """The tokens of these robots are gone since `t` [s]."""
         self.poses.gone[rows] = np.minimum(self.poses.gone[rows], t)
-        self.deciding.hearing.lose(self._links(rows), t)
+        self.deciding.hearing.mark_lost(self._links(rows), t)
 
-    def find(self, rows: Index) -> None:
+    def mark_alive(self, rows: Index) -> None:
         """The tokens of these robots are there: they live, whether or not they have something to say."""
         self.poses.gone[rows] = np.inf
-        self.deciding.hearing.find(self._links(rows))
+        self.deciding.hearing.mark_alive(self._links(rows))
 
     def forget(self, rows: Index) -> None:
         """These robots begin a new life: poses of the one before are of another robot."""
@@ -119,7 +119,7 @@ class Centre:
             start: (N,) when each began [s].
         """
         deciding, poses, limits = self.deciding, self.poses, self.assignment.limits
-        deciding.settle(t)
+        deciding.update_links(t)
         # a status that says so may still be on its way, but the start was known before
         phase = np.where((phase == AIRBORNE) & (t >= start - ROUNDING_S), RUNNING, phase)
         known = self.guided & np.isfinite(poses.stamp) & (poses.gone == np.inf)
@@ -184,7 +184,7 @@ class Guidance:
         self.stamp, self.gone = np.full(rows, -np.inf), np.inf
         self.fresh: Mask = np.zeros(rows, dtype=bool)
 
-    def hear(self, rows: Index, goal: Array, toward: Array, stamp: Array) -> Mask:
+    def receive(self, rows: Index, goal: Array, toward: Array, stamp: Array) -> Mask:
         """Goals (H, 3) of `rows` (H,), each once, that arrived: decided at `stamp` (H,) [s]. Which were news."""
         newer = np.asarray((stamp > self.stamp[rows]) & self.guided[rows] & np.isfinite(goal).all(axis=1))
         rows = rows[newer]
@@ -195,11 +195,11 @@ class Guidance:
             self.gone = np.inf
         return newer
 
-    def lose(self, t: float) -> None:
+    def mark_lost(self, t: float) -> None:
         """The centre is gone since `t` [s]; a goal that was decided later is of another one."""
         self.gone = min(self.gone, t)
 
-    def find(self) -> None:
+    def mark_alive(self) -> None:
         """The centre is back, though it may have nothing to say yet."""
         self.gone = np.inf
 

@@ -75,7 +75,7 @@ class Input(View):
         return self._both[1]
 
     @cached_property
-    def gap(self) -> Array:
+    def deviation(self) -> Array:
         """(N,) ‖ε‖ [m]."""
         gap = self.links.most_of_listeners(norm(self.now[0] - self._kept[0]), len(self.position))
         if some(self._anchored):

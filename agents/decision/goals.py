@@ -78,7 +78,7 @@ class GoalComputer:
         self._itineraries = tuple(itineraries)
         self._gated = self._listens & ~planned  # a plan moves its target while nobody looks
 
-    def settle(self, t: float) -> None:
+    def update_links(self, t: float) -> None:
         """Takes in who is there and who is gone at `t` [s]."""
         if self.hearing.unsettled:
             self._links_changed(self.hearing.choose(t))

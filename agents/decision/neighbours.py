@@ -74,7 +74,7 @@ class NeighbourStates:
         self.live: Index = np.zeros(0, dtype=np.intp)
         self.links = links.take(self.live)
 
-    def hear(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
+    def receive(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
         """Poses that arrived on links `at` (H,), in order of arrival; older samples than known are left out."""
         heard = self.heard
         if some(stamp[1:] < stamp[:-1]):  # of several on one link the newest stays, whichever came last
@@ -88,12 +88,12 @@ class NeighbourStates:
         heard.position[at], heard.velocity[at] = position, velocity
         heard.stamp[at], heard.arrived[at] = stamp, arrived
 
-    def lose(self, at: Index, t: float) -> None:
+    def mark_lost(self, at: Index, t: float) -> None:
         """The tokens of the speakers of links `at` are gone since `t` [s]."""
         self.heard.gone[at] = np.minimum(self.heard.gone[at], t)
         self.unsettled = True
 
-    def find(self, at: Index) -> None:
+    def mark_alive(self, at: Index) -> None:
         """The tokens of the speakers of links `at` are there: these live, whether or not they have something to say."""
         self.heard.gone[at] = np.inf
         self.unsettled = True

@@ -68,7 +68,7 @@ class Perception:
         self._rays: Rays | None = None
         self._points = _Points.nothing()
 
-    def see(self, t: float, state: BodyState, heard: Heard) -> tuple[Self, Nearby]:
+    def sense(self, t: float, state: BodyState, heard: Heard) -> tuple[Self, Nearby]:
         """What rows know of themselves and of what is near at `t` [s].
 
         Rows whose own position is missing or old know of nothing. A robot that was heard is where it was then, carried

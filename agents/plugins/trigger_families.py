@@ -30,7 +30,7 @@ class Relative(Trigger, frozen=True):
 
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
-        return view.gap > self.share * view.error
+        return view.deviation > self.share * view.error
 
 
 class Mixed(Trigger, frozen=True):
@@ -48,7 +48,7 @@ class Mixed(Trigger, frozen=True):
 
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
-        return view.gap**2 > self.share * view.error**2 + self.floor**2
+        return view.deviation**2 > self.share * view.error**2 + self.floor**2
 
 
 class Decaying(Trigger, frozen=True):
@@ -65,7 +65,7 @@ class Decaying(Trigger, frozen=True):
 
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
-        return view.gap > self.floor + self.extra * np.exp(-self.rate * view.since)
+        return view.deviation > self.floor + self.extra * np.exp(-self.rate * view.since)
 
 
 class Dynamic(Trigger, frozen=True):
@@ -89,7 +89,7 @@ class Dynamic(Trigger, frozen=True):
 
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
-        gap = view.gap
+        gap = view.deviation
         known = np.isfinite(gap)
         w = self.share * view.error**2 + self.floor**2 - np.where(known, gap, 0.0) ** 2
         step = np.where(np.isnan(memory[:, 1]), 0.0, view.t - memory[:, 1])
@@ -116,7 +116,7 @@ class Integral(Trigger, frozen=True):
 
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
-        told, gap = view.told.time, view.gap
+        told, gap = view.told.time, view.deviation
         anew = memory[:, 2] != told
         area, until = np.where(anew, 0.0, memory[:, 0]), np.where(anew, told, memory[:, 1])
         known = np.isfinite(gap) & np.isfinite(until)
@@ -174,7 +174,7 @@ class Lyapunov(Trigger, frozen=True):
         """See `Trigger.fires`."""
         now, then, slack = view.energy, view.told.energy, 0.5 * self.floor**2
         left = (now < self.level * then - slack) | (now > then / self.level + slack)
-        return left | (view.gap > self.largest)
+        return left | (view.deviation > self.largest)
 
 
 class RelativeControl(Trigger, frozen=True):

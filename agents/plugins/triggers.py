@@ -110,7 +110,7 @@ class View:
         return self._offset
 
     @cached_property
-    def held(self) -> Array:
+    def believed(self) -> Array:
         """(N, 3) where the neighbours believe each row to be [m]; infinite before it first spoke."""
         if self.predictor is HOLD:
             return self.told.position
@@ -118,9 +118,9 @@ class View:
         return self.predictor.position(self.told.position, self.told.velocity, age)
 
     @cached_property
-    def gap(self) -> Array:
+    def deviation(self) -> Array:
         """(N,) ‖ε‖: how far what is held is from what is [m]."""
-        return norm(self.position - self.held)
+        return norm(self.position - self.believed)
 
     @property
     def drift(self) -> Array:
@@ -223,4 +223,4 @@ class SendOnDelta(Trigger, frozen=True):
 
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
-        return view.gap > self.threshold
+        return view.deviation > self.threshold

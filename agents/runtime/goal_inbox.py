@@ -59,9 +59,9 @@ class HeardGoals:
             if token != self._centre:
                 self._begin(Keys.life_of(token), there=sample.kind == zenoh.SampleKind.PUT)
             elif sample.kind == zenoh.SampleKind.PUT:
-                self._guidance.find()
+                self._guidance.mark_alive()
             elif network.connected(self._session):  # without a router every token is gone, and that is another matter
-                self._guidance.lose(t)
+                self._guidance.mark_lost(t)
         for link, (row, goals) in enumerate(self._goals):
             for sample in network.received(goals.handler):
                 self._hear(link, row, sample, t, utc)

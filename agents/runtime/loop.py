@@ -300,13 +300,13 @@ class Runtime:
 
     def _wake(self, slept: float) -> None:
         """The process stood still for so long [s]: until it has heard the others again, it holds."""
-        self.agent.outside.wake(self._next, slept)
+        self.agent.health.wake(self._next, slept)
         print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
     def _listen(self, t: float) -> None:
         """Takes in what has arrived since the last tick."""
         agent = self.agent
-        outside = agent.outside
+        outside = agent.health
         outside.offline_since = self._cut_off_since(t)
         for sample in network.received(self._conductor.handler):
             gone = sample.kind == zenoh.SampleKind.DELETE
@@ -362,8 +362,9 @@ class Runtime:
                 query.reply_err(str(error).encode(), encoding="text/plain")
                 return
             waits = self.agent.life.phase[row] == Phase.AIRBORNE
-            slept = self.agent.outside.slept
-            if order.order == "takeoff" and slept > ASK_S and self.agent.outside.just_woke(t):  # he left long ago
+            slept = self.agent.health.slept
+            # the conductor left long ago
+            if order.order == "takeoff" and slept > ASK_S and self.agent.health.just_woke(t):
                 refusal, value = f"the process stood still for {slept:.1f} s; ask again", None
             else:
                 refusal, value = carry_out(self.agent, row, order, t, self._utc)
@@ -403,7 +404,7 @@ class Runtime:
             if self._watchdog.tripped:
                 self._recover(self._watchdog.forgive())
             if self._cut_off:
-                self._rest()
+                self._yield_after_stop()
             wait = zero + self._next - time.monotonic()
             behind = max(0, int(-wait / self._dt))
             if wait > 0.0:
@@ -431,7 +432,7 @@ class Runtime:
                 self._telemetry.report(t, everything=True)
                 return
 
-    def _rest(self) -> None:
+    def _yield_after_stop(self) -> None:
         """Leaves the processor to those whose motors still run."""
         ticks = ceil(STOP_YIELD_S / self._dt)
         self._next += ticks * self._dt

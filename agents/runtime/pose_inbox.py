@@ -236,12 +236,12 @@ class Neighbours:
             for coming in speaker.comings():
                 self.changed = True
                 if coming is Coming.CAME:
-                    self._agent.find(speaker.links)
+                    self._agent.mark_alive(speaker.links)
                 elif coming is Coming.ANEW:
                     self._begin(speaker)
                 else:
                     self._channel.forget(speaker.links)
-                    self._agent.lose(speaker.links, t)
+                    self._agent.mark_lost(speaker.links, t)
         arrived: list[tuple[int, ReceivedPose]] = []
         for speaker in self.speakers:
             behind = speaker.behind
@@ -253,7 +253,7 @@ class Neighbours:
                     arrived = [(link, before) for link, before in arrived if link not in speaker.links]
                 arrived += [(link, said) for link in speaker.links.tolist()]
             if speaker.behind != behind:
-                self._agent.hearing.distrust(speaker.links, speaker.behind)
+                self._agent.neighbours.distrust(speaker.links, speaker.behind)
         if arrived:
             self._send(arrived, t, utc)
         if (got := self._channel.due(t)) is not None:
@@ -292,7 +292,7 @@ class Neighbours:
     def _believe(self, got: Samples, utc: float) -> None:
         """Poses have got through."""
         assert got.extra is not None  # all bring along when they were measured; what is recorded keeps its own stamp
-        self._agent.hear(got.link, got.position, got.velocity, got.extra[:, 0], got.arrival)
+        self._agent.receive(got.link, got.position, got.velocity, got.extra[:, 0], got.arrival)
         columns = (got.link, got.seq, got.stamp, got.arrival, got.position, got.velocity)
         for link, seq, stamp, arrival, position, velocity in zip(*(c.tolist() for c in columns), strict=True):
             row, who = self._ends[link]

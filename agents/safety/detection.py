@@ -170,7 +170,7 @@ class Detector:
     ) -> list[Sighting]:
         """What is wrong at `t` [s]."""
         seen: list[Sighting] = []
-        if not where.sure:
+        if not where.all_valid:
             self._lost(t, state, where, seen)
         if some(rows.ordered):
             seen.append(Sighting(Cause.ORDERED, rows.ordered, lambda _: "by an operator"))
@@ -212,14 +212,14 @@ class Detector:
             return f"the last is {t - state.time[row]:.2f} s old" if np.isfinite(state.position[row]).all() else "none"
 
         def out(limit: float, row: int) -> str:
-            return f"{where.outside[row]:.2f} m outside (limit {limit:g} m)"
+            return f"{where.excess[row]:.2f} m outside (limit {limit:g} m)"
 
         cut = self._limits.cut_outside
         seen += [
-            Sighting(Cause.POSITION, where.blind, age),
-            Sighting(Cause.MARGIN, where.beyond & ~where.escaped, lambda row: out(0.0, row)),
-            Sighting(Cause.OUTSIDE, where.escaped, lambda row: out(ESCAPED, row)),
-            Sighting(Cause.FAR_OUTSIDE, where.flown & self._flies, lambda row: out(cut, row)),
+            Sighting(Cause.POSITION, where.invalid, age),
+            Sighting(Cause.MARGIN, where.outside_wall & ~where.outside, lambda row: out(0.0, row)),
+            Sighting(Cause.OUTSIDE, where.outside, lambda row: out(ESCAPED, row)),
+            Sighting(Cause.FAR_OUTSIDE, where.flyaway & self._flies, lambda row: out(cut, row)),
         ]
 
     def _measured(self, state: BodyState, rows: RowStatus, seen: list[Sighting]) -> None:

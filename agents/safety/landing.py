@@ -87,7 +87,7 @@ class Landing:
             self._until[duties.land] = t + PATIENCE_S
         gone = hearing.heard.gone < np.inf
         place = hearing.everywhere(self._assignment.predictor, t)
-        able = due & self._flies & state.flying & ~where.blind & ~where.beyond & (t <= self._until)
+        able = due & self._flies & state.flying & ~where.invalid & ~where.outside_wall & (t <= self._until)
         able &= (state.position[:, 2] > LOW) & (not late)
         self.aside = able & self._must_wait(state, place, gone)
         self.anybody_aside = some(self.aside)

@@ -89,13 +89,13 @@ class Preflight:
             off = misstamped(ahead, self._limits.own_silence_s)[row]
             return "no position of its own" + (f": {stamped(self._assignment.names, ahead, row)}" if off else "")
 
-        yield where.blind, nowhere
+        yield where.invalid, nowhere
         waits, whom = lacking
         yield waits, lambda row: "never heard " + ", ".join(whom(row))
         if outside.offline_since < np.inf:
             yield np.ones(len(self._flies), dtype=bool), lambda _: "no connection to a router"
-        if not where.sure:
-            yield where.outside > WALL_M, lambda row: f"it is {where.outside[row]:.2f} m outside the arena"
+        if not where.all_valid:
+            yield where.excess > WALL_M, lambda row: f"it is {where.excess[row]:.2f} m outside the arena"
 
     def _rests(self, state: BodyState) -> Iterator[Failing]:
         """Its body on the floor."""

@@ -21,23 +21,23 @@ ROUNDING = 1e-9  # smaller differences are arithmetic, not interventions
 
 @dataclass(frozen=True)
 class PoseValidity:
-    """What the measured poses of N rows are worth.
+    """Validity of the measured poses of N rows: known, fresh, inside the arena.
 
     Attributes:
-        sure: Every row knows where it is, and is inside the arena.
-        blind: (N,) own position missing, stale or not finite: no closed loop is possible.
-        beyond: (N,) outside a wall, or above the ceiling.
-        escaped: (N,) outside the arena beyond any doubt.
-        flown: (N,) so far outside that a flying row must be stopped there.
-        outside: (N,) how far from the arena [m], along the worst axis; 0 inside.
+        all_valid: Every row knows where it is, and is inside the arena.
+        invalid: (N,) own position missing, stale or not finite: no closed loop is possible.
+        outside_wall: (N,) outside a wall, or above the ceiling.
+        outside: (N,) outside the arena beyond any doubt.
+        flyaway: (N,) so far outside that a flying row must be stopped there.
+        excess: (N,) distance from the arena [m], along the worst axis; 0 inside.
     """
 
-    sure: bool
-    blind: Mask
-    beyond: Mask
-    escaped: Mask
-    flown: Mask
-    outside: Array
+    all_valid: bool
+    invalid: Mask
+    outside_wall: Mask
+    outside: Mask
+    flyaway: Mask
+    excess: Array
 
 
 class FilteredSetpoint(msgspec.Struct, frozen=True):
@@ -47,14 +47,15 @@ class FilteredSetpoint(msgspec.Struct, frozen=True):
         setpoint: (N, 4) safe.
         changed: (N,) the setpoint was not what had been decided.
         blind: (N,) own position missing, stale or not finite: no closed loop is possible.
-        wild: (N,) it was not made of finite numbers although the row is not blind; what is sent instead keeps it there.
+        not_finite: (N,) it was not made of finite numbers although the row is not blind;
+            the setpoint sent instead keeps the row in place.
         avoided: (N,) avoidance changed the setpoint.
     """
 
     setpoint: Array
     changed: Mask
     blind: Mask
-    wild: Mask
+    not_finite: Mask
     avoided: Mask
 
 
@@ -91,10 +92,10 @@ class Safety:
             return self._sure
         blind = ~np.asarray(known & (np.abs(position) < ABSURD).all(axis=1))
         off = np.where(blind[:, None], 0.0, off)  # what is not known is not outside
-        outside = np.maximum((off - self._half).max(axis=1), 0.0)
+        excess = np.maximum((off - self._half).max(axis=1), 0.0)
         walls = (off[:, :2] > self._half[:2]).any(axis=1) | (~blind & (position[:, 2] > self.limits.high[2]))
-        escaped = np.asarray((off > self._half + ESCAPED).any(axis=1))
-        return PoseValidity(False, blind, np.asarray(walls), escaped, outside > self.limits.cut_outside, outside)
+        outside = np.asarray((off > self._half + ESCAPED).any(axis=1))
+        return PoseValidity(False, blind, np.asarray(walls), outside, excess > self.limits.cut_outside, excess)
 
     def check(  # noqa: PLR0917 - the four that always are, and those of avoidance
         self,
@@ -122,9 +123,9 @@ class Safety:
         where = self.where(position, yaw, age) if where is None else where
         sane = np.abs(setpoint) < ABSURD
         nobody = self._nobody
-        blind, wild = where.blind, nobody
+        blind, wild = where.invalid, nobody
         safe, here = setpoint.copy(), position
-        troubled = not (where.sure and every(sane))
+        troubled = not (where.all_valid and every(sane))
         if troubled:
             wild = ~np.asarray(sane.all(axis=1) | blind)
             here, yaw = np.where(blind[:, None], self._centre, position), np.where(blind, 0.0, yaw)

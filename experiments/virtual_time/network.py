@@ -123,7 +123,7 @@ class Steering:
 
     def __init__(self, experiment: Experiment, seeds: Sequence[int]) -> None:
         self.centre = Centre(assignment.assign_centre(experiment, len(seeds)))
-        self.centre.find(self.centre.listens)  # all robots are there from the beginning
+        self.centre.mark_alive(self.centre.listens)  # all robots are there from the beginning
         self._sent: list[tuple[Any, ...]] = []
         self._followed: list[tuple[Any, ...]] = []
         self._heard: list[tuple[Any, ...]] = []
@@ -155,7 +155,7 @@ class Steering:
         arrived = self._poses.due(t)
         if arrived is not None and arrived.extra is not None:
             rows = self._poses_of[arrived.link]
-            self.centre.hear(
+            self.centre.receive(
                 rows, arrived.position, arrived.velocity, arrived.extra[:, 0], arrived.stamp, arrived.arrival
             )
             self._heard.append((arrived.arrival, rows))
@@ -180,10 +180,10 @@ class Steering:
         if not len(rows):
             return
         self._seq[rows] += 1
-        self._goal[rows], self._extra[rows, 0], self._extra[rows, 1] = told.goal, told.toward, told.rests
+        self._goal[rows], self._extra[rows, 0], self._extra[rows, 1] = told.goal, told.yaw, told.pose_stamp
         start, yaw = float(agent.life.start_at.min()), self._extra[:, 0]
         self._goals.send(t, rows, self._seq, self._goal, self._still, yaw=yaw, start=start, extra=self._extra)
-        self._sent.append((np.full(len(rows), t), rows, self._seq[rows], told.goal, told.toward, told.rests))
+        self._sent.append((np.full(len(rows), t), rows, self._seq[rows], told.goal, told.yaw, told.pose_stamp))
 
     def logged(self, begin: float) -> Steered:
         """All of it, when the common start was at `begin` [s]."""
@@ -220,7 +220,7 @@ class VirtualNetwork:
         self._steering = None if assignment.guided is None else Steering(experiment, seeds)
         self._seq: Index = np.zeros(rows, dtype=np.intp)
         self._nothing = np.zeros((rows, 0))
-        agent.find(np.arange(len(assignment.links)))  # all robots are there from the beginning
+        agent.mark_alive(np.arange(len(assignment.links)))  # all robots are there from the beginning
         self._sent: list[tuple[Any, ...]] = []
         self._heard: list[tuple[Any, ...]] = []
 
@@ -257,7 +257,7 @@ class VirtualNetwork:
         """What has arrived is heard."""
         heard = self._channel.due(t)
         if heard is not None:
-            self._agent.hear(heard.link, heard.position, heard.velocity, heard.stamp, heard.arrival)
+            self._agent.receive(heard.link, heard.position, heard.velocity, heard.stamp, heard.arrival)
             if not self._lean:
                 news = (heard.arrival, heard.link, heard.seq, heard.stamp, heard.position, heard.velocity)
                 self._heard.append(news)

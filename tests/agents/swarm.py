@@ -28,7 +28,7 @@ class Group:
         self.assignment = assignment.assign(experiment, self.names)
         self.agent = Agent(self.assignment)
         self.body = TwinBody(bodies.request(experiment, self.names, [experiment.seed]))
-        self.agent.find(np.arange(len(self.assignment.links)))
+        self.agent.mark_alive(np.arange(len(self.assignment.links)))
         self.by_speaker = links_by_speaker(self.assignment.links, self.assignment.speakers)
         self.state: BodyState
         self.actions: Actions
@@ -38,7 +38,7 @@ class Group:
         links = self.by_speaker.get(speaker)
         if links is not None:
             many = (len(links), 1)
-            self.agent.hear(
+            self.agent.receive(
                 links, np.tile(position, many), np.tile(velocity, many), np.full(len(links), stamp),
                 np.full(len(links), arrived),
             )  # fmt: skip

@@ -19,12 +19,12 @@ def bare(**parts):
     """The decision of A alone, ready to be told things; B is on link 0."""
     experiment = pair(**parts)
     agent = Agent(assignment.assign(experiment, ["A"]))
-    agent.find(np.arange(len(agent.assignment.links)))
+    agent.mark_alive(np.arange(len(agent.assignment.links)))
     return agent
 
 
 def say(agent, position, stamp, at=0):
-    agent.hear(np.array([at]), np.array([position]), np.zeros((1, 3)), np.array([stamp]), np.array([stamp + 0.01]))
+    agent.receive(np.array([at]), np.array([position]), np.zeros((1, 3)), np.array([stamp]), np.array([stamp + 0.01]))
 
 
 def test_older_samples_than_known_are_left_out():
@@ -42,7 +42,7 @@ def test_older_samples_than_known_are_left_out():
 def test_of_samples_that_arrive_together_the_newest_stays(order):
     stamps, places = np.array([1.0, 2.0, 3.0])[order], np.array([[1.0, 0, 0], [2.0, 0, 0], [3.0, 0, 0]])[order]
     together, one_by_one = bare(), bare()
-    together.hear(np.zeros(3, dtype=np.intp), places, np.zeros((3, 3)), stamps, np.full(3, 4.0))
+    together.receive(np.zeros(3, dtype=np.intp), places, np.zeros((3, 3)), stamps, np.full(3, 4.0))
     for place, stamp in zip(places.tolist(), stamps.tolist(), strict=True):
         say(one_by_one, place, stamp)
     for agent in (together, one_by_one):
@@ -82,7 +82,7 @@ def test_who_misses_a_neighbour_is_not_ready_and_says_whom():
     agent.step(0.71, seen(0.71))
     assert (agent.life.phase[0], agent.life.reason[0]) == (READY, "")
     assert agent.missing(0) == []
-    agent.lose(np.array([0]), 0.8)
+    agent.mark_lost(np.array([0]), 0.8)
     assert agent.missing(0) == ["B"]
 
 
@@ -104,7 +104,7 @@ def test_a_position_that_is_not_known_is_not_told():
 
 def live(agent):
     """The links that take part in the decision."""
-    return agent.hearing.live.tolist()
+    return agent.neighbours.live.tolist()
 
 
 def test_a_neighbour_that_is_gone_is_left_out_after_the_silence_and_back_when_found():
@@ -112,7 +112,7 @@ def test_a_neighbour_that_is_gone_is_left_out_after_the_silence_and_back_when_fo
     agent = swarm.agent("A")
     assert live(agent) == [0, 1]
     begin = swarm.t
-    agent.lose(np.array([0]), begin)
+    agent.mark_lost(np.array([0]), begin)
     swarm.groups[0].by_speaker.pop("B")  # and A hears nothing of it any more
     swarm.run(1.0)
     assert live(agent) == [0, 1]
@@ -122,7 +122,7 @@ def test_a_neighbour_that_is_gone_is_left_out_after_the_silence_and_back_when_fo
     before = swarm.row("A", "goal")
     swarm.run(0.1)
     assert not np.array_equal(swarm.row("A", "goal"), before)  # it still follows C
-    agent.find(np.array([0]))
+    agent.mark_alive(np.array([0]))
     swarm.step()
     assert live(agent) == [0, 1]
 
@@ -130,7 +130,7 @@ def test_a_neighbour_that_is_gone_is_left_out_after_the_silence_and_back_when_fo
 def test_a_neighbour_that_is_gone_is_not_back_because_it_is_heard_again():
     swarm = Swarm(triangle(), [["A"], ["B"], ["C"]]).running().run(0.5)
     agent = swarm.agent("A")
-    agent.lose(np.array([0]), swarm.t - 5.0)
+    agent.mark_lost(np.array([0]), swarm.t - 5.0)
     swarm._flying.clear()
     swarm.step()
     assert live(agent) == [1]
@@ -142,7 +142,7 @@ def test_a_neighbour_that_is_gone_is_not_back_because_it_is_heard_again():
 def test_a_neighbour_never_heard_does_not_hide_one_that_is_gone():
     experiment = triangle(start=Start(deadline_s=0.1, missing="go-on"))
     agent = Agent(assignment.assign(experiment, ["A"]))
-    agent.find(np.array([1]))
+    agent.mark_alive(np.array([1]))
     say(agent, [0.0, -0.5, 0.0], 0.1, at=1)  # C is heard, B never
     for tick in range(30):
         agent.step(0.01 * tick, seen(0.01 * tick))
@@ -152,7 +152,7 @@ def test_a_neighbour_never_heard_does_not_hide_one_that_is_gone():
     assert agent.start(0, 0.32) == ""
     agent.step(0.32, seen(0.32))
     assert live(agent) == [1]
-    agent.lose(np.array([1]), 0.33)
+    agent.mark_lost(np.array([1]), 0.33)
     for tick in range(33, 200):
         agent.step(0.01 * tick, seen(0.01 * tick))
     assert live(agent) == []
@@ -163,7 +163,7 @@ def test_who_is_alone_holds_where_it_was_then():
     swarm = Swarm(pair(), [["A"], ["B"]]).running().run(0.5)
     moving = swarm.row("A", "goal")
     agent = swarm.agent("A")
-    agent.lose(np.array([0]), swarm.t)
+    agent.mark_lost(np.array([0]), swarm.t)
     swarm.groups[0].by_speaker.clear()
     swarm.run(1.2)
     held = swarm.row("A", "goal")
@@ -171,7 +171,7 @@ def test_who_is_alone_holds_where_it_was_then():
     swarm.run(1.0)
     np.testing.assert_array_equal(swarm.row("A", "goal"), held)
     assert np.linalg.norm(swarm.row("A", "truth") - held) < 0.02
-    agent.find(np.array([0]))
+    agent.mark_alive(np.array([0]))
     swarm.run(0.2)
     assert not np.array_equal(swarm.row("A", "goal"), held)
 
@@ -179,7 +179,7 @@ def test_who_is_alone_holds_where_it_was_then():
 def test_who_is_cut_off_holds_and_goes_on():
     swarm = Swarm(pair(), [["A"], ["B"]]).running().run(0.5)
     agent = swarm.agent("A")
-    agent.outside.offline_since = swarm.t
+    agent.health.offline_since = swarm.t
     swarm.run(1.0)
     busy = swarm.row("A", "goal")
     swarm.run(0.2)
@@ -187,7 +187,7 @@ def test_who_is_cut_off_holds_and_goes_on():
     assert not np.array_equal(held, busy)
     swarm.run(0.5)
     np.testing.assert_array_equal(swarm.row("A", "goal"), held)
-    agent.outside.offline_since = np.inf
+    agent.health.offline_since = np.inf
     swarm.run(0.2)
     assert not np.array_equal(swarm.row("A", "goal"), held)
 

@@ -29,7 +29,7 @@ class Desk:
 
     def __init__(self, experiment, copies=1, seed=3):
         self.centre = Centre(assignment.assign_centre(experiment, copies))
-        self.centre.find(self.centre.listens)
+        self.centre.mark_alive(self.centre.listens)
         self.rows = len(self.centre.guided)
         rng = np.random.default_rng(seed)
         one = rng.uniform(-0.8, 0.8, (self.rows // copies, 3))
@@ -40,7 +40,7 @@ class Desk:
         rows = np.array(rows, dtype=np.intp)
         place = self.position[rows] if position is None else np.array(position, dtype=float)
         stamps = np.full(len(rows), t) if stamp is None else np.array(stamp, dtype=float)
-        self.centre.hear(rows, place, np.zeros((len(rows), 3)), np.zeros(len(rows)), stamps, np.full(len(rows), t))
+        self.centre.receive(rows, place, np.zeros((len(rows), 3)), np.zeros(len(rows)), stamps, np.full(len(rows), t))
 
     def decide(self, t):
         return self.centre.decide(t, self.phase, self.start)
@@ -53,7 +53,7 @@ def test_it_decides_what_the_robots_would_to_the_last_bit(park, update):
     desk = Desk(replaced(park, architecture="centralised"))
     agent = Agent(assignment.assign(park, tuple(park.robots)))
     links, rng = agent.assignment.links, np.random.default_rng(1)
-    agent.find(np.arange(len(links)))
+    agent.mark_alive(np.arange(len(links)))
     agent.life.phase[:] = AIRBORNE
     agent.life.start_at[:] = 0.0
     still, place = np.zeros((7, 3)), desk.position.copy()
@@ -63,12 +63,12 @@ def test_it_decides_what_the_robots_would_to_the_last_bit(park, update):
         t = 0.01 * tick
         if tick % 10 == 0:
             place[:, :2] += rng.normal(0.0, 0.02, (7, 2))
-            agent.hear(np.arange(len(links)), place[links.speaker], still[links.speaker],
+            agent.receive(np.arange(len(links)), place[links.speaker], still[links.speaker],
                        np.full(len(links), t), np.full(len(links), t))  # fmt: skip
             desk.hear(range(7), t, place)
             told = desk.decide(t)
             sent += len(told.rows)
-            np.testing.assert_array_equal(told.rests, np.full(len(told.rows), t))
+            np.testing.assert_array_equal(told.pose_stamp, np.full(len(told.rows), t))
         state = BodyState(
             time=np.full(7, t), position=place.copy(), velocity=still, yaw=np.zeros(7), battery=np.full(7, NAN),
             flying=desk.centre.deciding.ground > 0, true_position=place.copy(), true_yaw=np.zeros(7),
@@ -87,7 +87,7 @@ def test_goals_that_stay_are_said_again_before_they_are_too_old(park):
     told = {tick: desk.decide(0.1 * tick) for tick in range(13)}
     followers = [len(set(each.rows.tolist()) - {0}) for each in told.values()]
     assert followers == [6, 0, 0, 0, 0, 6, 0, 0, 0, 0, 6, 0, 0]  # every half of link_silence_s
-    assert set(told[10].rests[1:].tolist()) == {0.0}  # they rest on what was known when they were computed
+    assert set(told[10].pose_stamp[1:].tolist()) == {0.0}  # they rest on what was known when they were computed
 
 
 def test_older_poses_that_come_late_are_left_out(park):
@@ -126,14 +126,14 @@ def test_who_is_gone_gets_no_goals_and_his_neighbours_go_on_without_him(park):
     desk = Desk(replaced(park, architecture="centralised"))
     desk.hear(range(7), 0.0)
     assert desk.decide(0.0).rows.tolist() == list(range(7))
-    desk.centre.lose(np.array([6]), 0.1)
+    desk.centre.mark_lost(np.array([6]), 0.1)
     assert desk.decide(0.1).rows.tolist() == list(range(6))
     live = desk.centre.deciding.hearing
     assert 6 in desk.centre.assignment.links.speaker[live.live]
     desk.decide(1.2)
     assert 6 not in desk.centre.assignment.links.speaker[live.live]
     assert desk.centre.missing().tolist() == [6]
-    desk.centre.find(np.array([6]))
+    desk.centre.mark_alive(np.array([6]))
     assert desk.decide(1.3).rows.tolist() == list(range(7))
 
 
@@ -141,7 +141,7 @@ def test_who_has_lost_all_his_neighbours_stays_where_he_was_then(park):
     desk = Desk(replaced(park, architecture="centralised"))
     desk.hear(range(7), 0.0)
     desk.decide(0.0)
-    desk.centre.lose(np.array([4, 5]), 0.0)  # CF03 hears nobody else
+    desk.centre.mark_lost(np.array([4, 5]), 0.0)  # CF03 hears nobody else
     at = desk.position[6].copy()
     told = desk.decide(1.1)
     at[2] = 0.8
@@ -177,7 +177,7 @@ def test_copies_know_nothing_of_each_other(park):
         mine = (all_of_them.rows >= 7) & (all_of_them.rows < 14)
         np.testing.assert_array_equal(all_of_them.rows[mine] - 7, one.rows)
         np.testing.assert_array_equal(all_of_them.goal[mine], one.goal)
-        np.testing.assert_array_equal(all_of_them.rests[mine], one.rests)
+        np.testing.assert_array_equal(all_of_them.pose_stamp[mine], one.pose_stamp)
     assert len(one.rows) == 7
 
 

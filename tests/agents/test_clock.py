@@ -30,7 +30,7 @@ def believed(stamp: float, predictor: Predictor) -> float:
     hearing = NeighbourStates(links([(0, 1)], [0.5], [1.0]), None, 1.0)
     where = np.array([[SPEED * T, 0.0, 0.0]])
     at = np.array([0])
-    hearing.hear(at, where, np.array([[SPEED, 0.0, 0.0]]), np.array([stamp]), np.array([T]))
+    hearing.receive(at, where, np.array([[SPEED, 0.0, 0.0]]), np.array([stamp]), np.array([T]))
     return float(hearing.heard.believed(predictor, T + LATER, at)[0, 0])
 
 

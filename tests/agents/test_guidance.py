@@ -34,7 +34,7 @@ class Bench:
 
     def __init__(self, experiment, names=("A", "B")):
         self.agent = Agent(assignment.assign(experiment, names))
-        self.agent.find(np.arange(len(self.agent.assignment.links)))
+        self.agent.mark_alive(np.arange(len(self.agent.assignment.links)))
         self.position = np.array([[-0.4, 0.0, 0.0], [0.4, 0.1, 0.8]])[: len(names)]
         self.t = 0.0
 
@@ -149,15 +149,15 @@ def test_a_dead_centre_stops_all_that_it_guides_at_once():
     bench = Bench(pair()).running()
     bench.told([0, 1], [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])
     bench.step()
-    bench.agent.guidance.lose(bench.t)
+    bench.agent.guidance.mark_lost(bench.t)
     bench.step()
     np.testing.assert_array_equal(bench.agent.goal, bench.position)
     assert bench.agent.missing(1) == ["centre"]
     assert bench.phases == [RUNNING, RUNNING]
-    bench.agent.guidance.find()
+    bench.agent.guidance.mark_alive()
     bench.step()  # back in time: the last goal is still young
     np.testing.assert_array_equal(bench.agent.goal, [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])
-    bench.agent.guidance.lose(bench.t)
+    bench.agent.guidance.mark_lost(bench.t)
     bench.step()
     bench.told([0], [[-0.25, 0.1, 0.0]])  # whoever is heard is there
     bench.step()
@@ -182,7 +182,7 @@ def test_orders_are_obeyed_whatever_the_centre_says():
 
 def test_cut_off_from_the_network_it_holds():
     bench = Bench(pair()).running()
-    bench.agent.outside.offline_since = bench.t
+    bench.agent.health.offline_since = bench.t
     bench.step(50)
     bench.told([0, 1], [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])  # the last that came through
     bench.step(50)
@@ -225,8 +225,8 @@ def test_rows_are_guided_each_for_itself():
     rng = np.random.default_rng(7)
     for t in rng.uniform(0.0, 5.0, 40):
         goal = rng.normal(size=(3, 3))
-        many.hear(np.array([0, 1, 2]), goal, np.zeros(3), np.full(3, t))
-        one.hear(np.array([0]), goal[2:], np.zeros(1), np.array([t]))
+        many.receive(np.array([0, 1, 2]), goal, np.zeros(3), np.full(3, t))
+        one.receive(np.array([0]), goal[2:], np.zeros(1), np.array([t]))
         np.testing.assert_array_equal(many.goal[2], one.goal[0])
         for now in (t, t + 0.7, t + 2.0):
             assert many.lacking(now)[2] == one.lacking(now)[0]

@@ -273,7 +273,7 @@ def test_two_that_come_too_near_hold_and_go_on_when_one_is_taken_away():
     assert len(told["A"]) == len(told["B"]) == 1
     agent = swarm.agent("A")
     for k in range(80):  # B is somewhere else now
-        agent.hear(np.array([0]), np.array([[1.5, 0.0, 0.0]]), np.zeros((1, 3)), *np.full((2, 1), 99.0 + k))
+        agent.receive(np.array([0]), np.array([[1.5, 0.0, 0.0]]), np.zeros((1, 3)), *np.full((2, 1), 99.0 + k))
         swarm.groups[0].by_speaker.clear()
         swarm.step()
     assert swarm.row("A", "setpoint").any()
@@ -283,7 +283,7 @@ def test_two_that_nearly_touch_land():
     experiment = pair(safety=Safety(separation=0.3))
     swarm = Swarm(experiment, [["A"], ["B"]]).running().run(0.5)
     here = swarm.row("A", "position") + np.array([0.14, 0.0, 0.0])
-    swarm.agent("A").hear(np.array([0]), here[None], np.zeros((1, 3)), np.array([99.0]), np.array([99.0]))
+    swarm.agent("A").receive(np.array([0]), here[None], np.zeros((1, 3)), np.array([99.0]), np.array([99.0]))
     swarm.step()
     swarm.step()
     assert swarm.phase("A") >= LANDING
@@ -297,7 +297,7 @@ def test_two_that_nearly_touch_land():
 def test_a_neighbour_that_is_lost(choice, phase, moves):
     experiment = triangle(safety=Safety(lost_neighbour=choice))
     swarm = Swarm(experiment, [["A"], ["B"], ["C"]]).running().run(0.5)
-    swarm.agent("A").lose(np.array([0]), swarm.t)
+    swarm.agent("A").mark_lost(np.array([0]), swarm.t)
     swarm.groups[0].by_speaker.pop("B")
     swarm.run(1.0)
     assert happened(swarm)["A"] == []
@@ -308,14 +308,14 @@ def test_a_neighbour_that_is_lost(choice, phase, moves):
     assert min(swarm.phase("A"), LANDING) == phase
     assert (np.linalg.norm(swarm.row("A", "truth") - before) > 0.01) == moves
     if choice == "hold":
-        swarm.agent("A").find(np.array([0]))
+        swarm.agent("A").mark_alive(np.array([0]))
         swarm.run(1.2)
         assert happened(swarm)["A"][-1].startswith("over: a neighbour is lost, after ")
 
 
 def test_without_a_router_it_holds_and_then_lands():
     swarm = drone(safety=Safety(offline_s=3.0)).running().run(0.2)
-    swarm.agent("F").outside.offline_since = swarm.t
+    swarm.agent("F").health.offline_since = swarm.t
     swarm.run(2.9)
     assert happened(swarm)["F"] == ["hold: no connection to a router: for 1.0 s"]
     assert swarm.phase("F") == RUNNING
@@ -326,7 +326,7 @@ def test_without_a_router_it_holds_and_then_lands():
 @pytest.mark.parametrize(("choice", "phase"), [("finish", RUNNING), ("land", LANDING)])
 def test_without_a_conductor(choice, phase):
     swarm = drone(safety=Safety(lost_conductor=choice)).running().run(0.2)
-    swarm.agent("F").outside.unattended_since = swarm.t
+    swarm.agent("F").health.unattended_since = swarm.t
     swarm.run(1.9)
     assert happened(swarm)["F"] == []
     swarm.run(0.2)
@@ -350,7 +350,7 @@ def test_a_control_loop_that_hardly_runs_holds_and_then_lands():
     swarm = drone().running().run(0.2)
     agent = swarm.agent("F")
     for _ in range(30):
-        agent.outside.ticked(30, DT)
+        agent.health.ticked(30, DT)
         swarm.tick += 30
         swarm.step()
     assert swarm.phase("F") >= LANDING
@@ -403,12 +403,12 @@ EVENTS = st.sampled_from(["lose", "find", "offline", "online", "unattended", "sk
 
 def occur(agent, event, t):
     """Something happens around a decision."""
-    outside = agent.outside
+    outside = agent.health
     match event:
         case "lose":
-            agent.lose(np.arange(2), t)
+            agent.mark_lost(np.arange(2), t)
         case "find":
-            agent.find(np.arange(2))
+            agent.mark_alive(np.arange(2))
         case "offline" | "online":
             outside.offline_since = t if event == "offline" else np.inf
         case "unattended":
@@ -480,7 +480,7 @@ def woken(slept=0.6, **parts):
     """A and B run in processes of their own; that of A has just stood still."""
     swarm = Swarm(pair(**parts), [["A"], ["B"]]).running()
     swarm.run(3.0)
-    swarm.agent("A").outside.wake(swarm.t, slept)
+    swarm.agent("A").health.wake(swarm.t, slept)
     return swarm
 
 
@@ -502,13 +502,13 @@ def test_who_is_silent_after_a_standstill_has_nothing_new_to_say(slept):
 
 def test_who_is_gone_is_not_waited_for_after_a_standstill():
     swarm = woken(trigger={"kind": "send-on-delta", "threshold": 1.0}, safety=Safety(lost_neighbour="drop"))
-    swarm.agent("A").lose(np.array([0]), swarm.t)
+    swarm.agent("A").mark_lost(np.array([0]), swarm.t)
     assert held(swarm, 0.5) == 0
 
 
 def test_after_a_standstill_neighbours_are_waited_for_from_when_the_router_is_back():
     swarm = woken(trigger={"kind": "send-on-delta", "threshold": 1.0})
-    outside = swarm.agent("A").outside
+    outside = swarm.agent("A").health
     outside.offline_since = swarm.t
     assert held(swarm, 3.0) == round(3.0 / swarm.dt)
     outside.offline_since = np.inf
@@ -519,5 +519,5 @@ def test_after_a_standstill_neighbours_are_waited_for_from_when_the_router_is_ba
 
 def test_who_hears_nobody_does_not_hold_after_a_standstill():
     swarm = Swarm(pair(formation=Formation()), [["A"], ["B"]]).running()
-    swarm.agent("A").outside.wake(swarm.t, 0.6)
+    swarm.agent("A").health.wake(swarm.t, 0.6)
     assert held(swarm, 0.5) == 0

@@ -64,13 +64,13 @@ class Robot:
 
     def after(self, seconds: float = 0.02) -> None:
         self.neighbours.listen(self.t, UTC)
-        self.agent.deciding.settle(self.t)
+        self.agent.deciding.update_links(self.t)
         self.t += seconds
 
     @property
     def live(self) -> bool:
         """Whether B takes part in the law."""
-        return len(self.agent.hearing.live) == 1
+        return len(self.agent.neighbours.live) == 1
 
     @property
     def x(self) -> float:
@@ -89,7 +89,7 @@ def test_a_pose_without_a_token_is_not_believed(robot):
     robot.after()
     assert not robot.live
     assert robot.agent.missing(0) == ["B"]
-    assert robot.agent.assignment.lacking(robot.agent.hearing.greeted).all()
+    assert robot.agent.assignment.lacking(robot.agent.neighbours.greeted).all()
     robot.token("one")
     robot.after()
     assert robot.live
@@ -180,8 +180,8 @@ def test_no_other_session_speaks_for_a_robot_whose_token_is_there(robot):
 def hazards(robot: Robot) -> list[str]:
     agent = robot.agent
     seen: list = []
-    if agent.hearing.behind is not None:
-        agent._detector._behind(agent.hearing, agent.hearing.behind, seen)
+    if agent.neighbours.behind is not None:
+        agent._detector._behind(agent.neighbours, agent.neighbours.behind, seen)
     return [f"{each.cause.name}: {each.say(0)}" for each in seen if each.rows[0]]
 
 
@@ -212,7 +212,7 @@ def believed(robot: Robot) -> float:
     """Where B is believed to be now by a predictor without a horizon, x [m]."""
     heard, predictor = robot.agent.heard, ConstantVelocity()
     place = heard.believed(predictor, robot.t, np.array([0]))
-    np.testing.assert_array_equal(robot.agent.hearing.everywhere(predictor, robot.t), place)
+    np.testing.assert_array_equal(robot.agent.neighbours.everywhere(predictor, robot.t), place)
     return float(place[0, 0])
 
 

@@ -42,7 +42,7 @@ class Bench:
         self.assignment = assignment = assign.assign(experiment, tuple(robots))
         self.landing = Landing(assignment)
         self.hearing = NeighbourStates(assignment.links, None, 1.0)
-        self.hearing.find(np.arange(len(assignment.links)))
+        self.hearing.mark_alive(np.arange(len(assignment.links)))
         self.safety = Safety(assignment.kinds, assignment.limits)
         self.position = np.array(position, dtype=float)
         self.velocity = np.zeros_like(self.position)
@@ -60,7 +60,7 @@ class Bench:
         links = self.assignment.links
         speaker = links.speaker
         stamps = np.full(len(links), self.t)
-        self.hearing.hear(np.arange(len(links)), self.position[speaker], self.velocity[speaker], stamps, stamps)
+        self.hearing.receive(np.arange(len(links)), self.position[speaker], self.velocity[speaker], stamps, stamps)
         state = BodyState(
             np.full(len(every), self.t - self.lag), self.position.copy(), self.velocity.copy(), np.zeros(len(every)),
             self.position, np.zeros(len(every)), np.ones(len(every)), self.flies & (self.phase != DONE),
@@ -185,10 +185,10 @@ def test_who_is_gone_may_have_come_down_wherever_it_hung():
     bench = Bench(("crazyflie", "crazyflie"), [[0.0, 0.0, 1.5], [0.05, 0.0, 0.8]])
     bench.phase[0] = DONE
     bench.asked[0] = False
-    bench.hearing.hear(np.arange(2), bench.position[[0, 1]], np.zeros((2, 3)), np.zeros(2), np.zeros(2))
+    bench.hearing.receive(np.arange(2), bench.position[[0, 1]], np.zeros((2, 3)), np.zeros(2), np.zeros(2))
     bench.t = 1.0
-    bench.hearing.lose(np.arange(2), 0.5)
-    bench.hearing.hear = lambda *_: None
+    bench.hearing.mark_lost(np.arange(2), 0.5)
+    bench.hearing.receive = lambda *_: None
     bench.step()
     assert bench.landing.aside[1]
 

@@ -233,7 +233,7 @@ def test_the_silence_of_a_router_is_not_taken_for_a_free_name(faked):
     ],
 )
 def test_a_process_without_its_name_touches_no_body(reply, error, monkeypatch):
-    monkeypatch.setattr(name_ownership, "GHOST_S", 0.0)
+    monkeypatch.setattr(name_ownership, "OWNER_VANISH_S", 0.0)
     monkeypatch.setattr(name_ownership, "ANSWER_S", 0.0)
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
@@ -259,7 +259,7 @@ class Woken(Airborne):
 
 @pytest.mark.parametrize("way", ["still", "cut off"])
 def test_who_wakes_and_finds_its_name_taken_leaves_the_body_as_it_is(way, monkeypatch):
-    monkeypatch.setattr(name_ownership, "GHOST_S", 0.0)
+    monkeypatch.setattr(name_ownership, "OWNER_VANISH_S", 0.0)
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
     body = Woken()
@@ -335,7 +335,7 @@ def test_a_real_router_knows_who_owns_a_name_and_a_frozen_one_says_nothing(route
         network.open_session([router.endpoint], name="two") as two,
     ):
         owned = claim(one, [KEY], began=2.0)
-        monkeypatch.setattr(name_ownership, "GHOST_S", 0.0)
+        monkeypatch.setattr(name_ownership, "OWNER_VANISH_S", 0.0)
         with pytest.raises(NameTaken):
             claim(two, [KEY], began=1.0)
         for token in owned:

@@ -70,10 +70,10 @@ def test_ground_robots_may_roll_and_stand_on_a_table():
 def test_without_a_router_nobody_takes_off():
     swarm = drone().run(0.1)
     agent = swarm.agent("F")
-    agent.outside.offline_since = swarm.t
+    agent.health.offline_since = swarm.t
     swarm.run(0.6)
     assert agent.life.reason == ["no connection to a router"]
-    agent.outside.offline_since = np.inf
+    agent.health.offline_since = np.inf
     swarm.step()
     assert swarm.phase("F") == READY
 

@@ -105,7 +105,7 @@ def test_rows_are_checked_as_if_each_were_alone(setpoint, position):
     for row in range(ROWS):
         one = slice(row, row + 1)
         alone = Safety(ALL[one], LIMITS).check(setpoint[one], position[one], yaw[one], age[one])
-        for field in ("setpoint", "changed", "blind", "wild"):
+        for field in ("setpoint", "changed", "blind", "not_finite"):
             np.testing.assert_array_equal(getattr(alone, field)[0], getattr(whole, field)[row])
 
 
@@ -125,7 +125,7 @@ def test_lawful_setpoints_pass_untouched():
     ):
         verdict = check(kind, setpoint, [0.0, 0.0, 0.8])
         np.testing.assert_array_equal(verdict.setpoint, [setpoint])
-        assert (verdict.changed[0], verdict.blind[0], verdict.wild[0]) == (False, False, False)
+        assert (verdict.changed[0], verdict.blind[0], verdict.not_finite[0]) == (False, False, False)
 
 
 def test_goals_are_pulled_into_the_arena_and_near_the_robot():
@@ -163,9 +163,9 @@ def test_escaped_is_far_outside(axis, side):
         place = edge.copy()
         place[axis] += side * beyond
         where = whereabouts(CRAZYFLIE, place.tolist())
-        assert (bool(where.escaped[0]), bool(where.blind[0]), where.sure) == (escaped, False, False)
-        assert where.outside[0] == pytest.approx(beyond)
-        assert bool(where.beyond[0]) == (axis < 2 or side > 0)  # floors are measured a little below themselves
+        assert (bool(where.outside[0]), bool(where.invalid[0]), where.all_valid) == (escaped, False, False)
+        assert where.excess[0] == pytest.approx(beyond)
+        assert bool(where.outside_wall[0]) == (axis < 2 or side > 0)  # floors are measured a little below themselves
 
 
 @pytest.mark.parametrize(("age", "blind"), [(0.0, False), (0.5, False), (0.51, True), (np.inf, True), (np.nan, True)])

@@ -198,7 +198,7 @@ class Unseen(View):
     """A view in which nothing can be seen but what was told."""
 
     def __getattribute__(self, name):
-        if name in {"position", "velocity", "error", "energy", "offset", "gap", "held", "since"}:
+        if name in {"position", "velocity", "error", "energy", "offset", "deviation", "believed", "since"}:
             raise AssertionError(f"looked at {name}")
         return super().__getattribute__(name)
 

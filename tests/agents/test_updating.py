@@ -77,7 +77,7 @@ def test_who_loses_a_neighbour_computes_at_once():
     swarm = Swarm(triangle({"kind": "periodic", "period_s": 30.0}), [["A"], ["B"], ["C"]]).running().run(0.55)
     agent = swarm.agent("A")
     before = int(agent.updates[0])
-    agent.lose(np.array([0]), swarm.t - 5.0)
+    agent.mark_lost(np.array([0]), swarm.t - 5.0)
     swarm.groups[0].by_speaker.pop("B")
     swarm.run(0.2)
     assert int(agent.updates[0]) == before + 1
@@ -102,8 +102,8 @@ def test_what_moved_is_the_largest_change_on_a_link(trigger):
     apart = state.position[links.listener] - agent.heard.position
     moved = np.linalg.norm(apart - agent.deciding._updating._apart, axis=1)
     for row in range(2):
-        assert view.gap[row] == pytest.approx(moved[links.listener == row].max(), abs=1e-15)
-    assert view.gap[2] == 0.0
+        assert view.deviation[row] == pytest.approx(moved[links.listener == row].max(), abs=1e-15)
+    assert view.deviation[2] == 0.0
     np.testing.assert_array_equal(view.offset, agent.deciding.law_offset(swarm.t, state.position))
     error, energy = agent.deciding.errors(swarm.t, state.position)
     np.testing.assert_array_equal(view.error, error)

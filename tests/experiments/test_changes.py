@@ -207,7 +207,7 @@ def test_a_restart_lands_starts_and_joins_by_the_common_clock(stage: Stage) -> N
     assert set(reply.done) == {"CF01"}
     assert stage.view.given == [("CF01", "leave"), ("CF01", "takeoff"), ("CF01", "start")]
     assert stage.crew.did == [("start", "CF01")]
-    assert (stage.robots["CF01"].phase, stage.robots["CF01"].out) == ("running", "")
+    assert (stage.robots["CF01"].phase, stage.robots["CF01"].left_because) == ("running", "")
 
 
 def test_one_order_for_several_is_answered_when_all_are_done(stage: Stage) -> None:
@@ -215,7 +215,7 @@ def test_one_order_for_several_is_answered_when_all_are_done(stage: Stage) -> No
     query = stage.ask("remove", "KH01", "KH02", "KH01")
     stage.go_on(2.0)
     assert query.reply_sent is None
-    assert stage.robots["KH01"].out == "removed"
+    assert stage.robots["KH01"].left_because == "removed"
     reply = stage.after(query, 4.0)
     assert set(reply.done) == {"KH01", "KH02"}
     assert stage.crew.did == [("release", "KH02"), ("kill", "KH02")], "who hangs lands if it can, and is ended else"
@@ -277,12 +277,12 @@ def test_a_lost_robot_is_started_again_three_times(monkeypatch: pytest.MonkeyPat
     stage = Stage(monkeypatch, on_loss="restart")
     for _ in range(3):
         stage.end("KH01")
-        assert stage.robots["KH01"].out == "lost"
+        assert stage.robots["KH01"].left_because == "lost"
         stage.go_on(5.0)
         assert stage.robots["KH01"].phase == "running"
     stage.end("KH01")
     stage.go_on(5.0)
-    assert (stage.robots["KH01"].out, stage.view.said[-1]) == ("lost", ("given up", "KH01", "lost 4 times"))
+    assert (stage.robots["KH01"].left_because, stage.view.said[-1]) == ("lost", ("given up", "KH01", "lost 4 times"))
 
 
 def test_a_spare_takes_over_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,7 +303,7 @@ def test_a_process_that_ends_while_it_joins_is_told(stage: Stage) -> None:
     stage.crew.start_again = lambda names, bodies=None: stage.end("KH01")  # type: ignore[method-assign]
     reply = stage.after(query, 5.0)
     assert reply.refused == {"KH01": "KH01: its process ended"}
-    assert stage.robots["KH01"].out == "removed"
+    assert stage.robots["KH01"].left_because == "removed"
     assert stage.changes.under_way == set()
 
 

@@ -103,8 +103,8 @@ def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     assert agent.missing(0) == ["B", "C"]
     link = np.array([told.speakers[j] for j in told.links.speaker]) == "B"
     at = np.flatnonzero(link)
-    agent.find(at)
-    agent.hear(at, np.array([[0.5, 0.0, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+    agent.mark_alive(at)
+    agent.receive(at, np.array([[0.5, 0.0, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
     state = BodyState(
         time=np.zeros(1), position=np.zeros((1, 3)), yaw=np.zeros(1), velocity=np.zeros((1, 3)),
         flying=np.zeros(1, dtype=bool), battery=np.ones(1), true_position=np.zeros((1, 3)), true_yaw=np.zeros(1),

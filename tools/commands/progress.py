@@ -106,7 +106,7 @@ def _silence(progress: Progress) -> str:
 
 def _cells(seen: RobotView, now: float) -> tuple[str, ...]:
     status = seen.status
-    out = f"[{'red' if seen.out == 'lost' else 'dim'}]{seen.out}[/]"
+    out = f"[{'red' if seen.left_because == 'lost' else 'dim'}]{seen.left_because}[/]"
     if status is None:
         return (out if seen.gone else "starting", *[""] * 8)
     silent = now - status.stamp > FROZEN_S

@@ -99,7 +99,7 @@ class Conductor:
         self._clock = launcher.clock = Clock()  # of each case, for all its processes here, however late they start
         steered = guided(experiment)
         self._robots = {
-            name: RobotView(error=None if name in steered else 0.0, out="standby" if robot.standby else "")
+            name: RobotView(error=None if name in steered else 0.0, left_because="standby" if robot.standby else "")
             for name, robot in experiment.robots.items()
         }
         self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots, clock=self._clock)
@@ -155,7 +155,7 @@ class Conductor:
             raise
         finally:
             self._crew.end()
-        lost = tuple(name for name, seen in self._robots.items() if seen.out == "lost")
+        lost = tuple(name for name, seen in self._robots.items() if seen.left_because == "lost")
         return Result(self._recording, self._interrupted(), start, ready, lost)
 
     def _interrupted(self) -> bool:
@@ -207,7 +207,7 @@ class Conductor:
                 return False
             meanwhile()
             late = [name for name, seen in self._robots.items() if not (seen.reached(phase) or seen.gone)]
-            gone = [name for name, seen in self._robots.items() if seen.out == "lost"]
+            gone = [name for name, seen in self._robots.items() if seen.left_because == "lost"]
             if gone and self._experiment.start.missing == "abort":
                 raise RunFailed(self._excuse(gone, "could not start"))
             if not late and (not recorder or self._view.recording_begun):
@@ -358,7 +358,7 @@ class Conductor:
                 self._changes.lose(death.source)
         self._progress.events += [messages.Event(now, OUTPUT, place, line) for place, line in self._crew.output()]
         for name, seen in self._robots.items():
-            if seen.out == "lost" and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
+            if seen.left_because == "lost" and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
                 self._come_back(name, seen)
         self._changes.go_on()
         self._show(self._progress)
@@ -375,7 +375,7 @@ class Conductor:
         """It was only away, or somebody started it again."""
         if name in self._changes.under_way:
             return
-        seen.out = ""
+        seen.left_because = ""
         joins = "" if seen.reached("running") else f"; `zenpark robot add {name}` lets it join the run"
         self._view.say("back", name, f"alive again{joins}")
         if not self._crew.runs(name):

@@ -105,10 +105,11 @@ class HotChanges:
 
     def lose(self, name: str) -> None:
         """A robot is lost; what the file says of that is done."""
-        self._robots[name].out = "lost"
+        self._robots[name].left_because = "lost"
         policy = self._experiment.on_loss
         names = self._crew.companions(name)
-        if policy == "none" or self._start is None or not all(self._robots[each].out == "lost" for each in names):
+        view = self._robots
+        if policy == "none" or self._start is None or not all(view[each].left_because == "lost" for each in names):
             return
         self._losses[name] = self._losses.get(name, 0) + 1
         if self._losses[name] > RESTARTS:
@@ -224,7 +225,7 @@ class HotChanges:
         yield from ()
         for name in names:
             if self._robots[name].gone:
-                raise Refused(f"{name} is not in the run: {self._robots[name].out}")
+                raise Refused(f"{name} is not in the run: {self._robots[name].left_because}")
         for name, reply in self._view.order(names, order).items():
             if not reply.ok:
                 raise Refused(f"{name}: {reply.reason}")
@@ -258,7 +259,7 @@ class HotChanges:
                 raise Refused(f"{', '.join(still)}: cannot be ended")
             yield
         for name in names:
-            self._robots[name].out = "removed"
+            self._robots[name].left_because = "removed"
             self._robots[name].forget()
         self._leaving -= {*names}  # the next process that ends is another one
 
@@ -316,7 +317,7 @@ class HotChanges:
         """From a process that has just begun to one that takes part: ready, up, and on with the others."""
         robots = self._robots
         for name in names:
-            robots[name].out = ""
+            robots[name].left_because = ""
         try:
             yield from self._reach(names, "ready", self._experiment.start.deadline_s + READY_S)
             yield from self._room({name: self._here(name) for name in names}, ROOM_S)
@@ -331,7 +332,7 @@ class HotChanges:
             self._view.order(names, messages.Order("leave"))
             for name in names:
                 self._crew.release(name)
-                robots[name].out = "removed"
+                robots[name].left_because = "removed"
             raise
 
     def _insist(self, names: Sequence[str], order: messages.Order) -> Generator[None]:

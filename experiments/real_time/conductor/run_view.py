@@ -57,7 +57,7 @@ class RobotView:
         error: Formation error as the robot itself sees it [m]; None of one that is guided, and sees none.
         sent: Poses that it sent, and `rate` of them over the last second [1/s].
         alive: Whether its liveliness token stands.
-        out: Why the run goes on without it, if it does: its process has ended or its token vanished ("lost"), it was
+        left_because: Why the run goes on without the robot: process ended or token vanished ("lost"), it was
             taken out ("removed"), or nobody asked for it yet ("standby").
         vanished: Since when its token is missing [s, monotonic]; infinity while it is not, and when that was told.
         behind: The least time from a stamp of it to its arrival [s]: small, if its clock is right.
@@ -72,7 +72,7 @@ class RobotView:
     error: float | None = 0.0
     rate: float = 0.0
     alive: bool = False
-    out: Out = ""
+    left_because: Out = ""
     counted: tuple[float, int] = (0.0, 0)
     vanished: float = inf
     behind: float = inf
@@ -85,7 +85,7 @@ class RobotView:
     @property
     def gone(self) -> bool:
         """Whether the run goes on without it."""
-        return bool(self.out)
+        return bool(self.left_because)
 
     @property
     def phase(self) -> str:

@@ -125,12 +125,12 @@ class CentreProcess:
             rows = self.centre.listens[speaker.links]
             for coming in speaker.comings():
                 if coming is Coming.CAME:
-                    self.centre.find(rows)
+                    self.centre.mark_alive(rows)
                 elif coming is Coming.ANEW:
                     self._begin(speaker)
                 else:
                     self._channel.forget(speaker.links)
-                    self.centre.lose(rows, t)
+                    self.centre.mark_lost(rows, t)
             for said in speaker.news(self._utc + t):
                 if said.anew:
                     self._begin(speaker)
@@ -170,7 +170,7 @@ class CentreProcess:
         assert got.extra is not None  # all bring along their yaw, and when they were measured
         rows = self.centre.listens[got.link]
         yaw, measured = got.extra.T
-        self.centre.hear(rows, got.position, got.velocity, yaw, measured, got.arrival)
+        self.centre.receive(rows, got.position, got.velocity, yaw, measured, got.arrival)
         start = float(self._start[self._guided].min())
         for link, stamp in zip(got.link.tolist(), got.stamp.tolist(), strict=True):
             self._heard[link] += self._within(stamp, start)
@@ -197,14 +197,14 @@ class CentreProcess:
         self._seq += 1
         for k, row in enumerate(told.rows.tolist()):
             x, y, z = told.goal[k].tolist()
-            yaw = float(told.toward[k])
+            yaw = float(told.yaw[k])
             goal = messages.Goal(
                 self._names[row],
                 self._seq,
                 round(self._utc + t, 6),
                 (round(x, 6), round(y, 6), round(z, 6)),
                 round(yaw, 6) if isfinite(yaw) else None,
-                round(self._utc + float(told.rests[k]), 6),
+                round(self._utc + float(told.pose_stamp[k]), 6),
             )
             self._goals[row].put(messages.encode(goal, self._encoding))
         self._sent += len(told.rows)

@@ -146,7 +146,7 @@ class Exchange:
         self._scanned = np.full(rows, -inf)
         self._rays: Rays | None = None
         if len(mirrored):
-            self._reflect()
+            self._update_mirrors()
 
     def find(self, there: Set[str]) -> list[str]:
         """Puts carried robots of those that are on the network where they say that they are; their names."""
@@ -187,13 +187,13 @@ class Exchange:
             key = str(sample.key_expr)
             row = self._row.get(key)
             if row is None:
-                self._wonder(key)
+                self._reject_unknown(key)
                 continue
             try:
                 command = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Command)
                 validation.check_command(command, robot=self._names[row])
             except messages.Malformed as error:
-                self._deplore(error)
+                self._count_malformed(error)
                 continue
             if command.seq > self._done.get(command.robot, 0):
                 self._done[command.robot] = command.seq
@@ -254,7 +254,7 @@ class Exchange:
             self._done.pop(name, None)
         self._lives[name] = life
 
-    def _wonder(self, key: str) -> None:
+    def _reject_unknown(self, key: str) -> None:
         """A command to a robot that is not here."""
         if key in self._elsewhere:
             return
@@ -287,9 +287,9 @@ class Exchange:
                 self._place[row] = np.nan
                 changed = True
         if changed:
-            self._reflect()
+            self._update_mirrors()
 
-    def _reflect(self) -> None:
+    def _update_mirrors(self) -> None:
         rows = self._mirrored
         self._population.body.mirror(rows, self._place[rows], self._yaw[rows], self._velocity[rows])
 
@@ -301,7 +301,7 @@ class Exchange:
                 state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
                 validation.check_state(state, robot=name, now=self._clock.utc(), reach=self._reach)
             except messages.Malformed as error:
-                self._deplore(error)
+                self._count_malformed(error)
                 continue
             if state.position is not None:
                 found = state
@@ -312,7 +312,7 @@ class Exchange:
         try:
             status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
         except messages.Malformed as error:
-            self._deplore(error)
+            self._count_malformed(error)
             return
         if status.phase in UNDER_WAY and 0.0 < status.started < inf and status.robot in self._names:
             self._started[status.robot] = status.started
@@ -323,7 +323,7 @@ class Exchange:
             self._begun = begun
             self._population.begin(self._population.time + begun - (self.utc + t))
 
-    def _deplore(self, error: messages.Malformed) -> None:
+    def _count_malformed(self, error: messages.Malformed) -> None:
         self.malformed += 1
         self.trouble = str(error)
 
