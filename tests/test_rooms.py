@@ -46,7 +46,6 @@ tools.cli
 tools.guard
 """
 KNOWN = {
-    ("experiments.report.export", "experiments.run"),
     ("tools.bench.intruders", "tools.commands.authority"),
 }
 FLOORS = [line.split() for line in ORDER.strip().splitlines()]

@@ -41,20 +41,6 @@ def recover(source: Path, target: Path) -> Recovered:
     return Recovered(messages, tuple(robot for robot in robots if robot), records.complete)
 
 
-def recover_command(file: str, target: str | None) -> int:
-    """The command line: recovers `file` into `target`, beside it if left out, and says what was found.
-
-    Raises:
-        RecordingError: As `recover`.
-    """
-    source = Path(file)
-    chosen = Path(target) if target else source.with_name(f"{source.stem}-recovered.mcap")
-    found = recover(source, chosen)
-    what = f"{found.messages} messages of {', '.join(found.robots) or 'no robot'}"
-    print(f"{source} is whole already: {what}" if found.complete else f"{chosen}: {what}")
-    return 0
-
-
 def _write(source: Path, target: Path) -> None:
     try:
         with target.open("xb") as file:

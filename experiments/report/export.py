@@ -1,13 +1,14 @@
-"""`zenpark export RUN`: a run as a MATLAB file, or as one long table of trajectories.
+"""Traces and metrics of a run as a MATLAB file, or as one long table of trajectories.
 
-In a notebook: `export.write_mat(run, Path("run.mat"))`, with what `experiments.run` returned.
+In a notebook: `export.write_mat(run.traces, run.metrics, Path("run.mat"))`, with what `experiments.run` returned.
 """
 
 from __future__ import annotations
 
 import csv
+import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
 from types import NoneType
@@ -15,14 +16,11 @@ from typing import Any, Final, get_args, get_type_hints
 
 import numpy as np
 
-from agents.arrays import Array, Index
-from agents.formation.graph import Links, adjacency
+from agents.formation.graph import adjacency
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import formation_errors, links_of, phase_starts
 from experiments.recording.trace import Trace
-from experiments.run import Run, reopen
 
-STEM: Final = "run"  # of the file, if none is named
 LONGEST: Final = 63  # letters of a name in MATLAB
 LARGEST: Final = 2**31  # bytes of a variable that MATLAB reads from a file of this version
 KEYWORDS: Final = frozenset(
@@ -83,32 +81,10 @@ COLUMNS: Final = ("x", "y", "z", "yaw", "true_x", "true_y", "true_z", "goal_x", 
 
 
 class ExportError(RuntimeError):
-    """What cannot be exported, with the remedy."""
+    """A failed export, with the remedy."""
 
 
-def command(folder: str, target: str | None, *, as_csv: bool) -> int:
-    """`zenpark export`; returns the exit code.
-
-    Raises:
-        ExportError: If the file cannot be written, or scipy is missing.
-        RecordingError: If the folder holds no recording, or one cannot be read.
-    """
-    file = Path(target) if target else Path(folder) / f"{STEM}{'.csv' if as_csv else '.mat'}"
-    suffix = file.suffix.lower()
-    if suffix not in (".mat", ".csv") or (as_csv and suffix == ".mat"):
-        raise ExportError(f"{file}: is no name for the {'table' if as_csv else 'file'}; let it end with .mat or .csv")
-    write = write_csv if suffix == ".csv" else write_mat
-    if write is write_mat:
-        _savemat()  # before a long recording is read
-    run = reopen(Path(folder))
-    if not run.traces:
-        raise ExportError(f"{folder}: no case had begun; there is nothing to export")
-    write(run, file)
-    print(f"{file}: {', '.join(run.traces)}")
-    return 0
-
-
-def write_mat(run: Run, file: Path) -> None:
+def write_mat(traces: Mapping[str, Trace], metrics: Mapping[str, CaseMetrics], file: Path) -> None:
     """Writes a struct for each case, named after it, into a file of MATLAB's version 5.
 
     Numbers are doubles, robots are counted from 1, what is unknown is NaN. What is in the structs: docs/matlab.md.
@@ -116,9 +92,9 @@ def write_mat(run: Run, file: Path) -> None:
     Raises:
         ExportError: If scipy is missing, the file cannot be written, or a case is too large for it.
     """
-    savemat = _savemat()
-    names = matlab_names(run.traces)
-    cases = {names[case]: structure(trace, run.metrics[case]) for case, trace in run.traces.items()}
+    savemat = require_savemat()
+    names = matlab_names(traces)
+    cases = {names[case]: structure(trace, metrics[case]) for case, trace in traces.items()}
     for name, case in cases.items():
         if (size := _bytes(case)) >= LARGEST:
             raise ExportError(f"{file}: {name} has {size / 1e9:.1f} GB, MATLAB reads 2.1; export a table: --csv")
@@ -129,7 +105,7 @@ def write_mat(run: Run, file: Path) -> None:
         raise _unwritable(file, error) from None
 
 
-def write_csv(run: Run, file: Path) -> None:
+def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
     """Writes a table with a line for each case, time and robot; empty where a value is unknown.
 
     Raises:
@@ -139,50 +115,65 @@ def write_csv(run: Run, file: Path) -> None:
         with file.open("w", newline="", encoding="utf-8") as stream:
             table = csv.writer(stream)
             table.writerow(["case", "time", "robot", *COLUMNS])
-            for case, trace in run.traces.items():
+            for case, trace in traces.items():
                 parts = (trace.position, trace.yaw[..., None], trace.true_position, trace.goal)
                 values = np.concatenate([*parts, formation_errors(trace)[..., None]], axis=2)
-                told = values.astype(object)
-                told[~np.isfinite(values)] = None
-                for t, rows in zip(trace.time.tolist(), told.tolist(), strict=True):
+                cells = values.astype(object)
+                cells[~np.isfinite(values)] = None
+                for t, rows in zip(trace.time.tolist(), cells.tolist(), strict=True):
                     table.writerows([case, t, robot, *row] for robot, row in zip(trace.robots, rows, strict=True))
     except OSError as error:
         raise _unwritable(file, error) from None
 
 
-def structure(trace: Trace, measured: CaseMetrics) -> dict[str, Any]:
+def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     """A case as what becomes a struct: texts, arrays of doubles, arrays of texts, and structs in it."""
-    net, rows, sent = links_of(trace), len(trace.robots), trace.sent
-    experiment = trace.experiment
-    return {
-        "case": trace.case,
+    net, sent, experiment = links_of(trace), trace.sent, trace.experiment
+    arrays = ("time", "position", "yaw", "true_position", "goal", "setpoint")
+    columns = [name for name, kind in get_type_hints(RobotMetrics).items() if _is_number(kind)]
+    links = {
+        "listener": net.listener + 1,  # MATLAB counts from 1
+        "speaker": net.speaker + 1,
+        "distance": net.distance,
+        "gain": net.gain,
+        "relative": net.relative,
+        "bearing": net.bearing,
+    }
+    case = {
+        **{name: getattr(trace, name) for name in ("case", "seed", "clock", "robots", *arrays)},
         "title": experiment.title,
-        "seed": float(trace.seed),
-        "clock": trace.clock,
-        "robots": _texts(trace.robots),
-        "kinds": _texts(experiment.robots[name].kind for name in trace.robots),
-        "time": trace.time,
-        "position": trace.position,
-        "yaw": trace.yaw,
-        "true_position": trace.true_position,
-        "goal": trace.goal,
-        "setpoint": trace.setpoint,
+        "kinds": [experiment.robots[name].kind for name in trace.robots],
         "error": formation_errors(trace),
         "tolerance": experiment.tolerance,
-        "phase_start": np.array(phase_starts(trace)),
-        "sent": {
-            "time": sent.time,
-            "robot": _from_one(sent.robot),
-            "position": sent.position,
-            "velocity": sent.velocity,
-            "yaw": sent.yaw,
-            "bytes": sent.bytes.astype(float),
+        "phase_start": phase_starts(trace),
+        "sent": {name: getattr(sent, name) + (name == "robot") for name in UNITS["sent"]},
+        "links": {name: column for name, column in links.items() if column is not None},
+        "adjacency": adjacency(net, len(trace.robots)),
+        "metrics": {
+            "robot": [robot.robot for robot in metrics.robots],
+            **{name: [getattr(robot, name) for robot in metrics.robots] for name in columns},
+            **{name: getattr(metrics, name) for name in ("leaders", "mean", "j2", "belief_rms", "belief_max")},
+            "formation_acquired_s": metrics.acquired_s,
+            "rotation_rad_s": metrics.rotation_rad_s,
         },
-        "links": _links(net),
-        "adjacency": adjacency(net, rows),
-        "metrics": _metrics(measured),
         "units": UNITS,
     }
+    return {name: _converted(value) for name, value in case.items()}
+
+
+def _converted(value: Any) -> Any:  # noqa: ANN401 - any field of a struct
+    """A value as `savemat` takes it: a number as double, unknown as NaN, an array of texts for a cell array."""
+    match value:
+        case dict():
+            return {name: _converted(each) for name, each in value.items()}
+        case str():
+            return value
+        case list() | tuple() if all(isinstance(each, str) for each in value):
+            return np.array(value, dtype=object)
+        case np.ndarray() | list() | tuple():
+            return np.array(value, dtype=float)  # None becomes NaN
+        case _:
+            return math.nan if value is None else float(value)
 
 
 def matlab_names(names: Iterable[str]) -> dict[str, str]:
@@ -199,69 +190,23 @@ def matlab_names(names: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def _links(net: Links) -> dict[str, Any]:
-    """Whom each link is between, and what it asks for."""
-    told = {"relative": net.relative, "bearing": net.bearing}
-    return {
-        "listener": _from_one(net.listener),
-        "speaker": _from_one(net.speaker),
-        "distance": net.distance,
-        "gain": net.gain,
-        **{name: column for name, column in told.items() if column is not None},
-    }
-
-
-def _metrics(measured: CaseMetrics) -> dict[str, Any]:
-    """A column over the robots for each number; those of the whole; the means that leave out leaders."""
-    numbers = [name for name, kind in get_type_hints(RobotMetrics).items() if _is_number(kind)]
-    columns = {name: _numbers(getattr(robot, name) for robot in measured.robots) for name in numbers}
-    return {
-        "robot": _texts(robot.robot for robot in measured.robots),
-        **columns,
-        "leaders": _texts(measured.leaders),
-        "mean": {index: _number(value) for index, value in measured.mean.items()},
-        "formation_acquired_s": _numbers(measured.acquired_s),
-        "rotation_rad_s": _numbers(measured.rotation_rad_s),
-        "j2": measured.j2,
-        "belief_rms": _number(measured.belief_rms),
-        "belief_max": _number(measured.belief_max),
-    }
-
-
 def _is_number(kind: Any) -> bool:  # noqa: ANN401 - an annotation
     return set(get_args(kind) or (kind,)) <= {int, float, NoneType}
-
-
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else float(value)
-
-
-def _numbers(values: Iterable[float | None]) -> Array:
-    return np.array([_number(value) for value in values])
-
-
-def _texts(values: Iterable[str]) -> Any:  # noqa: ANN401 - numpy's arrays of objects become MATLAB's cell arrays
-    return np.array(list(values), dtype=object)
-
-
-def _from_one(rows: Index) -> Array:
-    """MATLAB counts from 1."""
-    return np.asarray(rows, dtype=float) + 1.0
 
 
 def _unwritable(file: Path, error: OSError) -> ExportError:
     return ExportError(f"{file}: cannot be written: {error.strerror}; name another place")
 
 
-def _bytes(value: Any) -> int:  # noqa: ANN401 - whatever is in a struct
+def _bytes(value: Any) -> int:  # noqa: ANN401 - any field of a struct
     """Size of the arrays in a struct."""
     if isinstance(value, dict):
         return sum(map(_bytes, value.values()))
     return value.nbytes if isinstance(value, np.ndarray) else 0
 
 
-def _savemat() -> Any:  # noqa: ANN401 - scipy has no types
-    """The function that writes.
+def require_savemat() -> Any:  # noqa: ANN401 - scipy has no types
+    """The function that writes MATLAB files.
 
     Raises:
         ExportError: If scipy is not installed.

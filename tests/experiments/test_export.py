@@ -15,6 +15,7 @@ from experiments.recording.run_folder import SOURCE
 from experiments.report import export
 from experiments.report.export import KEYWORDS, UNITS, ExportError, matlab_names, structure
 from experiments.run import simulate
+from tools.commands import run as commands
 
 scipy_io = pytest.importorskip("scipy.io")
 
@@ -33,7 +34,7 @@ def flown(tmp_path_factory):
 @pytest.fixture(scope="module")
 def mat(flown):
     """The run as it is read back from the file that the command writes."""
-    assert export.command(str(flown[0]), None, as_csv=False) == 0
+    assert commands.export(str(flown[0]), None, as_csv=False) == 0
     return scipy_io.loadmat(flown[0] / "run.mat", simplify_cells=True)
 
 
@@ -114,7 +115,7 @@ def test_what_links_ask_for_besides_distances_is_told():
 
 
 def test_the_table_has_a_line_for_each_robot_and_time(flown, tmp_path):
-    assert export.command(str(flown[0]), str(tmp_path / "way.csv"), as_csv=False) == 0
+    assert commands.export(str(flown[0]), str(tmp_path / "way.csv"), as_csv=False) == 0
     with (tmp_path / "way.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 2 * 201 * 3
@@ -147,15 +148,15 @@ def test_names_that_are_valid_stay():
 def test_what_cannot_be_exported_is_explained(flown, tmp_path, monkeypatch):
     folder, run = flown
     with pytest.raises(ExportError, match=r"run\.txt: is no name"):
-        export.command(str(folder), str(tmp_path / "run.txt"), as_csv=False)
+        commands.export(str(folder), str(tmp_path / "run.txt"), as_csv=False)
     with pytest.raises(ExportError, match=r"end with \.mat or \.csv"):
-        export.command(str(folder), str(tmp_path / "run.mat"), as_csv=True)
+        commands.export(str(folder), str(tmp_path / "run.mat"), as_csv=True)
     for name in ("run.mat", "run.csv"):
         with pytest.raises(ExportError, match="cannot be written: No such file or directory"):
-            export.command(str(folder), str(tmp_path / "nowhere" / name), as_csv=False)
+            commands.export(str(folder), str(tmp_path / "nowhere" / name), as_csv=False)
     monkeypatch.setattr(export, "LARGEST", 1000)
     with pytest.raises(ExportError, match=r"periodic has 0\.0 GB"):
-        export.write_mat(run, tmp_path / "run.mat")
+        export.write_mat(run.traces, run.metrics, tmp_path / "run.mat")
 
 
 def test_without_scipy_it_says_what_to_install(flown, monkeypatch):
@@ -164,16 +165,16 @@ def test_without_scipy_it_says_what_to_install(flown, monkeypatch):
 
     monkeypatch.setattr(export, "import_module", missing)
     with pytest.raises(ExportError, match=r"\./zenpark install scipy"):
-        export.command(str(flown[0]), None, as_csv=False)
-    assert export.command(str(flown[0]), None, as_csv=True) == 0
+        commands.export(str(flown[0]), None, as_csv=False)
+    assert commands.export(str(flown[0]), None, as_csv=True) == 0
 
 
 def test_a_run_without_a_case_has_nothing(monkeypatch, tmp_path):
-    monkeypatch.setattr(export, "reopen", lambda _folder: SimpleNamespace(traces={}))
+    monkeypatch.setattr(commands, "reopen", lambda _folder: SimpleNamespace(traces={}))
     with pytest.raises(ExportError, match="nothing to export"):
-        export.command(str(tmp_path), None, as_csv=True)
+        commands.export(str(tmp_path), None, as_csv=True)
 
 
 def test_unknown_numbers_become_nan():
-    assert math.isnan(export._number(None))
-    assert export._numbers([1, None, 2.5])[[0, 2]].tolist() == [1.0, 2.5]
+    assert math.isnan(export._converted(None))
+    assert export._converted([1, None, 2.5])[[0, 2]].tolist() == [1.0, 2.5]

@@ -200,7 +200,7 @@ def export(
     as_csv: Annotated[bool, typer.Option("--csv", help="A table of trajectories: case, time, robot, x, ...")] = False,
 ) -> None:
     """Write a run for MATLAB, or its trajectories as one table."""
-    from experiments.report.export import command  # noqa: PLC0415
+    from tools.commands.run import export as command  # noqa: PLC0415
 
     raise typer.Exit(command(folder, target, as_csv=as_csv))
 
@@ -211,9 +211,9 @@ def recover(
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Where the whole one goes.")] = None,
 ) -> None:
     """Repair a recording whose writer was killed."""
-    from experiments.recording.recover import recover_command  # noqa: PLC0415
+    from tools.commands.run import recover as command  # noqa: PLC0415
 
-    raise typer.Exit(recover_command(file, target))
+    raise typer.Exit(command(file, target))
 
 
 @app.command()

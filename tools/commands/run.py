@@ -1,4 +1,4 @@
-"""What `zenpark run`, `report`, `new` and `list` do and print."""
+"""What `zenpark run`, `report`, `export`, `recover`, `new` and `list` do and print."""
 
 from __future__ import annotations
 
@@ -168,6 +168,48 @@ def report(folders: Sequence[str], *, out: str | None) -> int:
         raise RecordingError(
             f"{target}: cannot be written: {error.strerror}; choose another place with --out"
         ) from None
+    return 0
+
+
+def export(folder: str, target: str | None, *, as_csv: bool) -> int:
+    """`zenpark export`: a run as `run.mat` or `run.csv` in its folder, or as the file `target`.
+
+    Raises:
+        ExportError: If the file cannot be written, or scipy is missing.
+        RecordingError: If the folder holds no recording, or one cannot be read.
+    """
+    from experiments.report.export import ExportError, require_savemat, write_csv, write_mat  # noqa: PLC0415
+
+    file = Path(target) if target else Path(folder) / f"run{'.csv' if as_csv else '.mat'}"
+    suffix = file.suffix.lower()
+    if suffix not in (".mat", ".csv") or (as_csv and suffix == ".mat"):
+        raise ExportError(f"{file}: is no name for the {'table' if as_csv else 'file'}; let it end with .mat or .csv")
+    if suffix == ".mat":
+        require_savemat()  # before a long recording is read
+    found = reopen(Path(folder))
+    if not found.traces:
+        raise ExportError(f"{folder}: no case had begun; there is nothing to export")
+    if suffix == ".mat":
+        write_mat(found.traces, found.metrics, file)
+    else:
+        write_csv(found.traces, file)
+    print(f"{file}: {', '.join(found.traces)}")
+    return 0
+
+
+def recover(file: str, target: str | None) -> int:
+    """`zenpark recover`: repairs `file` into `target`, beside it if left out, and prints the number of messages.
+
+    Raises:
+        RecordingError: If `file` is no recording, or `target` exists or cannot be written.
+    """
+    from experiments.recording.recover import recover as recovered  # noqa: PLC0415
+
+    source = Path(file)
+    chosen = Path(target) if target else source.with_name(f"{source.stem}-recovered.mcap")
+    found = recovered(source, chosen)
+    what = f"{found.messages} messages of {', '.join(found.robots) or 'no robot'}"
+    print(f"{source} is whole already: {what}" if found.complete else f"{chosen}: {what}")
     return 0
 
 
