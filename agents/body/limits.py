@@ -1,55 +1,74 @@
-"""Limits of setpoints, and of what a robot may meet before it holds or lands."""
+"""Safety settings of an experiment, and the limits of some of its robots that follow from them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from agents.arrays import Array
 
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
 
-@dataclass(frozen=True)
-class Limits:
-    """What no setpoint may exceed.
 
-    Attributes:
-        low: (3,) smallest x, y, z of the arena [m].
-        high: (3,) largest x, y, z of the arena [m].
-        margin: Goals stay this far inside the walls [m].
-        speed: [m/s]; the kind's own where that is lower.
-        goal_step: Farthest goal from where the robot is [m].
-        own_silence_s: Own position older than this is none.
-        blind_s: A flying row that has no position of its own for this long lands; one number, or one for each row.
-        link_silence_s: A neighbour gone for this long is left out.
-        cut_outside: A flying row this far outside the arena has its motors cut [m].
-        separation: Nearer than this to another robot a row holds, nearer than half of it it lands [m]; None: never.
-        overspeed: A row that moves faster than this times what its kind can is out of control.
-        tilt: A flying row that leans more than this has tipped over [rad].
-        battery_low: A row with less charge than this lands; a share.
-        battery_min: A row with less charge than this does not take off; a share.
-        offline_s: A row without a router for this long lands.
-        landing_s: A flying row that takes longer to land has its motors cut.
-        lost_neighbour: What is done without a neighbour: "drop" it, "hold" or "land".
-        lost_conductor: What is done without the conductor: "finish" or "land".
-    """
+class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Limits of setpoints, and of what may happen to a robot before it holds, lands or has its motors cut."""
 
-    low: Array
-    high: Array
-    margin: float = 0.05
-    speed: float = np.inf
-    goal_step: float = 0.5
-    own_silence_s: float = 0.5
-    blind_s: float | Array = 0.3
-    link_silence_s: float = 1.0
-    cut_outside: float = 0.75
-    separation: float | None = None
-    overspeed: float = 2.5
-    tilt: float = 1.2
-    battery_low: float = 0.1
-    battery_min: float = 0.2
-    offline_s: float = 10.0
-    landing_s: float = 20.0
-    lost_neighbour: Literal["drop", "hold", "land"] = "drop"
-    lost_conductor: Literal["finish", "land"] = "finish"
+    speed: Annotated[Positive | None, Meta(description="[m/s], if lower than the kind's own")] = None
+    goal_step: Annotated[Positive, Meta(description="farthest goal from where the robot is [m]")] = 0.5
+    margin: Annotated[NotNegative, Meta(description="how far inside the walls goals stay [m]")] = 0.05
+    own_silence_s: Annotated[Positive, Meta(description="own position older than this is none: hold [s]")] = 0.5
+    blind_s: Annotated[
+        NotNegative, Meta(description="a flying robot that has no position of its own for this long lands [s]")
+    ] = 0.3
+    link_silence_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
+    lost_neighbour: Annotated[
+        Literal["drop", "hold", "land"], Meta(description="what a robot does then: go on without it, hold, or land")
+    ] = "drop"
+    lost_conductor: Annotated[
+        Literal["finish", "land"], Meta(description="what robots do when the conductor is gone in mid-run")
+    ] = "finish"
+    offline_s: Annotated[
+        Positive, Meta(description="a robot without a router holds, and after this lands: no stop reaches it [s]")
+    ] = 10.0
+    separation: Annotated[
+        Positive | None,
+        Meta(
+            description="nearer than this to another robot that it hears, from middle to middle, a robot holds; nearer "
+            "than half of it, or touching, it lands [m]; left out: not watched"
+        ),
+    ] = None
+    cut_outside: Annotated[Positive, Meta(description="a drone this far outside the arena has its motors cut [m]")] = (
+        0.75
+    )
+    overspeed: Annotated[
+        float, Meta(gt=1, description="a robot that moves faster than this times what its kind can holds, then lands")
+    ] = 2.5
+    tilt: Annotated[
+        float, Meta(gt=0, lt=4, description="a drone that leans more than this has its motors cut [rad]")
+    ] = 1.2
+    battery_low: Annotated[Share, Meta(description="with less charge than this a robot lands; 0: never")] = 0.1
+    battery_min: Annotated[Share, Meta(description="with less charge than this it does not take off; 0: always")] = 0.2
+    landing_s: Annotated[
+        Positive, Meta(description="a drone that takes longer than this to land has its motors cut [s]")
+    ] = 20.0
+    loop_silence_s: Annotated[
+        Positive, Meta(description="a robot whose control loop hangs for this long is landed from outside of it [s]")
+    ] = 0.5
+
+
+class Limits(Safety, frozen=True):
+    """Safety settings of N rows, and the box of the arena."""
+
+    low: Array  # (3,) smallest x, y, z of the arena [m]
+    high: Array  # (3,) largest x, y, z of the arena [m]
+    hold_s: Array | None = None  # (N,) `blind_s` of each row [s], where rows differ
+
+    @property
+    def top_speed(self) -> float:
+        """Speed that no setpoint exceeds [m/s]; infinity: the kind's own limit is the only one."""
+        return np.inf if self.speed is None else self.speed

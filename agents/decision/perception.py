@@ -57,7 +57,7 @@ class Perception:
         takes = np.array(self._takes)
         self._by_position, self._by_twist = takes == "position", takes == "twist"
         self._radius, self._height = _column(kinds, "radius"), _column(kinds, "height")
-        self._speed = np.minimum(_column(kinds, "speed"), limits.speed)
+        self._speed = np.minimum(_column(kinds, "speed"), limits.top_speed)
         self._turn_rate, self._response = _column(kinds, "turn_rate"), _column(kinds, "response")
         self._lag = _column(kinds, "lag")
         self._flies = np.array([kind.flies for kind in kinds], dtype=bool)

@@ -11,14 +11,19 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from agents.arrays import Array, Index, Mask, every, some
 
+Share = Annotated[float, Meta(ge=0, le=1)]
+Delay = Annotated[float, Meta(ge=0, le=60)]
+AtLeastOne = Annotated[float, Meta(ge=1)]
+Positive = Annotated[float, Meta(gt=0)]
 Words = NDArray[np.uint64]
 Counter = NDArray[np.integer] | int
 
@@ -56,6 +61,27 @@ LOSS, JITTER, USES = 0, 1, 2  # each sample has so many numbers of its own
 SPAN: Final = 64  # so many samples before one are looked at together for what state it found its link in
 
 
+class LinkEffects(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Effects of the network on the samples of one link."""
+
+    delay_s: Annotated[
+        Delay,
+        Meta(description="from speaker to listener [s]; in real time what the network itself takes counts towards it"),
+    ] = 0.001
+    jitter_s: Annotated[Delay, Meta(description="mean of an exponential addition [s]")] = 0.0
+    loss: Annotated[Share, Meta(description="share of samples that never arrive")] = 0.0
+    burst: Annotated[
+        AtLeastOne | None,
+        Meta(description="mean number of samples that are lost in a row; left out: each is lost or not by itself"),
+    ] = None
+    bandwidth: Annotated[Positive | None, Meta(description="of each link [bit/s] of payload; left out: no limit")] = (
+        None
+    )
+    queue_s: Annotated[
+        Delay, Meta(description="a sample that would wait longer for its link to be free is dropped [s]")
+    ] = 0.5
+
+
 @dataclass(frozen=True)
 class Outage:
     """From `begin` to `end` [s] after the common start nothing passes on the `links` (E,)."""
@@ -67,30 +93,17 @@ class Outage:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Of links (E).
+    """Conditions of links (E): the columns of their `LinkEffects`, keys, outages and duration."""
 
-    Attributes:
-        delay: From speaker to listener [s].
-        jitter: Mean of an exponential addition [s].
-        loss: Share of the samples that are lost, in the long run.
-        burst: Mean number of samples that are lost one after the other, at least 1 / (1 − loss); NaN: each sample is
-            lost or not by itself.
-        bandwidth: [bit/s], infinity for no limit.
-        queue: A sample that would wait for longer than this until it is sent is dropped [s].
-        key: See `agents.network.channel_model.key`; from the seed, the speaker's and the listener's name.
-        outages: When nothing passes.
-        duration: From the common start [s]; only for so long is anything lost or too slow.
-    """
-
-    delay: Array
-    jitter: Array
-    loss: Array
-    burst: Array
-    bandwidth: Array
-    queue: Array
-    key: Words
+    delay: Array  # (E,) [s]
+    jitter: Array  # (E,) [s]
+    loss: Array  # (E,) share
+    burst: Array  # (E,) mean length, at least 1 / (1 - loss); NaN: each sample is lost or not by itself
+    bandwidth: Array  # (E,) [bit/s], infinity: no limit
+    queue: Array  # (E,) [s]
+    key: Words  # (E,) of `key`, from the seed and the names of sender and receiver
     outages: tuple[Outage, ...] = ()
-    duration: float = np.inf
+    duration: float = np.inf  # [s] from the common start; later nothing is lost or delayed
 
     def __len__(self) -> int:
         return len(self.delay)
@@ -100,6 +113,28 @@ class Conditions:
         """Nothing is lost, nothing takes time."""
         zero, never = np.zeros(links), np.full(links, np.inf)
         return cls(zero, zero, zero, np.full(links, np.nan), never, never, np.zeros(links, dtype=np.uint64))
+
+    @classmethod
+    def from_effects(
+        cls, effects: Sequence[LinkEffects], which: Index, outages: Sequence[Outage], duration: float
+    ) -> Conditions:
+        """Conditions, still without keys, of links (E) that have `effects[which]`, `which` (E,)."""
+
+        def column(name: str, absent: float = np.nan) -> Array:
+            values = [getattr(each, name) for each in effects]
+            return np.array([absent if value is None else value for value in values], dtype=float)[which]
+
+        return cls(
+            delay=column("delay_s"),
+            jitter=column("jitter_s"),
+            loss=column("loss"),
+            burst=column("burst"),
+            bandwidth=column("bandwidth", np.inf),
+            queue=column("queue_s"),
+            key=np.zeros(len(which), dtype=np.uint64),
+            outages=tuple(outages),
+            duration=duration,
+        )
 
     @classmethod
     def side_by_side(cls, parts: Sequence[Conditions]) -> Conditions:

@@ -138,7 +138,7 @@ RULES: Final[Mapping[Cause, Rule]] = {
 def rules(limits: Limits) -> dict[Cause, Rule]:
     """The table, with the numbers and the choices of an experiment."""
     chosen = {
-        Cause.POSITION: {"then_s": limits.blind_s},
+        Cause.POSITION: {"then_s": limits.blind_s if limits.hold_s is None else limits.hold_s},
         Cause.NEIGHBOUR: {"first": _LOST[limits.lost_neighbour]},
         Cause.ROUTER: {"after_s": limits.link_silence_s, "then_s": limits.offline_s},
         Cause.CONDUCTOR: {"first": _LOST[limits.lost_conductor]},

@@ -69,7 +69,7 @@ class Safety:
         self._position, self._velocity, self._twist = span(position), span(velocity), span(twist)
         self._any_position, self._any_velocity, self._any_twist = len(position), len(velocity), len(twist)
         self._takes_position = takes == "position"
-        self._speed = np.minimum(np.array([kind.speed for kind in kinds]), limits.speed)
+        self._speed = np.minimum(np.array([kind.speed for kind in kinds]), limits.top_speed)
         # a body that closes position errors by itself goes as fast as its goal is far
         self._closes_s = 1.0 / np.array([kind.response for kind in kinds])
         self._step = np.minimum(limits.goal_step, self._speed * self._closes_s)

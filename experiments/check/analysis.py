@@ -106,7 +106,7 @@ class Analysis:
     def speed(self) -> Array:
         """(N,) that each robot may drive or fly at [m/s]."""
         own = np.array([kind.speed for kind in self.assignment.kinds])
-        return np.asarray(np.minimum(own, self.assignment.limits.speed))
+        return np.asarray(np.minimum(own, self.assignment.limits.top_speed))
 
     @property
     def pull(self) -> Array:

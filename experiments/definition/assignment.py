@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 
 from agents.arrays import Index, Mask
@@ -112,28 +113,13 @@ def _patience(experiment: Experiment, name: str) -> float:
 
 
 def limits(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Limits:
-    """For `agents.safety.setpoint_filter`."""
+    """Limits of robots `names`, repeated `copies` times."""
     x, y, z = experiment.arena.size
-    safety = experiment.safety
     return Limits(
         low=np.array([-x / 2, -y / 2, 0.0]),
         high=np.array([x / 2, y / 2, z]),
-        margin=safety.margin,
-        speed=np.inf if safety.speed is None else safety.speed,
-        goal_step=safety.goal_step,
-        own_silence_s=safety.own_silence_s,
-        blind_s=np.array([_patience(experiment, name) for name in names] * copies),
-        link_silence_s=safety.link_silence_s,
-        cut_outside=safety.cut_outside,
-        separation=safety.separation,
-        overspeed=safety.overspeed,
-        tilt=safety.tilt,
-        battery_low=safety.battery_low,
-        battery_min=safety.battery_min,
-        offline_s=safety.offline_s,
-        landing_s=safety.landing_s,
-        lost_neighbour=safety.lost_neighbour,
-        lost_conductor=safety.lost_conductor,
+        hold_s=np.array([_patience(experiment, name) for name in names] * copies),
+        **msgspec.structs.asdict(experiment.safety),
     )
 
 

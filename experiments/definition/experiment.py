@@ -11,14 +11,13 @@ import msgspec
 from msgspec import Meta
 
 from agents.body.interface import Disturbance
+from agents.body.limits import Safety
+from agents.network.channel_model import AtLeastOne, Delay, LinkEffects, Share
 from twins.scene import Obstacle
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
-Share = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(gt=0, le=2000)]
-Delay = Annotated[float, Meta(ge=0, le=60)]
-AtLeastOne = Annotated[float, Meta(ge=1)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Planar = tuple[float, float]
 Vector = Annotated[list[float], Meta(min_length=2, max_length=3)]
@@ -217,14 +216,14 @@ class Leg(Part, frozen=True):
 
 
 class LinkChannel(Part, frozen=True):
-    """What is otherwise on one link; what is left out is as on all others."""
+    """Effects on one link; what is left out is as in the channel."""
 
-    delay_s: Annotated[Delay | None, Meta(description="from speaker to listener [s]")] = None
-    jitter_s: Annotated[Delay | None, Meta(description="mean of an exponential addition [s]")] = None
-    loss: Annotated[Share | None, Meta(description="share of samples that never arrive")] = None
-    burst: Annotated[AtLeastOne | None, Meta(description="mean number of samples that are lost in a row")] = None
-    bandwidth: Annotated[Positive | None, Meta(description="[bit/s] of payload")] = None
-    queue_s: Annotated[Delay | None, Meta(description="longest wait for a link that is busy [s]")] = None
+    delay_s: Delay | None = None
+    jitter_s: Delay | None = None
+    loss: Share | None = None
+    burst: AtLeastOne | None = None
+    bandwidth: Positive | None = None
+    queue_s: Delay | None = None
 
 
 class Outage(Part, frozen=True):
@@ -242,25 +241,9 @@ class Outage(Part, frozen=True):
             raise ValueError("`until_s` must be later than `from_s`; or leave it out")
 
 
-class Channel(Part, frozen=True):
-    """What the network does to poses between robots: modelled in virtual time, added at the listener in real time."""
+class Channel(LinkEffects, Part, frozen=True):
+    """Effects of the network on poses between robots: modelled in virtual time, added at the receiver in real time."""
 
-    delay_s: Annotated[
-        Delay,
-        Meta(description="from speaker to listener [s]; in real time what the network itself takes counts towards it"),
-    ] = 0.001
-    jitter_s: Annotated[Delay, Meta(description="mean of an exponential addition [s]")] = 0.0
-    loss: Annotated[Share, Meta(description="share of samples that never arrive")] = 0.0
-    burst: Annotated[
-        AtLeastOne | None,
-        Meta(description="mean number of samples that are lost in a row; left out: each is lost or not by itself"),
-    ] = None
-    bandwidth: Annotated[Positive | None, Meta(description="of each link [bit/s] of payload; left out: no limit")] = (
-        None
-    )
-    queue_s: Annotated[
-        Delay, Meta(description="a sample that would wait longer for its link to be free is dropped [s]")
-    ] = 0.5
     outages: Annotated[list[Outage], Meta(description="times in which nothing passes")] = []
     links: Annotated[
         dict[str, LinkChannel], Meta(description='"A > B": what A says to B; "A - B": both ways; what is otherwise')
@@ -326,52 +309,6 @@ class Host(Part, frozen=True):
     ] = "zenpark-lab"
     robots: Annotated[list[Name], Meta(description="who runs there; robots that no host names run here")] = []
     tags: Annotated[list[Name], Meta(description="by which `zenpark hosts` chooses among hosts")] = []
-
-
-class Safety(Part, frozen=True):
-    """The last word before a body."""
-
-    speed: Annotated[Positive | None, Meta(description="[m/s], if lower than the kind's own")] = None
-    goal_step: Annotated[Positive, Meta(description="farthest goal from where the robot is [m]")] = 0.5
-    margin: Annotated[NotNegative, Meta(description="how far inside the walls goals stay [m]")] = 0.05
-    own_silence_s: Annotated[Positive, Meta(description="own position older than this is none: hold [s]")] = 0.5
-    blind_s: Annotated[
-        NotNegative, Meta(description="a flying robot that has no position of its own for this long lands [s]")
-    ] = 0.3
-    link_silence_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
-    lost_neighbour: Annotated[
-        Literal["drop", "hold", "land"], Meta(description="what a robot does then: go on without it, hold, or land")
-    ] = "drop"
-    lost_conductor: Annotated[
-        Literal["finish", "land"], Meta(description="what robots do when the conductor is gone in mid-run")
-    ] = "finish"
-    offline_s: Annotated[
-        Positive, Meta(description="a robot without a router holds, and after this lands: no stop reaches it [s]")
-    ] = 10.0
-    separation: Annotated[
-        Positive | None,
-        Meta(
-            description="nearer than this to another robot that it hears, from middle to middle, a robot holds; nearer "
-            "than half of it, or touching, it lands [m]; left out: not watched"
-        ),
-    ] = None
-    cut_outside: Annotated[Positive, Meta(description="a drone this far outside the arena has its motors cut [m]")] = (
-        0.75
-    )
-    overspeed: Annotated[
-        float, Meta(gt=1, description="a robot that moves faster than this times what its kind can holds, then lands")
-    ] = 2.5
-    tilt: Annotated[
-        float, Meta(gt=0, lt=4, description="a drone that leans more than this has its motors cut [rad]")
-    ] = 1.2
-    battery_low: Annotated[Share, Meta(description="with less charge than this a robot lands; 0: never")] = 0.1
-    battery_min: Annotated[Share, Meta(description="with less charge than this it does not take off; 0: always")] = 0.2
-    landing_s: Annotated[
-        Positive, Meta(description="a drone that takes longer than this to land has its motors cut [s]")
-    ] = 20.0
-    loop_silence_s: Annotated[
-        Positive, Meta(description="a robot whose control loop hangs for this long is landed from outside of it [s]")
-    ] = 0.5
 
 
 class World(Part, frozen=True):

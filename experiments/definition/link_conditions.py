@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf, nan
+from math import inf
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.arrays import Array, Index, Mask
+from agents.arrays import Index, Mask
 from agents.formation.graph import Links, links
 from agents.network import channel_model
-from agents.network.channel_model import Conditions, Outage
+from agents.network.channel_model import Conditions, LinkEffects, Outage
 from experiments.definition.assignment import guided
 from experiments.definition.experiment import Channel, Experiment, LinkChannel
 from experiments.definition.links import pairs
 
 OWN_S: Final = Channel().delay_s  # any real network takes as long: to wait for it would cost a tick in ten milliseconds
-_PLAIN: Final = LinkChannel()
 TO_CENTRE, FROM_CENTRE = "to centre", "from centre"  # streams
 
 
@@ -28,10 +27,12 @@ def modelled(experiment: Experiment) -> bool:
     return experiment.channel != Channel()
 
 
-def of_link(channel: Channel, own: LinkChannel = _PLAIN) -> LinkChannel:
-    """What holds on a link that has `own` settings: those, and for the rest the channel's."""
-    given = {name: getattr(own, name) for name in LinkChannel.__struct_fields__}
-    return LinkChannel(**{name: getattr(channel, name) if value is None else value for name, value in given.items()})
+def of_link(channel: Channel, own: LinkChannel | None = None) -> LinkEffects:
+    """Effects on a link: its `own` settings, and the channel's where it has none."""
+    effects = {name: getattr(channel, name) for name in LinkEffects.__struct_fields__}
+    if own is not None:
+        effects |= {name: value for name in effects if (value := getattr(own, name)) is not None}
+    return LinkEffects(**effects)
 
 
 def virtual(experiment: Experiment, over: Links, seeds: Sequence[int], *, stream: str = "") -> Conditions:
@@ -89,16 +90,11 @@ class _Ends:
 
 def _of(channel: Channel, ends: _Ends, duration: float) -> Conditions:
     """Without keys."""
-    held = [of_link(channel), *(of_link(channel, own) for own in channel.links.values())]
+    effects = [of_link(channel), *(of_link(channel, own) for own in channel.links.values())]
     count = len(ends.listener)
     which = np.zeros(count, dtype=np.intp)
     for number, text in enumerate(channel.links, start=1):
         which[ends.named(text)] = number
-
-    def column(name: str, left_out: float = nan) -> Array:
-        values = [getattr(each, name) for each in held]
-        return np.array([left_out if value is None else value for value in values], dtype=float)[which]
-
     outages = []
     for outage in channel.outages:
         there = np.full(count, not (outage.links or outage.robots))
@@ -106,17 +102,7 @@ def _of(channel: Channel, ends: _Ends, duration: float) -> Conditions:
             there |= ends.named(text)
         there |= np.isin(ends.listener, outage.robots) | np.isin(ends.speaker, outage.robots)
         outages.append(Outage(outage.from_s, inf if outage.until_s is None else outage.until_s, there))
-    return Conditions(
-        delay=column("delay_s"),
-        jitter=column("jitter_s"),
-        loss=column("loss"),
-        burst=column("burst"),
-        bandwidth=column("bandwidth", inf),
-        queue=column("queue_s"),
-        key=np.zeros(count, dtype=np.uint64),
-        outages=tuple(outages),
-        duration=duration,
-    )
+    return Conditions.from_effects(effects, which, outages, duration)
 
 
 def _seeded(bare: Conditions, ends: _Ends, seeds: Sequence[int], stream: str) -> list[Conditions]:

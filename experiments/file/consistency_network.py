@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from typing import Final
 
+from agents.network.channel_model import LinkEffects
 from agents.network.endpoints import Endpoint
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
@@ -133,7 +134,7 @@ ROUNDING: Final = 1e-9
 def channel_faults(experiment: Experiment) -> Iterator[Fault]:
     """Everything in [channel] that contradicts something else."""
     channel = experiment.channel
-    yield from _bursts(of_link(channel), ("channel",), LinkChannel(loss=channel.loss, burst=channel.burst))
+    yield from _bursts(channel, ("channel",), channel)
     there = _heard(experiment) if channel.links or any(outage.links for outage in channel.outages) else None
     said: dict[tuple[str, str], str] = {}
     for text, own in channel.links.items():
@@ -197,9 +198,9 @@ def _heard(experiment: Experiment) -> set[tuple[str, str]] | None:
     return {(names[i], names[j]) for i, j in zip(links.listener.tolist(), links.speaker.tolist(), strict=True)}
 
 
-def _bursts(held: LinkChannel, path: Path, own: LinkChannel) -> Iterator[Fault]:
+def _bursts(held: LinkEffects, path: Path, own: LinkEffects | LinkChannel) -> Iterator[Fault]:
     """Losses in a row: `held` is what holds on a link, `own` what stands at this place of the file."""
-    loss, burst = held.loss or 0.0, held.burst
+    loss, burst = held.loss, held.burst
     if burst is None or (own.loss is None and own.burst is None):
         return
     at = (*path, "burst" if own.burst is not None else "loss")

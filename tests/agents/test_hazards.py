@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.limits import Limits
+from agents.body.limits import Limits, Safety
 from agents.decision.lifecycle import AIRBORNE, DONE, LANDING, READY, RUNNING
 from agents.safety.detection import LATE_SHARE, SILENT_S, ProcessHealth, lean, leaning
 from agents.safety.hazards import RULES, Cause, Hazards, Outcome, Sighting, rules
 from agents.safety.landing import PATIENCE_S
-from experiments.definition.experiment import Formation, Robot, Safety
+from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import drone, pair, triangle
 from tests.agents.swarm import Swarm
 

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from agents.body.limits import Safety
 from agents.decision.lifecycle import IDLE, READY, RUNNING
-from experiments.definition.experiment import Robot, Safety
+from experiments.definition.experiment import Robot
 from tests.agents.few import drone, pair
 from tests.agents.swarm import Swarm
 from tests.agents.test_hazards import leant, spoiled

@@ -8,11 +8,12 @@ import pytest
 
 from agents.body.interface import Disturbance, Jitter
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, TURTLEBOT3
+from agents.body.limits import Safety
 from agents.plugins.laws import Distance
 from agents.plugins.planners import Line
 from agents.plugins.triggers import Periodic, SendOnDelta
 from experiments.definition import assignment, bodies
-from experiments.definition.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Safety, Start
+from experiments.definition.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Start
 from experiments.file import document
 from twins.scene import Obstacle
 
@@ -119,7 +120,7 @@ def test_limits_are_the_arena_and_the_safety_of_the_file():
     np.testing.assert_array_equal(made.high, [1.0, 1.5, 4.0])
     assert (made.speed, made.goal_step, made.margin) == (0.3, 0.2, 0.1)
     assert (made.own_silence_s, made.link_silence_s) == (0.5, 1.0)
-    assert assignment.limits(experiment(), []).speed == np.inf
+    assert assignment.limits(experiment(), []).top_speed == np.inf
 
 
 def test_links_may_have_gains_of_their_own():

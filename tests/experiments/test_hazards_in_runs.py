@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from agents.body.limits import Safety
 from agents.decision.lifecycle import DONE
 from experiments.check.check import check
-from experiments.definition.experiment import Formation, Robot, Safety
+from experiments.definition.experiment import Formation, Robot
 from experiments.file import document
 from experiments.recording import playback
 from experiments.virtual_time.log import Logbook
