@@ -11,8 +11,8 @@ import numpy as np
 
 from agents.arrays import Array
 from agents.network import messages
+from experiments.recording.topics import SentGoal
 from experiments.recording.trace import ROUNDING_S, Goals, _first
-from experiments.recording.writer import SentGoal
 
 STATUS_S: Final = 1.0  # a report at most this much after the end of a run still counts for it
 

@@ -14,8 +14,8 @@ from agents.network.messages import Status
 from agents.network.validation import missed, said_within
 from experiments.definition import assignment
 from experiments.definition.experiment import Experiment
+from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
-from experiments.recording.writer import SentPose
 
 STATUS_S: Final = 1.0  # what happened in the run is counted by a status at most this much after its end
 

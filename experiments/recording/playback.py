@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from agents.arrays import Array, Index
 from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, State, Status, WorldState
 from experiments.definition.assignment import guided
 from experiments.definition.experiment import Experiment
-from experiments.recording.cdr import Undecodable, codec
+from experiments.recording.cdr import Codec, Undecodable, codec
 from experiments.recording.centre_goals import of_recording
-from experiments.recording.clocks import ClockOffset, Correction
+from experiments.recording.clocks import Correction
 from experiments.recording.losses import STATUS_S, dropped, lost
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
+from experiments.recording.topics import JSON, METADATA, TOPICS, SentGoal, SentPose
 from experiments.recording.trace import ROUNDING_S, HeardPoses, Sent, Trace, looked_for, within
-from experiments.recording.writer import JSON, METADATA, SentGoal, SentPose
 
 HOLD_PERIODS: Final = 2.0  # for so many state periods a robot is where it last said; then nobody knows
 EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the whole run are not that much early
@@ -102,36 +103,19 @@ def read(path: Path) -> Playback:
     return Playback(trace, start, records.complete, messages)
 
 
-@dataclass
 class _Content:
     """The messages of a recording, by kind."""
 
-    records: Records
-    states: list[State] = field(default_factory=list)
-    poses: list[SentPose] = field(default_factory=list)
-    statuses: list[Status] = field(default_factory=list)
-    events: list[Event] = field(default_factory=list)
-    contacts: list[Contact] = field(default_factory=list)
-    world: list[WorldState] = field(default_factory=list)
-    goals: list[SentGoal] = field(default_factory=list)
-    reports: list[CentreState] = field(default_factory=list)
-    clocks: list[HostClock] = field(default_factory=list)
+    def __init__(self, records: Records) -> None:
+        self.records = records
+        self._lists: dict[type[msgspec.Struct], list[Any]] = {topic.recorded: [] for topic in TOPICS}
+
+    def __getitem__(self, kind: type[S]) -> list[S]:
+        return self._lists[kind]
 
     def fill(self) -> int:
         """Reads all messages and counts them; those of other types are passed over."""
-        known = dict(
-            [
-                _reader(State, self.states),
-                _reader(SentPose, self.poses),
-                _reader(Status, self.statuses),
-                _reader(Event, self.events),
-                _reader(Contact, self.contacts),
-                _reader(WorldState, self.world),
-                _reader(SentGoal, self.goals),
-                _reader(CentreState, self.reports),
-                _reader(HostClock, self.clocks),
-            ]
-        )
+        known = {made.name: (made, self._lists[kind].append) for kind in self._lists for made in [codec(kind)]}
         readers: dict[int, Callable[[bytes], None] | None] = {}
         count = 0
         for message in self.records.messages():
@@ -144,22 +128,18 @@ class _Content:
                     take(message.data)
                 except Undecodable as error:
                     raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
-        right = Correction(self.clocks)
-        if self.clocks:
-            self.states = [right.state(state) for state in self.states]
-            self.poses = [msgspec.structs.replace(p, stamp=right(p.robot, p.stamp)) for p in self.poses]
-            self.statuses = [right.status(status) for status in self.statuses]
-            self.goals = [msgspec.structs.replace(g, pose=right(g.robot, g.pose)) for g in self.goals]
+        if self[HostClock]:
+            right = Correction(self[HostClock])
+            self[State][:] = [right.state(state) for state in self[State]]
+            self[SentPose][:] = [replace(pose, stamp=right(pose.robot, pose.stamp)) for pose in self[SentPose]]
+            self[Status][:] = [right.status(status) for status in self[Status]]
+            self[SentGoal][:] = [replace(goal, pose=right(goal.robot, goal.pose)) for goal in self[SentGoal]]
         return count
-
-    def lies(self) -> tuple[ClockOffset, ...]:
-        """How the clocks of other machines lay to the conductor's."""
-        return Correction(self.clocks).lies()
 
     def start(self, announced: float | None) -> float | None:
         """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
-        said = [event.stamp for event in self.events if event.kind == "start" and math.isfinite(event.stamp)]
-        began = [status.started for status in self.statuses if status.started > 0.0]
+        said = [event.stamp for event in self[Event] if event.kind == "start" and math.isfinite(event.stamp)]
+        began = [status.started for status in self[Status] if status.started > 0.0]
         if said or announced is not None:
             return said[0] if said else announced
         return min(began, default=None)
@@ -168,7 +148,7 @@ class _Content:
         """How long the run lasted from the common start on [s], at most as long as it was to last."""
         said = [
             (event.stamp - start, event.text != "landing")
-            for event in self.events
+            for event in self[Event]
             if (event.kind, event.source) == ("phase", "conductor")
             and event.text.startswith("landing")
             and math.isfinite(event.stamp)
@@ -177,7 +157,7 @@ class _Content:
             end, interrupted = min(said)
             return min(end, duration) if interrupted or end < duration - EARLY_S else duration
         last: dict[str, float] = {}
-        for state in self.states:
+        for state in self[State]:
             if state.phase not in LANDED and math.isfinite(state.stamp):
                 last[state.robot] = max(last.get(state.robot, -math.inf), state.stamp - start)
         end = max(last.values(), default=duration)
@@ -186,27 +166,22 @@ class _Content:
         end = min((at for at in last.values() if at > end - HOLE_S), default=end)
         return duration if end > duration - EARLY_S else end
 
-    def _choose(self, channel: int, known: dict[str, _Reader]) -> Callable[[bytes], None] | None:
+    def _choose(self, channel: int, known: Mapping[str, _Sink]) -> Callable[[bytes], None] | None:
         about = self.records.channels[channel]
         schema = self.records.schemas.get(about.schema_id)
         if schema is None or schema.name not in known:
             return None
-        text, take = known[schema.name]
-        if schema.data.decode(errors="replace") != text:
+        made, append = known[schema.name]
+        if schema.data.decode(errors="replace") != made.schema:
             raise RecordingError(
                 f"{self.records.path}: {about.topic} was recorded by a version of zenpark with other fields of "
                 f"{schema.name}; read it with that version"
             )
-        return take
+        decode = made.decode
+        return lambda data: append(decode(data))
 
 
-_Reader = tuple[str, Callable[[bytes], None]]
-
-
-def _reader(kind: type[S], sink: list[S]) -> tuple[str, _Reader]:
-    made = codec(kind)
-    decode, append = made.decode, sink.append
-    return made.name, (made.schema, lambda data: append(decode(data)))
+_Sink = tuple[Codec[Any], Callable[[Any], None]]
 
 
 def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], about: tuple[str, int, str]) -> Trace:
@@ -214,22 +189,24 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
     robots = tuple(experiment.robots)
     rate, (start, duration) = experiment.rates.state_hz, run
     time = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
-    states = _by_robot(content.states, robots)
-    poses = [list({(pose.stamp, pose.seq): pose for pose in own}.values()) for own in _by_robot(content.poses, robots)]
-    statuses = _by_robot(content.statuses, robots)
+    states = _by_robot(content[State], robots)
+    poses = [
+        list({(pose.stamp, pose.seq): pose for pose in own}.values()) for own in _by_robot(content[SentPose], robots)
+    ]
+    statuses = _by_robot(content[Status], robots)
     last = [_by_the_end(own, start + duration) for own in statuses]
     sampled = [_Sampled.of(own, start, time, HOLD_PERIODS / rate) for own in states]
 
     def column(what: str) -> Array:
         return np.stack([getattr(own, what) for own in sampled], axis=1)
 
-    turned = any(state.attitude is not None for state in content.states)
-    shadowed = any(state.shadow_position is not None for state in content.states)
-    contacts, world = within(content.contacts, start, duration), within(content.world, start, duration)
+    turned = any(state.attitude is not None for state in content[State])
+    shadowed = any(state.shadow_position is not None for state in content[State])
+    contacts, world = within(content[Contact], start, duration), within(content[WorldState], start, duration)
     goals = None
     if guided(experiment):
         told = dict(zip(robots, states, strict=True))
-        goals = of_recording(content.goals, told, content.reports, start, duration)
+        goals = of_recording(content[SentGoal], told, content[CentreState], start, duration)
     return Trace(
         case=about[0],
         experiment=experiment,
@@ -251,8 +228,7 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         ticks=_counted(last, "ticks"),
         decisions=_counted(last, "decisions"),
         events=tuple(
-            msgspec.structs.replace(event, stamp=event.stamp - start)
-            for event in sorted(content.events, key=lambda event: event.stamp)
+            replace(event, stamp=event.stamp - start) for event in sorted(content[Event], key=lambda event: event.stamp)
         ),
         interventions=_counted(last, "interventions"),
         avoided=_counted(last, "avoided"),
@@ -262,7 +238,7 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         shadow_position=column("shadow_position") if shadowed else None,
         shadow_yaw=column("shadow_yaw")[:, :, 0] if shadowed else None,
         goals=goals,
-        clocks=content.lies(),
+        clocks=Correction(content[HostClock]).lies(),
     )
 
 

@@ -1,25 +1,9 @@
-"""The recording of one case: an MCAP file that describes itself and survives a killed recorder.
-
-    /<robot>/pose       zenpark_msgs/SentPose         what was sent to the neighbours, with its size on the network
-    /<robot>/state      zenpark_msgs/State            telemetry, with the poses heard since the one before
-    /<robot>/true_pose  geometry_msgs/PoseStamped     the same place in a type that every viewer draws
-    /<robot>/status     zenpark_msgs/Status
-    /<robot>/goal       zenpark_msgs/SentGoal         what the centre told a robot that it guides
-    /centre/report      zenpark_msgs/CentreState      what the centre says of itself
-    /world/contact      zenpark_msgs/Contact          what touched in the world, when it began
-    /world/state        zenpark_msgs/WorldState       what the world says of itself
-    /run/clock          zenpark_msgs/HostClock        how another machine's clock lay to the conductor's
-    /events             zenpark_msgs/Event
-
-Attached are the experiment as it was written (`experiment.toml`) and this case with its overrides (`experiment.json`);
-the metadata record `zenpark` says which case, which seed, which clock and which version.
-"""
+"""Writes the recording of one case: an MCAP file that describes itself and survives a killed recorder."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import TracebackType
@@ -30,21 +14,12 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, Writer
 
-from agents.network.messages import (
-    CentreState,
-    Contact,
-    Event,
-    Goal,
-    HostClock,
-    Pose,
-    State,
-    Status,
-    Vector,
-    WorldState,
-)
+from agents.network.messages import Event, State
 from experiments.definition.experiment import Experiment
+from experiments.recording import version
 from experiments.recording.cdr import POSE_STAMPED, POSE_STAMPED_SCHEMA, Unencodable, codec, pose_stamped
 from experiments.recording.reader import RecordingError
+from experiments.recording.topics import CHUNK_BYTES, JSON, METADATA, TOML, TOPICS, Message
 
 BLOCK_BYTES: Final = 1024 * 1024
 PRIVATE: Final = "_Writer__chunk_indices"  # as of mcap 1.6; the library has no public place for it
@@ -99,42 +74,8 @@ class ChunkIndices:
 
 
 FRAME: Final = "park"
-TOML: Final = "experiment.toml"
-JSON: Final = "experiment.json"
-METADATA: Final = "zenpark"
-RUN: Final = "run"  # these stand where a robot's name would; no robot may be called so
-WORLD: Final = "world"
-CENTRE: Final = "centre"
-CHUNK_BYTES: Final = 32 * 1024  # what a kill can cost: a third of a second of seven robots
+DRAWN: Final = "/{robot}/true_pose"
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
-
-
-class SentPose(msgspec.Struct, frozen=True):
-    """A pose as it was sent, when the recorder got it (UTC [s]) and how many bytes its payload had."""
-
-    robot: str
-    seq: int
-    stamp: float
-    position: Vector
-    velocity: Vector | None
-    yaw: float | None
-    received: float
-    size: int
-
-
-class SentGoal(msgspec.Struct, frozen=True):
-    """A goal as it was sent, see `agents.network.messages.Goal`, when the recorder got it (UTC [s]) and its size
-    [bytes].
-    """
-
-    robot: str
-    seq: int
-    stamp: float
-    position: Vector
-    yaw: float | None
-    pose: float
-    received: float
-    size: int
 
 
 class Recording:
@@ -172,17 +113,15 @@ class Recording:
         """
         self.path = path
         self.refused = 0
-        self._channels: dict[tuple[str, str], int] = {}
+        self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._latest = 0  # [ns]
-        self._pose = _topic("pose", SentPose)
-        self._state = _topic("state", State)
-        self._status = _topic("status", Status)
-        self._event = _topic("events", Event)
-        self._clock = _topic("clock", HostClock)
-        self._contact, self._world = _topic("contact", Contact), _topic("state", WorldState)
-        self._goal, self._centre = _topic("goal", SentGoal), _topic("report", CentreState)
-        self._drawn = _Topic("true_pose", POSE_STAMPED, POSE_STAMPED_SCHEMA, _drawing())
+        self._topics = {
+            topic.message: (topic.recorded, _Written(topic.name, made.name, made.schema, made.encode))
+            for topic in TOPICS
+            for made in [codec(topic.recorded)]
+        }
+        self._drawn = _Written(DRAWN, POSE_STAMPED, POSE_STAMPED_SCHEMA, _drawing())
         self._over = ""  # why nothing more can be written
         try:
             self._file = _Unbuffered(path)
@@ -193,7 +132,7 @@ class Recording:
         self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._index = ChunkIndices(path.parent)
         self._index.stand_in(self._writer)
-        about = {"case": case, "seed": str(seed), "clock": clock, "version": _version()}
+        about = {"case": case, "seed": str(seed), "clock": clock, "version": version.number()}
         if started is not None:
             about["started"] = repr(started)
         try:
@@ -202,87 +141,30 @@ class Recording:
             self._let_go()
             raise
 
-    def pose(self, pose: Pose, received: float, size: int) -> None:
-        """Records a pose that was sent to the neighbours.
+    def write(self, message: Message, received: float | None = None, size: int = 0) -> None:
+        """Records a message. An event brings everything so far to the disk: events are few, and explain the rest.
+
+        With a state, its place goes to the viewers' topic if it is known: the truth of a twin, else as measured.
 
         Args:
-            pose: What was sent.
-            received: When the recorder got it, UTC [s].
-            size: Of its payload on the network [bytes].
+            message: As it was sent.
+            received: When the recorder got it, UTC [s]; of poses and goals.
+            size: Of its payload on the network [bytes]; of poses and goals.
 
         Raises:
             RecordingError: If it cannot be written; what was written before stays.
         """
-        sent = SentPose(pose.robot, pose.seq, pose.stamp, pose.position, pose.velocity, pose.yaw, received, size)
-        self._record(self._pose, pose.robot, sent, received, pose.stamp, seq=pose.seq)
-
-    def state(self, state: State) -> None:
-        """Records telemetry, and for the viewers where the robot is, if known: the truth of a twin, else as measured.
-
-        Raises:
-            RecordingError: If it cannot be written; what was written before stays.
-        """
-        written = self._record(self._state, state.robot, state, state.stamp, state.stamp, seq=state.seq)
-        if written and (state.true_position or state.position) is not None:
-            self._record(self._drawn, state.robot, state, state.stamp, state.stamp, seq=state.seq)
-
-    def status(self, status: Status) -> None:
-        """Records lifecycle and counters.
-
-        Raises:
-            RecordingError: If it cannot be written; what was written before stays.
-        """
-        self._record(self._status, status.robot, status, status.stamp, status.stamp)
-
-    def goal(self, goal: Goal, received: float, size: int) -> None:
-        """Records a goal that was sent to a robot; see `pose`.
-
-        Raises:
-            RecordingError: If it cannot be written; what was written before stays.
-        """
-        sent = SentGoal(goal.robot, goal.seq, goal.stamp, goal.position, goal.yaw, goal.pose, received, size)
-        self._record(self._goal, goal.robot, sent, received, goal.stamp, seq=goal.seq)
-
-    def centre(self, said: CentreState) -> None:
-        """Records what the centre says of itself.
-
-        Raises:
-            RecordingError: If it cannot be written; what was written before stays.
-        """
-        self._record(self._centre, CENTRE, said, said.stamp, said.stamp)
-
-    def contact(self, contact: Contact) -> None:
-        """Records the beginning of a contact in the world.
-
-        Raises:
-            RecordingError: If it cannot be written; what was written before stays.
-        """
-        self._record(self._contact, WORLD, contact, contact.stamp, contact.stamp)
-
-    def world(self, said: WorldState) -> None:
-        """Records what the world says of itself.
-
-        Raises:
-            RecordingError: If it cannot be written; what was written before stays.
-        """
-        self._record(self._world, WORLD, said, said.stamp, said.stamp)
-
-    def clock(self, said: HostClock) -> None:
-        """Records how another machine's clock lay to the conductor's.
-
-        Raises:
-            RecordingError: If it cannot be written; what was written before stays.
-        """
-        self._record(self._clock, RUN, said, said.stamp, said.stamp)
-
-    def event(self, event: Event) -> None:
-        """Records something that happened, and brings all so far to the disk: events are few, and explain the rest.
-
-        Raises:
-            RecordingError: If it cannot be written; what was written before stays.
-        """
-        self._record(self._event, "", event, event.stamp, event.stamp)
-        self.flush()
+        recorded, topic = self._topics[type(message)]
+        entry: Any = message
+        if received is not None:
+            entry = recorded(*msgspec.structs.astuple(message), received, size)
+        logged = message.stamp if received is None else received
+        written = self._record(topic, message, entry, logged)
+        if isinstance(message, State):
+            if written and (message.true_position or message.position) is not None:
+                self._record(self._drawn, message, message, logged)
+        elif isinstance(message, Event):
+            self.flush()
 
     def flush(self) -> None:
         """Brings everything so far to the disk.
@@ -323,27 +205,25 @@ class Recording:
         self._writer.add_attachment(0, 0, JSON, "application/json", msgspec.json.encode(experiment))
         self._writer.add_metadata(METADATA, about)
 
-    def _record(
-        self, topic: _Topic, robot: str, message: msgspec.Struct, logged: float, published: float, *, seq: int = 0
-    ) -> bool:
+    def _record(self, topic: _Written, message: Message, entry: msgspec.Struct, logged: float) -> bool:
         """Whether the message was whole, and is written."""
         try:
-            data = topic.encode(message)
+            data = topic.encode(entry)
         except Unencodable:
             self.refused += 1
             return False
-        channel = self._channels.get((robot, topic.what)) or self._register(topic, robot)
-        times = self._nanoseconds(logged), self._nanoseconds(published)
-        self._guarded(self._writer.add_message, channel, times[0], data, times[1], seq & 0xFFFFFFFF)
+        name = topic.name.format(robot=getattr(message, "robot", ""))
+        channel = self._channels.get(name) or self._register(topic, name)
+        times = self._nanoseconds(logged), self._nanoseconds(message.stamp)
+        number = getattr(message, "seq", 0) & 0xFFFFFFFF
+        self._guarded(self._writer.add_message, channel, times[0], data, times[1], number)
         return True
 
-    def _register(self, topic: _Topic, robot: str) -> int:
-        if topic.name not in self._schemas:
-            self._schemas[topic.name] = self._writer.register_schema(topic.name, "ros2msg", topic.schema.encode())
-        name = f"/{robot}/{topic.what}" if robot else f"/{topic.what}"
-        channel = self._writer.register_channel(name, "cdr", self._schemas[topic.name])
-        self._channels[robot, topic.what] = channel
-        return channel
+    def _register(self, topic: _Written, name: str) -> int:
+        if topic.kind not in self._schemas:
+            self._schemas[topic.kind] = self._writer.register_schema(topic.kind, "ros2msg", topic.schema.encode())
+        self._channels[name] = self._writer.register_channel(name, "cdr", self._schemas[topic.kind])
+        return self._channels[name]
 
     def _nanoseconds(self, stamp: float) -> int:
         if 0.0 <= stamp < LATEST_S:
@@ -367,18 +247,13 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class _Topic:
-    """What is written where, for one robot or for all."""
+class _Written:
+    """A topic as the file has it."""
 
-    what: str
-    name: str
+    name: str  # with `{robot}` for the robot's name
+    kind: str  # the ROS 2 type
     schema: str
     encode: Callable[[Any], bytes]
-
-
-def _topic(what: str, kind: type[msgspec.Struct]) -> _Topic:
-    made = codec(kind)
-    return _Topic(what, made.name, made.schema, made.encode)
 
 
 def _drawing() -> Callable[[State], bytes]:
@@ -417,10 +292,3 @@ class _Unbuffered:
 
     def close(self) -> None:
         self._raw.close()
-
-
-def _version() -> str:
-    try:
-        return version("zenpark")
-    except PackageNotFoundError:
-        return "unknown"

@@ -219,28 +219,28 @@ class Logbook:
             started=EPOCH,
         ) as recording:
             for t, kind, source, text in self._events():
-                recording.event(messages.Event(EPOCH + t, kind, source, text))
+                recording.write(messages.Event(EPOCH + t, kind, source, text))
             every = np.ones(len(self._sent[0]), dtype=bool)
             said = zip(self._sent[0].tolist(), self._poses(every), strict=True)
             pending = next(said, None)
             for t, states in self._states():
                 while pending is not None and pending[0] <= t + ROUNDING_S:
                     size = len(messages.encode(pending[1], self._encoding))
-                    recording.pose(pending[1], pending[1].stamp, size)
+                    recording.write(pending[1], pending[1].stamp, size)
                     pending = next(said, None)
                 for state in states:
-                    recording.state(state)
+                    recording.write(state)
             for t, goal in self._told():
-                recording.goal(goal, EPOCH + t, len(messages.encode(goal, self._encoding)))
+                recording.write(goal, EPOCH + t, len(messages.encode(goal, self._encoding)))
             if self._log.steered is not None:
                 steered, end = self._log.steered, self._experiment.duration_s
-                recording.centre(centre_report(steered, self._log.names, self._mine.start, end))
+                recording.write(centre_report(steered, self._log.names, self._mine.start, end))
             for status in self._statuses():
-                recording.status(status)
+                recording.write(status)
             for report in self._world():
-                recording.world(report)
+                recording.write(report)
             for contact in self._contacts():
-                recording.contact(contact)
+                recording.write(contact)
 
     @property
     def _encoding(self) -> messages.Encoding:

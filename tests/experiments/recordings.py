@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from agents.network.messages import Contact, Event, Heard, HostClock, ObstaclePose, Pose, State, Status, WorldState
+from agents.network.messages import Contact, Event, Heard, ObstaclePose, Pose, State, Status, WorldState
 from experiments.definition.experiment import Experiment, Rates, Robot
 from experiments.recording.writer import Recording
 
@@ -87,21 +87,10 @@ def write(path, *messages, experiment=PAIR, **more):
 
 def put(recording, messages):
     for message in messages:
-        match message:
-            case Pose():
-                recording.pose(message, message.stamp + 0.002, 150)
-            case State():
-                recording.state(message)
-            case Status():
-                recording.status(message)
-            case Event():
-                recording.event(message)
-            case Contact():
-                recording.contact(message)
-            case HostClock():
-                recording.clock(message)
-            case WorldState():
-                recording.world(message)
+        if isinstance(message, Pose):
+            recording.write(message, message.stamp + 0.002, 150)
+        else:
+            recording.write(message)
 
 
 def touched(at, first="TB01", second="CF01"):

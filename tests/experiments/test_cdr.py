@@ -22,7 +22,7 @@ from experiments.recording.cdr import (
     codec,
     pose_stamped,
 )
-from experiments.recording.writer import SentPose
+from experiments.recording.topics import SentPose
 
 
 class Inner(msgspec.Struct):

@@ -12,8 +12,7 @@ from rosbags.highlevel import AnyReader
 from agents.network.messages import Event, Heard, HostClock
 from experiments.definition.experiment import Formation, Rates
 from experiments.recording.playback import NotStarted, read
-from experiments.recording.reader import RecordingError
-from experiments.recording.recover import recover
+from experiments.recording.reader import RecordingError, recover
 from tests.experiments.recordings import (
     PAIR,
     START,

@@ -27,14 +27,9 @@ class Taken:
         self.worlds: list[messages.WorldState] = []
         self.events: list[messages.Event] = []
 
-    def contact(self, contact: messages.Contact) -> None:
-        self.contacts.append(contact)
-
-    def event(self, event: messages.Event) -> None:
-        self.events.append(event)
-
-    def world(self, said: messages.WorldState) -> None:
-        self.worlds.append(said)
+    def write(self, message: messages.Message) -> None:
+        kept = {messages.Contact: self.contacts, messages.Event: self.events, messages.WorldState: self.worlds}
+        kept[type(message)].append(message)  # type: ignore[attr-defined, index]
 
 
 def test_whoever_serves_robots_or_records_them_waits_for_the_longest_way_down() -> None:

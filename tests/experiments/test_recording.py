@@ -12,8 +12,7 @@ from rosbags.highlevel import AnyReader
 
 from experiments.definition.experiment import Experiment
 from experiments.recording.playback import read
-from experiments.recording.reader import RecordingError
-from experiments.recording.recover import recover
+from experiments.recording.reader import RecordingError, recover
 from experiments.recording.writer import Recording
 from tests.experiments.recordings import (
     DOCUMENT,
@@ -87,7 +86,7 @@ def test_closed_twice_and_used_after(path):
     recording = write(path, begun())
     recording.close()
     with pytest.raises(RecordingError, match="closed"):
-        recording.state(state())
+        recording.write(state())
 
 
 def test_an_error_of_the_caller_leaves_a_finished_file(path):
@@ -129,7 +128,7 @@ def test_after_a_write_error_nothing_more_is_written(path):
     with pytest.raises(RecordingError):
         put(recording, messages)
     with pytest.raises(RecordingError, match="make room"):
-        recording.state(messages[0])
+        recording.write(messages[0])
     recording.close()
     assert path.stat().st_size == 40_000
 

@@ -13,8 +13,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from experiments.recording.playback import read
-from experiments.recording.reader import RecordingError
-from experiments.recording.recover import Recovered, recover
+from experiments.recording.reader import RecordingError, Recovered, recover
 from tests.experiments.recordings import DOCUMENT, begun, scattered, whole_run, write
 from tools.commands import run as commands
 
@@ -29,7 +28,7 @@ print("flushed", flush=True)
 k = 0
 while True:
     k += 1
-    recording.state(state("CF01", 100 + k, 5.0 + k / 1000, k * 0.37))
+    recording.write(state("CF01", 100 + k, 5.0 + k / 1000, k * 0.37))
 """
 
 

@@ -160,14 +160,14 @@ def recording_bytes(*, plain: bool) -> list[bytes]:
                 for name in ("KH01", "CF01"):
                     said = good(name, k + 1)
                     at = began + 0.1 * k
-                    writer.state(msgspec.structs.replace(said["state"][0], stamp=at))  # type: ignore[type-var]
-                    writer.pose(msgspec.structs.replace(said["pose"][0], stamp=at), at, 150)  # type: ignore[type-var]
+                    writer.write(msgspec.structs.replace(said["state"][0], stamp=at))  # type: ignore[type-var]
+                    writer.write(msgspec.structs.replace(said["pose"][0], stamp=at), at, 150)  # type: ignore[type-var]
                     if k % 5 == 0:
                         status = msgspec.structs.replace(said["status"][0], stamp=at, started=began)  # type: ignore[type-var]
-                        writer.status(status)
-            writer.event(wire.Event(began, "start", "conductor", "go"))
-            writer.contact(wire.Contact(began + 0.5, "KH01", "CF01", 0.1, 0.01))
-            writer.world(
+                        writer.write(status)
+            writer.write(wire.Event(began, "start", "conductor", "go"))
+            writer.write(wire.Contact(began + 0.5, "KH01", "CF01", 0.1, 0.01))
+            writer.write(
                 wire.WorldState(
                     began,
                     "pymunk",
@@ -185,8 +185,8 @@ def recording_bytes(*, plain: bool) -> list[bytes]:
                 )
             )
             for stamp, lies in ((began, 0.2), (began + 1.0, 0.21)):
-                writer.clock(wire.HostClock("lab1", stamp, lies, 0.001, ["KH01"]))
-            writer.event(wire.Event(began + 1.0, "phase", "conductor", "landing"))
+                writer.write(wire.HostClock("lab1", stamp, lies, 0.001, ["KH01"]))
+            writer.write(wire.Event(began + 1.0, "phase", "conductor", "landing"))
         made.append(path.read_bytes())
         if not plain:
             return [made[0], made[0][: len(made[0]) // 2]]
@@ -228,7 +228,7 @@ def resealed(data: bytes) -> bytes:
 def recording_of(*, plain: bool) -> Iterator[Target]:
     """A recording is read, analysed as `zenpark report` begins, and recovered."""
     from experiments.recording import playback  # noqa: PLC0415
-    from experiments.recording.recover import recover  # noqa: PLC0415
+    from experiments.recording.reader import recover  # noqa: PLC0415
 
     with place_for("some.mcap") as file:
         target = file.with_name("other.mcap")
@@ -258,7 +258,7 @@ def forged() -> Iterator[Target]:
 def cdr() -> Iterator[Target]:
     """Every recorded struct: name and CDR with a zero byte between them; what is decoded can be encoded."""
     from experiments.recording.cdr import Undecodable, Unencodable, codec  # noqa: PLC0415
-    from experiments.recording.writer import SentGoal, SentPose  # noqa: PLC0415
+    from experiments.recording.topics import SentGoal, SentPose  # noqa: PLC0415
 
     said = good("KH01")
     pose: Any = said["pose"][0]

@@ -17,7 +17,7 @@ import pytest
 
 from experiments.file import catalogue
 from experiments.recording import playback
-from experiments.recording.writer import CHUNK_BYTES
+from experiments.recording.topics import CHUNK_BYTES
 from tests.system.lab import ROOT, typed, until
 from tests.system.machines import Machines, machines, why_not
 

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from experiments.recording import playback
-from experiments.recording.recover import recover
+from experiments.recording.reader import recover
 from tests.system.lab import Flight, Watcher, gone, typed, until
 
 pytestmark = pytest.mark.system

@@ -203,7 +203,7 @@ def recover(file: str, target: str | None) -> int:
     Raises:
         RecordingError: If `file` is no recording, or `target` exists or cannot be written.
     """
-    from experiments.recording.recover import recover as recovered  # noqa: PLC0415
+    from experiments.recording.reader import recover as recovered  # noqa: PLC0415
 
     source = Path(file)
     chosen = Path(target) if target else source.with_name(f"{source.stem}-recovered.mcap")

@@ -14,8 +14,7 @@ import msgspec
 from experiments.file.problems import DocumentError
 from experiments.recording import playback
 from experiments.recording.playback import NotStarted
-from experiments.recording.reader import RecordingError
-from experiments.recording.recover import recover
+from experiments.recording.reader import RecordingError, recover
 from experiments.report import style
 from experiments.report.page import Finding, Section, Table, date_of, numbered, render
 from experiments.report.page import Row as Line

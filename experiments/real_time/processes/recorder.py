@@ -10,13 +10,16 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from math import isfinite, remainder, tau
 from pathlib import Path
 from typing import Final
 
 import msgspec
 import zenoh
+from zenoh.ext import AdvancedSubscriber
+from zenoh.handlers import Handler
 
 from agents.clock import Clock
 from agents.network import messages, pubsub
@@ -30,6 +33,7 @@ from experiments.definition import mesh
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.recording.reader import RecordingError
+from experiments.recording.topics import DEPTH, TOPICS, Topic
 from experiments.recording.writer import Recording
 
 POLL_S: Final = 0.02
@@ -38,8 +42,6 @@ FRESH_S: Final = 0.05  # a truth that is farther away in time does not belong to
 PATIENCE_S: Final = 0.2  # a state waits so long for the truth that follows it
 TRUTHS: Final = 256  # that are kept of each robot
 NAMED: Final = 100  # keys of which is told that something could not be read
-DEPTH: Final = 20_000  # samples that may wait while the disk does
-RARE: Final = 1_000  # of those that come once a second, or now and then: a ring takes its memory as it first goes round
 
 
 class Recorder:
@@ -53,15 +55,7 @@ class Recorder:
         self._unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
         self._told: dict[str, int] = {}
         self._alive: set[str] = set()
-        self._poses = pubsub.pose_subscriber(session, keys.pose("*"), DEPTH)
-        self._statuses = pubsub.pose_subscriber(session, keys.status("*"), RARE)
-        self._states = pubsub.subscriber(session, keys.state("*"), DEPTH)
-        self._events = pubsub.pose_subscriber(session, keys.event, RARE, pubsub.EVENTS)
-        self._contacts = pubsub.subscriber(session, keys.contact, RARE)
-        self._world = pubsub.subscriber(session, keys.world, RARE)
-        self._goals = pubsub.subscriber(session, keys.goal("*"), DEPTH)
-        self._centre = pubsub.subscriber(session, keys.centre, RARE)
-        self._clocks = pubsub.pose_subscriber(session, keys.clock, RARE)
+        self._subscribers = [(topic, self._subscribe(topic)) for topic in TOPICS]
         self._truths = pubsub.subscriber(session, keys.truth("*"), DEPTH)
         self._truth: dict[str, deque[messages.Position]] = {}
         self._waiting: dict[str, deque[tuple[float, messages.State]]] = {}  # for truth, since when
@@ -82,30 +76,17 @@ class Recorder:
         for sample in network.received(self._watch.handler):
             robot = str(sample.key_expr)
             (self._alive.discard if sample.kind == zenoh.SampleKind.DELETE else self._alive.add)(robot)
-        for handler, what in (
-            (self._truths.handler, self._take_truth),
-            (self._states.handler, self._state),
-            (self._poses.handler, self._pose),
-            (self._statuses.handler, self._status),
-            (self._events.handler, self._event),
-            (self._contacts.handler, self._contact),
-            (self._world.handler, self._said_by_world),
-            (self._goals.handler, self._goal),
-            (self._centre.handler, self._said_by_centre),
-            (self._clocks.handler, self._clock),
-        ):
-            for sample in network.received(handler):
-                try:
-                    what(sample)
-                except ValueError as error:  # malformed, or on a key that is nobody's
-                    key = str(sample.key_expr)
-                    self._unread[key] = self._unread.get(key, (0, ""))[0] + 1, str(error)
-
+        for sample in network.received(self._truths.handler):
+            self._try(self._take_truth, sample)
+        for topic, subscriber in self._subscribers:
+            take = partial(self._take, topic)
+            for sample in network.received(subscriber.handler):
+                self._try(take, sample)
         now = time.monotonic()
         for robot, waiting in self._waiting.items():
             truths = self._truth[robot]
             while waiting and (last or waiting[0][1].stamp <= truths[-1].stamp or now - waiting[0][0] > PATIENCE_S):
-                self._recording.state(with_truth(waiting.popleft()[1], truths))
+                self._recording.write(with_truth(waiting.popleft()[1], truths))
 
     @property
     def malformed(self) -> int:
@@ -123,77 +104,63 @@ class Recorder:
             if not before or (last and count != before):
                 self._told[key] = count
                 text = f"could not read {count} {'message' if count == 1 else 'messages'} on {key}: {why}"
-                self._recording.event(messages.Event(self._arrival.utc(), "unread", "recorder", text))
+                self._recording.write(messages.Event(self._arrival.utc(), "unread", "recorder", text))
 
-    def _pose(self, sample: zenoh.Sample) -> None:
+    def _subscribe(
+        self, topic: Topic
+    ) -> zenoh.Subscriber[Handler[zenoh.Sample]] | AdvancedSubscriber[Handler[zenoh.Sample]]:
+        key = topic.key(self._keys)
+        if not topic.repeated:
+            return pubsub.subscriber(self._session, key, topic.depth)
+        return pubsub.pose_subscriber(
+            self._session, key, topic.depth, pubsub.EVENTS if topic.message is messages.Event else 1
+        )
+
+    def _try(self, take: Callable[[zenoh.Sample], None], sample: zenoh.Sample) -> None:
+        """Counts a sample that is malformed, or on a key of no robot."""
+        try:
+            take(sample)
+        except ValueError as error:
+            key = str(sample.key_expr)
+            self._unread[key] = self._unread.get(key, (0, ""))[0] + 1, str(error)
+
+    def _take(self, topic: Topic, sample: zenoh.Sample) -> None:
         payload = sample.payload.to_bytes()
-        pose = messages.decode(payload, str(sample.encoding), messages.Pose)
-        self._own(sample, pose.robot)
-        self._recording.pose(pose, self._arrival.utc(), len(payload))
-
-    def _state(self, sample: zenoh.Sample) -> None:
-        state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
-        self._own(sample, state.robot)
-        if state.true_position is None and state.robot in self._truth:
-            self._waiting.setdefault(state.robot, deque()).append((time.monotonic(), state))
+        message = messages.decode(payload, str(sample.encoding), topic.message)
+        if topic.of_robot:
+            self._own(sample, getattr(message, "robot", ""))
+        if topic.finite and not _finite(message):
+            raise messages.Malformed(f"a number on {sample.key_expr} is not finite")
+        if isinstance(message, messages.State) and message.true_position is None and message.robot in self._truth:
+            self._waiting.setdefault(message.robot, deque()).append((time.monotonic(), message))
+        elif topic.recorded is topic.message:
+            self._recording.write(message)
         else:
-            self._recording.state(state)
+            self._recording.write(message, self._arrival.utc(), len(payload))
 
     def _take_truth(self, sample: zenoh.Sample) -> None:
         """A protocol twin says where its robot really is: its bridge cannot know."""
         truth = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position)
         self._own(sample, truth.robot)
-        self._finite(sample, truth.stamp, *truth.position, truth.yaw or 0.0)
+        if not _finite(truth):
+            raise messages.Malformed(f"a number on {sample.key_expr} is not finite")
         truths = self._truth.setdefault(truth.robot, deque(maxlen=TRUTHS))
         if truths and truth.stamp <= truths[-1].stamp:
             truths.clear()  # its device was started again
         truths.append(truth)
 
-    def _status(self, sample: zenoh.Sample) -> None:
-        status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
-        self._own(sample, status.robot)
-        self._recording.status(status)
-
-    def _event(self, sample: zenoh.Sample) -> None:
-        self._recording.event(messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Event))
-
-    def _contact(self, sample: zenoh.Sample) -> None:
-        contact = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Contact)
-        self._finite(sample, contact.stamp, contact.impulse, contact.overlap)
-        self._recording.contact(contact)
-
-    def _said_by_world(self, sample: zenoh.Sample) -> None:
-        said = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.WorldState)
-        self._finite(sample, said.stamp, said.time, said.factor, said.load)
-        for standing in said.obstacles:
-            self._finite(sample, *standing.pose)
-        self._recording.world(said)
-
-    def _goal(self, sample: zenoh.Sample) -> None:
-        payload = sample.payload.to_bytes()
-        goal = messages.decode(payload, str(sample.encoding), messages.Goal)
-        self._own(sample, goal.robot)
-        self._finite(sample, goal.stamp, goal.pose)
-        self._recording.goal(goal, self._arrival.utc(), len(payload))
-
-    def _said_by_centre(self, sample: zenoh.Sample) -> None:
-        said = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.CentreState)
-        self._finite(sample, said.stamp, said.load, said.late_s, said.cpu_s, said.rss_mb)
-        self._recording.centre(said)
-
-    def _clock(self, sample: zenoh.Sample) -> None:
-        said = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.HostClock)
-        self._finite(sample, said.stamp, said.offset, said.uncertainty, said.applied or 0.0)
-        self._recording.clock(said)
-
-    @staticmethod
-    def _finite(sample: zenoh.Sample, *numbers: float) -> None:
-        if not all(map(isfinite, numbers)):
-            raise messages.Malformed(f"a number on {sample.key_expr} is not finite")
-
     def _own(self, sample: zenoh.Sample, robot: str) -> None:
         if self._keys.robot(str(sample.key_expr)) != robot:
             raise messages.Malformed(f"a message of '{robot}' on {sample.key_expr}")
+
+
+def _finite(value: object) -> bool:
+    """Whether all numbers of a message are finite."""
+    if isinstance(value, msgspec.Struct):
+        value = msgspec.structs.astuple(value)
+    if isinstance(value, tuple | list):
+        return all(map(_finite, value))
+    return not isinstance(value, float) or isfinite(value)
 
 
 def with_truth(state: messages.State, truths: Sequence[messages.Position]) -> messages.State:

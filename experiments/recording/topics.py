@@ -1,0 +1,96 @@
+"""Topics of a recording: each kind of message with its key on the network, its topic and its type in the file.
+
+The recorder subscribes by this table, the writer and the playback look topics up in it. Beside them stands
+`/<robot>/true_pose` (geometry_msgs/PoseStamped), the place of a robot in a type that every viewer draws.
+
+Attached are the experiment as it was written (`experiment.toml`) and this case with its overrides (`experiment.json`);
+the metadata record `zenpark` has case, seed, clock and version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import msgspec
+
+from agents.network.keys import Keys
+from agents.network.messages import (
+    CentreState,
+    Contact,
+    Event,
+    Goal,
+    HostClock,
+    Pose,
+    State,
+    Status,
+    Vector,
+    WorldState,
+)
+
+TOML: Final = "experiment.toml"
+JSON: Final = "experiment.json"
+METADATA: Final = "zenpark"
+CHUNK_BYTES: Final = 32 * 1024  # lost at most by a kill: a third of a second of seven robots
+DEPTH: Final = 20_000  # samples that may wait while the disk does
+RARE: Final = 1_000  # of those at 1 Hz or rarer: a ring takes its memory as it first goes round
+
+Message = Pose | State | Status | Event | Contact | WorldState | Goal | CentreState | HostClock
+
+
+class SentPose(msgspec.Struct, frozen=True):
+    """A pose as it was sent to the neighbours."""
+
+    robot: str
+    seq: int
+    stamp: float
+    position: Vector
+    velocity: Vector | None
+    yaw: float | None
+    received: float  # [s] UTC, by the recorder
+    size: int  # [bytes] of the payload on the network
+
+
+class SentGoal(msgspec.Struct, frozen=True):
+    """A goal as the central controller sent it, see `agents.network.messages.Goal`."""
+
+    robot: str
+    seq: int
+    stamp: float
+    position: Vector
+    yaw: float | None
+    pose: float
+    received: float  # [s] UTC, by the recorder
+    size: int  # [bytes] of the payload on the network
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One kind of message."""
+
+    message: type[Message]  # on the network
+    recorded: type[msgspec.Struct]  # in the file, as `zenpark_msgs/<its name>`
+    name: str  # in the file, with `{robot}` for the robot's name
+    key: Callable[[Keys], str]
+    depth: int = RARE  # samples that may wait for the recorder
+    repeated: bool = False  # by the publisher's cache for late subscribers
+    finite: bool = False  # messages with numbers that are not finite are malformed
+
+    @property
+    def of_robot(self) -> bool:
+        """Whether each robot has a topic of its own."""
+        return "{robot}" in self.name
+
+
+TOPICS: Final = (
+    Topic(State, State, "/{robot}/state", lambda keys: keys.state("*"), DEPTH),  # with the poses received since
+    Topic(Pose, SentPose, "/{robot}/pose", lambda keys: keys.pose("*"), DEPTH, repeated=True),
+    Topic(Status, Status, "/{robot}/status", lambda keys: keys.status("*"), repeated=True),
+    Topic(Event, Event, "/events", lambda keys: keys.event, repeated=True),
+    Topic(Contact, Contact, "/world/contact", lambda keys: keys.contact, finite=True),
+    Topic(WorldState, WorldState, "/world/state", lambda keys: keys.world, finite=True),
+    Topic(Goal, SentGoal, "/{robot}/goal", lambda keys: keys.goal("*"), DEPTH, finite=True),
+    Topic(CentreState, CentreState, "/centre/report", lambda keys: keys.centre, finite=True),
+    Topic(HostClock, HostClock, "/run/clock", lambda keys: keys.clock, repeated=True, finite=True),
+)
