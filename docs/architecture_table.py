@@ -14,8 +14,8 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from experiments.definition import assignment
 from experiments.definition.experiment import Channel, Experiment
+from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.sweep.runs import Figures, figures_of
 from experiments.virtual_time import simulation
@@ -31,7 +31,7 @@ TRIGGERS: Final[dict[str, dict[str, Any]]] = {
 
 def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[Figures], float, float, float]:
     """Figures of each seed; of a run, on average: messages of the network, deliveries, and the delay of goals [s]."""
-    listeners = np.bincount(assignment.heard_links(experiment).speaker, minlength=len(experiment.robots))
+    listeners = np.bincount(Plan(experiment).heard_links.speaker, minlength=len(experiment.robots))
     found: list[Figures] = []
     messages, deliveries, delay = [], [], []
     for begin in range(0, len(seeds), BATCH):

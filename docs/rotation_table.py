@@ -14,7 +14,8 @@ import numpy as np
 
 from agents.plugins import registry
 from experiments.definition.experiment import Experiment, Formation, Link, Robot, Start
-from experiments.definition.formation import FormationArrays, errors
+from experiments.definition.formation import errors
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.metrics.signals import net_rotation
 from experiments.metrics.statistics import spread
@@ -51,7 +52,7 @@ def measured(name: str, experiment: Experiment) -> Row:
     late = (log.time >= SETTLED_S) & (log.time < experiment.duration_s)
     rows, time = len(log.names), log.time[late]
     follow = [row for row, each in enumerate(log.names) if each != experiment.formation.leader]
-    pattern = FormationArrays.of(experiment, log.names)
+    pattern = Plan(experiment).formation
     law = registry.build(registry.LAWS, experiment.formation.law)
     rate, error = [], []
     for copy in range(len(SEEDS)):

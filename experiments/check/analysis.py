@@ -30,11 +30,11 @@ from experiments.check.realisation import (
     unfolded,
 )
 from experiments.check.stability import Modes, modes
-from experiments.definition import assignment as assign
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.formation import FormationArrays, errors
 from experiments.definition.links import pairs
+from experiments.definition.plan import Plan
 from experiments.file.problems import Path
 from experiments.metrics.measure import WINDOW_S
 from twins.scene import Scene
@@ -49,14 +49,12 @@ class Analysis:
     """The numbers of one case.
 
     Attributes:
-        experiment: The case.
+        plan: The case, compiled.
         assignment: Of all its robots; without avoidance, and without the links that only avoidance needs.
-        leaders: Names.
         silent: Rows that hear nobody.
         start: (N, 3) on the floor [m].
         parts: Of the network.
         fiedler: Algebraic connectivity.
-        pattern: The links, what becomes of them, and when they are there.
         asked: The links of the beginning, with what the law takes them to ask for.
         standing: (E,) those that are there at the beginning, however far the robots are from each other.
         shapes: Places that were tried for the last stage of the formation, the best of which is to be its end.
@@ -72,14 +70,12 @@ class Analysis:
         scene: What stands in the arena.
     """
 
-    experiment: Experiment
+    plan: Plan
     assignment: Assignment
-    leaders: tuple[str, ...]
     silent: Index
     start: Array
     parts: int
     fiedler: float
-    pattern: FormationArrays
     asked: Links
     standing: Mask
     shapes: tuple[Shape, ...]
@@ -94,8 +90,16 @@ class Analysis:
     scene: Scene
 
     @property
+    def experiment(self) -> Experiment:
+        return self.plan.experiment
+
+    @property
+    def pattern(self) -> FormationArrays:
+        return self.plan.formation
+
+    @property
     def names(self) -> tuple[str, ...]:
-        return self.assignment.names
+        return self.plan.names
 
     @property
     def edges(self) -> int:
@@ -198,9 +202,9 @@ class Analysis:
 def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     """All the numbers of one case that goes like `prediction`."""
     names = tuple(experiment.robots)
-    bare = msgspec.structs.replace(experiment, avoidance=None, architecture="distributed")
-    assignment = assign.assign(bare, names)
-    pattern = FormationArrays.of(experiment, names)
+    plan = Plan(experiment)
+    bare = Plan(msgspec.structs.replace(experiment, avoidance=None, architecture="distributed"))
+    assignment, pattern = bare.assignment(), plan.formation
     links, rows, hz = assignment.links, len(names), experiment.rates.coordination_hz
     start, _ = bodies.start(experiment, names)
     aloft = start.copy()
@@ -225,14 +229,12 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
         within = experiment.duration_s
         loop = modes(assignment.law, here, shape.position, share, hz, anchors=assignment.anchors, within_s=within)
     return Analysis(
-        experiment=experiment,
+        plan=plan,
         assignment=assignment,
-        leaders=tuple(assign.leaders(experiment)),
         silent=silent,
         start=start,
         parts=components(links, rows),
         fiedler=algebraic_connectivity(links, rows),
-        pattern=pattern,
         asked=asked,
         standing=standing,
         shapes=tuple(stages[-1]) if stages else (),

@@ -23,9 +23,9 @@ from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse, link_errors
 from experiments.check.findings import FORGIVEN, Claim, Severity, few, listed
 from experiments.check.ideal_run import Prediction, message_rate, predict, undisturbed
-from experiments.definition import assignment as assign
 from experiments.definition import bodies, standby
 from experiments.definition.experiment import Channel, Experiment, Network
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import Document
 from experiments.file.overrides import parse
@@ -66,7 +66,7 @@ class Finding:
 
 def chance(analysis: Analysis) -> Iterator[Claim]:
     """Do seeds change anything."""
-    if not assign.uses_chance(analysis.experiment):
+    if not analysis.plan.uses_chance:
         message = "nothing in this file is random: runs of other seeds are the same"
         remedy = "add what nature adds, such as [disturbance.all] with position_sigma = 0.0005"
         yield Claim("warning", NOT_RANDOM, message, remedy, ("disturbance",))
@@ -74,7 +74,7 @@ def chance(analysis: Analysis) -> Iterator[Claim]:
 
 def telemetry(analysis: Analysis) -> Iterator[Claim]:
     """Does what a robot hears between two samples of telemetry fit into one message."""
-    experiment, links = analysis.experiment, assign.heard_links(analysis.experiment)
+    experiment, links = analysis.experiment, analysis.plan.heard_links
     if not len(links):
         return
     heard = np.bincount(links.listener)
@@ -248,12 +248,12 @@ def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
 
 def _of_case(known: Analysis, case: Experiment, prediction: Prediction) -> Analysis:
     """The analysis of a case whose links, shape and plans are those of `known`."""
-    told = assign.assign(case, tuple(case.robots))
-    assignment = replace(known.assignment, trigger=told.trigger, predictor=told.predictor)
+    plan = Plan(case)
+    assignment = replace(known.assignment, trigger=plan.trigger, predictor=plan.predictor)
     error = link_errors(assignment.law, known.pattern, prediction)
     if error[-1].max(initial=0.0) > case.tolerance >= known.error[-1].max(initial=0.0):
         known = analyse(known.experiment, prediction)  # it ends elsewhere: another shape may be near
-    return replace(known, experiment=case, assignment=assignment, prediction=prediction, error=error)
+    return replace(known, plan=plan, assignment=assignment, prediction=prediction, error=error)
 
 
 @QUIET
@@ -413,7 +413,7 @@ def _figures(analysis: Analysis) -> Figures:
         links=len(assignment.links),
         edges=analysis.edges,
         parts=analysis.parts,
-        leaders=analysis.leaders,
+        leaders=analysis.plan.leaders,
         algebraic_connectivity=analysis.fiedler,
         rank=planar.rank if planar else None,
         rank_needed=planar.needed if planar else None,

@@ -9,7 +9,6 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask
 from agents.plugins import registry
-from agents.plugins.avoidance import Avoidance
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Claim, listed
 from experiments.definition.bodies import WORLD
@@ -103,9 +102,9 @@ def contacts(analysis: Analysis) -> Iterator[Claim]:
 def perception(analysis: Analysis) -> Iterator[Claim]:
     """Can robots that shall avoid know of what is around them."""
     experiment, scene = analysis.experiment, analysis.scene
-    if experiment.avoidance is None:
+    avoidance = analysis.plan.avoidance
+    if avoidance is None:
         return
-    avoidance: Avoidance = registry.build(registry.AVOIDANCES, experiment.avoidance)
     deaf = set() if avoidance.hears == "all" else {analysis.names[row] for row in analysis.silent}
     height = np.nan_to_num(analysis.assignment.hover)
     low, high = _heights(analysis, height)

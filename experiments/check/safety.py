@@ -12,8 +12,7 @@ from agents.plugins import registry
 from agents.safety.setpoint_filter import ESCAPED
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Claim, listed
-from experiments.definition import assignment, bodies
-from experiments.definition.assignment import guided
+from experiments.definition import bodies
 
 SLOW_M_S: Final = 0.2  # no robot comes down more slowly
 
@@ -45,7 +44,7 @@ def safety(analysis: Analysis) -> Iterator[Claim]:
 def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
     """Pairs that hear each other: at the start, as the formation wants them, and on their way."""
     names, path = tuple(analysis.experiment.robots), ("safety", "separation")
-    links, heard = assignment.all_links(analysis.experiment), assignment.heard_links(analysis.experiment)
+    links, heard = analysis.plan.links, analysis.plan.heard_links
     pairs = sorted({tuple(sorted(pair)) for pair in zip(heard.listener.tolist(), heard.speaker.tolist(), strict=True)})
     wanted = {
         tuple(sorted(pair)): distance
@@ -83,7 +82,7 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
 def architecture(analysis: Analysis) -> Iterator[Claim]:
     """Who decides for whom, what happens when the centre is gone, and whether the trigger suits that."""
     experiment, path = analysis.experiment, ("architecture",)
-    steered = guided(experiment)
+    steered = analysis.plan.guided
     if not steered:
         return
     everyone, rate = len(steered) == len(experiment.robots), experiment.rates.coordination_hz
@@ -96,8 +95,8 @@ def architecture(analysis: Analysis) -> Iterator[Claim]:
         message = f"goals come every {1.0 / rate:g} s, and are too old after {experiment.safety.link_silence_s:g} s"
         remedy = "give safety.link_silence_s more than twice that, or decide more often"
         yield Claim("error", "goals-too-old", message, remedy, ("safety", "link_silence_s"))
-    kind, _ = registry.split(experiment.trigger)
-    if getattr(registry.struct(registry.TRIGGERS, kind), "judges_errors", False):
+    if getattr(analysis.plan.trigger, "judges_errors", False):
+        kind, _ = registry.split(experiment.trigger)
         message = (
             f"the trigger '{kind}' judges by the formation error, which robots that are guided do not know: it is 0"
         )

@@ -24,7 +24,7 @@ RINGS: Final = 1.2  # beyond 1 an error changes its sign; what is left to 2 is f
 
 def network(analysis: Analysis) -> Iterator[Claim]:
     """Does everybody hear of a leader, in one network."""
-    names, links, leaders = analysis.names, analysis.assignment.links, analysis.leaders
+    names, links, leaders = analysis.names, analysis.assignment.links, analysis.plan.leaders
     path = ("formation", "links")
     if not len(links):
         yield Claim("note", "no-formation", "no links: every robot follows its own plan, or stays where it is")

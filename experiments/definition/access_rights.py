@@ -15,9 +15,10 @@ from agents.network.access_control import ADMIN, Grant, Rights
 from agents.network.keys import Keys
 from agents.plugins import registry
 from agents.protocols import turtlebot3
-from experiments.definition import assignment, bodies
+from experiments.definition import bodies
 from experiments.definition.bodies import VICON_TWIN
 from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.plan import Plan
 
 FAR: Final = ("external", bodies.WORLD)  # bodies whose poses come from the process that carries them
 MANY: Final = 16  # who hears so many, and all there are, hears "*": a router reads N² keys for minutes
@@ -45,14 +46,14 @@ def needed(experiment: Experiment, operator: str = "operator") -> list[str]:
         found.append("twin")
     if experiment.positioning is not None:
         found.append("positioning")
-    if assignment.guided(experiment):
+    if Plan(experiment).guided:
         found.append("centre")
     return found
 
 
 def _rights(experiment: Experiment) -> Rights:
     keys = Keys(experiment.network.realm)
-    hears, steered = heard(experiment), assignment.guided(experiment)
+    hears, steered = heard(experiment), Plan(experiment).guided
     robots: dict[str, Grant] = {}
     for group in processes(experiment):
         others = sorted({speaker for name in group for speaker in hears[name]})
@@ -84,13 +85,13 @@ def _rights(experiment: Experiment) -> Rights:
 
 
 def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
-    names = experiment.robots
+    names, plan = experiment.robots, Plan(experiment)
     far = [name for name, robot in names.items() if robot.body in FAR]
     ranged = [name for name, robot in names.items() if robot.body in FAR or robot.ranges == bodies.WORLD]
-    located = assignment.measured(experiment)
+    located = plan.externally_measured
     twins = [name for name, robot in names.items() if robot.body in registry.names(registry.DEVICES)]
     measured = sorted({*located, *twins})
-    goals = _each(assignment.guided(experiment), keys.goal)
+    goals = _each(plan.guided, keys.goal)
     foreign = sorted({key for name, robot in names.items() for key in _foreign(name, robot)})
     tokens = sorted({key for name, robot in names.items() for key in _foreign_tokens(name, robot)})
     everything = [keys.everything]
@@ -149,10 +150,11 @@ def processes(experiment: Experiment) -> list[list[str]]:
 
 def heard(experiment: Experiment) -> dict[str, set[str]]:
     """Whom each robot listens to: what its process subscribes to, and no one else."""
-    told = assignment.assign(experiment, tuple(experiment.robots))
-    found: dict[str, set[str]] = {name: set() for name in told.names}
-    for listener, speaker in zip(told.links.listener.tolist(), told.links.speaker.tolist(), strict=True):
-        found[told.names[listener]].add(told.speakers[speaker])
+    plan = Plan(experiment)
+    links = plan.heard_links
+    found: dict[str, set[str]] = {name: set() for name in plan.names}
+    for listener, speaker in zip(links.listener.tolist(), links.speaker.tolist(), strict=True):
+        found[plan.names[listener]].add(plan.names[speaker])
     return found
 
 

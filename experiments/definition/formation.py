@@ -16,7 +16,7 @@ from agents.formation.graph import BY_DISTANCE, Links
 from agents.plugins.laws import Distance, Law
 from experiments.definition.experiment import Anchor, Experiment
 from experiments.definition.experiment import Change as Described
-from experiments.definition.links import UNKNOWN, OneWay, height, one_way_links, pairs, target
+from experiments.definition.links import UNKNOWN, OneWay, height, pairs, target
 
 AT_ONCE: Final = 200_000  # errors of links that are held in memory at once
 
@@ -36,11 +36,9 @@ class FormationArrays:
     presence: Presence | None
 
     @classmethod
-    def of(cls, experiment: Experiment, names: Sequence[str]) -> FormationArrays:
-        """The links between robots; `names` are the rows, and links with an end elsewhere are left out."""
-        row = {name: number for number, name in enumerate(names)}
-        there = [link for link in one_way_links(experiment) if link.listener in row and link.speaker in row]
-        there.sort(key=lambda link: (row[link.listener], row[link.speaker]))
+    def compiled(cls, experiment: Experiment, there: Sequence[OneWay]) -> FormationArrays:
+        """Of these links; rows are the robots of the file."""
+        row = {name: number for number, name in enumerate(experiment.robots)}
         wants = np.array([link.wanted.wants for link in there], dtype=np.intp)
         plain = bool((wants == BY_DISTANCE).all())
         links = Links(

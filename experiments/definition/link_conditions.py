@@ -14,9 +14,9 @@ from agents.arrays import Index, Mask
 from agents.formation.graph import Links, links
 from agents.network import channel_model
 from agents.network.channel_model import Conditions, LinkEffects, Outage
-from experiments.definition.assignment import guided
 from experiments.definition.experiment import Channel, Experiment, LinkChannel
 from experiments.definition.links import pairs
+from experiments.definition.plan import Plan
 
 OWN_S: Final = Channel().delay_s  # any real network takes as long: to wait for it would cost a tick in ten milliseconds
 TO_CENTRE, FROM_CENTRE = "to centre", "from centre"  # streams
@@ -64,7 +64,7 @@ def to_centre(experiment: Experiment, speakers: Index) -> Conditions:
 
 def from_centre(experiment: Experiment, listeners: Sequence[str]) -> Conditions:
     """Of goals that those of the robots `listeners` hear which are guided, in their order, on a real network."""
-    names, told = tuple(experiment.robots), guided(experiment)
+    names, told = tuple(experiment.robots), Plan(experiment).guided
     pairs = [(row, names.index(name)) for row, name in enumerate(listeners) if name in told]
     return at_listeners(experiment, links(pairs), listeners, stream=FROM_CENTRE)
 

@@ -9,9 +9,10 @@ from agents.network import endpoints as topology
 from agents.network import lab
 from agents.network.access_control import Rights
 from agents.network.endpoints import Endpoint, free_endpoint
-from experiments.definition import access_rights, assignment, bodies
+from experiments.definition import access_rights, bodies
 from experiments.definition.bodies import VICON_TWIN
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 
 ENDPOINTS: Final = "network.txt"  # what to say behind --connect to look at a run: @FOLDER/network.txt
 
@@ -33,7 +34,7 @@ def members(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
             found.setdefault(topology.TOGETHER.join(group), given)
         if any(bodies.WORLD in (robot.body, robot.ranges) for robot in case.robots.values()):
             services["world"] = None
-        if assignment.guided(case):
+        if Plan(case).guided:
             services["centre"] = None
         if case.positioning == VICON_TWIN:
             services[VICON_TWIN] = None

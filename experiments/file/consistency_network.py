@@ -10,10 +10,10 @@ from agents.network.channel_model import LinkEffects
 from agents.network.endpoints import Endpoint
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
-from experiments.definition import assignment
 from experiments.definition.experiment import Experiment, LinkChannel
 from experiments.definition.link_conditions import of_link
 from experiments.definition.links import pairs
+from experiments.definition.plan import Plan
 from experiments.file.problems import Fault, Path, shown
 
 _WHAT: Final = {"address": "address that ssh takes", "zenpark": "path of a command", "lab": "path of a folder"}
@@ -191,7 +191,7 @@ def _link(
 def _heard(experiment: Experiment) -> set[tuple[str, str]] | None:
     """Who listens to whom, for the formation or for avoidance; None where that cannot be told, which is said there."""
     try:
-        links = assignment.heard_links(experiment)
+        links = Plan(experiment).heard_links
     except (ValueError, KeyError):
         return None
     names = tuple(experiment.robots)

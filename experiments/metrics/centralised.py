@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 
 from agents.arrays import Array, Index, Mask
-from experiments.definition import assignment
 from experiments.metrics.results import Guidance
 from experiments.recording.trace import Trace
 
@@ -32,13 +31,13 @@ class Delays:
 
 def guided_rows(trace: Trace) -> Mask:
     """Which robots (N,) a centre decides for."""
-    return np.isin(np.array(trace.robots), assignment.guided(trace.experiment))
+    return np.isin(np.array(trace.robots), trace.plan.guided)
 
 
 def centre_hears(trace: Trace) -> Mask:
     """Which robots (N,) the centre listens to: those that it guides, and those to whom they listen."""
     rows = guided_rows(trace)
-    net = assignment.all_links(trace.experiment)
+    net = trace.plan.links
     hears = rows.copy()
     hears[net.speaker[rows[net.listener]]] = True
     return np.asarray(hears & rows.any())
@@ -65,7 +64,7 @@ def goals_to(trace: Trace) -> tuple[Index, Index]:
 def deliveries(trace: Trace, sent: Index) -> int:
     """Messages counted once for everybody who listens, when robots `sent` (N,) poses: to each other, to the centre, and
     the goals."""
-    listeners = np.bincount(assignment.heard_links(trace.experiment).speaker, minlength=len(sent)) + centre_hears(trace)
+    listeners = np.bincount(trace.plan.heard_links.speaker, minlength=len(sent)) + centre_hears(trace)
     return int(sent @ listeners) + (0 if trace.goals is None else len(trace.goals.time))
 
 
@@ -79,7 +78,7 @@ def guidance(trace: Trace) -> Guidance | None:
     load = [report.load for report in goals.reports] if trace.clock == "real" else []
     missed = [report.missed for report in goals.reports]
     return Guidance(
-        guided=assignment.guided(trace.experiment),
+        guided=trace.plan.guided,
         goals=len(goals.time),
         goals_hz=len(goals.time) / duration,
         goal_bytes=int(goals.bytes.sum()),

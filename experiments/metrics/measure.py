@@ -76,7 +76,7 @@ def measure(trace: Trace) -> CaseMetrics:
     passed = passages(trace)
     robots = _robots(trace, errors, phases, touched, clearance, passed=passed)
 
-    leading = leaders(trace.experiment)
+    leading = leaders(trace)
     died = tuple(robot.robot for robot in robots if robot.known < KNOWN and robot.robot not in leading)
     kept = [i for i, name in enumerate(names) if name not in leading and name not in died]
     together = [_all([phase[i].acquired_s for i in kept if errors.own[:, i].any()]) for phase in phases]

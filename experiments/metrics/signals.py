@@ -15,10 +15,7 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
 from agents.formation.graph import Links
-from agents.plugins import registry
-from experiments.definition import assignment
-from experiments.definition.experiment import Experiment
-from experiments.definition.formation import FormationArrays, errors
+from experiments.definition.formation import errors
 from experiments.metrics.results import Passage
 from experiments.recording.losses import unrecorded
 from experiments.recording.trace import Trace
@@ -28,7 +25,7 @@ RETURN_S: Final = 3.0  # robots come back one after the other when the network d
 
 def links_of(trace: Trace) -> Links:
     """The links of the experiment in the row numbers of the trace."""
-    return FormationArrays.of(trace.experiment, trace.robots).links
+    return trace.plan.formation.links
 
 
 def phase_starts(trace: Trace) -> tuple[float, ...]:
@@ -39,10 +36,10 @@ def phase_starts(trace: Trace) -> tuple[float, ...]:
     return (first, *sorted(at for at in begins if first < at < last))
 
 
-def leaders(experiment: Experiment) -> tuple[str, ...]:
-    """Who is left out of the means; nobody if that would leave out all."""
-    leading = tuple(assignment.leaders(experiment))
-    return () if len(leading) == len(experiment.robots) else leading
+def leaders(trace: Trace) -> tuple[str, ...]:
+    """Robots that means leave out; none if that would leave out all."""
+    leading = trace.plan.leaders
+    return () if len(leading) == len(trace.robots) else leading
 
 
 def own_links(net: Links, rows: int) -> Array:
@@ -78,10 +75,9 @@ class LinkErrors:
     @classmethod
     def of(cls, trace: Trace) -> LinkErrors:
         """The errors of a whole trace."""
-        pattern = FormationArrays.of(trace.experiment, trace.robots)
-        law = registry.build(registry.LAWS, trace.experiment.formation.law)
+        pattern = trace.plan.formation
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
-        error = errors(law, pattern, trace.time, trace.true_position)
+        error = errors(trace.plan.law, pattern, trace.time, trace.true_position)
         own, (_, away) = own_links(pattern.links, len(trace.robots)), network_away(alive, trace.time)
         return cls(trace.time, pattern.links, own, error, alive, away)
 
@@ -208,7 +204,6 @@ def beliefs(trace: Trace, net: Links) -> Array:
 
     NaN before the first pose, and after a death.
     """
-    predictor = assignment.predictor(trace.experiment)
     rows, heard = len(trace.robots), trace.heard
     number = np.full((rows, rows), -1)
     number[net.listener, net.speaker] = np.arange(len(net))
@@ -224,7 +219,7 @@ def beliefs(trace: Trace, net: Links) -> Array:
         at = np.searchsorted(heard.time[mine], trace.time, side="right") - 1
         newest = mine[at]
         age = np.maximum(trace.time - heard.stamp[newest], 0.0)
-        believed = predictor.position(heard.position[newest], heard.velocity[newest], age)
+        believed = trace.plan.predictor.position(heard.position[newest], heard.velocity[newest], age)
         error[:, k] = norm(believed - trace.true_position[:, net.speaker[k]])
         error[at < 0, k] = np.nan
     return error
@@ -268,7 +263,7 @@ def transmissions(trace: Trace) -> tuple[Index, Index]:
 
 def passages(trace: Trace) -> tuple[Passage, ...]:
     """Of every link on which something may be heard, those that only avoidance needs included."""
-    links, rows = assignment.heard_links(trace.experiment), len(trace.robots)
+    links, rows = trace.plan.heard_links, len(trace.robots)
     count = len(links)
     dropped = np.zeros(count, dtype=np.intp) if trace.dropped is None else trace.dropped
     ends = links.listener * rows + links.speaker

@@ -12,8 +12,8 @@ import numpy as np
 from agents.arrays import Index
 from agents.network.messages import Status
 from agents.network.validation import missed, said_within
-from experiments.definition import assignment
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
 
@@ -65,8 +65,8 @@ def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float
 
 
 def dropped(experiment: Experiment, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
-    """(E,) what the modelled network dropped on each of `assign.heard_links`; `statuses` of each robot."""
-    links, robots = assignment.heard_links(experiment), list(experiment.robots)
+    """(E,) what the modelled network dropped on each of `Plan.heard_links`; `statuses` of each robot."""
+    links, robots = Plan(experiment).heard_links, list(experiment.robots)
     found = [_by_speaker(said, run, "dropped") for said in statuses]
     ends = zip(links.listener.tolist(), links.speaker.tolist(), strict=True)
     return np.array([found[i][robots[j]] for i, j in ends], dtype=np.intp)

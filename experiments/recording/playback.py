@@ -15,8 +15,8 @@ from msgspec.structs import replace
 from agents.arrays import Array, Index
 from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, State, Status, WorldState
-from experiments.definition.assignment import guided
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.recording.cdr import Codec, Undecodable, codec
 from experiments.recording.centre_goals import of_recording
 from experiments.recording.clocks import Correction
@@ -204,7 +204,7 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
     shadowed = any(state.shadow_position is not None for state in content[State])
     contacts, world = within(content[Contact], start, duration), within(content[WorldState], start, duration)
     goals = None
-    if guided(experiment):
+    if Plan(experiment).guided:
         told = dict(zip(robots, states, strict=True))
         goals = of_recording(content[SentGoal], told, content[CentreState], start, duration)
     return Trace(

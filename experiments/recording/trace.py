@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, TypeVar
 
 import msgspec
@@ -14,6 +15,7 @@ from agents.network import messages
 from agents.network.messages import Contact, Event, WorldState
 from agents.plugins import registry
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.recording.clocks import ClockOffset
 
 EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
@@ -173,7 +175,7 @@ class Trace:
         attitude: (T, N, 4) unit quaternions w, x, y, z from robot to room, NaN where unknown; None if none was told.
         shadow_position: (T, N, 3) of the twin beside each robot [m], NaN for robots without one; None if there is none.
         shadow_yaw: (T, N) of those twins [rad].
-        dropped: (E,) samples that the modelled network dropped on each of `assign.heard_links`, in their order; None
+        dropped: (E,) samples that the modelled network dropped on each of `plan.heard_links`, in their order; None
             if that is not known.
         goals: What the centre told robots, and heard of them; None if every robot decides for itself.
         clocks: Of the other machines on which robots ran; what they stamped is set right by it.
@@ -207,3 +209,7 @@ class Trace:
     dropped: Index | None = None
     goals: Goals | None = None
     clocks: tuple[ClockOffset, ...] = ()
+
+    @cached_property
+    def plan(self) -> Plan:
+        return Plan(self.experiment)

@@ -199,7 +199,7 @@ def intervals(traces: Sequence[Trace]) -> Figure:
     handles: dict[str, Line2D] = {}
     for k, trace in enumerate(traces):
         colour = CASES[k % len(CASES)]
-        out = leaders(trace.experiment)
+        out = leaders(trace)
         waits = [wait for wait, name in zip(gaps(trace), trace.robots, strict=True) if name not in out and len(wait)]
         for wait in waits if len(waits) > 1 else []:
             axes.plot(*_steps(wait), color=colour, linewidth=0.5, alpha=0.45, drawstyle="steps-post")

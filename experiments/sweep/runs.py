@@ -194,7 +194,7 @@ def _figures(trace: Trace, dropped: int) -> Figures:
     acquired = errors.part(begin, end).acquired(window, trace.experiment.tolerance)
     sent = transmissions(trace)[0].astype(float)
     waits = [float(wait.min()) for wait in gaps(trace) if len(wait)]
-    leading = leaders(trace.experiment)
+    leading = leaders(trace)
     kept = [i for i, name in enumerate(trace.robots) if name not in leading and errors.alive[:, i].mean() >= KNOWN]
     iae, itae, rmse = (_mean(each[kept].tolist()) for each in integrals(errors.per_robot(), trace.time))
     arrived = [acquired[i] for i in kept]

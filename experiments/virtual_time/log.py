@@ -16,8 +16,9 @@ from agents.formation.graph import Links
 from agents.network import messages
 from agents.plugins import registry
 from agents.safety.hazards import Incident, Outcome
-from experiments.definition import assignment, bodies
+from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.recording.trace import (
     EPOCH,
     ROUNDING_S,
@@ -133,7 +134,7 @@ class Logbook:
         self._mine = slice(copy * rows, (copy + 1) * rows)
         self._seed = log.seeds[copy]
         self._scene = bodies.scene(experiment)
-        self._links: Links = assignment.heard_links(experiment)
+        self._links: Links = Plan(experiment).heard_links
         time, row, seq, position, velocity, yaw = log.sent
         own = (row >= copy * rows) & (row < (copy + 1) * rows)
         self._sent = (time[own], row[own] - copy * rows, seq[own], position[own], velocity[own], yaw[own])

@@ -16,9 +16,10 @@ from agents.decision.transmission import Transmission
 from agents.formation.graph import Links, links
 from agents.network import channel_model, messages
 from agents.network.channel_model import Samples
-from experiments.definition import assignment, link_conditions
+from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
 from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE
+from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
 
 
@@ -122,7 +123,7 @@ class Steering:
     """
 
     def __init__(self, experiment: Experiment, seeds: Sequence[int]) -> None:
-        self.centre = Centre(assignment.assign_centre(experiment, len(seeds)))
+        self.centre = Centre(Plan(experiment).centre_assignment(len(seeds)))
         self.centre.mark_alive(self.centre.listens)  # all robots are there from the beginning
         self._sent: list[tuple[Any, ...]] = []
         self._followed: list[tuple[Any, ...]] = []

@@ -20,9 +20,9 @@ from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
 from agents.decision.lifecycle import Phase
 from agents.safety.hazards import Incident
-from experiments.definition import assignment as assign
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.virtual_time.network import Steered, VirtualNetwork
 from twins.body import TwinBody
 from twins.engines.engine import Touch
@@ -137,7 +137,7 @@ def simulate(
         Stuck: If robots do not become ready, airborne or done.
     """
     names = tuple(experiment.robots)
-    assignment = assign.assign(experiment, names, copies=len(seeds))
+    assignment = Plan(experiment).assignment(names, copies=len(seeds))
     agent = Agent(assignment)
     request = bodies.request(experiment, names, seeds)
     request = replace(request, external=(False,) * len(request.names))  # nobody measures in virtual time

@@ -13,8 +13,9 @@ import numpy as np
 from agents.agent import Actions, Agent, links_by_speaker
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
-from experiments.definition import assignment, bodies
+from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from twins.body import TwinBody
 
 LEAD_S = 0.5
@@ -25,7 +26,7 @@ class Group:
 
     def __init__(self, experiment: Experiment, names: Sequence[str]) -> None:
         self.names = tuple(names)
-        self.assignment = assignment.assign(experiment, self.names)
+        self.assignment = Plan(experiment).assignment(self.names)
         self.agent = Agent(self.assignment)
         self.body = TwinBody(bodies.request(experiment, self.names, [experiment.seed]))
         self.agent.mark_alive(np.arange(len(self.assignment.links)))

@@ -7,8 +7,8 @@ from agents.agent import Agent
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, IDLE, READY, RUNNING
 from agents.decision.neighbours import Heard
-from experiments.definition import assignment
 from experiments.definition.experiment import Formation, Leg, Robot, Start
+from experiments.definition.plan import Plan
 from tests.agents.few import pair, triangle
 from tests.agents.swarm import Swarm
 
@@ -18,7 +18,7 @@ from tests.agents.swarm import Swarm
 def bare(**parts):
     """The decision of A alone, ready to be told things; B is on link 0."""
     experiment = pair(**parts)
-    agent = Agent(assignment.assign(experiment, ["A"]))
+    agent = Agent(Plan(experiment).assignment(["A"]))
     agent.mark_alive(np.arange(len(agent.assignment.links)))
     return agent
 
@@ -141,7 +141,7 @@ def test_a_neighbour_that_is_gone_is_not_back_because_it_is_heard_again():
 
 def test_a_neighbour_never_heard_does_not_hide_one_that_is_gone():
     experiment = triangle(start=Start(deadline_s=0.1, missing="go-on"))
-    agent = Agent(assignment.assign(experiment, ["A"]))
+    agent = Agent(Plan(experiment).assignment(["A"]))
     agent.mark_alive(np.array([1]))
     say(agent, [0.0, -0.5, 0.0], 0.1, at=1)  # C is heard, B never
     for tick in range(30):

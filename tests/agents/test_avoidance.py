@@ -15,8 +15,8 @@ from agents.decision.lifecycle import RUNNING
 from agents.plugins.avoidance import Avoidance, Potential
 from agents.plugins.registry import AVOIDANCES, PluginError, build
 from agents.safety.setpoint_filter import Safety
-from experiments.definition import assignment
 from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.plan import Plan
 from tests.agents.things import NOTHING, near, own
 
 LIMITS = Limits(np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5]), speed=0.5)
@@ -181,7 +181,7 @@ def running_pair(avoidance, gap=1.0, **parts):
     experiment = Experiment(
         title="A pair", duration_s=60.0, robots=robots, avoidance={"kind": "barrier", "hears": "all"}, **parts
     )
-    agent = Agent(replace(assignment.assign(experiment, tuple(robots)), avoidance=avoidance))
+    agent = Agent(replace(Plan(experiment).assignment(tuple(robots)), avoidance=avoidance))
     agent.life.phase[:] = RUNNING
     agent.life.start_at[:] = 0.0
     place = np.array([[0.0, 0.0, 0.0], [0.14 + gap, 0.0, 0.0]])

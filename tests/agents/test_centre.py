@@ -8,8 +8,8 @@ from agents.agent import Agent
 from agents.body.interface import BodyState
 from agents.decision.centralised import Centre
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, RUNNING
-from experiments.definition import assignment
 from experiments.definition.experiment import Hybrid
+from experiments.definition.plan import Plan
 from experiments.file import document
 
 NAN = np.nan
@@ -28,7 +28,7 @@ class Desk:
     """A centre, and poses to tell it."""
 
     def __init__(self, experiment, copies=1, seed=3):
-        self.centre = Centre(assignment.assign_centre(experiment, copies))
+        self.centre = Centre(Plan(experiment).centre_assignment(copies))
         self.centre.mark_alive(self.centre.listens)
         self.rows = len(self.centre.guided)
         rng = np.random.default_rng(seed)
@@ -51,7 +51,7 @@ def test_it_decides_what_the_robots_would_to_the_last_bit(park, update):
     formation = msgspec.structs.replace(park.formation, update=update)
     park = replaced(park, formation=formation, duration_s=5.0, timeline=[])
     desk = Desk(replaced(park, architecture="centralised"))
-    agent = Agent(assignment.assign(park, tuple(park.robots)))
+    agent = Agent(Plan(park).assignment(tuple(park.robots)))
     links, rng = agent.assignment.links, np.random.default_rng(1)
     agent.mark_alive(np.arange(len(links)))
     agent.life.phase[:] = AIRBORNE

@@ -16,8 +16,8 @@ from agents.network.keys import Keys
 from agents.runtime.loop import Runtime
 from agents.runtime.orders import carry_out
 from agents.runtime.setup import Setup
-from experiments.definition import assignment
 from experiments.definition.experiment import Formation, Leg, Robot
+from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.agents.test_way_out import Airborne
 from tests.fuzz.loopnet import Net
@@ -40,7 +40,7 @@ class Life:
     """A process of A, at a place, `late_s` after the common start."""
 
     def __init__(self, place, late_s: float, origin: messages.Setpoint | None = None, *, listens: bool = False) -> None:
-        self.agent = Agent(assignment.assign(leader(listens=listens), ("A",)))
+        self.agent = Agent(Plan(leader(listens=listens)).assignment(("A",)))
         links = np.arange(len(self.agent.assignment.links))
         self.agent.mark_alive(links)
         self.t, self.place = 0.0, np.array([[*place, 0.0]])
@@ -108,7 +108,7 @@ def test_a_start_with_an_origin_that_is_not_known_is_refused():
 def test_a_start_that_is_repeated_does_not_move_the_ticks_of_a_robot_that_runs():
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
     with Net().worn() as net:
-        robot = Runtime(assignment.assign(pair(), ("A",)), Airborne(), setup)
+        robot = Runtime(Plan(pair()).assignment(("A",)), Airborne(), setup)
         robot._join(net.session)
         robot._utc, robot._now, robot._next = UTC, 7.0, 7.01
 

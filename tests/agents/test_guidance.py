@@ -7,8 +7,8 @@ from agents.agent import Agent
 from agents.body.interface import BodyState
 from agents.decision.centralised import Guidance
 from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING
-from experiments.definition import assignment
 from experiments.definition.experiment import Experiment, Formation, Hybrid, Robot, Start
+from experiments.definition.plan import Plan
 
 NAN = np.nan
 
@@ -33,7 +33,7 @@ class Bench:
     """The rows of an experiment on a clock, where they are put."""
 
     def __init__(self, experiment, names=("A", "B")):
-        self.agent = Agent(assignment.assign(experiment, names))
+        self.agent = Agent(Plan(experiment).assignment(names))
         self.agent.mark_alive(np.arange(len(self.agent.assignment.links)))
         self.position = np.array([[-0.4, 0.0, 0.0], [0.4, 0.1, 0.8]])[: len(names)]
         self.t = 0.0
@@ -200,20 +200,20 @@ def test_safety_has_the_last_word_on_goals_too():
 
 
 def test_who_is_guided_listens_to_nobody_but_to_keep_clear():
-    assert len(assignment.assign(pair(), ["A", "B"]).links) == 0
-    told = assignment.assign(pair(avoidance={"kind": "barrier", "hears": "neighbours"}), ["A"])
+    assert len(Plan(pair()).assignment(["A", "B"]).links) == 0
+    told = Plan(pair(avoidance={"kind": "barrier", "hears": "neighbours"})).assignment(["A"])
     assert told.watched.tolist() == [True]
     assert told.speakers[told.links.speaker[0]] == "B"
 
 
 def test_in_a_hybrid_only_the_others_have_a_law_of_their_own():
     hybrid = pair(architecture=Hybrid(kind="hybrid", robots=["B"]))
-    told = assignment.assign(hybrid, ["A", "B"])
+    told = Plan(hybrid).assignment(["A", "B"])
     assert told.guided.tolist() == [False, True]
     assert told.links.listener.tolist() == [0]
     assert told.links.speaker.tolist() == [1]
     assert (
-        not Agent(assignment.assign(hybrid, ["A"]))
+        not Agent(Plan(hybrid).assignment(["A"]))
         .hear_goal(np.array([0]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
         .any()
     )  # who decides for himself takes no goals

@@ -14,7 +14,7 @@ from agents.network.channel_model import Conditions
 from agents.network.keys import Keys
 from agents.plugins.predictors import ConstantVelocity
 from agents.runtime.pose_inbox import LATE_S, Neighbours
-from experiments.definition import assignment
+from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net, Payload
 
@@ -42,7 +42,7 @@ class Robot:
     """A, alone in its process, and B, of which the test says everything."""
 
     def __init__(self, net: Net, conditions: Conditions | None = None) -> None:
-        self.net, self.agent = net, Agent(assignment.assign(pair(), ("A",)))
+        self.net, self.agent = net, Agent(Plan(pair()).assignment(("A",)))
         self.neighbours = Neighbours(net.session, KEYS, self.agent, reach=(5.0, 5.0, 5.0), conditions=conditions)
         (self.speaker,) = self.neighbours.speakers
         self.t = 0.0

@@ -11,8 +11,8 @@ from agents.decision.neighbours import NeighbourStates
 from agents.safety.hazards import Cause
 from agents.safety.landing import NEAR, PATIENCE_S, ROOM, Landing
 from agents.safety.setpoint_filter import Safety
-from experiments.definition import assignment as assign
 from experiments.definition.experiment import Arena, Experiment, Formation, Robot
+from experiments.definition.plan import Plan
 from tests.agents.swarm import Swarm
 
 DT = 0.01
@@ -39,7 +39,7 @@ class Bench:
             formation=Formation(links=links),
             arena=Arena(size=list(arena)),
         )
-        self.assignment = assignment = assign.assign(experiment, tuple(robots))
+        self.assignment = assignment = Plan(experiment).assignment(tuple(robots))
         self.landing = Landing(assignment)
         self.hearing = NeighbourStates(assignment.links, None, 1.0)
         self.hearing.mark_alive(np.arange(len(assignment.links)))

@@ -12,8 +12,9 @@ from agents.network.keys import Keys
 from agents.runtime.loop import Runtime
 from agents.runtime.setup import Setup
 from agents.safety.detection import stamped
-from experiments.definition import assignment, bodies
+from experiments.definition import bodies
 from experiments.definition.experiment import Formation, Robot
+from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
@@ -61,7 +62,7 @@ def flown(ahead: Callable[[float], float | None], seconds: float) -> tuple[Runti
     with net.worn():
         body = assemble(bodies.request(few, ("T",), [1]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True])
-        runtime = Runtime(assignment.assign(few, ("T",)), body, setup)
+        runtime = Runtime(Plan(few).assignment(("T",)), body, setup)
         body.open()
         runtime._join(net.session)  # type: ignore[arg-type]
         runtime._utc = runtime._telemetry.utc = UTC

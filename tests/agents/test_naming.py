@@ -19,8 +19,8 @@ from agents.network.name_ownership import NameTaken, claim, keep
 from agents.runtime import loop
 from agents.runtime.loop import Runtime
 from agents.runtime.setup import Setup
-from experiments.definition import assignment
 from experiments.definition.experiment import Formation, Robot
+from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.agents.test_way_out import Airborne
 from tests.conftest import RouterProcess
@@ -240,7 +240,7 @@ def test_a_process_without_its_name_touches_no_body(reply, error, monkeypatch):
     body = Airborne()
     with Net().worn() as net:
         net.replies = [reply]
-        robot = Runtime(assignment.assign(experiment, ("F",)), body, setup)
+        robot = Runtime(Plan(experiment).assignment(("F",)), body, setup)
         with pytest.raises(error):
             robot.run()
     assert body.calls == []
@@ -265,7 +265,7 @@ def test_who_wakes_and_finds_its_name_taken_leaves_the_body_as_it_is(way, monkey
     body = Woken()
     told: list[int] = []
     with Net().worn() as net:
-        robot = Runtime(assignment.assign(experiment, ("F",)), body, setup)
+        robot = Runtime(Plan(experiment).assignment(("F",)), body, setup)
 
         def looks() -> None:
             if not told:
@@ -302,7 +302,7 @@ def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_i
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False, False])
     with Net().worn() as net, monkeypatch.context() as patched:
         patched.setattr(pubsub, "alive_token", CountedToken)
-        robot = Runtime(assignment.assign(pair(), ("A", "B")), Airborne(), setup)
+        robot = Runtime(Plan(pair()).assignment(("A", "B")), Airborne(), setup)
         robot._join(net.session)
         robot._joined = True
         shown = [Keys().alive("A"), Keys().alive("B")]

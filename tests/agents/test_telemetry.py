@@ -10,7 +10,8 @@ from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.runtime.pose_inbox import NEWS, Neighbours
 from agents.runtime.telemetry import Counts, Telemetry
-from experiments.definition import assignment, bodies
+from experiments.definition import bodies
+from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from twins.body import TwinBody
 
@@ -41,7 +42,7 @@ class Robot:
         for name in ("publisher", "pose_publisher", "pose_subscriber", "alive_watch"):
             monkeypatch.setattr(pubsub, name, lambda *_: Taken())
         experiment = pair()
-        self.agent = Agent(assignment.assign(experiment, ("A",)))
+        self.agent = Agent(Plan(experiment).assignment(("A",)))
         self.body = TwinBody(bodies.request(experiment, ("A",), [1]))
         self.body.open()
         nowhere = None

@@ -6,8 +6,8 @@ import pytest
 
 from agents.plugins.trigger_families import RelativeControl, SelfTriggered
 from agents.plugins.triggers import SendOnDelta
-from experiments.definition import assignment
 from experiments.definition.experiment import Experiment, Formation, Leg, Robot
+from experiments.definition.plan import Plan
 from tests.agents.swarm import Swarm
 
 LINKS = {"A - B": 0.5, "C > A": 0.5, "C > B": 0.5}
@@ -98,7 +98,7 @@ def test_what_moved_is_the_largest_change_on_a_link(trigger):
     (group,) = swarm.groups
     agent, state = group.agent, group.state
     view = agent.deciding.input(swarm.t, state.position, state.velocity, agent.life.start_at)
-    links = assignment.all_links(swarm.experiment)
+    links = Plan(swarm.experiment).links
     apart = state.position[links.listener] - agent.heard.position
     moved = np.linalg.norm(apart - agent.deciding._updating._apart, axis=1)
     for row in range(2):

@@ -13,8 +13,8 @@ from agents.network.keys import Keys
 from agents.runtime import loop
 from agents.runtime.loop import Runtime
 from agents.runtime.setup import Setup
-from experiments.definition import assignment
 from experiments.definition.experiment import Formation, Robot
+from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
@@ -84,7 +84,7 @@ def run(body: Airborne, silence_s: float = 5.0) -> Net:
     with Net().worn() as net:
         body.net = net
         setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], loop_silence_s=silence_s)
-        Runtime(assignment.assign(experiment, ("F",)), body, setup).run()
+        Runtime(Plan(experiment).assignment(("F",)), body, setup).run()
     return net
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from agents.arrays import norm
 from experiments.check import check
-from experiments.definition import assignment
 from experiments.definition.experiment import Channel, Experiment, Formation, Hybrid, Leg, Robot
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.metrics import measure
@@ -132,9 +132,9 @@ def test_robots_that_decide_for_themselves_do_not_feel_that_others_are_guided(ca
     second = simulation.simulate(with_delay(park, 0.0, HYBRID), [1])
     np.testing.assert_array_equal(first.sent[1], second.sent[1])
     names = np.array(first.names)
-    links = assignment.heard_links(with_delay(park, 0.0, HYBRID))
+    links = Plan(with_delay(park, 0.0, HYBRID)).heard_links
     assert not set(names[links.listener]) & set(HYBRID.robots)
-    assert len(second.heard[0]) == len(first.heard[0]) * len(links) / len(assignment.heard_links(park))
+    assert len(second.heard[0]) == len(first.heard[0]) * len(links) / len(Plan(park).heard_links)
 
 
 def test_lost_poses_and_goals_are_counted(cases):
@@ -188,7 +188,7 @@ def test_messages_of_the_whole_network_are_counted_alike(cases):
     assert centralised.network_messages == centralised.deliveries == poses + 7 * 40
     # of 21 links 10 are those of KH02, CF02, CF03; the centre hears all but the leader
     listened = {robot.robot: robot.listeners for robot in hybrid.robots}
-    links = assignment.heard_links(with_delay(park, 0.0, HYBRID))
+    links = Plan(with_delay(park, 0.0, HYBRID)).heard_links
     assert hybrid.deliveries == (len(links) + 6) * 200 + 3 * 40
     assert sum(listened.values()) == len(links) + 6
     assert centralised.guidance.goals_hz == pytest.approx(70.0)
@@ -284,9 +284,9 @@ def test_check_says_what_it_means(tmp_path):
 
 def test_who_is_guided(cases):
     park = cases["periodic"]
-    assert assignment.guided(park) == ()
-    assert assignment.guided(with_delay(park, 0.0, "centralised")) == tuple(park.robots)
-    assert assignment.guided(with_delay(park, 0.0, HYBRID)) == ("KH02", "CF02", "CF03")
+    assert Plan(park).guided == ()
+    assert Plan(with_delay(park, 0.0, "centralised")).guided == tuple(park.robots)
+    assert Plan(with_delay(park, 0.0, HYBRID)).guided == ("KH02", "CF02", "CF03")
 
 
 def test_robots_without_a_formation_are_guided_too():

@@ -12,8 +12,9 @@ from agents.body.limits import Safety
 from agents.plugins.laws import Distance
 from agents.plugins.planners import Line
 from agents.plugins.triggers import Periodic, SendOnDelta
-from experiments.definition import assignment, bodies
+from experiments.definition import bodies
 from experiments.definition.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Start
+from experiments.definition.plan import Plan
 from experiments.file import document
 from twins.scene import Obstacle
 
@@ -26,7 +27,7 @@ def park():
 
 
 def test_everybody_together(park):
-    made = assignment.assign(park, NAMES)
+    made = Plan(park).assignment(NAMES)
     assert made.names == made.speakers == NAMES
     assert made.kinds == (TURTLEBOT3, KHEPERA4, KHEPERA4, KHEPERA4, CRAZYFLIE, CRAZYFLIE, CRAZYFLIE)
     np.testing.assert_array_equal(made.hover, [np.nan] * 4 + [0.8] * 3)
@@ -43,7 +44,7 @@ def test_everybody_together(park):
 
 def test_the_links_of_the_paper(park):
     """Eq. (11) and figure 11: 12 edges, three of them from the leader only."""
-    net = assignment.all_links(park)
+    net = Plan(park).links
     heard = {NAMES[i]: {NAMES[j] for j in net.speaker[net.listener == i]} for i in range(7)}
     assert heard == {
         "TB01": set(),
@@ -62,7 +63,7 @@ def test_the_links_of_the_paper(park):
 
 @pytest.mark.parametrize("names", [("CF01",), ("KH02", "CF03"), ("CF03", "TB01", "KH02")])
 def test_some_robots_in_any_order_know_their_own_part(park, names):
-    made, whole = assignment.assign(park, names), assignment.all_links(park)
+    made, whole = Plan(park).assignment(names), Plan(park).links
     assert made.names == names
     assert made.speakers == NAMES
 
@@ -76,15 +77,15 @@ def test_some_robots_in_any_order_know_their_own_part(park, names):
 
 
 def test_repetitions_stand_side_by_side(park):
-    made = assignment.assign(park, NAMES, copies=3)
+    made = Plan(park).assignment(NAMES, copies=3)
     assert made.names == made.speakers == NAMES * 3
-    assert len(made.links) == 3 * len(assignment.all_links(park))
+    assert len(made.links) == 3 * len(Plan(park).links)
     assert (made.links.listener // 7 == made.links.speaker // 7).all()
     ((rows, _),) = made.legs
     assert rows.tolist() == [0, 7, 14]
     assert made.hover.shape == (21,)
     with pytest.raises(ValueError, match="only the whole experiment can be repeated"):
-        assignment.assign(park, NAMES[1:], copies=2)
+        Plan(park).assignment(NAMES[1:], copies=2)
 
 
 def test_bodies_of_repetitions_differ_in_their_seeds_only(park):
@@ -115,17 +116,17 @@ def test_starts_are_on_the_floor_with_a_yaw():
 
 def test_limits_are_the_arena_and_the_safety_of_the_file():
     given = experiment(arena=Arena(size=(2.0, 3.0, 4.0)), safety=Safety(speed=0.3, goal_step=0.2, margin=0.1))
-    made = assignment.limits(given, [])
+    made = Plan(given).limits([])
     np.testing.assert_array_equal(made.low, [-1.0, -1.5, 0.0])
     np.testing.assert_array_equal(made.high, [1.0, 1.5, 4.0])
     assert (made.speed, made.goal_step, made.margin) == (0.3, 0.2, 0.1)
     assert (made.own_silence_s, made.link_silence_s) == (0.5, 1.0)
-    assert assignment.limits(experiment(), []).top_speed == np.inf
+    assert Plan(experiment()).limits([]).top_speed == np.inf
 
 
 def test_links_may_have_gains_of_their_own():
     given = {"A > B": Link(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": Link(distance=1.0)}
-    net = assignment.all_links(experiment(formation=Formation(gain=2.0, links=given)))
+    net = Plan(experiment(formation=Formation(gain=2.0, links=given))).links
     table = zip(*(column.tolist() for column in (net.listener, net.speaker, net.distance, net.gain)), strict=True)
     assert list(table) == [(0, 2, 1.0, 2.0), (1, 0, 0.5, 7.0), (1, 2, 0.6, 2.0), (2, 1, 0.6, 2.0)]
 
@@ -141,7 +142,7 @@ def test_links_may_have_gains_of_their_own():
     ],
 )
 def test_who_leads(formation, leaders):
-    assert assignment.leaders(experiment(formation=formation)) == leaders
+    assert list(Plan(experiment(formation=formation)).leaders) == leaders
 
 
 def test_disturbances_merge_field_by_field_the_narrower_wins():
@@ -159,13 +160,13 @@ def test_disturbances_merge_field_by_field_the_narrower_wins():
 def test_rates_patience_and_triggers():
     rates = Rates(body_hz=200.0, pose_hz=40.0, coordination_hz=20.0)
     trigger = {"kind": "send-on-delta", "threshold": 0.02, "maximum_silence_s": 1.0}
-    made = assignment.assign(
-        experiment(rates=rates, start=Start(deadline_s=7.0, missing="go-on"), trigger=trigger), ("A", "B", "C")
+    made = Plan(experiment(rates=rates, start=Start(deadline_s=7.0, missing="go-on"), trigger=trigger)).assignment(
+        ("A", "B", "C")
     )
     assert (made.body_hz, made.pose_every, made.decide_every, made.patience_s) == (200.0, 5, 10, 7.0)
     assert made.trigger == SendOnDelta(threshold=0.02, maximum_silence_s=1.0)
     with pytest.raises(msgspec.ValidationError, match="threshold"):
-        assignment.assign(experiment(trigger={**trigger, "threshold": -1.0}), ("A",))
+        Plan(experiment(trigger={**trigger, "threshold": -1.0})).assignment(("A",))
 
 
 def test_robots_are_not_scattered_into_obstacles():

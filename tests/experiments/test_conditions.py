@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from agents.network import channel_model
-from experiments.definition import assignment, link_conditions
+from experiments.definition import link_conditions
 from experiments.definition.experiment import Channel, Experiment, Formation, LinkChannel, Outage, Robot
+from experiments.definition.plan import Plan
 from experiments.file import consistency
 
 NAMES = ("A", "B", "C")
@@ -26,12 +27,12 @@ def experiment(channel=None, **parts):
 
 def virtual(channel, seeds=(1,)):
     chosen = experiment(channel)
-    return link_conditions.virtual(chosen, assignment.assign(chosen, NAMES, copies=len(seeds)).links, seeds)
+    return link_conditions.virtual(chosen, Plan(chosen).assignment(NAMES, copies=len(seeds)).links, seeds)
 
 
 def at(channel, *names):
     chosen = experiment(channel)
-    return link_conditions.at_listeners(chosen, assignment.assign(chosen, names).links, names)
+    return link_conditions.at_listeners(chosen, Plan(chosen).assignment(names).links, names)
 
 
 def test_the_default_is_a_millisecond_and_nothing_at_a_real_listener():
@@ -78,7 +79,7 @@ def test_keys_come_from_the_seed_and_the_names_wherever_the_link_is():
     assert both.key.tolist() == [channel_model.key(seed, *names) for seed in (1, 7) for names in ends]
     for names in (("A",), ("B",), ("C",), ("C", "A"), NAMES):  # processes with some of the robots
         here = at(channel, *names)
-        links = assignment.assign(experiment(channel), names).links
+        links = Plan(experiment(channel)).assignment(names).links
         for k, (i, j) in enumerate(zip(links.listener, links.speaker, strict=True)):
             k_all = ends.index((NAMES[j], names[i]))
             assert here.key[k] == both.key[k_all]
@@ -90,7 +91,7 @@ def test_another_robot_does_not_change_the_luck_of_the_others():
     bigger = experiment(channel)
     robots = {"Z": Robot(kind="khepera4", start=[0.0, 1.0]), **bigger.robots}
     bigger = msgspec.structs.replace(bigger, robots=robots)
-    made = link_conditions.virtual(bigger, assignment.assign(bigger, tuple(robots)).links, [1])
+    made = link_conditions.virtual(bigger, Plan(bigger).assignment(tuple(robots)).links, [1])
     assert made.key.tolist() == virtual(channel).key.tolist()
 
 
@@ -156,7 +157,7 @@ def test_links_that_only_avoidance_hears_are_links():
     everybody = {"kind": "potential", "hears": "all"}
     assert wrong(channel, avoidance=everybody) == []
     chosen = experiment(channel, avoidance=everybody)
-    links = assignment.assign(chosen, NAMES).links
+    links = Plan(chosen).assignment(NAMES).links
     made = link_conditions.virtual(chosen, links, [1])
     ((k),) = np.flatnonzero(made.loss)
     assert (NAMES[links.listener[k]], NAMES[links.speaker[k]]) == ("A", "C")

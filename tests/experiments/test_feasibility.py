@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from agents.formation.graph import Links, links
 from experiments.check.realisation import algebraic_connectivity, conflicts, link_errors, realise, stiffness, unfolded
-from experiments.definition import assignment
+from experiments.definition.plan import Plan
 from experiments.file import document
 
 # where the reference formation may stand: TB01, KH01..03, CF01..03
@@ -30,7 +30,7 @@ PUBLISHED = np.array(
 
 @pytest.fixture(scope="module")
 def reference() -> Links:
-    return assignment.all_links(document.read("robotic-park").experiment)
+    return Plan(document.read("robotic-park").experiment).links
 
 
 def test_the_published_shape_meets_the_published_distances(reference):

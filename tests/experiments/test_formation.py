@@ -9,8 +9,8 @@ from agents.plugins import registry
 from experiments.check import check
 from experiments.check.realisation import contradictions
 from experiments.definition.experiment import Start
-from experiments.definition.formation import FormationArrays, anchors_of, errors
-from experiments.definition.links import one_way_links
+from experiments.definition.formation import anchors_of, errors
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.metrics.signals import net_rotation
 from experiments.virtual_time import simulation
@@ -89,7 +89,7 @@ def flown(experiment, seeds=(1,)):
     running = (log.time >= 0.0) & (log.time < experiment.duration_s)
     time, position = log.time[running], log.true_position[running][:, : len(log.names)]
     law = registry.build(registry.LAWS, experiment.formation.law)
-    return time, position, errors(law, FormationArrays.of(experiment, log.names), time, position)
+    return time, position, errors(law, Plan(experiment).formation, time, position)
 
 
 def codes(given):
@@ -101,16 +101,16 @@ def codes(given):
 
 def test_both_ends_of_a_link_are_asked_for_the_same(written):
     experiment = written(SQUARE).experiment
-    asked = {(link.listener, link.speaker): link.wanted for link in one_way_links(experiment)}
+    asked = {(link.listener, link.speaker): link.wanted for link in Plan(experiment).one_way}
     assert asked["B", "A"].relative == (0.6, 0.0, 0.0)  # B stands 0.6 m along x from A
     assert asked["A", "B"].relative == (-0.6, -0.0, -0.0)
     assert asked["C", "B"].relative == (0.0, 0.6, 0.6)  # the heights that they hold
     assert asked["B", "C"].distance == pytest.approx(np.hypot(0.6, 0.6))
-    assert {link.gain for link in one_way_links(experiment)} == {0.5}  # the stiffness, not the gain of distances
+    assert {link.gain for link in Plan(experiment).one_way} == {0.5}  # the stiffness, not the gain of distances
 
 
 def test_each_link_has_the_gain_of_what_it_asks_for(written):
-    links = one_way_links(written(MIXED).experiment)
+    links = Plan(written(MIXED).experiment).one_way
     assert {(link.listener, link.speaker): link.gain for link in links} == {
         ("B", "A"): 0.5, ("B", "C"): 3.0, ("C", "B"): 3.0, ("C", "A"): 3.0, ("C", "D"): 3.0, ("D", "C"): 3.0,
         ("D", "A"): 0.5,
@@ -119,7 +119,7 @@ def test_each_link_has_the_gain_of_what_it_asks_for(written):
 
 def test_a_law_of_distances_takes_offsets_for_distances(written):
     given = written(SQUARE.replace('"displacement"', '"distance"'))
-    links = FormationArrays.of(given.experiment, "ABCD").links
+    links = Plan(given.experiment).formation.links
     assert links.distance[:2].tolist() == pytest.approx([0.6, np.hypot(0.6, 0.6)])
     assert "realisable" in codes(given)
 
@@ -301,9 +301,9 @@ def test_offsets_that_do_not_add_up(written):
     found = codes(given)["offsets-contradict"]
     assert (found.severity, found.where.rsplit(":", 2)[1]) == ("error", "24")
     assert "100.0 mm" in found.message
-    (first, *_) = contradictions(FormationArrays.of(given.experiment, "ABCD").links)
+    (first, *_) = contradictions(Plan(given.experiment).formation.links)
     assert sorted(first.rows) == [0, 1, 2, 3]
-    assert contradictions(FormationArrays.of(written(SQUARE).experiment, "ABCD").links) == []
+    assert contradictions(Plan(written(SQUARE).experiment).formation.links) == []
 
 
 def test_what_check_says_of_formations(written):

@@ -6,7 +6,8 @@ import pytest
 from experiments.authoring.generate import Wanted, command, experiment_file, layout
 from experiments.authoring.layouts import LayoutError
 from experiments.check.check import check, figures
-from experiments.definition import assignment, bodies
+from experiments.definition import bodies
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.virtual_time import simulation
@@ -75,7 +76,7 @@ def test_starts_do_not_overlap_whatever_the_seed(tmp_path):
 def test_a_hundred_drones_form_their_hemisphere_from_random_starts(tmp_path, seed):
     experiment = written(tmp_path, "hemisphere", "100", Wanted(duration_s=25.0)).experiment
     log = simulation.simulate(experiment, [seed])
-    net = assignment.all_links(experiment)
+    net = Plan(experiment).links
     apart = np.linalg.norm(log.true_position[:, net.listener] - log.true_position[:, net.speaker], axis=2)
     worst = np.abs(apart - net.distance).max(axis=1)
     running = (log.time >= 0.0) & (log.time <= 25.0)
@@ -89,8 +90,8 @@ def test_by_offsets_they_come_from_anywhere(tmp_path):
     read = written(tmp_path, "hemisphere", "20", wanted)
     assert [found for found in check(read) if found.severity != "note"] == []
     log = simulation.simulate(read.experiment, [1])
-    net = assignment.all_links(read.experiment)
-    law = assignment.assign(read.experiment, tuple(read.experiment.robots)).law
+    net = Plan(read.experiment).links
+    law = Plan(read.experiment).assignment(tuple(read.experiment.robots)).law
     begin, end = (log.true_position[np.searchsorted(log.time, at)] for at in (0.0, 29.9))
     assert law.error(begin, begin[net.speaker], net).max() > 3.0
     assert law.error(end, end[net.speaker], net).max() < 0.07  # three times the threshold at which robots speak

@@ -6,7 +6,7 @@ import pytest
 from experiments.authoring.robotic_park.convert import command, imported
 from experiments.authoring.robotic_park.older_formats import starts_from
 from experiments.check.check import check, figures
-from experiments.definition import assignment
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.virtual_time import simulation
@@ -46,8 +46,8 @@ def test_they_convert_and_pass_the_check(tmp_path, count):
 def test_they_run(tmp_path, count):
     experiment = converted(tmp_path, FILES[count]())[0].experiment
     log = simulation.simulate(experiment, [1])
-    law = assignment.assign(experiment, tuple(experiment.robots)).law
-    net = assignment.all_links(experiment)
+    law = Plan(experiment).assignment(tuple(experiment.robots)).law
+    net = Plan(experiment).links
     last = log.true_position[np.searchsorted(log.time, 19.9)]
     allowed = experiment.tolerance if experiment.formation.update is None else 0.15  # what a chain of thresholds leaves
     assert law.error(last, last[net.speaker], net).max() < allowed

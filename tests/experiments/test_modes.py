@@ -11,7 +11,7 @@ from agents.plugins.laws import Displacement, Distance
 from experiments.authoring import layouts
 from experiments.check.realisation import realise
 from experiments.check.stability import modes
-from experiments.definition import assignment
+from experiments.definition.plan import Plan
 from experiments.file import document
 
 PUBLISHED = np.array(
@@ -49,7 +49,7 @@ def by_hand(law, net, position, share, anchors=None):
 
 
 def test_stiffest_and_slowest_mode_of_the_reference():
-    reference = assignment.all_links(document.read("robotic-park").experiment)
+    reference = Plan(document.read("robotic-park").experiment).links
     shape = realise(reference, [PUBLISHED], np.arange(7) > 0)[0]
     hz = 1000.0  # u applied as a velocity: h = 1 / hz
     found = modes(Distance(), reference, shape.position, np.full(7, 1.0 / hz), hz)

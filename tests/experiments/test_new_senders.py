@@ -8,8 +8,8 @@ from agents.agent import Agent
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.goal_inbox import HeardGoals
-from experiments.definition import assignment
 from experiments.definition.experiment import Formation, Robot
+from experiments.definition.plan import Plan
 from experiments.real_time.processes.world_network import Exchange
 from experiments.real_time.processes.world_population import Population
 from tests.agents.few import pair
@@ -49,7 +49,7 @@ def test_a_world_obeys_the_stop_of_a_process_whose_clock_is_behind_that_of_the_o
 
 def test_a_centre_whose_clock_is_behind_that_of_the_one_before_is_followed():
     experiment = pair(architecture="centralised")
-    agent = Agent(assignment.assign(experiment, ("A",)))
+    agent = Agent(Plan(experiment).assignment(("A",)))
     with Net().worn() as net:
         goals = HeardGoals(net.session, KEYS, agent, agent.guidance, reach=(5.0, 5.0, 5.0))
 
@@ -70,7 +70,7 @@ def test_a_centre_whose_clock_is_behind_that_of_the_one_before_is_followed():
 
 
 def test_a_late_goal_does_not_bring_a_dead_centre_back():
-    agent = Agent(assignment.assign(pair(architecture="centralised"), ("A",)))
+    agent = Agent(Plan(pair(architecture="centralised")).assignment(("A",)))
     guidance, row, goal = agent.guidance, np.array([0]), np.zeros((1, 3))
     guidance.hear(row, goal, np.zeros(1), np.array([1.0]))
     guidance.lose(2.0)

@@ -8,7 +8,8 @@ import pytest
 from agents.arrays import norm
 from agents.body.kinds import KINDS
 from experiments.check.realisation import link_errors
-from experiments.definition import assignment, bodies
+from experiments.definition import bodies
+from experiments.definition.plan import Plan
 from experiments.file.document import read
 from experiments.virtual_time import simulation
 from twins import scene as outlines
@@ -39,6 +40,6 @@ def test_it_passes_without_contact_and_recovers(case):
     i, j = np.triu_indices(place.shape[1], 1)
     assert (norm(place[:, i, :2] - place[:, j, :2]) > 2.0 * RADIUS + 0.04).all()
     assert (place[-1, :, 0] > 0.5).all()  # all are through
-    error = link_errors(assignment.all_links(experiment), place).max(axis=1)
+    error = link_errors(Plan(experiment).links, place).max(axis=1)
     assert error.max() > 0.3  # it had to fold
     assert error[time > 75.0].max() < 0.025

@@ -13,7 +13,6 @@ from agents.agent import Agent
 from agents.body.interface import BodyState
 from agents.network import messages
 from experiments import run
-from experiments.definition import assignment
 from experiments.definition import standby as reserves
 from experiments.definition.experiment import (
     Channel,
@@ -26,6 +25,7 @@ from experiments.definition.experiment import (
     Outage,
     Robot,
 )
+from experiments.definition.plan import Plan
 from experiments.file import consistency, document
 from experiments.real_time.conductor.replacement import Refused, Spares
 
@@ -98,7 +98,7 @@ def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:
 def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     case = experiment()
     robots = {**case.robots, "C": msgspec.structs.replace(FLY, standby=standby)}
-    told = assignment.assign(msgspec.structs.replace(case, robots=robots), ["A"])
+    told = Plan(msgspec.structs.replace(case, robots=robots)).assignment(["A"])
     agent = Agent(told)
     assert agent.missing(0) == ["B", "C"]
     link = np.array([told.speakers[j] for j in told.links.speaker]) == "B"

@@ -10,8 +10,8 @@ import pytest
 
 from agents.body.interface import Disturbance, Jitter
 from experiments import run
-from experiments.definition.assignment import uses_chance
 from experiments.definition.experiment import Channel, LinkChannel, Start
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.recording import run_folder
@@ -73,7 +73,7 @@ def test_whether_seeds_change_anything() -> None:
         {"channel": Channel(loss=0.1)},
         {"channel": Channel(links={"A > B": LinkChannel(jitter_s=0.1)})},
     ]
-    assert not uses_chance(bare)
-    assert not uses_chance(msgspec.structs.replace(bare, disturbance={"all": Disturbance(latency_s=0.1)}))
+    assert not Plan(bare).uses_chance
+    assert not Plan(msgspec.structs.replace(bare, disturbance={"all": Disturbance(latency_s=0.1)})).uses_chance
     for parts in random:
-        assert uses_chance(msgspec.structs.replace(bare, **parts))
+        assert Plan(msgspec.structs.replace(bare, **parts)).uses_chance

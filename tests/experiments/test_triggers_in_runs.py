@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from agents.plugins.predictors import HOLD, ConstantVelocity
-from experiments.definition import assignment
 from experiments.definition.experiment import Channel, Formation
+from experiments.definition.plan import Plan
 from experiments.file import consistency, document
 from experiments.metrics import measure, signals
 from experiments.virtual_time import simulation
@@ -39,13 +39,13 @@ def mean(cases, index):
 
 
 def test_prediction_is_what_the_trigger_needs_unless_it_is_said(park):
-    assert assignment.predictor(park) is HOLD
-    assert assignment.predictor(changed(park, trigger="predictive")) == ConstantVelocity()
-    assert assignment.predictor(changed(park, trigger=CHOSEN)) == ConstantVelocity()
+    assert Plan(park).predictor is HOLD
+    assert Plan(changed(park, trigger="predictive")).predictor == ConstantVelocity()
+    assert Plan(changed(park, trigger=CHOSEN)).predictor == ConstantVelocity()
     said = {"kind": "constant-velocity", "horizon_s": 0.5}
-    assert assignment.predictor(changed(park, trigger=CHOSEN, prediction=said)) == ConstantVelocity(horizon_s=0.5)
-    assert assignment.predictor(changed(park, prediction="constant-velocity")) == ConstantVelocity()
-    assert assignment.predictor(changed(park, prediction="hold")) is HOLD
+    assert Plan(changed(park, trigger=CHOSEN, prediction=said)).predictor == ConstantVelocity(horizon_s=0.5)
+    assert Plan(changed(park, prediction="constant-velocity")).predictor == ConstantVelocity()
+    assert Plan(changed(park, prediction="hold")).predictor is HOLD
 
 
 def updating(park, update):

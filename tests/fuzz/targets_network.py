@@ -19,7 +19,8 @@ from agents.body.kinds import KINDS
 from agents.network import messages as wire
 from agents.runtime.loop import Runtime
 from agents.runtime.setup import Setup
-from experiments.definition import assignment, bodies
+from experiments.definition import bodies
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import orders
 from tests.fuzz.loopnet import Net, Reply, Sample
@@ -62,7 +63,7 @@ def robot() -> Iterator[Target]:
         net.forget()
         body = assemble(bodies.request(experiment, ["KH01"], [1], ["tcp/127.0.0.1:1"]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True], ranging=["world"])
-        runtime = Runtime(assignment.assign(experiment, ["KH01"]), body, setup)
+        runtime = Runtime(Plan(experiment).assignment(["KH01"]), body, setup)
         body.open()
         runtime._join(net.session)
         runtime._utc = runtime._telemetry.utc = time.time()

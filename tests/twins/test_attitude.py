@@ -9,8 +9,9 @@ import pytest
 
 from agents.body.interface import BodyError, Disturbance, Jitter
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO
-from experiments.definition import assignment, bodies
+from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Robot, World
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.virtual_time.simulation import simulate
 from tests.twins.runge_kutta import runge_kutta
@@ -388,7 +389,7 @@ def test_the_drones_are_what_the_engine_flies():
 def test_the_reference_formation_needs_half_the_gain():
     """With the attitude's lag in the loop the file's gain of 3 hunts; see docs/mujoco.md."""
     park = document.read("robotic-park").cases()["periodic"]
-    links = assignment.all_links(park)
+    links = Plan(park).links
     error = {}
     for gain in (1.5, 3.0):
         formation = msgspec.structs.replace(park.formation, gain=gain)

@@ -72,7 +72,7 @@ def process() -> Iterator[Figure]:
     from agents.agent import links_by_speaker  # noqa: PLC0415
     from agents.network import messages  # noqa: PLC0415
     from agents.network.endpoints import free_endpoint  # noqa: PLC0415
-    from experiments.definition.assignment import assign  # noqa: PLC0415
+    from experiments.definition.plan import Plan  # noqa: PLC0415
     from experiments.file import document  # noqa: PLC0415
     from experiments.real_time.conductor.conductor import Conductor  # noqa: PLC0415
     from experiments.real_time.conductor.support import start_router  # noqa: PLC0415
@@ -107,7 +107,7 @@ def process() -> Iterator[Figure]:
             endpoints = [free_endpoint()]
             start_router(launcher, endpoints)
             for robot in experiment.robots:
-                mine = assign(experiment, [robot])
+                mine = Plan(experiment).assignment([robot])
                 speakers = links_by_speaker(mine.links, mine.speakers)
                 rate = f"{experiment.rates.pose_hz:g}"
                 started = launcher.start(

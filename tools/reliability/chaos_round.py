@@ -28,7 +28,7 @@ from agents.network import messages
 from agents.network import session as network
 from agents.network.endpoints import free_endpoint
 from experiments.definition.experiment import Experiment
-from experiments.definition.links import one_way_links
+from experiments.definition.plan import Plan
 from experiments.real_time.hosts.launcher import Launcher
 from tools.reliability.cables import Cables
 from tools.reliability.chaos_report import Ended, Outcome, line, misrecorded
@@ -138,7 +138,7 @@ class Flight:
         self._well: float | None = None  # since when all is well, before a fault
         self._formed_since: float | None = None
         self._hears: dict[str, set[str]] = {name: set() for name in setting.experiment.robots}
-        for link in one_way_links(setting.experiment):
+        for link in Plan(setting.experiment).one_way:
             self._hears[link.listener].add(link.speaker)
 
     def fly(self) -> Ended:

@@ -24,7 +24,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.messages import Command
 from experiments.definition.experiment import Experiment
-from experiments.definition.links import one_way_links
+from experiments.definition.plan import Plan
 from experiments.real_time.conductor.run_view import by_robots
 
 TOUCH_M: Final = 1e-3  # [m] less overlap than this is rounding and the age of what was heard
@@ -52,7 +52,7 @@ class Invariants:
         self._low = np.array([-0.5 * x - OUT_M, -0.5 * y - OUT_M, -BELOW_M])
         self._high = np.array([0.5 * x + OUT_M, 0.5 * y + OUT_M, z + OUT_M])
         self.position: Array = np.full((len(row), 3), np.nan)
-        links = [link for link in one_way_links(experiment) if np.isinf(link.reach)]
+        links = [link for link in Plan(experiment).one_way if np.isinf(link.reach)]
         self._links = links
         self._listener = np.array([row[link.listener] for link in links], dtype=np.intp)
         self._speaker = np.array([row[link.speaker] for link in links], dtype=np.intp)

@@ -15,8 +15,8 @@ from typing import Final
 from agents.clock import Clock
 from agents.network import messages
 from agents.network.keys import Keys
-from experiments.definition.assignment import guided
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.real_time.conductor.crew import CaseProcesses
 from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
 from experiments.real_time.conductor.orders import lead
@@ -97,7 +97,7 @@ class Conductor:
         self._emergency = Emergency() if emergency is None else emergency
         self._keys = Keys(experiment.network.realm)
         self._clock = launcher.clock = Clock()  # of each case, for all its processes here, however late they start
-        steered = guided(experiment)
+        steered = Plan(experiment).guided
         self._robots = {
             name: RobotView(error=None if name in steered else 0.0, left_because="standby" if robot.standby else "")
             for name, robot in experiment.robots.items()

@@ -14,9 +14,9 @@ import msgspec
 
 from agents.network import endpoints as topology
 from agents.plugins import registry
-from experiments.definition import assignment, bodies
-from experiments.definition.assignment import guided
+from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.plan import Plan
 from experiments.real_time.hosts.launcher import ROUTER, Launcher, Process, is_router
 
 READY_S: Final = 15.0
@@ -127,7 +127,7 @@ def _positioning(
     interrupted: Callable[[], bool],
 ) -> tuple[list[str], tuple[str, Callable[[], Process]] | None]:
     """Who measures external positions: the names of the processes that were started for it; see `StandIns`."""
-    measured = assignment.measured(msgspec.structs.replace(experiment, robots=robots))
+    measured = Plan(msgspec.structs.replace(experiment, robots=robots)).externally_measured
     if experiment.positioning is None or not measured:
         return [], None
     started = []
@@ -199,7 +199,7 @@ class Servants:
             launcher: Starts them.
         """
         connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
-        self._centre = f"{case}-centre" if guided(experiment) else None
+        self._centre = f"{case}-centre" if Plan(experiment).guided else None
         several = experiment.network.routers > 1
         self._known = {
             each.name: _Servant(

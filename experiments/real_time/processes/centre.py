@@ -40,9 +40,9 @@ from agents.runtime.lifeline import Lifeline
 from agents.runtime.pose_inbox import Coming, NeighbourSubscription, ReceivedPose
 from agents.runtime.telemetry import resident_mb
 from experiments.definition import link_conditions, mesh
-from experiments.definition.assignment import assign_centre, guided
 from experiments.definition.endpoints import routers
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import chosen_case
 from experiments.file.problems import DocumentError, Problem
@@ -65,7 +65,7 @@ class CentreProcess:
         self, experiment: Experiment, session: zenoh.Session, keys: Keys, endpoints: Sequence[str] = ()
     ) -> None:
         """Declares everything but the token: whoever sees that is listened to. `endpoints` are those of the session."""
-        assignment = assign_centre(experiment)
+        assignment = Plan(experiment).centre_assignment()
         self.centre = centre = Centre(assignment)
         self._names, self._session, self._keys = assignment.names, session, keys
         self._router = network.RouterWatch(session, keys.centre_alive, endpoints)
@@ -247,7 +247,7 @@ def serve(
     began = Clock().utc()
     read = document.read(file)
     experiment = chosen_case(read, case)
-    steered = guided(experiment)
+    steered = Plan(experiment).guided
     if not steered:
         hint = 'write architecture = "centralised" at the top of the file, or choose another case with --case'
         raise DocumentError([Problem(file, 0, 0, "every robot of this experiment decides for itself", hint)])

@@ -37,10 +37,10 @@ from agents.plugins import registry
 from agents.runtime import command_line
 from agents.runtime.loop import Runtime
 from agents.runtime.setup import Ranging, Setup
-from experiments.definition import assignment as assign
 from experiments.definition import bodies, link_conditions, mesh
 from experiments.definition.endpoints import routers
 from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import chosen_case
 from experiments.file.problems import DocumentError, Problem
@@ -119,7 +119,7 @@ def _run(
     endpoints = mesh.near(experiment, names, endpoints)
     request = replace(bodies.request(experiment, names, [experiment.seed], endpoints), clock=clock)
     body = shadowed(assemble(request), request, bodies.shadows(experiment, names))
-    assignment = assign.assign(experiment, names)
+    assignment = Plan(experiment).assignment(names)
     setup = Setup(
         keys=Keys(experiment.network.realm),
         endpoints=endpoints,

@@ -23,9 +23,9 @@ from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.runtime import range_inbox
-from experiments.definition.assignment import measured
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.real_time.processes.world_population import Population
 
 DEPTH: Final = 16_384  # commands that may wait: of two hundred robots, those of 0.8 s
@@ -66,7 +66,7 @@ class Exchange:
         self._truth_every = max(1, round(experiment.rates.body_hz / TRUTH_HZ))
         # robots with another body have another simulator, or none, to tell things to
         self._elsewhere = {keys.setpoint(name) for name, robot in experiment.robots.items() if robot.body != WORLD}
-        self._measured = frozenset(measured(experiment))
+        self._measured = frozenset(Plan(experiment).externally_measured)
         self._clock = Clock()
         self.utc = self._clock.utc()
         self.contacts = self.refused = self.malformed = 0
