@@ -12,7 +12,7 @@ from twins.devices.crazyflie.device import open_device
 from twins.devices.crazyflie.supervisor import State
 
 NOTHING = (np.nan,) * 4
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
 
 
 class Process:

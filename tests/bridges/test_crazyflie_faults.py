@@ -2,7 +2,6 @@
 
 import socket
 import sys
-import threading
 import time
 
 import numpy as np
@@ -13,6 +12,7 @@ from agents.protocols.crtp import Info
 from bridges.crazyflie.body import open_crazyflie
 from bridges.crazyflie.telemetry import Board, Telemetry
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
+from tests.system.lab import until
 from tests.twins.loopback import Served, request
 from twins.devices.crazyflie.device import open_device
 from twins.devices.crazyflie.supervisor import State
@@ -88,10 +88,7 @@ def test_loop_that_stops_commanding():
         process.takeoff(0.3)
         process.setpoint = [(0.0, 0.0, 0.3, 0.0)]
         process.run(0.2)
-        pause, deadline = threading.Event(), time.monotonic() + 8.0
-        while truth(twin)[2] > 0.0:
-            assert time.monotonic() < deadline, "it was not landed"
-            pause.wait(0.02)
+        until(lambda: truth(twin)[2] == 0.0, "it was landed")
         assert supervised(twin) != State.LOCKED
         assert "nobody commanded" in process.tick().notes[0]
 

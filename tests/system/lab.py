@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import zenoh
 from mcap.reader import make_reader
@@ -23,6 +24,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
+from experiments.recording.trace import Trace
 from experiments.run import reopen
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -114,7 +116,7 @@ class Watcher(Looking):
         return self.status[robot].phase if robot in self.status else ""
 
     def order(self, robot: str, order: messages.Order) -> messages.Reply:
-        return orders.give(self.session, self.keys, [robot], order)[robot]
+        return orders.give(self.session, self.keys, [robot], order, PATIENCE_S)[robot]
 
     def close(self) -> None:
         self.session.close()  # type: ignore[no-untyped-call]
@@ -249,6 +251,14 @@ class Flight:
 def gone(processes: Sequence[psutil.Process]) -> bool:
     """Whether none of them runs any more; a zombie that nobody reaps counts as gone."""
     return not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in processes)
+
+
+def transmits_at_50_hz(trace: Trace) -> None:
+    """Each robot has transmitted 50 times a second, but for ticks that it counted as missed."""
+    wanted = 50.0 * trace.experiment.duration_s
+    sent = np.bincount(trace.sent.robot, minlength=len(trace.robots))
+    assert (sent <= wanted + 1).all()
+    assert (sent >= wanted - trace.missed_deadlines - 3).all()
 
 
 def assert_held_in_time(flight: Flight, case: str, stopped: float) -> None:

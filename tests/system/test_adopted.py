@@ -15,7 +15,7 @@ from agents.network.lab import Role
 from experiments.file import catalogue
 from experiments.recording import playback
 from tests.conftest import RouterProcess
-from tests.system.lab import Flight, RobotProcess, Started, Watcher
+from tests.system.lab import PATIENCE_S, Flight, RobotProcess, Started, Watcher
 from tools.commands import authority
 
 pytestmark = pytest.mark.system
@@ -96,7 +96,7 @@ def test_who_joined_lands_when_the_conductor_is_dead(router: RouterProcess, tmp_
         watcher.until(lambda: watcher.phase("KH02") == "running", "it takes part")
         flight.signal(signal.SIGKILL)
         flight.finish()
-        assert joined.wait(15.0) == 0
+        assert joined.wait(PATIENCE_S) == 0
         watcher.look()
         assert (watcher.phase("KH02"), watcher.status["KH02"].reason) == ("done", "told to end")
         watcher.until(lambda: not watcher.alive, "so do the others")

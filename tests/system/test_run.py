@@ -14,11 +14,11 @@ from rosbags.highlevel import AnyReader
 
 from experiments.recording import playback
 from experiments.recording.reader import recover
-from tests.system.lab import Flight, Watcher, gone, typed, until
+from tests.system.lab import Flight, Watcher, gone, transmits_at_50_hz, typed, until
 
 pytestmark = pytest.mark.system
 
-SHORT = ("--set", "duration_s=5")
+SHORT = ("--set", "duration_s=4")
 
 
 @dataclass
@@ -62,7 +62,6 @@ def test_a_run_forms_up_loses_nothing_and_reports(whole: Whole) -> None:
                 "missed_deadlines",
             }
             assert robot["acquired_s"] is not None
-    assert document["cases"]["periodic"]["mean"]["f_hz"] == pytest.approx(50.0, rel=0.02)
     assert document["cases"]["event"]["ratio"]["f_hz"] < 0.3
     for name in ("report.html", "metrics.json", "metrics.csv", "experiment.toml"):
         assert (folder / name).stat().st_size > 100
@@ -73,6 +72,8 @@ def test_a_run_forms_up_loses_nothing_and_reports(whole: Whole) -> None:
         assert not read.trace.lost.any()
         finite = np.isfinite(read.trace.true_position).all(axis=(1, 2))
         assert finite.mean() > 0.99
+        if case == "periodic":
+            transmits_at_50_hz(read.trace)
 
 
 def test_a_recording_opens_elsewhere_with_typed_messages(whole: Whole) -> None:

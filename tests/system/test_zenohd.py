@@ -122,7 +122,7 @@ def test_a_plain_zenohd_is_read_by_rest_and_may_freeze(tmp_path: Path) -> None:
             return json.load(answer)
 
     with started(endpoint, "-l", endpoint, "--no-multicast-scouting", "--rest-http-port", rest) as process:
-        changes = ("--set", f'network.connect=["{endpoint}"]', "--set", "duration_s=8", "--no-report")
+        changes = ("--set", f'network.connect=["{endpoint}"]', "--set", "duration_s=60", "--no-report")
         flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", *changes)
         flight.until_said("phase conductor: formation")
         (last,) = read("park/CF01/pose")
@@ -137,12 +137,12 @@ def test_a_plain_zenohd_is_read_by_rest_and_may_freeze(tmp_path: Path) -> None:
         assert {each["robot"] for each in told if each["ok"]} == set(names)
         process.send_signal(signal.SIGSTOP)
         stopped = time.time()
-        flight.until_said(r"router conductor: no router answers for \d\.\d s")
+        flight.until_said(r"router conductor: no router answers for \d+\.\d s")
         until(lambda: time.time() > stopped + 3.0, "every robot has had the time to hold")
         process.send_signal(signal.SIGCONT)
-        flight.until_said(r"router conductor: a router answers again, after \d\.\d s")
-        code, _ = flight.finish()
-        assert code == 0, flight.logs()
+        flight.until_said(r"router conductor: a router answers again, after \d+\.\d s")
+        flight.signal(signal.SIGINT)
+        assert flight.finish()[0] == 130, flight.logs()
     assert_held_in_time(flight, "periodic", stopped)
     for name in names:
         assert typed(flight.folder / "periodic.mcap", f"/{name}/status")[-1].malformed == 0
