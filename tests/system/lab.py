@@ -39,6 +39,12 @@ NEAR = [
     for part in ("--set", f"robots.{name}.start={start}")
 ]  # fmt: skip
 
+NEAR_TRIANGLE = [
+    part
+    for name, start in {"KH01": "[-0.35, -0.3]", "KH02": "[0.35, -0.3]", "CF01": "[0.05, 0.2]"}.items()
+    for part in ("--set", f"robots.{name}.start={start}")
+]
+
 
 def until(true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
     """Waits until something is true."""

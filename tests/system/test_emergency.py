@@ -36,7 +36,6 @@ def estop(endpoint: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=30)
 
 
-@pytest.mark.mechanism("emergency stop of every run of the machine")
 @pytest.mark.timeout(120)
 def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -76,6 +75,7 @@ def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
     assert ends["CF01"] == "done: emergency stop by operator: person in arena"
 
 
+@pytest.mark.mechanism("emergency stop of a run")
 @pytest.mark.timeout(120)
 def test_before_the_common_start_too(tmp_path: Path) -> None:
     file, folder = tmp_path / "two.toml", tmp_path / "run"

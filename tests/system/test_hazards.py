@@ -34,7 +34,6 @@ def written(folder: Path, safety: str) -> Path:
     return file
 
 
-@pytest.mark.mechanism("hazard: separation")
 def test_who_comes_too_near_holds_and_the_run_says_so(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, str(written(tmp_path, "separation = 0.5")), "--no-report")

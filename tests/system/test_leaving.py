@@ -89,9 +89,7 @@ def test_an_estop_that_nobody_answers_ends(router: RouterProcess) -> None:
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize(
-    "bodies", ["twin", pytest.param("world", marks=pytest.mark.mechanism("way out: frozen robot, killed launcher"))]
-)
+@pytest.mark.parametrize("bodies", ["twin", "world"])
 def test_a_frozen_robot_keeps_nobody_when_the_launcher_is_killed(tmp_path: Path, bodies: str) -> None:
     flight = Flight(tmp_path / "run", "triangle", "--bodies", bodies, "--set", "duration_s=60")
     flight.until_said("formation")

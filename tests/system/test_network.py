@@ -16,7 +16,7 @@ from experiments.recording.trace import Trace
 from experiments.run import reopen
 from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import simulate
-from tests.system.lab import Flight
+from tests.system.lab import Flight, transmits_at_50_hz
 
 pytestmark = pytest.mark.system
 
@@ -48,6 +48,7 @@ def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Pat
     assert [robot["lost"] for robot in robots.values()] == [0, 0, 0], "of the real network nothing is lost"
 
     real, other = playback.read(folder / "periodic.mcap").trace, virtual(15.0)
+    transmits_at_50_hz(real)
     shares, sent = [], 0
     pairs = sorted({*zip(real.heard.listener.tolist(), real.heard.speaker.tolist(), strict=True)})
     assert len(pairs) == len(real.dropped if real.dropped is not None else ())

@@ -27,9 +27,7 @@ def found(folder: Path, *hosts: str) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    "protocol", ["unixsock-stream", "tls", pytest.param("quic", marks=pytest.mark.mechanism("run in a lab over QUIC"))]
-)
+@pytest.mark.parametrize("protocol", ["unixsock-stream", "tls", "quic"])
 def test_an_experiment_over_each_transport(tmp_path: Path, protocol: str) -> None:
     secure = protocol in ("tls", "quic")
     listen = free_endpoint(0, protocol) if secure else f"{protocol}/{tmp_path}/router.sock"

@@ -17,7 +17,7 @@ from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
 from experiments.recording import playback
 from tests.conftest import RouterProcess
-from tests.system.lab import NEAR, Flight, Looking, RobotProcess, Watcher, WorldProcess, gone, until
+from tests.system.lab import NEAR, NEAR_TRIANGLE, Flight, Looking, RobotProcess, Watcher, WorldProcess, gone, until
 
 pytestmark = pytest.mark.system
 
@@ -158,13 +158,15 @@ def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
 def test_a_world_that_is_killed_is_started_again_and_robots_go_on_where_they_were(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(
-        folder, "triangle", "--bodies", "world", "--case", "event", "--json", "--no-report", "--set", "duration_s=8"
-    )
+        folder, "triangle", "--bodies", "world", "--case", "event", "--json", "--no-report", "--set", "duration_s=6",
+        *NEAR_TRIANGLE,
+    )  # fmt: skip
     flight.until_said(r"phase conductor: formation", 60.0)
     watcher = Watcher(flight.endpoint())
     try:
-        begun = time.time()
-        watcher.until(lambda: time.time() > begun + 1.0, "they are on their way")
+        watcher.until(lambda: len(watcher.state) == 3, "they are there")
+        begun = watcher.state["CF01"].stamp
+        watcher.until(lambda: watcher.state["CF01"].stamp > begun + 1.0, "they are on their way")
         before = dict(watcher.state)
         flight.children()["world"].kill()
         flight.until_said(r"world conductor: the world ended \(killed by SIGKILL\); started again")
@@ -179,7 +181,7 @@ def test_a_world_that_is_killed_is_started_again_and_robots_go_on_where_they_wer
     known = np.isfinite(truth).all(axis=(1, 2))
     step = np.linalg.norm(np.diff(truth[known], axis=0), axis=2)
     assert step.max() < 0.05, "nobody jumps"
-    middle = (when > 0.5) & (when < 7.5) & known
+    middle = (when > 0.5) & (when < 5.5) & known
     assert truth[middle][:, list(trace.robots).index("CF01"), 2].min() > 0.5, "it holds in the air"
     assert not [event for event in trace.events if event.kind == "robot" and "lost" in event.text]
 
