@@ -18,6 +18,7 @@ import pytest
 from hypothesis import settings as hypothesis_settings
 
 from agents.network.endpoints import free_endpoint
+from tests.waiting import until
 
 hypothesis_settings.register_profile("zenpark", deadline=None)  # no test depends on how fast this machine is
 hypothesis_settings.load_profile("zenpark")
@@ -120,16 +121,8 @@ def patient_router() -> Iterator[RouterProcess]:
 
 @pytest.fixture
 def eventually() -> Callable[[Callable[[], object]], None]:
-    """Waits until something is true, and fails when it is not after 30 s."""
-
-    def wait(true: Callable[[], object]) -> None:
-        deadline = time.monotonic() + 30.0
-        pause = threading.Event()
-        while not true():
-            assert time.monotonic() < deadline, "it did not become true in 30 s"
-            pause.wait(0.005)
-
-    return wait
+    """Waits until something is true."""
+    return until
 
 
 @pytest.fixture(autouse=True)

@@ -12,8 +12,8 @@ from agents.protocols.crtp import Info
 from bridges.crazyflie.body import open_crazyflie
 from bridges.crazyflie.telemetry import Board, Telemetry
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
-from tests.system.lab import until
 from tests.twins.loopback import Served, request
+from tests.waiting import until
 from twins.devices.crazyflie.device import open_device
 from twins.devices.crazyflie.supervisor import State
 from twins.devices.device import Faults

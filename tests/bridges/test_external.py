@@ -20,7 +20,7 @@ from agents.network.keys import Keys
 from bridges import external
 from bridges.external import ExternalBody, open_external
 from tests.conftest import RouterProcess
-from tests.system.lab import until
+from tests.waiting import until
 
 KEYS = Keys()
 

@@ -22,8 +22,8 @@ from bridges.khepera4 import body as khepera4
 from bridges.khepera4.body import OPEN_S, open_khepera4
 from bridges.khepera4.link import Address, Heard, Link
 from bridges.khepera4.odometry import Odometer
-from tests.system.lab import until
 from tests.twins.loopback import Served, reached, request
+from tests.waiting import until
 from twins.devices import khepera4 as twin
 from twins.devices.device import Faults
 from twins.devices.khepera4 import open_device
@@ -410,10 +410,7 @@ def test_a_serial_line_that_another_process_has_is_left_alone():
     link = Link("KH02", address, protocol.Settings(), (0.0, 0.0, 0.0))
     link.start()
     try:
-        deadline = time.monotonic() + 10.0
-        while "another process has this line; end it first" not in link.trouble:
-            assert time.monotonic() < deadline, link.trouble
-            time.sleep(0.01)
+        until(lambda: "another process has this line; end it first" in link.trouble, "it is named")
         assert not select.select([ours], [], [], 0.0)[0]  # nothing was said on it
     finally:
         link.end()

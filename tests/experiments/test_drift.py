@@ -1,6 +1,5 @@
 """Clocks that drift during a run: how often they are measured, and what is left in stamps when robots follow."""
 
-import threading
 import time
 
 import numpy as np
@@ -13,6 +12,7 @@ from agents.network.messages import HostClock
 from experiments.real_time.hosts import clock_drift
 from experiments.real_time.hosts.hosts import HostError
 from experiments.recording.clocks import Correction
+from tests.waiting import until
 
 DT, UNCERTAINTY_S = 0.01, 1e-4
 
@@ -81,14 +81,16 @@ class Host:
 def test_robots_are_told_drift_and_no_jump(monkeypatch):
     monkeypatch.setattr(clock_drift, "SOONEST_S", 0.01)
     monkeypatch.setattr(clock_drift, "LATEST_S", 0.01)
-    host, pause = Host([0.21, 0.21 + 2 * STEP_S, 0.22]), threading.Event()
+    host = Host([0.21, 0.21 + 2 * STEP_S, 0.22])
     measured, trouble = [], []
+
+    def followed():
+        for every, more in zip((measured, trouble), following.news(), strict=True):
+            every.extend(more)
+        return len(trouble) >= 2
+
     with clock_drift.Drift([(host, ["CF01"])]) as following:
-        deadline = time.monotonic() + 20.0
-        while len(trouble) < 2 and time.monotonic() < deadline:
-            more = following.news()
-            measured, trouble = measured + more[0], trouble + more[1]
-            pause.wait(0.01)
+        until(followed, "a jump and silence are noticed")
     assert host.told == pytest.approx([0.21 - UNCERTAINTY_S, 0.22 - UNCERTAINTY_S])
     assert [each.offset for each in measured] == pytest.approx([0.21, 0.21 + 2 * STEP_S, 0.22])
     assert "its clock jumped by +1" in trouble[0]

@@ -14,6 +14,7 @@ from experiments.real_time.hosts.launcher import RUN
 from experiments.real_time.hosts.station import Answer, Question, answer, devices
 from experiments.recording import version
 from tests.system.lab import ENVIRONMENT, ROOT
+from tests.waiting import until
 
 
 def test_it_says_who_it_is():
@@ -93,10 +94,8 @@ def test_it_answers_until_its_lifeline_ends():
 def test_it_sweeps_up_its_own_run_only():
     started, mine, other = Started("run.lab1"), sleeper("run.lab1"), sleeper("run.lab2")
     try:
-        found = []
-        deadline = time.monotonic() + 10.0
-        while not found and time.monotonic() < deadline:  # a process has its environment only after its exec
-            found = started.ask(Question("sweep")).found
+        found = []  # a process has its environment only after its exec
+        until(lambda: found.extend(started.ask(Question("sweep")).found) or found, "it is found")
         assert [each.what for each in found] == [str(mine.pid)]
         assert mine.wait(5) == -9
         assert other.poll() is None

@@ -8,8 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,10 +24,10 @@ from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
 from experiments.recording.trace import Trace
 from experiments.run import reopen
+from tests.waiting import PATIENCE_S, until
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
-PATIENCE_S = 30.0
 # Robots of the reference experiment begin within some 0.3 m of where the formation ends up, which takes half the time.
 NEAR = [
     part
@@ -44,15 +42,6 @@ NEAR_TRIANGLE = [
     for name, start in {"KH01": "[-0.35, -0.3]", "KH02": "[0.35, -0.3]", "CF01": "[0.05, 0.2]"}.items()
     for part in ("--set", f"robots.{name}.start={start}")
 ]
-
-
-def until(true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
-    """Waits until something is true."""
-    deadline = time.monotonic() + limit_s
-    pause = threading.Event()
-    while not true():
-        assert time.monotonic() < deadline, f"not in {limit_s:g} s: {what}"
-        pause.wait(0.01)
 
 
 def zenpark(*arguments: object, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
@@ -231,12 +220,12 @@ class Flight:
         return Path(self._errors.name).read_text()
 
     def until_said(self, pattern: str, limit_s: float = PATIENCE_S) -> None:
-        deadline = time.monotonic() + limit_s
-        pause = threading.Event()
-        while not re.search(pattern, self.said()):
-            waiting = self.process.poll() is None and time.monotonic() < deadline
-            assert waiting, f"{pattern!r} not in {limit_s:g} s; it said:\n{self.said()}\n{self.logs()}"
-            pause.wait(0.02)
+        def said_or_over() -> bool:
+            return bool(re.search(pattern, self.said())) or self.process.poll() is not None
+
+        with contextlib.suppress(AssertionError):
+            until(said_or_over, pattern, limit_s)
+        assert re.search(pattern, self.said()), f"{pattern!r} not said, but:\n{self.said()}\n{self.logs()}"
 
     def logs(self) -> str:
         """What its processes said."""
