@@ -64,6 +64,7 @@ def test_a_device_that_is_driven_gets_nothing_from_a_second(opened):
         first.release()
 
 
+@pytest.mark.slow
 def test_a_body_that_cannot_be_opened_leaves_its_device_to_others():
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))

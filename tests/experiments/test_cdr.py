@@ -280,6 +280,7 @@ def test_what_the_annotations_exclude_is_refused(wrong):
         codec(type(wrong)).encode(wrong)
 
 
+@pytest.mark.slow
 @given(state, st.data())
 def test_a_message_cut_short_is_refused(message, data):
     made = codec(State)

@@ -20,6 +20,7 @@ def written(tmp_path, what, size, wanted=None, jumps=(1, 2)):
     return document.read(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "size", "kind"),
     [
@@ -27,11 +28,11 @@ def written(tmp_path, what, size, wanted=None, jumps=(1, 2)):
         ("polygon", "9", "crazyflie"),
         ("grid", "3x4", "turtlebot3"),
         ("hemisphere", "4", "crazyflie"),
-        pytest.param("hemisphere", "40", "crazyflie", marks=pytest.mark.slow),
+        ("hemisphere", "40", "crazyflie"),
         ("hemisphere", "12", "tello"),
         ("henneberg", "2", "crazyflie"),
-        pytest.param("henneberg", "15", "khepera4", marks=pytest.mark.slow),
-        pytest.param("circulant", "24", "crazyflie", marks=pytest.mark.slow),
+        ("henneberg", "15", "khepera4"),
+        ("circulant", "24", "crazyflie"),
     ],
 )
 def test_files_pass_the_check_without_a_word(tmp_path, what, size, kind):

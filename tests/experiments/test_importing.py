@@ -28,6 +28,7 @@ def converted(tmp_path, text, name="park"):
     return document.read(path), notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", FILES)
 def test_they_convert_and_pass_the_check(tmp_path, count):
     read, notes = converted(tmp_path, FILES[count]())
@@ -237,6 +238,7 @@ def test_the_address_may_be_called_ip(tmp_path):
     assert robots["khepera02"].body == "khepera4://192.168.0.22:50000"
 
 
+@pytest.mark.slow
 def test_a_flat_formation_stays_flat_whatever_the_origin_says(tmp_path):
     place = [(0.8, 0.0), (0.25, 0.76), (-0.65, 0.47), (-0.65, -0.47), (0.25, -0.76)]
     names = [f"dron0{k + 1}" for k in range(5)]

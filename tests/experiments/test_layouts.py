@@ -43,6 +43,7 @@ def test_grids_have_all_neighbours(rows, columns):
     assert made.position.mean(axis=0) == pytest.approx(np.zeros(3))
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(st.integers(4, 120))
 def test_hemispheres_are_rigid_and_keep_their_distances(count):

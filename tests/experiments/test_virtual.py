@@ -47,6 +47,7 @@ def same(a: Log, b: Log):
             np.testing.assert_array_equal(np.asarray(x), np.asarray(y), err_msg=field.name)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_and_another_seed_others(park):
     first = simulate(park, [7])
     same(first, simulate(park, [7]))
