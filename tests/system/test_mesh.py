@@ -81,7 +81,6 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
     assert run.notes == ("event: lost CF02",) or "event" in run.traces
 
 
-@pytest.mark.mechanism("mesh: link loss")
 def test_a_robot_that_is_cut_off_from_everybody_holds(tmp_path: Path) -> None:
     flight = Flight(
         tmp_path / "run", "triangle", "--case", "periodic", "--no-report",
@@ -117,6 +116,7 @@ def test_an_endpoint_that_somebody_else_has_is_named(tmp_path: Path) -> None:
     assert "network.addresses" in said
 
 
+@pytest.mark.mechanism("mesh")
 def test_a_silent_missing_link_is_named() -> None:
     robots = ("KH01", "KH02", "CF01")
     right = [topology.owned(endpoint, name) for endpoint, name in zip(free(3), robots, strict=True)]

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.system
 
 WORLD = """
 title = "{real} stands in the way of {twin}"
-duration_s = 13.0
+duration_s = 12.0
 positioning = "vicon-twin"
 [arena]
 size = [4.0, 4.0, 2.0]
