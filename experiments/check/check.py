@@ -206,12 +206,6 @@ def command(file: str, *, settings: Sequence[str], as_json: bool) -> int:
     return 2 if any(each.severity == "error" for each in found) else 0
 
 
-def schema_command() -> int:
-    """`zenpark schema`; returns the exit code."""
-    print(json.dumps(document.schema(), indent=2))
-    return 0
-
-
 def _unreadable(problem: Problem) -> Finding:
     where = f"{problem.file}:{problem.line}:{problem.column}" if problem.line else problem.file
     return Finding("error", "document", problem.message, problem.hint, where)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE
-from agents.plugins import registry
+from agents.plugins.laws import Law
 from experiments.definition.experiment import Experiment, Link, Target
 
 _LINK: Final = re.compile(r"\s*(\w+)\s*([>-])\s*(\w+)\s*", re.ASCII)
@@ -68,7 +68,7 @@ def pairs(text: str) -> tuple[tuple[str, str], ...]:
     return ((second, first),) if sign == ">" else ((second, first), (first, second))
 
 
-def one_way_links(experiment: Experiment) -> list[OneWay]:
+def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
     """Every link that there may be, in the robots' order: by listener, then speaker.
 
     Raises:
@@ -83,13 +83,13 @@ def one_way_links(experiment: Experiment) -> list[OneWay]:
         given = link if isinstance(link, Link) else Link(distance=link)
         for listener, speaker in pairs(text):
             wanted = target(experiment, text, given, listener)
-            gain = _gain(experiment, wanted.wants) if given.gain is None else given.gain
+            gain = _gain(experiment, law, wanted.wants) if given.gain is None else given.gain
             until = math.inf if given.until_s is None else given.until_s
             found.append(OneWay(listener, speaker, wanted, gain, given.from_s, until, reach, release, text))
     if near is not None and near.distance is not None:
         there = {(link.listener, link.speaker) for link in found}
         wanted = LinkTarget(BY_DISTANCE, near.distance)
-        gain = _gain(experiment, BY_DISTANCE)
+        gain = _gain(experiment, law, BY_DISTANCE)
         found += [
             OneWay(a, b, wanted, gain, reach=reach, release=release)
             for a in experiment.robots
@@ -98,18 +98,6 @@ def one_way_links(experiment: Experiment) -> list[OneWay]:
         ]
     row = {name: number for number, name in enumerate(experiment.robots)}
     return sorted(found, key=lambda link: (row[link.listener], row[link.speaker]))
-
-
-def parse_links(experiment: Experiment) -> list[tuple[str, str, float, float]]:
-    """Every directed link as (listener, speaker, distance [m], gain), in the robots' order: by listener, then speaker.
-
-    The distance is NaN where only a direction is asked for.
-
-    Raises:
-        ValueError: If a link is not written as it must be; never for an experiment that `document.read` returned.
-        KeyError: If it names no robot; likewise.
-    """
-    return [(link.listener, link.speaker, link.wanted.distance, link.gain) for link in one_way_links(experiment)]
 
 
 def target(experiment: Experiment, text: str, given: Target | float, listener: str) -> LinkTarget:
@@ -143,10 +131,9 @@ def height(experiment: Experiment, name: str) -> float:
     return experiment.robots[name].hover or 0.0
 
 
-def _gain(experiment: Experiment, wants: int) -> float:
+def _gain(experiment: Experiment, law: Law, wants: int) -> float:
     """The formation's gain for what a link asks, as the law takes it."""
     formation = experiment.formation
-    law = registry.struct(registry.LAWS, registry.split(formation.law)[0])
     by = getattr(law, "PULLS_BY", "gain")
     if by == "by link":
         by = "gain" if wants == BY_DISTANCE else "stiffness"

@@ -91,7 +91,7 @@ class Plan:
     @cached_property
     def one_way(self) -> tuple[OneWay, ...]:
         """Every link of the formation, by listener, then speaker."""
-        return tuple(one_way_links(self.experiment))
+        return tuple(one_way_links(self.experiment, self.law))
 
     @cached_property
     def formation(self) -> FormationArrays:

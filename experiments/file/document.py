@@ -18,19 +18,14 @@ import msgspec
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
-from experiments.definition.links import parse_links
 from experiments.file import arena_file, catalogue, consistency, structure
 from experiments.file.arena_file import ArenaFile
-from experiments.file.json_schema import schema, write_schema
 from experiments.file.overrides import Override, OverrideError, assign, merged, parse, used
 from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places
 from experiments.file.problems import Path as Keys
-from experiments.file.text import LARGEST, content, decoded, parsed
+from experiments.file.text import content, decoded, parsed
 
-__all__ = [
-    "LARGEST", "Document", "DocumentError", "Problem", "parse_links", "read", "read_text", "schema", "write_json",
-    "write_schema",
-]  # fmt: skip
+__all__ = ["Document", "DocumentError", "Problem"]
 
 _Table = dict[str, Any]
 TEXT: Final = "text"  # what an experiment is called that stands in no file

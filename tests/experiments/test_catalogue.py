@@ -14,8 +14,9 @@ from agents.formation.graph import edges, links
 from agents.formation.rigidity import rigidity
 from experiments.catalogue import index
 from experiments.file import catalogue as entries
-from experiments.file import document
-from experiments.file.document import DocumentError, parse_links, read
+from experiments.file import json_schema
+from experiments.file.document import DocumentError, read
+from tests.experiments.traces import parse_links
 
 PARK = index.FOLDER / "robotic-park.toml"
 
@@ -75,7 +76,7 @@ def test_the_leader_of_the_convoy_stays_inside_and_below_its_top_speed():
 def test_copy_gives_an_experiment_that_reads_and_never_overwrites(tmp_path):
     target = entries.copy("triangle", tmp_path / "mine.toml")
     assert read(target).experiment == read("triangle").experiment
-    assert json.loads((tmp_path / index.SCHEMA).read_bytes()) == document.schema()
+    assert json.loads((tmp_path / index.SCHEMA).read_bytes()) == json_schema.schema()
     with pytest.raises(DocumentError, match="exists already"):
         entries.copy("convoy", target)
     assert read(target).experiment == read("triangle").experiment
@@ -89,20 +90,13 @@ def test_copy_gives_an_experiment_that_reads_and_never_overwrites(tmp_path):
 # The schema
 
 
-def test_the_schema_beside_the_catalogue_is_the_one_that_is_generated(tmp_path):
-    document.write_schema(tmp_path / index.SCHEMA)
-    fresh = (tmp_path / index.SCHEMA).read_text("utf-8")
-    remedy = "call document.write_schema(catalogue.FOLDER / catalogue.SCHEMA) and look at what changed"
-    assert (index.FOLDER / index.SCHEMA).read_text("utf-8") == fresh, remedy
-
-
 def test_every_entry_of_the_catalogue_shows_the_schema_to_editors():
     for name in index.names():
         assert entries.path(name).read_text("utf-8").startswith(f"#:schema ./{index.SCHEMA}\n")
 
 
 def test_the_schema_is_draft_7_and_knows_the_plugins():
-    schema = document.schema()
+    schema = json_schema.schema()
     text = msgspec.json.encode(schema).decode()
     assert schema["$schema"] == "http://json-schema.org/draft-07/schema#"
     assert "prefixItems" not in text

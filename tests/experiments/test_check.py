@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from agents.body.interface import Disturbance, Jitter
 from agents.decision.position_control import REACHED
-from experiments.check.check import Figures, check, command, figures, schema_command
+from experiments.check.check import Figures, check, command, figures
 from experiments.check.ideal_run import REPETITIONS, isolated, predict, repeat, repetitions, undisturbed
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.file import catalogue, document
@@ -434,11 +434,6 @@ def test_a_terminal_without_greek(monkeypatch):
     assert command("triangle", settings=[], as_json=False) == 0
     out.seek(0)
     assert "no errors, no warnings" in out.read()
-
-
-def test_the_schema(capsys):
-    assert schema_command() == 0
-    assert json.loads(capsys.readouterr().out) == document.schema()
 
 
 # ------------------------------------------------------------------ whatever is in the file

@@ -13,12 +13,17 @@ from agents.arrays import Array, norm
 from agents.formation.graph import links
 from agents.network.messages import Event
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
-from experiments.definition.links import parse_links
+from experiments.definition.plan import Plan
 from experiments.recording.trace import HeardPoses, Sent, Trace
 
 Said = TypeVar("Said", Sent, HeardPoses)
 STEP = 0.02
 TIMED = ("position", "yaw", "true_position", "goal", "setpoint")
+
+
+def parse_links(experiment):
+    """Every directed link: listener, speaker, distance [m], gain."""
+    return [(link.listener, link.speaker, link.wanted.distance, link.gain) for link in Plan(experiment).one_way]
 
 
 def experiment(

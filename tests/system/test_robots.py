@@ -12,9 +12,9 @@ import pytest
 import zenoh
 
 from agents.network import messages
-from experiments.definition.links import parse_links
 from experiments.file import document
 from tests.conftest import RouterProcess
+from tests.experiments.traces import parse_links
 from tests.system.lab import RobotProcess, Watcher
 
 pytestmark = pytest.mark.system
