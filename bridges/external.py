@@ -207,7 +207,7 @@ class ExternalBody:
         return round(self._utc + self._now(), 6)
 
     def _listen(self) -> None:
-        for row, taken, position, yaw in self._positions.take(self._utc, self._now()):
+        for row, taken, position, yaw in self._positions.receive(self._utc, self._now()):
             self._seen.update(row, taken, position, yaw)
 
     def _missing(self) -> list[str]:

@@ -57,25 +57,29 @@ class Graph:
 
     Attributes:
         robots: Those in the graph now.
-        malformed: Samples of the realm that were not what their key promises.
         refused: Goals that were not finite, not in the frame "map", for a robot whose pose ROS never got, or that came
             while a centre decides.
     """
 
     def __init__(self, session: zenoh.Session, participant: Participant, keys: Keys) -> None:
-        self.malformed = self.refused = 0
+        self.refused = 0
         self._session, self._keys = session, keys
         self._types = participant.types
         self._node = participant.node(NODE)
         self._diagnostics = self._node.publisher("/diagnostics", ros2.DIAGNOSTIC_ARRAY)
         self._robots: dict[str, _Robot] = {}
-        self._states = pubsub.subscriber(session, keys.state("*"), 1024)
-        self._statuses = pubsub.pose_subscriber(session, keys.status("*"), 256)
-        self._alive = pubsub.alive_watch(session, keys.alive("*"))
-        self._centres = pubsub.alive_watch(session, keys.centre_alive)
+        self._states = pubsub.Inbox(pubsub.subscriber(session, keys.state("*"), 1024), messages.State, keys=keys)
+        self._statuses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.status("*"), 256), messages.Status)
+        self._alive = pubsub.AliveWatch(session, keys.alive("*"))
+        self._centres = pubsub.AliveWatch(session, keys.centre_alive)
         self._guided = False
         self._clock = participant.clock
         self._seq = round(self._clock.utc() * 1e3)  # beyond whatever somebody else who decided had reached
+
+    @property
+    def malformed(self) -> int:
+        """Samples of the realm that were refused."""
+        return self._states.malformed + self._statuses.malformed
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -89,8 +93,8 @@ class Graph:
             header = self._types.header(self._clock.utc(), "")
             self._diagnostics.put(self._types.make(ros2.DIAGNOSTIC_ARRAY, header=header, status=statuses))
         self._moves()
-        for sample in network.received(self._centres.handler):
-            self._guided = sample.kind == zenoh.SampleKind.PUT
+        for _, guided in self._centres.changes():
+            self._guided = guided
         for name, robot in self._robots.items():
             for message in robot.goal.received():
                 self._order(name, robot, message)
@@ -98,11 +102,11 @@ class Graph:
     def _lives(self) -> list[Message]:
         """Who comes and goes; says so to the graph."""
         gone = []
-        for sample in network.received(self._alive.handler):
-            name = self._keys.whose(str(sample.key_expr))
+        for token, there in self._alive.changes():
+            name = self._keys.whose(token)
             if name is None:
                 continue
-            if sample.kind == zenoh.SampleKind.DELETE:
+            if not there:
                 if (robot := self._robots.pop(name, None)) is not None:
                     robot.close()
                     gone.append(diagnostic(self._types, name, ERROR, "gone", {}))
@@ -121,16 +125,9 @@ class Graph:
 
     def _moves(self) -> None:
         """Telemetry as pose and velocity."""
-        for sample in network.received(self._states.handler):
-            name = self._keys.whose(str(sample.key_expr))
-            robot = self._robots.get(name or "")
-            if name is None or robot is None:
-                continue
-            try:
-                state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
-                validation.check_state(state, robot=name, now=self._clock.utc(), reach=REACH)
-            except messages.Malformed:
-                self.malformed += 1
+        now = self._clock.utc()
+        for state in self._states.read(lambda state: validation.check_state(state, now=now, reach=REACH)):
+            if (robot := self._robots.get(state.robot)) is None:
                 continue
             robot.stamp = state.stamp
             if state.position is not None:
@@ -140,16 +137,7 @@ class Graph:
 
     def _reports(self) -> list[Message]:
         """Statuses as diagnostics."""
-        found = []
-        for sample in network.received(self._statuses.handler):
-            try:
-                status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
-            except messages.Malformed:
-                self.malformed += 1
-                continue
-            if status.robot in self._robots:
-                found.append(diagnosis(self._types, status))
-        return found
+        return [diagnosis(self._types, status) for status in self._statuses.read() if status.robot in self._robots]
 
     def _order(self, name: str, robot: _Robot, message: Message) -> None:
         """A goal from ROS, passed on into the realm: a robot that is guided obeys, but two cannot guide it."""

@@ -1,10 +1,10 @@
-"""Publishers, subscribers and liveliness tokens, as every process of a run declares them."""
+"""Publishers, subscribers, typed inboxes, orders and liveliness tokens, as every process of a run declares them."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from typing import Final, Self
+from collections.abc import Callable, Iterator
+from typing import Final, Generic, Protocol, Self, TypeVar
 
 import zenoh
 from zenoh.ext import (
@@ -20,19 +20,25 @@ from zenoh.ext import (
 from zenoh.handlers import Callback, Handler, RingChannel
 
 from agents.network import messages
-from agents.network.session import EVENTS_OF_LIFE, ORDERS, Inbox, Orders, received
+from agents.network.keys import Keys
+from agents.network.messages import M
+from agents.network.session import Polled, received
 
-HEARTBEAT_S: Final = 0.5  # how long the loss of the last pose before a silence goes unnoticed
+HEARTBEAT_S: Final = 0.5  # delay until the loss of the last pose before a silence is noticed
+POSES: Final = 16  # queued poses of one robot
+EVENTS: Final = 64  # of a run, repeated to a subscriber that was cut off: without a router much happens at once
+ORDERS: Final = 8  # queued
+TOKEN_CHANGES: Final = 256  # queued
+NO_ORDER: Final = 'an order is a query with a payload, such as {"order": "land"}'
+
+T = TypeVar("T")
 
 
-POSES: Final = 16  # of one robot that wait to be polled
-
-
-EVENTS: Final = 64  # of a run that are said again to who was cut off: without a router much happens at once
+# ---------------------------------------------------------------------- publish and subscribe
 
 
 def pose_publisher(session: zenoh.Session, key: str, mime: str, kept: int = 1) -> AdvancedPublisher:
-    """A publisher whose last value is never lost, however rarely it speaks; nor are the last `kept`.
+    """A publisher whose last `kept` values are never lost, however rarely it publishes.
 
     Late joiners ask for the last value (cache), subscribers that were cut off ask again when they see the publisher
     reappear (detection), and a value lost before a silence is noticed by the heartbeat.
@@ -67,17 +73,17 @@ def pose_subscriber(
 
 
 def publisher(session: zenoh.Session, key: str, mime: str) -> zenoh.Publisher:
-    """A plain publisher for what comes again soon (telemetry): dropped when the link is congested."""
+    """A plain publisher for frequent values (telemetry): dropped when the link is congested."""
     return session.declare_publisher(
         key, encoding=mime, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.DATA
     )
 
 
 def urgent_publisher(session: zenoh.Session, key: str, mime: str) -> zenoh.Publisher:
-    """A publisher for what must overtake all else, and is said again: orders to a body elsewhere.
+    """A publisher for repeated values that must overtake all others: commands to a body in another process.
 
     Not express: then each sample fills a batch, a link has two of a priority, and a router drops what twenty robots
-    say to one world at once.
+    send to one world at once.
     """
     return session.declare_publisher(
         key, encoding=mime, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.REAL_TIME
@@ -89,33 +95,123 @@ def subscriber(session: zenoh.Session, key: str, depth: int = 256) -> zenoh.Subs
     return session.declare_subscriber(key, RingChannel(depth))
 
 
+# ---------------------------------------------------------------------- typed receive
+
+
+class Subscription(Protocol):
+    """A subscriber with queued samples, plain or advanced."""
+
+    @property
+    def handler(self) -> Polled[zenoh.Sample]: ...
+
+    def undeclare(self) -> None: ...
+
+
+class Inbox(Generic[M]):
+    """Queued messages of one kind: `for pose in inbox.read(check)` decodes, checks, and counts what is refused."""
+
+    malformed: int  # refused payloads
+    trouble: str  # reason of the last refusal
+
+    def __init__(
+        self,
+        subscription: Subscription,
+        kind: type[M],
+        *,
+        keys: Keys | None = None,
+        on_refusal: Callable[[str, str], object] | None = None,
+    ) -> None:
+        """Reads `kind` from a subscription.
+
+        Args:
+            subscription: Its queue is emptied by `read`.
+            kind: Of the messages.
+            keys: If given, a message must carry the name of the robot of its key.
+            on_refusal: Called with key and reason of each refusal.
+        """
+        self._subscription, self._kind, self._keys, self._on_refusal = subscription, kind, keys, on_refusal
+        self.malformed, self.trouble = 0, ""
+
+    def read(self, check: Callable[[M], object] | None = None) -> Iterator[M]:
+        """Queued messages, oldest first, without waiting; those for which `check` raises `Malformed` are left out."""
+        return (message for message, _ in self.read_samples(check))
+
+    def read_samples(
+        self, check: Callable[[M], object] | None = None, wanted: Callable[[str], bool] | None = None
+    ) -> Iterator[tuple[M, zenoh.Sample]]:
+        """As `read`, with the sample of each message; keys that are not `wanted` are skipped before decoding."""
+        for sample in received(self._subscription.handler):
+            key = str(sample.key_expr)
+            if wanted is not None and not wanted(key):
+                continue
+            try:
+                message = messages.decode(sample.payload.to_bytes(), str(sample.encoding), self._kind)
+                if self._keys is not None and (robot := getattr(message, "robot", "")) != self._keys.whose(key):
+                    raise messages.Malformed(
+                        f"{self._kind.__name__.lower()} of '{robot}' on the key of '{self._keys.whose(key)}'"
+                    )
+                if check is not None:
+                    check(message)
+            except messages.Malformed as error:
+                self.malformed += 1
+                self.trouble = str(error)
+                if self._on_refusal is not None:
+                    self._on_refusal(key, self.trouble)
+            else:
+                yield message, sample
+
+    def close(self) -> None:
+        """Ends the subscription."""
+        self._subscription.undeclare()
+
+
+class CallbackQueue(Generic[T]):
+    """A queue of rare items, filled by the receiving thread, emptied by polling.
+
+    Polling an empty one costs a tenth of polling an empty ring channel. Frequent items belong into a ring channel: each
+    item here costs the receiving thread a wait for the interpreter's lock.
+    """
+
+    def __init__(self, depth: int, wanted: Callable[[T], bool] = lambda _: True) -> None:
+        """Keeps the newest `depth` items that are `wanted`. `callback` is the one to declare."""
+        self._items: deque[T] = deque(maxlen=depth)
+        self._wanted = wanted
+        self.callback = Callback(self._append, indirect=False)
+
+    def try_recv(self) -> T | None:
+        """See `Polled`."""
+        return self._items.popleft() if self._items else None
+
+    def _append(self, item: T) -> None:
+        if self._wanted(item):
+            self._items.append(item)
+
+
 class ImmediateSubscriber:
-    """Emergency stops, obeyed as they come, without waiting for a control loop that may hang; it polls them later.
+    """Emergency stops, obeyed on reception: the control loop, which may hang, polls them later.
 
-    Everything that is put on the key is a stop (`wire.read_stop`). A DELETE is none, and takes none back: it is what
-    clears a storage.
+    Every PUT on the key is a stop (`messages.read_stop`). A DELETE is none, and revokes none: it clears a storage.
 
-    The callback runs in the thread that receives, without one of its own: what it calls must be quick, and must not
-    ask this session anything.
+    The callback runs in the receiving thread: it must be quick, and must not query this session.
     """
 
     def __init__(
         self, session: zenoh.Session, key: str, obey: Callable[[messages.Stop], object], depth: int = 256
     ) -> None:
-        """Listens on a key: each stop is given to `obey`; the newest `depth` wait besides, from then on."""
+        """Subscribes: each stop is given to `obey`; the newest `depth` wait to be polled from then on."""
         self._obey = obey
         self._waiting: deque[messages.Stop] = deque(maxlen=depth)
-        self._subscriber = session.declare_subscriber(key, Callback(self._take, indirect=False))
+        self._subscriber = session.declare_subscriber(key, Callback(self._receive, indirect=False))
 
     def try_recv(self) -> messages.Stop | None:
         """See `Polled`."""
         return self._waiting.popleft() if self._waiting else None
 
     def close(self) -> None:
-        """Listens no longer."""
+        """Ends the subscription."""
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _receive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.DELETE:
             return
         stop = messages.read_stop(sample.payload.to_bytes(), str(sample.encoding))
@@ -125,33 +221,76 @@ class ImmediateSubscriber:
             self._waiting.append(stop)
 
 
+# ---------------------------------------------------------------------- queries
+
+
+class Orders(Generic[M]):
+    """Queries on a key that carry an order of one kind; polled.
+
+    Declare it before the liveliness token: a client that sees the token may then give orders.
+    """
+
+    malformed: int  # refused payloads
+
+    def __init__(self, session: zenoh.Session, key: str, kind: type[M]) -> None:
+        self._kind, self.malformed = kind, 0
+        self._queries = CallbackQueue[zenoh.Query](ORDERS)
+        self._queryable = session.declare_queryable(key, self._queries.callback, complete=True)
+
+    def read(self) -> Iterator[tuple[zenoh.Query, M]]:
+        """Queued orders with their queries. Reply inside `with query:` and on the key, or the client waits.
+
+        A malformed order gets an error for a reply. A query without payload is no order: tools that read all keys
+        (`get park/**`) send such and get no reply; one on the key itself gets the form of an order.
+        """
+        for query in received(self._queries):
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            reason = NO_ORDER
+            if payload:
+                try:
+                    order = messages.decode(payload, str(query.encoding or messages.JSON), self._kind)
+                except messages.Malformed as error:
+                    self.malformed += 1
+                    reason = str(error)
+                else:
+                    yield query, order
+                    continue
+            with query:
+                if payload or "*" not in str(query.key_expr):
+                    query.reply_err(reason.encode(), encoding="text/plain")
+
+    def close(self) -> None:
+        """Accepts no more orders."""
+        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+
+
 class LastValue:
     """Answers a plain `get` (z_get, REST) on a key with its last value, which the cache of an advanced publisher does
-    not: call `answer` from the control loop."""
+    not; polled by `answer` from the control loop, so it costs no thread."""
 
     def __init__(self, session: zenoh.Session, key: str, mime: str) -> None:
         self.key = key
         self.mime = mime
         self._payload: bytes | None = None
-        self._questions = Inbox[zenoh.Query](ORDERS)
-        self._queryable = session.declare_queryable(key, self._questions.filled)
+        self._queries = CallbackQueue[zenoh.Query](ORDERS)
+        self._queryable = session.declare_queryable(key, self._queries.callback)
 
     def hold(self, payload: bytes) -> None:
-        """Remembers the value to answer with."""
+        """Stores the value to answer with."""
         self._payload = payload
 
     def answer(self) -> int:
-        """Replies to whoever asked since the last call, with nothing if there is no value yet; says to how many."""
-        asked = 0
-        for query in received(self._questions):
+        """Replies to the queries since the last call, with nothing if there is no value yet; returns their number."""
+        answered = 0
+        for query in received(self._queries):
             with query:
                 if self._payload is not None:
                     query.reply(self.key, self._payload, encoding=self.mime)
-            asked += 1
-        return asked
+            answered += 1
+        return answered
 
     def close(self) -> None:
-        """Takes no more questions."""
+        """Answers no more queries."""
         self._queryable.undeclare()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:
@@ -161,40 +300,26 @@ class LastValue:
         self.close()
 
 
-def last_value(session: zenoh.Session, key: str, mime: str) -> LastValue:
-    """Makes the last value of a key visible to a plain `get`; polled, so it costs no thread."""
-    return LastValue(session, key, mime)
-
-
-def orders(session: zenoh.Session, key: str) -> Orders:
-    """The orders on a key.
-
-    Declare it before the liveliness token: whoever sees the token can then give orders.
-    """
-    return Orders(session, key)
+# ---------------------------------------------------------------------- liveliness
 
 
 def alive_token(session: zenoh.Session, key: str) -> zenoh.LivelinessToken:
-    """Says that the owner of this session is there, until the token is undeclared or the session is gone."""
+    """Declares a liveliness token: it stands until it is undeclared or the session is gone."""
     return session.liveliness().declare_token(key)
 
 
 class AliveWatch:
-    """Who comes (PUT) and goes (DELETE), as samples that wait in `handler`.
+    """Liveliness tokens that appear (PUT) and vanish (DELETE), those that stand already first; polled.
 
-    A token on many keys at once (`park/**`) is nobody's life: it is left out.
+    When the router dies every token vanishes at once and comes back after the reconnection: ask `connected` before
+    a robot counts as lost. A token on many keys at once (`park/**`) belongs to no robot and is left out.
     """
 
     def __init__(self, session: zenoh.Session, keyexpr: str) -> None:
-        """Those already there come first."""
-        self.handler = Inbox[zenoh.Sample](EVENTS_OF_LIFE, lambda sample: "*" not in str(sample.key_expr))
-        self._subscriber = session.liveliness().declare_subscriber(keyexpr, self.handler.filled, history=True)
+        self.handler = CallbackQueue[zenoh.Sample](TOKEN_CHANGES, lambda sample: "*" not in str(sample.key_expr))
+        self._subscriber = session.liveliness().declare_subscriber(keyexpr, self.handler.callback, history=True)
 
-
-def alive_watch(session: zenoh.Session, keyexpr: str) -> AliveWatch:
-    """Who comes and goes, those already there first.
-
-    When the router dies every token goes at once and comes back after the reconnection: ask `connected` before
-    holding a robot for lost.
-    """
-    return AliveWatch(session, keyexpr)
+    def changes(self) -> Iterator[tuple[str, bool]]:
+        """Key of each token that appeared (True) or vanished (False) since the last call, oldest first."""
+        for sample in received(self.handler):
+            yield str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT

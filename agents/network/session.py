@@ -1,9 +1,9 @@
 """Sessions on the Zenoh network, and what a robot declares on them.
 
 Everything that is received waits to be polled from the control loop: frequent samples in a ring channel, which keeps
-the newest ones and never blocks; rare ones in an `Inbox`. A callback of the usual kind would cost a thread each, a slow
-one stops all reception of its session, and one that is left open keeps the interpreter from exiting. The emergency stop
-alone cannot wait for the next tick (`Alarm`).
+the newest ones and never blocks; rare ones in a queue (`agents.network.pubsub`). A callback of the usual kind would
+cost a thread each, a slow one stops all reception of its session, and one that is left open keeps the interpreter from
+exiting. The emergency stop alone cannot wait for the next tick (`pubsub.ImmediateSubscriber`).
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import chain
 from math import inf
 from pathlib import Path
-from typing import Final, Generic, Protocol, Self, TypeVar
+from typing import Final, Protocol, TypeVar
 
 import zenoh
-from zenoh.handlers import Callback, RingChannel
+from zenoh.handlers import RingChannel
 
 from agents.network import access_control, lab
 from agents.network import endpoints as topology
@@ -112,7 +112,6 @@ def _ask(slice_ns: int) -> bool:
     return bool(ctypes.CDLL(None).syscall(number, 0, attributes, 0) == 0)
 
 
-T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
 RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
@@ -124,9 +123,6 @@ ASK_EVERY_S: Final = 0.4  # between two questions whether the router still answe
 ANSWER_S: Final = 0.3  # a question without an answer for so long begins a silence
 ASKED: Final = 8  # questions that are waited for at once
 LOOK_S: Final = 0.1  # between two looks for an answer no more than this is held against the router
-NO_ORDER: Final = 'an order is a query with a payload, such as {"order": "land"}'
-ORDERS: Final = 8  # that wait to be answered
-EVENTS_OF_LIFE: Final = 256  # comings and goings that wait to be polled
 
 
 class Unreachable(ConnectionError):
@@ -330,61 +326,6 @@ def links(session: zenoh.Session) -> int:
 def deserted(session: zenoh.Session) -> bool:
     """Whether nobody but other routers is connected to a router."""
     return all(transport.whatami == zenoh.WhatAmI.ROUTER for transport in session.info.transports())
-
-
-class Inbox(Generic[T]):
-    """Rare items, put in by the thread that receives, until they are polled.
-
-    An empty one costs a tenth of an empty ring channel to poll. Items that come often belong into a ring channel: each
-    item here costs the receiving thread a wait for the interpreter's lock.
-    """
-
-    def __init__(self, depth: int, wanted: Callable[[T], bool] = lambda _: True) -> None:
-        """Keeps the newest `depth` items that are `wanted`. `filled` is the callback to declare."""
-        self._items: deque[T] = deque(maxlen=depth)
-        self._wanted = wanted
-        self.filled = Callback(self._take, indirect=False)
-
-    def try_recv(self) -> T | None:
-        """See `Polled`."""
-        return self._items.popleft() if self._items else None
-
-    def _take(self, item: T) -> None:
-        if self._wanted(item):
-            self._items.append(item)
-
-
-class Orders:
-    """Queries that carry an order, as they wait in `handler`.
-
-    Reply inside `with query:` and on the key, or the asker waits.
-
-    A query without payload is no order. Tools that read all keys (`get park/**`) send such: they get no answer. One
-    on the key itself is told what an order is.
-    """
-
-    def __init__(self, session: zenoh.Session, key: str) -> None:
-        self._queries = Inbox[zenoh.Query](ORDERS)
-        self._queryable = session.declare_queryable(key, self._queries.filled, complete=True)
-
-    @property
-    def handler(self) -> Self:
-        """See `Polled`."""
-        return self
-
-    def try_recv(self) -> zenoh.Query | None:
-        """See `Polled`."""
-        for query in received(self._queries):
-            if query.payload is not None and query.payload.to_bytes():
-                return query
-            with query:
-                if "*" not in str(query.key_expr):
-                    query.reply_err(NO_ORDER, encoding="text/plain")
-        return None
-
-    def close(self) -> None:
-        """Takes no more orders."""
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]
 
 
 def here(session: zenoh.Session, keyexpr: str, wait_s: float = ASK_S) -> set[str] | None:

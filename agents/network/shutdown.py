@@ -17,7 +17,6 @@ from typing import Final, NoReturn
 import zenoh
 
 from agents.network import pubsub
-from agents.network import session as network
 from agents.network.keys import Keys
 
 LEAVE_S: Final = 1.0
@@ -72,7 +71,7 @@ class Farewell:
 
     def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str], lost: threading.Event) -> None:
         """`lost` is that of the lifeline."""
-        self._watches = [pubsub.alive_watch(session, keys.alive(robot)) for robot in robots]
+        self._watches = [pubsub.AliveWatch(session, keys.alive(robot)) for robot in robots]
         self._alive = [False] * len(self._watches)
         self._lost = lost
         self._last = float("inf")
@@ -80,8 +79,8 @@ class Farewell:
     def over(self) -> bool:
         """Whether the starter is gone, and then the robots, or their time is up; costs microseconds."""
         for row, watch in enumerate(self._watches):
-            for sample in network.received(watch.handler):
-                self._alive[row] = sample.kind != zenoh.SampleKind.DELETE
+            for _, alive in watch.changes():
+                self._alive[row] = alive
         if not self._lost.is_set():
             return False
         now = time.monotonic()

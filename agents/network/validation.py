@@ -43,71 +43,61 @@ def taken(stamp: float, now: float) -> float:
     return min(stamp, now)
 
 
-def check_pose(pose: Pose, *, robot: str, now: float, reach: Vector) -> None:
+def check_pose(pose: Pose, *, now: float, reach: Vector) -> None:
     """Refuses a pose that cannot be true.
 
     Args:
         pose: What arrived.
-        robot: Whose key it arrived on.
         now: UTC time of arrival [s].
         reach: Largest |x|, |y|, |z| [m] that a robot of this experiment can have.
 
     Raises:
-        Malformed: If the name is another's, a number is not finite, the stamp lies in the future, the position is out
+        Malformed: If a number is not finite, the stamp lies in the future, the position is out
             of reach, or the velocity is no robot's.
     """
-    if pose.robot != robot:
-        raise Malformed(f"pose of '{pose.robot}' on the key of '{robot}'")
     if not (_counted(pose.seq) and _past(pose.stamp, now)):
         raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
     _refuse_place(pose.position, reach)
     _refuse_motion(pose.velocity, pose.yaw)
 
 
-def check_state(state: State, *, robot: str, now: float, reach: Vector) -> None:
+def check_state(state: State, *, now: float, reach: Vector) -> None:
     """Refuses telemetry whose pose cannot be true; it may have none.
 
     Raises:
         Malformed: As `check_pose`.
     """
-    if state.robot != robot:
-        raise Malformed(f"state of '{state.robot}' on the key of '{robot}'")
     _refuse_stamp(state.stamp, now)
     if state.position is not None:
         _refuse_place(state.position, reach)
     _refuse_motion(state.velocity, state.yaw)
 
 
-def check_position(measured: Position, *, robot: str, now: float, reach: Vector) -> None:
+def check_position(measured: Position, *, now: float, reach: Vector) -> None:
     """Refuses a measured position that cannot be true.
 
     Raises:
         Malformed: As `check_pose`.
     """
-    if measured.robot != robot:
-        raise Malformed(f"position of '{measured.robot}' on the key of '{robot}'")
     _refuse_stamp(measured.stamp, now)
     _refuse_place(measured.position, reach)
     if measured.yaw is not None and not abs(measured.yaw) <= MAX_YAW:
         raise Malformed(f"yaw {measured.yaw} is impossible")
 
 
-def check_goal(goal: Goal, *, robot: str, now: float, reach: Vector, oldest_s: float) -> None:
+def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> None:
     """Refuses a goal that no robot can follow, or that is too old to be followed.
 
     Args:
         goal: What arrived.
-        robot: Whose key it arrived on.
         now: UTC time of arrival [s].
         reach: See `check_pose`.
         oldest_s: A goal that was decided longer ago is none [s].
 
     Raises:
-        Malformed: If the name is another's, a number is not finite, the stamp is old or lies in the future, the pose is
+        Malformed: If a number is not finite, the stamp is old or lies in the future, the pose is
             younger than the goal that rests on it, or the position is out of reach.
     """
-    if goal.robot != robot:
-        raise Malformed(f"goal of '{goal.robot}' on the key of '{robot}'")
     if not (_counted(goal.seq) and now - oldest_s <= goal.stamp and _past(goal.stamp, now)):
         raise Malformed(f"sequence number {goal.seq} or stamp {goal.stamp} is impossible, or the goal is old")
     if not 0.0 < goal.pose <= goal.stamp + FUTURE_S:  # the robot's clock may be ahead
@@ -117,15 +107,13 @@ def check_goal(goal: Goal, *, robot: str, now: float, reach: Vector, oldest_s: f
         raise Malformed(f"yaw {goal.yaw} is impossible")
 
 
-def check_ranges(ranges: Ranges, *, robot: str, now: float) -> None:
+def check_ranges(ranges: Ranges, *, now: float) -> None:
     """Refuses a sweep of range sensors that cannot be true.
 
     Raises:
-        Malformed: If the name is another's, the stamp is not finite or lies in the future, there is no ray or too many,
+        Malformed: If the stamp is not finite or lies in the future, there is no ray or too many,
             the lists differ in length, an angle or a distance is not finite, or a distance is no sensor's.
     """
-    if ranges.robot != robot:
-        raise Malformed(f"ranges of '{ranges.robot}' on the key of '{robot}'")
     _refuse_stamp(ranges.stamp, now)
     if not 1 <= len(ranges.distance) <= MAX_RAYS:
         raise Malformed(f"{len(ranges.distance)} rays; a sweep has 1 to {MAX_RAYS}")
@@ -137,15 +125,12 @@ def check_ranges(ranges: Ranges, *, robot: str, now: float) -> None:
         raise Malformed(f"a distance is not between 0 and {MAX_RANGE:g} m")
 
 
-def check_command(command: Command, *, robot: str) -> None:
+def check_command(command: Command) -> None:
     """Refuses a command that no body can carry out.
 
     Raises:
-        Malformed: If the name is another's, the sequence number is impossible, `drive` has no finite setpoint, or
-            `takeoff` no height.
+        Malformed: If the sequence number is impossible, `drive` has no finite setpoint, or `takeoff` no height.
     """
-    if command.robot != robot:
-        raise Malformed(f"command of '{command.robot}' on the key of '{robot}'")
     if not _counted(command.seq):
         raise Malformed(f"sequence number {command.seq} is impossible")
     if command.action == "drive":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 from math import nan
 
 import numpy as np
@@ -22,7 +23,6 @@ class HeardGoals:
     """The goals of the rows of one process; polled.
 
     Attributes:
-        malformed: Goals that were refused.
         news: Per row, goals that it got since somebody emptied this; for telemetry.
     """
 
@@ -43,28 +43,34 @@ class HeardGoals:
         self._session, self._agent, self._guidance, self._reach = session, agent, guidance, reach
         self._names: Sequence[str] = agent.assignment.names
         rows = np.flatnonzero(guidance.guided).tolist()
-        self._goals = [(row, pubsub.subscriber(session, keys.goal(self._names[row]), 8)) for row in rows]
-        self._watch = pubsub.alive_watch(session, keys.lives(keys.centre_alive))
+        self._inboxes = [
+            pubsub.Inbox(pubsub.subscriber(session, keys.goal(self._names[row]), 8), messages.Goal, keys=keys)
+            for row in rows
+        ]
+        self._watch = pubsub.AliveWatch(session, keys.lives(keys.centre_alive))
         self._centre, self._life = keys.centre_alive, ""
         self._seq = dict.fromkeys(rows, 0)
         self._rows = np.array(rows, dtype=np.intp)
         self._channel = Channel(conditions or Conditions.ideal(len(rows)))
-        self.malformed = 0
         self.news = [deque[messages.GoalReceipt](maxlen=NEWS) for _ in self._names]
+
+    @property
+    def malformed(self) -> int:
+        """Goals that were refused."""
+        return sum(inbox.malformed for inbox in self._inboxes)
 
     def take(self, t: float, utc: float) -> None:
         """Takes in what has come by `t` [s] of a clock that was 0 at `utc`."""
-        for sample in network.received(self._watch.handler):
-            token = str(sample.key_expr)
+        for token, there in self._watch.changes():
             if token != self._centre:
-                self._begin(Keys.life_of(token), there=sample.kind == zenoh.SampleKind.PUT)
-            elif sample.kind == zenoh.SampleKind.PUT:
+                self._begin(Keys.life_of(token), there=there)
+            elif there:
                 self._guidance.mark_alive()
             elif network.connected(self._session):  # without a router every token is gone, and that is another matter
                 self._guidance.mark_lost(t)
-        for link, (row, goals) in enumerate(self._goals):
-            for sample in network.received(goals.handler):
-                self._hear(link, row, sample, t, utc)
+        for link, (row, inbox) in enumerate(zip(self._rows.tolist(), self._inboxes, strict=True)):
+            for goal, sample in inbox.read_samples(partial(self._check, row, utc + t)):
+                self._receive(link, goal, len(sample.payload), t, utc)
         if (got := self._channel.due(t)) is not None and got.extra is not None:
             said = (got.link.tolist(), got.seq.tolist(), got.stamp.tolist(), got.position, got.extra.tolist())
             for link, seq, stamp, position, (toward, sent, pose) in zip(*said, strict=True):
@@ -82,17 +88,15 @@ class HeardGoals:
             self._guidance.stamp[self._rows] = -np.inf
         self._life = life
 
-    def _hear(self, link: int, row: int, sample: zenoh.Sample, t: float, utc: float) -> None:
+    def _check(self, row: int, now: float, goal: messages.Goal) -> None:
         oldest_s = self._agent.assignment.limits.link_silence_s
-        payload = sample.payload.to_bytes()
-        try:
-            goal = messages.decode(payload, str(sample.encoding), messages.Goal)
-            validation.check_goal(goal, robot=self._names[row], now=utc + t, reach=self._reach, oldest_s=oldest_s)
-            if goal.seq <= self._seq[row]:
-                raise messages.Malformed(f"goal {goal.seq} after {self._seq[row]}")
-        except messages.Malformed:
-            self.malformed += 1
-            return
+        validation.check_goal(goal, now=now, reach=self._reach, oldest_s=oldest_s)
+        if goal.seq <= self._seq[row]:
+            raise messages.Malformed(f"goal {goal.seq} after {self._seq[row]}")
+
+    def _receive(self, link: int, goal: messages.Goal, size: int, t: float, utc: float) -> None:
+        """Puts a goal of `size` [bytes] into the modelled channel."""
+        row = int(self._rows[link])
         self._seq[row] = goal.seq
         stamp, sent = validation.taken(goal.stamp - utc, t), goal.stamp - utc
         start = self._agent.life.start_at[[row]]
@@ -103,7 +107,7 @@ class HeardGoals:
             np.array([goal.position]),
             np.zeros((1, 3)),
             start=start,
-            size=np.array([len(payload)]),
+            size=np.array([size]),
             now=t,
             extra=np.array([[nan if goal.yaw is None else goal.yaw, sent, goal.pose - utc]]),
         )

@@ -242,10 +242,10 @@ class Runtime:
         self._router_due, self._silent_since = -np.inf, np.inf
         self._router = network.RouterWatch(session, keys.alive(names[0]), self._setup.endpoints)
         self._poses = [pubsub.pose_publisher(session, keys.pose(name), self._mime) for name in names]
-        self._last = [pubsub.last_value(session, keys.pose(name), self._mime) for name in names]
-        self._orders = [pubsub.orders(session, keys.order(name)) for name in names]
+        self._last = [pubsub.LastValue(session, keys.pose(name), self._mime) for name in names]
+        self._orders = [pubsub.Orders(session, keys.order(name), messages.Order) for name in names]
         self._estop = pubsub.ImmediateSubscriber(session, keys.estop, self._cut)
-        self._conductor = pubsub.alive_watch(session, keys.conductor)
+        self._conductor = pubsub.AliveWatch(session, keys.conductor)
         located = np.flatnonzero(self._setup.located).tolist()
         self._located = MeasuredPositions(session, keys, names, located, self._reach) if located else None
         ranging = tuple(self._setup.ranging) or ("body",) * len(names)
@@ -267,6 +267,7 @@ class Runtime:
             agent=self.agent,
             neighbours=neighbours,
             counts=self._counts,
+            malformed=self._malformed,
             ranged=[source == "body" for source in ranging],
             followed=None if self._goals is None else self._goals.news,
         )
@@ -308,23 +309,18 @@ class Runtime:
         agent = self.agent
         outside = agent.health
         outside.offline_since = self._cut_off_since(t)
-        for sample in network.received(self._conductor.handler):
-            gone = sample.kind == zenoh.SampleKind.DELETE
-            outside.unattended_since = min(outside.unattended_since, t) if gone else np.inf
+        for _, there in self._conductor.changes():
+            outside.unattended_since = np.inf if there else min(outside.unattended_since, t)
         self._neighbours.listen(t, self._utc)
         if self._goals is not None:
-            refused = self._goals.malformed
             self._goals.take(t, self._utc)
-            self._counts.malformed += self._goals.malformed - refused
         self._heed_stops()
         if (located := self._located) is not None:
-            refused = sum(located.malformed)
-            for row, taken, position, yaw in located.take(self._utc, t):
+            for row, taken, position, yaw in located.receive(self._utc, t):
                 self._body.locate(row, taken, position, yaw)
-            self._counts.malformed += sum(located.malformed) - refused
-        for row, queryable in enumerate(self._orders):
-            for query in network.received(queryable.handler):
-                self._obey(row, query, t)
+        for row, orders in enumerate(self._orders):
+            for query, order in orders.read():
+                self._obey(row, query, order, t)
         for last in self._last:
             last.answer()
 
@@ -350,17 +346,19 @@ class Runtime:
             for row in range(len(self._names)):
                 self.agent.life.stop(row, stop.words)
 
-    def _obey(self, row: int, query: zenoh.Query, t: float) -> None:
-        """One order to one row; it always gets a reply."""
+    def _malformed(self) -> int:
+        """Payloads that were refused, of all kinds but poses."""
+        return (
+            sum(orders.malformed for orders in self._orders)
+            + (self._goals.malformed if self._goals is not None else 0)
+            + (sum(self._located.malformed) if self._located is not None else 0)
+            + (self._ranges.malformed if self._ranges is not None else 0)
+        )
+
+    def _obey(self, row: int, query: zenoh.Query, order: messages.Order, t: float) -> None:
+        """Carries out one order to one row, and replies."""
         key = self._setup.keys.order(self._names[row])
         with query:
-            payload = query.payload.to_bytes() if query.payload is not None else b""
-            try:
-                order = messages.decode(payload, str(query.encoding or messages.JSON), messages.Order)
-            except messages.Malformed as error:
-                self._counts.malformed += 1
-                query.reply_err(str(error).encode(), encoding="text/plain")
-                return
             waits = self.agent.life.phase[row] == Phase.AIRBORNE
             slept = self.agent.health.slept
             # the conductor left long ago
@@ -448,9 +446,7 @@ class Runtime:
             known = np.isfinite(located.ahead)
             state.ahead = located.ahead if state.ahead is None else np.where(known, located.ahead, state.ahead)
         if self._ranges is not None:
-            refused = self._ranges.malformed
             state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))
-            self._counts.malformed += self._ranges.malformed - refused
         said = self.agent.speak(t, state)
         for row in said.rows if not self._retired else [row for row in said.rows if row not in self._retired]:
             self._say(int(row), said, float(state.yaw[row]), t)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from enum import Enum
+from functools import partial
 from math import inf
 from typing import Final, NamedTuple
 
@@ -14,7 +15,6 @@ import zenoh
 from agents.agent import Agent, links_by_speaker
 from agents.arrays import Index
 from agents.network import messages, pubsub, validation
-from agents.network import session as network
 from agents.network.channel_model import Channel, Conditions, Samples
 from agents.network.keys import Keys
 
@@ -57,7 +57,6 @@ class NeighbourSubscription:
         links: (K,) on which it is heard.
         lost: Poses that never came; whoever listens counts them, because it knows since when they matter.
         stale: Poses that were left out because a newer one was known, or because they are of a life that is over.
-        malformed: Samples that were refused.
         behind: Age [s] of the last pose on arrival if the clock of the robot is behind: the last poses were older than
             a network delays them. 0 if not.
     """
@@ -85,9 +84,9 @@ class NeighbourSubscription:
             depth: Newest poses that may wait.
         """
         self.name, self.links, self._reach, self._rate = name, links, reach, rate
-        self._poses = pubsub.pose_subscriber(session, keys.pose(name), depth)
+        self._poses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.pose(name), depth), messages.Pose, keys=keys)
         self._token = keys.alive(name)
-        self._alive = pubsub.alive_watch(session, keys.lives(self._token))
+        self._alive = pubsub.AliveWatch(session, keys.lives(self._token))
         self._seq, self._stamp = 0, 0.0
         self._life: str | None = None  # session of the robot's process, as far as it is known
         self._past: set[str] = set()
@@ -95,8 +94,13 @@ class NeighbourSubscription:
         self._gone = False
         self._heard_at = -inf  # when news came last (UTC [s])
         self._old, self._old_at = 0, 0.0  # how often in succession poses were old on arrival, and when last
-        self.lost = self.stale = self.malformed = 0
+        self.lost = self.stale = 0
         self.behind = 0.0
+
+    @property
+    def malformed(self) -> int:
+        """Samples that were refused."""
+        return self._poses.malformed
 
     def news(self, now: float) -> Iterator[ReceivedPose]:
         """Poses that have come until `now` (UTC [s]), oldest first: what cannot be true is refused, what is known left
@@ -105,14 +109,8 @@ class NeighbourSubscription:
         A new session of the robot, or a clock that was set back in one session, begins anew.
         """
         before = self._heard_at  # what waited with others while this process stood still was not heard then
-        for sample in network.received(self._poses.handler):
-            payload = sample.payload.to_bytes()
-            try:
-                pose = messages.decode(payload, str(sample.encoding), messages.Pose)
-                validation.check_pose(pose, robot=self.name, now=now, reach=self._reach)
-            except messages.Malformed:
-                self.malformed += 1
-                continue
+        check = partial(validation.check_pose, now=now, reach=self._reach)
+        for pose, sample in self._poses.read_samples(check):
             life = _session_of(sample)
             if life in self._past or (self._owned and life not in (None, self._life)):
                 self.stale += 1
@@ -132,12 +130,11 @@ class NeighbourSubscription:
             slow = self.behind or (pose.stamp < before and now - pose.stamp > LATE_S)
             measured = now - LATE_S if slow else validation.taken(pose.stamp, now)
             self._heard_at = now
-            yield ReceivedPose(pose, len(payload), missed, measured, anew)
+            yield ReceivedPose(pose, len(sample.payload), missed, measured, anew)
 
     def comings(self) -> Iterator[Coming]:
         """Changes of its liveliness, oldest first."""
-        for sample in network.received(self._alive.handler):
-            token, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+        for token, there in self._alive.changes():
             if token == self._token:
                 if there and self._gone and self._life is None and self._stamp:  # no token tells which life it is
                     self._seq, self._stamp = 0, 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import zenoh
@@ -10,7 +11,6 @@ import zenoh
 from agents.arrays import Index
 from agents.body.interface import RangeScan, Rays
 from agents.network import messages, pubsub, validation
-from agents.network import session as network
 from agents.network.keys import Keys
 
 OLD_S = 1.0  # readings older than this say nothing of where things are now
@@ -40,28 +40,33 @@ def instead(own: Rays | None, heard: Rays | None, rows: Index) -> Rays | None:
 
 
 class HeardRanges:
-    """The newest sweep of each of some rows, as it came on their keys `ranges`.
-
-    Attributes:
-        malformed: Payloads that were refused, and `trouble` why the last of them was.
-        trouble: See `malformed`.
-    """
+    """The newest sweep of each of some rows, as received on their keys `ranges`."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, names: Sequence[str], rows: Sequence[int]) -> None:
         """Listens for `rows` of those called `names`."""
-        self._names = tuple(names)
-        self._scans: list[RangeScan | None] = [None] * len(self._names)
-        self._subscribers = [(row, pubsub.subscriber(session, keys.ranges(self._names[row]), 4)) for row in rows]
+        self._scans: list[RangeScan | None] = [None] * len(names)
+        self._inboxes = {
+            row: pubsub.Inbox(pubsub.subscriber(session, keys.ranges(names[row]), 4), messages.Ranges, keys=keys)
+            for row in rows
+        }
         self._rays: Rays | None = None
-        self.malformed = 0
-        self.trouble = ""
+
+    @property
+    def malformed(self) -> int:
+        """Payloads that were refused."""
+        return sum(inbox.malformed for inbox in self._inboxes.values())
+
+    @property
+    def trouble(self) -> str:
+        """Why the last payload of a row was refused."""
+        return next((inbox.trouble for inbox in self._inboxes.values() if inbox.trouble), "")
 
     def read(self, utc: float, now: float) -> Rays | None:
         """What is known at `now` [s] of a clock that was 0 at `utc`; sweeps older than `OLD_S` are forgotten."""
         changed = False
-        for row, subscriber in self._subscribers:
-            for sample in network.received(subscriber.handler):
-                changed |= self._take(row, sample, utc, now)
+        for row, inbox in self._inboxes.items():
+            for ranges in inbox.read(partial(validation.check_ranges, now=utc + now)):
+                changed |= self._store(row, ranges, utc, now)
             scan = self._scans[row]
             if scan is not None and now - scan.time > OLD_S:
                 self._scans[row], changed = None, True
@@ -69,18 +74,12 @@ class HeardRanges:
             self._rays = Rays.gather(self._scans)
         return self._rays
 
-    def _take(self, row: int, sample: zenoh.Sample, utc: float, now: float) -> bool:
-        try:
-            said = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Ranges)
-            validation.check_ranges(said, robot=self._names[row], now=utc + now)
-        except messages.Malformed as error:
-            self.malformed += 1
-            self.trouble = str(error)
-            return False
-        time = validation.taken(said.stamp - utc, now)
+    def _store(self, row: int, ranges: messages.Ranges, utc: float, now: float) -> bool:
+        """Stores a sweep unless a newer one is known; returns whether it was stored."""
+        time = validation.taken(ranges.stamp - utc, now)
         known = self._scans[row]
         if known is not None and time <= known.time:
             return False
-        distance = np.array([np.nan if value is None else value for value in said.distance])
-        self._scans[row] = RangeScan(time, np.array(said.bearing), np.array(said.elevation), distance)
+        distance = np.array([np.nan if value is None else value for value in ranges.distance])
+        self._scans[row] = RangeScan(time, np.array(ranges.bearing), np.array(ranges.elevation), distance)
         return True

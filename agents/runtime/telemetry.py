@@ -9,7 +9,7 @@ import os
 import resource
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Any, Final
@@ -41,7 +41,6 @@ class Counts:
         sent: (n) poses said.
         interventions: (n,) ticks on which safety changed what had been decided.
         avoided: (n,) ticks on which avoidance did.
-        malformed: Payloads that were refused, other than poses.
         refused: Orders that were.
         ticks: Since the start, and `missed` ones.
         missed: See `ticks`.
@@ -51,7 +50,6 @@ class Counts:
     sent: list[int]
     interventions: Index
     avoided: Index
-    malformed: int = 0
     refused: int = 0
     ticks: int = 0
     missed: int = 0
@@ -85,6 +83,7 @@ class Telemetry:
         agent: Agent,
         neighbours: Neighbours,
         counts: Counts,
+        malformed: Callable[[], int],
         ranged: Sequence[bool],
         followed: Sequence[deque[messages.GoalReceipt]] | None = None,
     ) -> None:
@@ -97,11 +96,12 @@ class Telemetry:
             agent: Whose rows they are.
             neighbours: Whom the rows listen to; what they said since the last telemetry is sent along and emptied.
             counts: Kept by the runtime.
+            malformed: Number of payloads that were refused, other than poses.
             ranged: (n) rows whose range readings are their own: the others' come from the network, where they need
                 not be said again.
             followed: Goals that reached each row since the last telemetry; emptied here. None: nobody is guided.
         """
-        self._agent, self._neighbours, self._counts = agent, neighbours, counts
+        self._agent, self._neighbours, self._counts, self._malformed = agent, neighbours, counts, malformed
         self._encoding = encoding
         names = self._names = agent.assignment.names
         mime = messages.MIME[encoding]
@@ -204,7 +204,7 @@ class Telemetry:
                 lost={speaker.name: speaker.lost for speaker in mine},
                 dropped=self._dropped_of(row),
                 stale={speaker.name: speaker.stale for speaker in mine if speaker.stale},
-                malformed=counts.malformed + self._neighbours.malformed,
+                malformed=self._malformed() + self._neighbours.malformed,
                 refused=counts.refused,
                 ticks=counts.ticks,
                 missed=counts.missed,

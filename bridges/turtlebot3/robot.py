@@ -83,7 +83,7 @@ class Robot:
         self._command = node.publisher(self.chosen.command_topic, self._command_type)
         topic = ros2.absolute(where.namespace, self.chosen.command_topic)
         watched = ros2.endpoints(where.style, "MS", topic, domain=where.domain)
-        self._watch = pubsub.alive_watch(participant.session, watched)
+        self._watch = pubsub.AliveWatch(participant.session, watched)
 
     @property
     def device(self) -> str:

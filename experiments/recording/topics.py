@@ -77,11 +77,6 @@ class Topic:
     repeated: bool = False  # by the publisher's cache for late subscribers
     finite: bool = False  # messages with numbers that are not finite are malformed
 
-    @property
-    def of_robot(self) -> bool:
-        """Whether each robot has a topic of its own."""
-        return "{robot}" in self.name
-
 
 TOPICS: Final = (
     Topic(State, State, "/{robot}/state", lambda keys: keys.state("*"), DEPTH),  # with the poses received since

@@ -11,7 +11,6 @@ from agents.agent import Agent
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
 from agents.network import messages
-from agents.network import session as network
 from agents.network.keys import Keys
 from agents.runtime.loop import Runtime
 from agents.runtime.orders import carry_out
@@ -112,14 +111,14 @@ def test_a_start_that_is_repeated_does_not_move_the_ticks_of_a_robot_that_runs()
         robot._join(net.session)
         robot._utc, robot._now, robot._next = UTC, 7.0, 7.01
 
-        def order(at: float) -> None:
+        def start(at: float) -> None:
             net.deliver(sent("park/A/order", messages.Order("start", at=UTC + at))[0])
-            for query in network.received(robot._orders[0].handler):
-                robot._obey(0, query, robot._now)
+            for query, order in robot._orders[0].read():
+                robot._obey(0, query, order, robot._now)
 
         robot.agent.life.phase[0] = AIRBORNE
-        order(7.504)
+        start(7.504)
         assert robot._next == pytest.approx(7.004)
         robot.agent.life.phase[0] = RUNNING
-        order(7.508)
+        start(7.508)
         assert robot._next == pytest.approx(7.004)

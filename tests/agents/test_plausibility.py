@@ -13,14 +13,13 @@ REACH = (2.0, 2.0, 3.5)
 
 
 def test_an_honest_pose_passes():
-    validation.check_pose(POSE, robot="KH01", now=1000.0, reach=REACH)
-    validation.check_pose(POSE, robot="KH01", now=1e9, reach=REACH)  # late joiners get old ones
+    validation.check_pose(POSE, now=1000.0, reach=REACH)
+    validation.check_pose(POSE, now=1e9, reach=REACH)  # late joiners get old ones
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"robot": "KH02"}, "pose of 'KH02' on the key of 'KH01'"),
         ({"seq": 0}, "sequence number 0"),
         ({"seq": -1}, "sequence number -1"),
         ({"seq": 2**53}, "sequence number"),
@@ -42,13 +41,12 @@ def test_an_honest_pose_passes():
 def test_a_pose_that_no_robot_can_have(change, says):
     pose = msgspec.structs.replace(POSE, **change)
     with pytest.raises(Malformed, match=says):
-        validation.check_pose(pose, robot="KH01", now=1000.0, reach=REACH)
+        validation.check_pose(pose, now=1000.0, reach=REACH)
 
 
 @pytest.mark.parametrize(
     ("command", "why"),
     [
-        (Command("KH02", 1, 1.0, "stop"), "command of 'KH02' on the key of 'KH01'"),
         (Command("KH01", 0, 1.0, "stop"), "sequence number 0 is impossible"),
         (Command("KH01", 2**53, 1.0, "stop"), "is impossible"),
         (Command("KH01", 1, 1.0, "drive"), "drive with the setpoint None"),
@@ -60,13 +58,12 @@ def test_a_pose_that_no_robot_can_have(change, says):
 )
 def test_commands_that_no_body_can_carry_out(command: Command, why: str) -> None:
     with pytest.raises(Malformed, match=why):
-        validation.check_command(command, robot="KH01")
+        validation.check_command(command)
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"robot": "KH02"},
         {"stamp": math.nan},
         {"stamp": 1006.0},
         {"position": (2.1, 0.0, 0.0)},
@@ -77,18 +74,16 @@ def test_commands_that_no_body_can_carry_out(command: Command, why: str) -> None
 )
 def test_states_of_mirrored_robots_that_cannot_be(changes: dict[str, object]) -> None:
     state = State("KH01", 1, 1000.0, "running", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.5, None, None, 0.0)
-    validation.check_state(state, robot="KH01", now=1000.0, reach=(2.0, 2.0, 2.0))
+    validation.check_state(state, now=1000.0, reach=(2.0, 2.0, 2.0))
     with pytest.raises(Malformed):
-        validation.check_state(
-            msgspec.structs.replace(state, **changes), robot="KH01", now=1000.0, reach=(2.0, 2.0, 2.0)
-        )
+        validation.check_state(msgspec.structs.replace(state, **changes), now=1000.0, reach=(2.0, 2.0, 2.0))
 
 
 GOAL = Goal("KH01", 7, 999.9, (0.5, -0.5, 0.0), 0.25, 999.85)
 
 
 def check_goal(**changes):
-    validation.check_goal(msgspec.structs.replace(GOAL, **changes), robot="KH01", now=1000.0, reach=REACH, oldest_s=1.0)
+    validation.check_goal(msgspec.structs.replace(GOAL, **changes), now=1000.0, reach=REACH, oldest_s=1.0)
 
 
 def test_an_honest_goal_passes():
@@ -100,7 +95,6 @@ def test_an_honest_goal_passes():
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"robot": "KH02"}, "on the key of"),
         ({"seq": 0}, "sequence number"),
         ({"seq": 2**60}, "sequence number"),
         ({"stamp": 998.9}, "old"),

@@ -30,13 +30,12 @@ def scan(t: float, *distance: float) -> RangeScan:
 def test_a_sweep_as_a_message() -> None:
     said = range_inbox.message("KH01", 1000.0, scan(2.5, 0.12345678, np.nan, 1.0))
     assert said == messages.Ranges("KH01", 1002.5, [0.0, 0.5, 1.0], [0.0, 0.0, 0.0], [0.123457, None, 1.0])
-    validation.check_ranges(said, robot="KH01", now=1002.5)
+    validation.check_ranges(said, now=1002.5)
 
 
 @pytest.mark.parametrize(
     ("field", "value", "why"),
     [
-        ("robot", "KH02", "ranges of 'KH02' on the key of 'KH01'"),
         ("stamp", math.nan, "stamp nan is impossible"),
         ("stamp", 1006.0, "stamp 1006.0 is impossible"),
         ("distance", [0.25], "differ in number"),
@@ -50,9 +49,9 @@ def test_a_sweep_as_a_message() -> None:
     ],
 )
 def test_what_no_sensor_sees_is_refused(field: str, value: object, why: str) -> None:
-    validation.check_ranges(GOOD, robot="KH01", now=1000.0)
+    validation.check_ranges(GOOD, now=1000.0)
     with pytest.raises(messages.Malformed, match=why):
-        validation.check_ranges(msgspec.structs.replace(GOOD, **{field: value}), robot="KH01", now=1000.0)
+        validation.check_ranges(msgspec.structs.replace(GOOD, **{field: value}), now=1000.0)
 
 
 def test_what_is_heard_takes_the_place_of_what_is_seen() -> None:

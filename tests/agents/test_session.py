@@ -14,13 +14,15 @@ import pytest
 import zenoh
 
 from agents.network.endpoints import EndpointError, free_endpoint
-from agents.network.messages import JSON, MSGPACK, Stop
+from agents.network.messages import JSON, MSGPACK, Order, Stop
 from agents.network.pubsub import (
+    NO_ORDER,
+    AliveWatch,
+    CallbackQueue,
     ImmediateSubscriber,
+    LastValue,
+    Orders,
     alive_token,
-    alive_watch,
-    last_value,
-    orders,
     pose_publisher,
     pose_subscriber,
     publisher,
@@ -29,8 +31,6 @@ from agents.network.pubsub import (
 from agents.network.session import (
     ANSWER_S,
     ASK_EVERY_S,
-    NO_ORDER,
-    Inbox,
     RouterWatch,
     Unreachable,
     connected,
@@ -312,7 +312,7 @@ def test_at_a_frozen_first_router_with_a_long_lease_all_goes_on_at_the_second(pa
         watches = [RouterWatch(each, "park/CF01/alive", ends) for each in (robot, listener)]
         token = alive_token(robot, "park/CF01/alive")
         poses, heard = pose_publisher(robot, POSE, JSON), pose_subscriber(listener, POSE)
-        alive, here = alive_watch(listener, "park/*/alive"), [zenoh.SampleKind.DELETE]
+        alive, here = AliveWatch(listener, "park/*/alive"), [zenoh.SampleKind.DELETE]
         got: list[int] = []
         said = 0
 
@@ -361,7 +361,7 @@ def test_members_of_a_mesh_are_not_asked():
 def test_last_value_answers_a_plain_get(router, eventually):
     with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
         asker = ui.declare_querier(POSE, timeout=5.0)  # a wildcard is never told that it matches
-        with last_value(robot, POSE, JSON) as last:
+        with LastValue(robot, POSE, JSON) as last:
             eventually(lambda: asker.matching_status.matching)
             empty = ui.get("park/*/pose", timeout=5.0)
             eventually(last.answer)
@@ -380,29 +380,30 @@ def test_last_value_answers_a_plain_get(router, eventually):
 @pytest.mark.system
 def test_orders_wait_until_they_are_polled(router, eventually):
     with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
-        taken = orders(robot, "park/CF01/order")
+        taken = Orders(robot, "park/CF01/order", Order)
         asker = ui.declare_querier("park/CF01/order")
         eventually(lambda: asker.matching_status.matching)
-        asked = ui.get("park/*/order", payload=b"land", timeout=5.0)
+        asked = ui.get("park/*/order", payload=b'{"order": "land"}', timeout=5.0)
         waiting = []
-        eventually(lambda: waiting.extend(received(taken.handler)) or waiting)
-        with waiting[0] as order:
-            assert order.payload.to_bytes() == b"land"
-            order.reply("park/CF01/order", b"ok")
+        eventually(lambda: waiting.extend(taken.read()) or waiting)
+        ((query, order),) = waiting
+        with query:
+            assert order == Order("land")
+            query.reply("park/CF01/order", b"ok")
         assert [reply.ok.payload.to_bytes() for reply in asked] == [b"ok"]
 
 
 @pytest.mark.system
 def test_a_query_without_payload_is_no_order(router, eventually):
     with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
-        taken = orders(robot, "park/CF01/order")
+        taken = Orders(robot, "park/CF01/order", Order)
         asker = ui.declare_querier("park/CF01/order")
         eventually(lambda: asker.matching_status.matching)
         for key, told in (("park/**", []), ("park/*/order", []), ("park/CF01/order", [NO_ORDER])):
             asked, waiting, replies = ui.get(key, timeout=5.0), [], []
             ended = threading.Thread(target=lambda asked=asked, replies=replies: replies.extend(asked))
             ended.start()
-            eventually(lambda w=waiting, e=ended: w.extend(received(taken.handler)) or not e.is_alive())
+            eventually(lambda w=waiting, e=ended: w.extend(taken.read()) or not e.is_alive())
             assert [reply.err.payload.to_string() for reply in replies] == told
             assert not waiting
 
@@ -422,14 +423,15 @@ def test_telemetry_keeps_the_newest(router, eventually):
 
 ROBOT = """
 import sys
-from agents.network.pubsub import alive_token, orders, pose_publisher, pose_subscriber
+from agents.network.messages import Order
+from agents.network.pubsub import Orders, alive_token, pose_publisher, pose_subscriber
 from agents.network.session import open_session
 session = open_session([sys.argv[1]], name="CF01")
 held = [
     alive_token(session, "park/CF01/alive"),
     pose_publisher(session, "park/CF01/pose", "application/json"),
     pose_subscriber(session, "park/CF02/pose"),
-    orders(session, "park/CF01/order"),
+    Orders(session, "park/CF01/order", Order),
 ]
 print("ready", flush=True)
 sys.stdin.read()
@@ -453,10 +455,10 @@ def test_interpreter_exits_although_a_session_was_left_open(router):
 
 @pytest.mark.system
 def test_an_inbox_keeps_the_newest_wanted_items(router, eventually):
-    inbox = Inbox[zenoh.Sample](2, lambda sample: sample.payload.to_bytes() != b"1")
+    inbox = CallbackQueue[zenoh.Sample](2, lambda sample: sample.payload.to_bytes() != b"1")
     assert list(received(inbox)) == []
     with open_session([router.endpoint], name="CF01") as session:
-        session.declare_subscriber(POSE, inbox.filled)
+        session.declare_subscriber(POSE, inbox.callback)
         for number in (b"0", b"1", b"2", b"3"):
             session.put(POSE, number)
         got = []
@@ -474,7 +476,7 @@ def test_a_killed_robot_is_noticed(router, eventually):
     with robot, open_session([router.endpoint], name="CF02") as session:
         assert robot.stdout.readline() == b"ready\n"
         own = alive_token(session, "park/CF02/alive")
-        watch = alive_watch(session, "park/*/alive")
+        watch = AliveWatch(session, "park/*/alive")
         seen = []
         eventually(lambda: seen.extend(received(watch.handler)) or len(seen) == 2)
         assert {str(sample.key_expr) for sample in seen} == {"park/CF01/alive", "park/CF02/alive"}

@@ -39,7 +39,7 @@ class Robot:
     """A of a pair, with what it hears of B put into its ears."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        for name in ("publisher", "pose_publisher", "pose_subscriber", "alive_watch"):
+        for name in ("publisher", "pose_publisher", "pose_subscriber", "AliveWatch"):
             monkeypatch.setattr(pubsub, name, lambda *_: Taken())
         experiment = pair()
         self.agent = Agent(Plan(experiment).assignment(("A",)))
@@ -49,7 +49,7 @@ class Robot:
         self.neighbours = Neighbours(nowhere, Keys(), self.agent, reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
         self.telemetry = Telemetry(
             nowhere, Keys(), "json",  # type: ignore[arg-type]
-            agent=self.agent, neighbours=self.neighbours, counts=Counts.nothing(1), ranged=[True],
+            agent=self.agent, neighbours=self.neighbours, counts=Counts.nothing(1), malformed=lambda: 0, ranged=[True],
         )  # fmt: skip
         self.telemetry.utc = UTC
 

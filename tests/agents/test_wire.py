@@ -143,7 +143,7 @@ def test_fields_of_other_types_are_malformed(value, field):
         return
     assert isinstance(value, int | float | str | list) or (value is None and field in {"velocity", "yaw"})
     try:
-        validation.check_pose(pose, robot="KH01", now=1000.0, reach=REACH)
+        validation.check_pose(pose, now=1000.0, reach=REACH)
     except Malformed:
         return
     assert all(
@@ -224,8 +224,8 @@ def test_a_yaw_is_within_half_a_turn_however_far_a_robot_has_turned():
         for said in poses:
             assert abs(said.yaw) <= math.pi
             assert math.cos(said.yaw - yaw) == pytest.approx(1.0, abs=1e-9)
-        validation.check_pose(poses[0], robot="KH01", now=1000.0, reach=REACH)
-        validation.check_position(poses[1], robot="KH01", now=1000.0, reach=REACH)
+        validation.check_pose(poses[0], now=1000.0, reach=REACH)
+        validation.check_position(poses[1], now=1000.0, reach=REACH)
     assert wire.heading(1.234567890123) == 1.234567890123
 
 

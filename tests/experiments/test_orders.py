@@ -29,7 +29,7 @@ def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProc
         waiting = {}
         while not over.wait(0.005):
             for name, queryable in told.items():
-                for query in network.received(queryable.handler):
+                for query, _ in queryable.read():
                     waiting[name] = query
             if len(waiting) == len(names):
                 for name, query in waiting.items():
@@ -42,7 +42,7 @@ def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProc
         network.open_session([router.endpoint], name="robots") as robots,
         network.open_session([router.endpoint], name="conductor") as conductor,
     ):
-        told = {name: pubsub.orders(robots, KEYS.order(name)) for name in names}
+        told = {name: pubsub.Orders(robots, KEYS.order(name), messages.Order) for name in names}
         thread = threading.Thread(target=answer)
         thread.start()
         try:

@@ -15,6 +15,10 @@ from unittest import mock
 import zenoh
 from zenoh.handlers import Callback
 
+from agents.network import messages, pubsub
+
+Orders = pubsub.Orders  # the real one: `Net.worn` replaces it
+
 
 class Payload:
     def __init__(self, data: bytes) -> None:
@@ -80,6 +84,14 @@ class Channel:
         self._waiting.clear()
 
     close = undeclare
+
+
+def typed_orders(channel: Channel, kind: type[messages.Message]) -> pubsub.Orders[Any]:
+    """Orders of a kind that wait in a channel."""
+    orders = Orders.__new__(Orders)
+    orders._kind, orders._queries, orders.malformed = kind, channel, 0  # type: ignore[assignment]
+    orders.close = channel.close  # type: ignore[method-assign]
+    return orders
 
 
 class Mute:
@@ -211,11 +223,11 @@ class Net:
         declared: dict[str, Any] = {
             "pose_subscriber": heard,
             "subscriber": heard,
-            "orders": lambda _session, key: self.listen(key, asked=True),
+            "Orders": lambda _session, key, kind: typed_orders(self.listen(key, asked=True), kind),
             "pose_publisher": mute,
             "publisher": mute,
             "urgent_publisher": mute,
-            "last_value": mute,
+            "LastValue": mute,
             "alive_token": mute,
         }
         opened: dict[str, Any] = {

@@ -90,7 +90,7 @@ class Watcher(Looking):
         self.session = network.open_session(endpoints, name="test", identity="operator")
         self._statuses = pubsub.pose_subscriber(self.session, self.keys.status("*"), 4096)
         self._states = pubsub.subscriber(self.session, self.keys.state("*"), 8192)
-        self._alive = pubsub.alive_watch(self.session, self.keys.alive("*"))
+        self._alive = pubsub.AliveWatch(self.session, self.keys.alive("*"))
         self.status: dict[str, messages.Status] = {}
         self.state: dict[str, messages.State] = {}
         self.alive: set[str] = set()

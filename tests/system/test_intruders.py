@@ -215,16 +215,16 @@ def test_robots_are_changed_by_operators_only(laboratory: Laboratory, who: str) 
     """Somebody else neither asks the conductor for a change, nor answers in its place."""
     order = messages.RunOrder("remove", ["CF01"], who="operator")
     with laboratory.session(who) as session:
-        false = pubsub.orders(session, KEYS.run_order)
+        false = pubsub.Orders(session, KEYS.run_order, messages.RunOrder)
         reply = orders.give_run(laboratory.watcher.session, KEYS, order, 0.5)
         assert "no conductor answers" in reply.reason
-        assert false.handler.try_recv() is None, "and it does not even hear of it"
+        assert not list(false.read()), "and it does not even hear of it"
         false.close()
-        asked = pubsub.orders(laboratory.watcher.session, KEYS.run_order)
+        asked = pubsub.Orders(laboratory.watcher.session, KEYS.run_order, messages.RunOrder)
         settled(laboratory)
         for key in (KEYS.run_order, "park/run/*", "park/**"):
             assert not list(session.get(key, payload=messages.encode(order), encoding=messages.JSON, timeout=0.5))
-        assert asked.handler.try_recv() is None
+        assert not list(asked.read())
         asked.close()
 
 
@@ -235,7 +235,7 @@ def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory: Laboratory) ->
             pubsub.pose_subscriber(session, key)
             for key in (KEYS.pose("KH02"), KEYS.state("KH01"), "park/*/pose", "park/**", "**", KEYS.event)
         ]
-        watches = [pubsub.alive_watch(session, key) for key in ("park/KH02/alive", "park/*/alive", "park/**")]
+        watches = [pubsub.AliveWatch(session, key) for key in ("park/KH02/alive", "park/*/alive", "park/**")]
         settled(laboratory)
         assert len(list(network.received(neighbour.handler))) > 10
         heard = {str(sample.key_expr) for other in others for sample in network.received(other.handler)}
@@ -248,8 +248,8 @@ def test_a_robot_hears_its_neighbours_and_nobody_else(laboratory: Laboratory) ->
 def test_no_one_takes_anothers_place(laboratory: Laboratory) -> None:
     """Neither its orders, nor its token, nor the memory of its last value."""
     with laboratory.session("KH03") as session:
-        order = pubsub.orders(session, KEYS.order("KH02"))
-        last = pubsub.last_value(session, KEYS.pose("KH02"), messages.JSON)
+        order = pubsub.Orders(session, KEYS.order("KH02"), messages.Order)
+        last = pubsub.LastValue(session, KEYS.pose("KH02"), messages.JSON)
         last.hold(forged("KH02"))
         token = pubsub.alive_token(session, KEYS.alive("KH09"))
         memory = pubsub.pose_publisher(session, KEYS.pose("KH02"), messages.JSON)
@@ -265,7 +265,7 @@ def test_no_one_takes_anothers_place(laboratory: Laboratory) -> None:
         assert all(pose.seq < 10**8 for pose in poses)
         late.undeclare()  # type: ignore[no-untyped-call]
         assert "KH09" not in laboratory.watcher.alive
-        assert not list(network.received(order.handler))
+        assert not list(order.read())
         assert not last.answer()
         token.undeclare()  # type: ignore[no-untyped-call]
 

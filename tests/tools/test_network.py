@@ -8,7 +8,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from agents.network.pubsub import alive_token, orders, pose_publisher, publisher, subscriber
+from agents.network.messages import Order
+from agents.network.pubsub import Orders, alive_token, pose_publisher, publisher, subscriber
 from agents.network.session import open_session
 from tools.commands.network import HEADING, Cadence, KeyExpressionError, echo, key_expression, members, readable
 
@@ -99,7 +100,7 @@ def test_keys_shows_who_holds_what(router, eventually):
     ):
         held = [
             pose_publisher(robot, "park/CF01/pose", JSON),
-            orders(robot, "park/CF01/order"),
+            Orders(robot, "park/CF01/order", Order),
             alive_token(robot, "park/CF01/alive"),
             subscriber(recorder, "park/**"),
         ]

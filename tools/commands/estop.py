@@ -88,7 +88,7 @@ class _Stop:
                 if reply.ok is not None
             }
             self.left = set(self.there)
-            watch = pubsub.alive_watch(session, keys.alive("*"))
+            watch = pubsub.AliveWatch(session, keys.alive("*"))
             while (self.left or self._awaited(session, begun)) and time.monotonic() < begun + ANSWER_S:
                 urgent.put(stop)
                 time.sleep(AGAIN_S)

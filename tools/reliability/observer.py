@@ -171,7 +171,7 @@ class Eyes:
         self._truths = pubsub.subscriber(session, keys.truth("*"), 8192)
         self._commands = pubsub.subscriber(session, keys.setpoint("*"), 8192)
         self._contacts = pubsub.subscriber(session, keys.contact, 1024)
-        self._watch = pubsub.alive_watch(session, keys.alive("*"))
+        self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self.status: dict[str, messages.Status] = {}
         self.heard: dict[str, float] = {}
         self.alive: set[str] = set()

@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 import msgspec
@@ -221,28 +222,24 @@ class Truths:
 
     def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str]) -> None:
         self._robots = list(robots)
-        self._heard = [pubsub.subscriber(session, keys.truth(robot), 4) for robot in robots]
+        self._inboxes = [
+            pubsub.Inbox(pubsub.subscriber(session, keys.truth(robot), 4), messages.Position, keys=keys)
+            for robot in robots
+        ]
         self._stamp = np.full(len(self._robots), -np.inf)
 
     def show(self, vicon: ViconTwin, now: float) -> None:
         """Places every robot that was heard of lately, at UTC time `now` [s], and hides the others."""
-        for row, subscriber in enumerate(self._heard):
-            for sample in network.received(subscriber.handler):
-                self._take(vicon, row, sample, now)
+        check = partial(validation.check_position, now=now, reach=REACH)
+        for row, inbox in enumerate(self._inboxes):
+            for truth in inbox.read(check):
+                self._stamp[row] = truth.stamp
+                vicon.place(row, np.array(truth.position), upright(truth.yaw or 0.0))
         age = now - self._stamp
         fresh = age <= FRESH_S
         for row in np.flatnonzero(~fresh).tolist():
             vicon.hide(row)
         vicon.latency_s = max(0.0, float(age[fresh].mean())) if fresh.any() else 0.0
-
-    def _take(self, vicon: ViconTwin, row: int, sample: zenoh.Sample, now: float) -> None:
-        try:
-            truth = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position)
-            validation.check_position(truth, robot=self._robots[row], now=now, reach=REACH)
-        except messages.Malformed:
-            return
-        self._stamp[row] = truth.stamp
-        vicon.place(row, np.array(truth.position), upright(truth.yaw or 0.0))
 
 
 def serve(vicon: ViconTwin, truths: Truths, rate_hz: float, over: Callable[[], bool]) -> None:

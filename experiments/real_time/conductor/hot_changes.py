@@ -14,7 +14,6 @@ from typing import Final
 import zenoh
 
 from agents.network import messages
-from agents.network import session as network
 from agents.network.keys import Keys
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
@@ -119,8 +118,8 @@ class HotChanges:
 
     def go_on(self) -> None:
         """Takes new orders, goes on with what is under way, and answers what is done."""
-        for query in network.received(self._view.orders.handler):
-            self._heed(query)
+        for query, order in self._view.orders.read():
+            self._accept(query, order)
         for change in list(self._changes):
             try:
                 next(change.steps)
@@ -135,14 +134,7 @@ class HotChanges:
 
     # ------------------------------------------------------------------ orders and answers
 
-    def _heed(self, query: zenoh.Query) -> None:
-        payload = query.payload.to_bytes() if query.payload is not None else b""
-        try:
-            order = messages.decode(payload, str(query.encoding or messages.JSON), messages.RunOrder)
-        except messages.Malformed as error:
-            with query:
-                query.reply_err(str(error).encode(), encoding="text/plain")
-            return
+    def _accept(self, query: zenoh.Query, order: messages.RunOrder) -> None:
         if refusal := next(self._refusals(order), None):
             with query:
                 reply = messages.RunReply(reason=refusal)

@@ -193,12 +193,12 @@ class Overview:
         self._clock = pubsub.publisher(self._session, keys.clock, messages.JSON)
         self._told = pubsub.pose_publisher(self._session, keys.experiment, messages.JSON)
         self._told.put(document.case_document(experiment))
-        self.orders = pubsub.orders(self._session, keys.run_order)
+        self.orders = pubsub.Orders(self._session, keys.run_order, messages.RunOrder)
         self._token = pubsub.alive_token(self._session, keys.conductor)
         self._statuses = pubsub.pose_subscriber(self._session, keys.status("*"), 4096)
         self._states = pubsub.subscriber(self._session, keys.state("*"), 4096)
-        self._watch = pubsub.alive_watch(self._session, keys.alive("*"))
-        self._recorder_watch = pubsub.alive_watch(self._session, keys.recorder)
+        self._watch = pubsub.AliveWatch(self._session, keys.alive("*"))
+        self._recorder_watch = pubsub.AliveWatch(self._session, keys.recorder)
         self.recording_begun = False
         self._cut_off = -inf
         self._router = network.RouterWatch(self._session, keys.conductor, endpoints)

@@ -82,7 +82,10 @@ class CentreProcess:
         self._heard: Index = np.zeros(len(rows), dtype=np.intp)
         self._channel = Channel(link_conditions.to_centre(experiment, centre.listens))
         self._guided = [row for row in rows if centre.guided[row]]
-        self._statuses = {row: pubsub.pose_subscriber(session, keys.status(names[row])) for row in self._guided}
+        self._statuses = {
+            row: pubsub.Inbox(pubsub.pose_subscriber(session, keys.status(names[row])), messages.Status, keys=keys)
+            for row in self._guided
+        }
         mime = messages.MIME[self._encoding]
         self._goals = {row: pubsub.publisher(session, keys.goal(names[row]), mime) for row in self._guided}
         self._reports = pubsub.pose_publisher(session, keys.centre, messages.JSON)
@@ -91,7 +94,7 @@ class CentreProcess:
         self._next = self._utc = 0.0
         self._clock = Clock()
         self._seq = round(self._clock.utc() * 1e3)  # beyond whatever a centre before this one had reached
-        self._sent = self._missed = self._malformed = 0
+        self._sent = self._missed = 0
         self._late_s, self._reported, self._cpu_s = 0.0, 0.0, time.process_time()
 
     def run(self, over: threading.Event) -> None:
@@ -118,9 +121,9 @@ class CentreProcess:
     def _listen(self, t: float) -> None:
         """Takes in what has arrived since the last decision."""
         self._router.silent_since(t)
-        for row, statuses in self._statuses.items():
-            for sample in network.received(statuses.handler):
-                self._heed(row, sample)
+        for row, inbox in self._statuses.items():
+            for status in inbox.read(_check_status):
+                self._update_status(row, status)
         for speaker in self._speakers:
             rows = self.centre.listens[speaker.links]
             for coming in speaker.comings():
@@ -179,14 +182,7 @@ class CentreProcess:
         """Whether a pose was taken in the run that began at `start` [s]."""
         return 0.0 <= taken - start + ROUNDING_S < self.centre.assignment.duration
 
-    def _heed(self, row: int, sample: zenoh.Sample) -> None:
-        try:
-            status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
-            if status.robot != self._names[row] or status.phase not in PHASES or not isfinite(status.started):
-                raise messages.Malformed(f"a status of '{status.robot}', {status.phase}")
-        except messages.Malformed:
-            self._malformed += 1
-            return
+    def _update_status(self, row: int, status: messages.Status) -> None:
         self._phase[row] = PHASES[status.phase]
         if status.origin is not None and all(map(isfinite, status.origin)):
             self.centre.begin(row, status.origin)
@@ -224,13 +220,19 @@ class CentreProcess:
             heard=dict(zip(listened, self._heard.tolist(), strict=True)),
             lost={speaker.name: speaker.lost for speaker in self._speakers},
             dropped=dict(zip(listened, self._channel.dropped.tolist(), strict=True)),
-            malformed=self._malformed + sum(speaker.malformed for speaker in self._speakers),
+            malformed=sum(inbox.malformed for inbox in self._statuses.values())
+            + sum(speaker.malformed for speaker in self._speakers),
             pid=os.getpid(),
             cpu_s=cpu_s,
             rss_mb=resident_mb(),
         )
         self._cpu_s, self._reported, self._late_s = cpu_s, t, 0.0
         self._reports.put(messages.encode(report))
+
+
+def _check_status(status: messages.Status) -> None:
+    if status.phase not in PHASES or not isfinite(status.started):
+        raise messages.Malformed(f"phase '{status.phase}' or start {status.started} is impossible")
 
 
 def serve(

@@ -65,7 +65,7 @@ class ConductorWatch:
             silence_s: A conductor that is gone for this long is gone [s].
         """
         self._session, self._silence_s = session, silence_s
-        self._watch = pubsub.alive_watch(session, keys.conductor)
+        self._watch = pubsub.AliveWatch(session, keys.conductor)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._look, name="tether", daemon=True)
         self._thread.start()
@@ -78,8 +78,8 @@ class ConductorWatch:
     def _look(self) -> None:
         there, gone_s = True, 0.0
         while not self._over.wait(LOOK_S):
-            for sample in network.received(self._watch.handler):
-                there = sample.kind == zenoh.SampleKind.PUT
+            for _, alive in self._watch.changes():
+                there = alive
             gone_s = 0.0 if there or not network.connected(self._session) else gone_s + LOOK_S
             if gone_s > self._silence_s:
                 print("the conductor is gone", flush=True)

@@ -10,22 +10,20 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from math import isfinite, remainder, tau
 from pathlib import Path
 from typing import Final
 
 import msgspec
 import zenoh
-from zenoh.ext import AdvancedSubscriber
-from zenoh.handlers import Handler
 
 from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
+from agents.network.messages import M
 from agents.network.shutdown import AFTER_S, end, held
 from agents.runtime.command_line import told_to_end
 from agents.runtime.lifeline import Lifeline
@@ -33,7 +31,7 @@ from experiments.definition import mesh
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.recording.reader import RecordingError
-from experiments.recording.topics import DEPTH, TOPICS, Topic
+from experiments.recording.topics import DEPTH, TOPICS, Message, Topic
 from experiments.recording.writer import Recording
 
 POLL_S: Final = 0.02
@@ -55,11 +53,11 @@ class Recorder:
         self._unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
         self._told: dict[str, int] = {}
         self._alive: set[str] = set()
-        self._subscribers = [(topic, self._subscribe(topic)) for topic in TOPICS]
-        self._truths = pubsub.subscriber(session, keys.truth("*"), DEPTH)
+        self._inboxes = [(topic, self._inbox(self._subscribe(topic), topic.message)) for topic in TOPICS]
+        self._truths = self._inbox(pubsub.subscriber(session, keys.truth("*"), DEPTH), messages.Position)
         self._truth: dict[str, deque[messages.Position]] = {}
         self._waiting: dict[str, deque[tuple[float, messages.State]]] = {}  # for truth, since when
-        self._watch = pubsub.alive_watch(session, keys.alive("*"))
+        self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self._token = pubsub.alive_token(session, keys.recorder)
 
     @property
@@ -73,15 +71,13 @@ class Recorder:
         Raises:
             RecordingError: If it cannot be written.
         """
-        for sample in network.received(self._watch.handler):
-            robot = str(sample.key_expr)
-            (self._alive.discard if sample.kind == zenoh.SampleKind.DELETE else self._alive.add)(robot)
-        for sample in network.received(self._truths.handler):
-            self._try(self._take_truth, sample)
-        for topic, subscriber in self._subscribers:
-            take = partial(self._take, topic)
-            for sample in network.received(subscriber.handler):
-                self._try(take, sample)
+        for token, there in self._watch.changes():
+            (self._alive.add if there else self._alive.discard)(token)
+        for truth in self._truths.read(_require_finite):
+            self._store_truth(truth)
+        for topic, inbox in self._inboxes:
+            for message, sample in inbox.read_samples(_require_finite if topic.finite else None):
+                self._store(topic, message, len(sample.payload))
         now = time.monotonic()
         for robot, waiting in self._waiting.items():
             truths = self._truth[robot]
@@ -106,9 +102,11 @@ class Recorder:
                 text = f"could not read {count} {'message' if count == 1 else 'messages'} on {key}: {why}"
                 self._recording.write(messages.Event(self._arrival.utc(), "unread", "recorder", text))
 
-    def _subscribe(
-        self, topic: Topic
-    ) -> zenoh.Subscriber[Handler[zenoh.Sample]] | AdvancedSubscriber[Handler[zenoh.Sample]]:
+    def _inbox(self, subscription: pubsub.Subscription, kind: type[M]) -> pubsub.Inbox[M]:
+        keys = self._keys if "robot" in kind.__struct_fields__ else None
+        return pubsub.Inbox(subscription, kind, keys=keys, on_refusal=self._note_unread)
+
+    def _subscribe(self, topic: Topic) -> pubsub.Subscription:
         key = topic.key(self._keys)
         if not topic.repeated:
             return pubsub.subscriber(self._session, key, topic.depth)
@@ -116,42 +114,28 @@ class Recorder:
             self._session, key, topic.depth, pubsub.EVENTS if topic.message is messages.Event else 1
         )
 
-    def _try(self, take: Callable[[zenoh.Sample], None], sample: zenoh.Sample) -> None:
-        """Counts a sample that is malformed, or on a key of no robot."""
-        try:
-            take(sample)
-        except ValueError as error:
-            key = str(sample.key_expr)
-            self._unread[key] = self._unread.get(key, (0, ""))[0] + 1, str(error)
+    def _note_unread(self, key: str, reason: str) -> None:
+        self._unread[key] = self._unread.get(key, (0, ""))[0] + 1, reason
 
-    def _take(self, topic: Topic, sample: zenoh.Sample) -> None:
-        payload = sample.payload.to_bytes()
-        message = messages.decode(payload, str(sample.encoding), topic.message)
-        if topic.of_robot:
-            self._own(sample, getattr(message, "robot", ""))
-        if topic.finite and not _finite(message):
-            raise messages.Malformed(f"a number on {sample.key_expr} is not finite")
+    def _store(self, topic: Topic, message: Message, size: int) -> None:
         if isinstance(message, messages.State) and message.true_position is None and message.robot in self._truth:
             self._waiting.setdefault(message.robot, deque()).append((time.monotonic(), message))
         elif topic.recorded is topic.message:
             self._recording.write(message)
         else:
-            self._recording.write(message, self._arrival.utc(), len(payload))
+            self._recording.write(message, self._arrival.utc(), size)
 
-    def _take_truth(self, sample: zenoh.Sample) -> None:
-        """A protocol twin says where its robot really is: its bridge cannot know."""
-        truth = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Position)
-        self._own(sample, truth.robot)
-        if not _finite(truth):
-            raise messages.Malformed(f"a number on {sample.key_expr} is not finite")
+    def _store_truth(self, truth: messages.Position) -> None:
+        """Stores the true pose that a protocol twin publishes: its bridge cannot know it."""
         truths = self._truth.setdefault(truth.robot, deque(maxlen=TRUTHS))
         if truths and truth.stamp <= truths[-1].stamp:
             truths.clear()  # its device was started again
         truths.append(truth)
 
-    def _own(self, sample: zenoh.Sample, robot: str) -> None:
-        if self._keys.robot(str(sample.key_expr)) != robot:
-            raise messages.Malformed(f"a message of '{robot}' on {sample.key_expr}")
+
+def _require_finite(message: msgspec.Struct) -> None:
+    if not _finite(message):
+        raise messages.Malformed("a number is not finite")
 
 
 def _finite(value: object) -> bool:

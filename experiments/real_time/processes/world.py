@@ -90,7 +90,7 @@ class WorldProcess:
         self._dt = 1.0 / experiment.rates.body_hz
         self._exchange = Exchange(experiment, population, session, endpoints)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
-        self._orders = pubsub.orders(session, self._keys.world_order)
+        self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
         self._pace = Pace()
         self.paused = False
         self._steps = 0
@@ -129,8 +129,8 @@ class WorldProcess:
 
     def _tick(self, t: float) -> None:
         changed = False
-        for query in network.received(self._orders.handler):
-            changed |= self._obey(query)
+        for query, order in self._orders.read():
+            changed |= self._obey(query, order)
         if self._lost.is_set() and self.paused:
             self.paused, changed = False, True  # who must land cannot wait
         self._exchange.listen(t)
@@ -155,16 +155,9 @@ class WorldProcess:
 
     # ------------------------------------------------------------------ orders
 
-    def _obey(self, query: zenoh.Query) -> bool:
-        """One order; it always gets a reply. Whether it changed anything."""
+    def _obey(self, query: zenoh.Query, order: messages.WorldOrder) -> bool:
+        """Carries out one order, and replies; returns whether it changed anything."""
         with query:
-            payload = query.payload.to_bytes() if query.payload is not None else b""
-            try:
-                order = messages.decode(payload, str(query.encoding or messages.JSON), messages.WorldOrder)
-            except messages.Malformed as error:
-                self._exchange.malformed += 1
-                query.reply_err(str(error).encode(), encoding="text/plain")
-                return False
             reason = ""
             try:
                 self._carry_out(order)
@@ -214,7 +207,7 @@ class WorldProcess:
             obstacles=[messages.ObstaclePose(name, pose) for name, pose in population.obstacles().items()],
             contacts=exchange.contacts,
             refused=exchange.refused,
-            malformed=exchange.malformed,
+            malformed=exchange.malformed + self._orders.malformed,
             trouble=exchange.trouble,
         )
         self._reports.put(messages.encode(state))

@@ -9,12 +9,12 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence, Set
+from functools import partial
 from math import inf
 from typing import Final
 
 import numpy as np
 import zenoh
-from zenoh.handlers import Handler
 
 from agents.arrays import Array, some
 from agents.body.interface import RangeScan, Rays
@@ -72,15 +72,22 @@ class Exchange:
         self.contacts = self.refused = self.malformed = 0
         self.trouble = ""
         self._router = network.RouterWatch(session, keys.world_alive, endpoints)
-        self._setpoints = pubsub.subscriber(session, keys.setpoint("*"), DEPTH)
-        self._statuses = pubsub.pose_subscriber(session, keys.status("*"), 1024)
+        self._setpoints = pubsub.Inbox(
+            pubsub.subscriber(session, keys.setpoint("*"), DEPTH),
+            messages.Command,
+            keys=keys,
+            on_refusal=self._count_malformed,
+        )
+        self._statuses = pubsub.Inbox(
+            pubsub.pose_subscriber(session, keys.status("*"), 1024), messages.Status, on_refusal=self._count_malformed
+        )
         self._contacts = pubsub.publisher(session, keys.contact, messages.JSON)
         self._events = pubsub.publisher(session, keys.event, messages.JSON)
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._mirrors: dict[str, tuple[int, zenoh.Subscriber[Handler[zenoh.Sample]]]] = {}
+        self._mirrors: dict[str, tuple[int, pubsub.Inbox[messages.State]]] = {}
         self._done: dict[str, int] = {}  # number of the last command that was carried out
         self._lives: dict[str, str] = {}  # session that owns the name of a robot: a new one counts its commands anew
-        self._owners = pubsub.alive_watch(session, keys.lives(keys.alive("*")))
+        self._owners = pubsub.AliveWatch(session, keys.lives(keys.alive("*")))
         self._strangers: set[str] = set()
         self._met: set[frozenset[str]] = set()
         self._started: dict[str, float] = {}
@@ -135,12 +142,9 @@ class Exchange:
         self._mirrored = mirrored
         there = {names[row]: row for row in mirrored.tolist()}
         for name in self._mirrors.keys() - there.keys():
-            self._mirrors.pop(name)[1].undeclare()  # type: ignore[no-untyped-call]
+            self._mirrors.pop(name)[1].close()
         self._mirrors = {
-            name: (
-                row,
-                self._mirrors[name][1] if name in self._mirrors else pubsub.subscriber(session, keys.state(name), 4),
-            )
+            name: (row, self._mirrors[name][1] if name in self._mirrors else self._states_of(name))
             for name, row in there.items()
         }
         self._scanned = np.full(rows, -inf)
@@ -151,7 +155,7 @@ class Exchange:
     def find(self, there: Set[str]) -> list[str]:
         """Puts carried robots of those that are on the network where they say that they are; their names."""
         waiting = {
-            name: pubsub.subscriber(self._session, self._keys.state(name), 4)
+            name: self._states_of(name)
             for name in (self._names[row] for row in self._carried.tolist())
             if name in there
         }
@@ -159,8 +163,8 @@ class Exchange:
         deadline, pause = time.monotonic() + ANSWER_S, threading.Event()
         while waiting and time.monotonic() < deadline:
             pause.wait(0.01)
-            for name, subscriber in list(waiting.items()):
-                state = self._newest(name, subscriber.handler)
+            for name, inbox in list(waiting.items()):
+                state = self._newest(inbox)
                 if state is None or state.position is None:
                     continue
                 flying = state.position[2] > IN_AIR_M and state.phase in UP
@@ -168,9 +172,9 @@ class Exchange:
                 row = self._names.index(name)
                 self._quiet[row] = CLIMB_S if flying and self._population.flies[row] else inf
                 found.append(name)
-                waiting.pop(name).undeclare()  # type: ignore[no-untyped-call]
-        for subscriber in waiting.values():
-            subscriber.undeclare()  # type: ignore[no-untyped-call]
+                waiting.pop(name).close()
+        for inbox in waiting.values():
+            inbox.close()
         return found
 
     def mirrored(self) -> list[str]:
@@ -181,27 +185,18 @@ class Exchange:
 
     def listen(self, t: float) -> None:
         """Takes in what has arrived."""
-        for sample in network.received(self._owners.handler):
-            self._own(sample)
-        for sample in network.received(self._setpoints.handler):
-            key = str(sample.key_expr)
-            row = self._row.get(key)
-            if row is None:
-                self._reject_unknown(key)
-                continue
-            try:
-                command = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Command)
-                validation.check_command(command, robot=self._names[row])
-            except messages.Malformed as error:
-                self._count_malformed(error)
-                continue
+        for token, there in self._owners.changes():
+            if there:
+                self._note_owner(token)
+        for command, sample in self._setpoints.read_samples(validation.check_command, self._known):
+            row = self._row[str(sample.key_expr)]
             if command.seq > self._done.get(command.robot, 0):
                 self._done[command.robot] = command.seq
                 self._obey(row, command, t)
         if len(self._mirrored):
             self._look_around(t)
-        for sample in network.received(self._statuses.handler):
-            self._heed(sample, t)
+        for status in self._statuses.read():
+            self._update_start(status, t)
 
     def slept(self, seconds: float, t: float) -> None:
         """The world itself stood still for so long, until `t`."""
@@ -244,20 +239,23 @@ class Exchange:
             (population.land if action == "land" else population.stop)(np.array([row]))
             self._quiet[row] = inf
 
-    def _own(self, sample: zenoh.Sample) -> None:
-        """A process owns the name of a robot: its clock, from which its numbers come, may be behind the last one's."""
-        key = str(sample.key_expr)
-        name, life = self._keys.whose(key), Keys.life_of(key)
-        if name is None or life is None or sample.kind == zenoh.SampleKind.DELETE:
+    def _note_owner(self, token: str) -> None:
+        """A new process owns the name of a robot: it numbers commands by its own clock, which may be behind."""
+        name, life = self._keys.whose(token), Keys.life_of(token)
+        if name is None or life is None:
             return
         if self._lives.get(name, life) != life:
             self._done.pop(name, None)
         self._lives[name] = life
 
+    def _known(self, key: str) -> bool:
+        """Whether a command is for a robot of this world; one that is for no robot of this system is refused."""
+        known = key in self._row
+        if not known and key not in self._elsewhere:
+            self._reject_unknown(key)
+        return known
+
     def _reject_unknown(self, key: str) -> None:
-        """A command to a robot that is not here."""
-        if key in self._elsewhere:
-            return
         try:
             name = self._keys.robot(key)
         except ValueError:
@@ -276,8 +274,8 @@ class Exchange:
     def _look_around(self, t: float) -> None:
         """Where the mirrored robots are."""
         changed = False
-        for name, (row, subscriber) in self._mirrors.items():
-            state = self._newest(name, subscriber.handler)
+        for row, inbox in self._mirrors.values():
+            state = self._newest(inbox)
             if state is not None and state.position is not None:
                 self._place[row], self._velocity[row] = state.position, state.velocity or messages.STILL
                 self._yaw[row] = state.yaw or 0.0
@@ -293,27 +291,21 @@ class Exchange:
         rows = self._mirrored
         self._population.body.mirror(rows, self._place[rows], self._yaw[rows], self._velocity[rows])
 
-    def _newest(self, name: str, handler: network.Polled[zenoh.Sample]) -> messages.State | None:
-        """The last state with a position that can be believed of those that wait."""
+    def _states_of(self, name: str) -> pubsub.Inbox[messages.State]:
+        subscriber = pubsub.subscriber(self._session, self._keys.state(name), 4)
+        return pubsub.Inbox(subscriber, messages.State, keys=self._keys, on_refusal=self._count_malformed)
+
+    def _newest(self, inbox: pubsub.Inbox[messages.State]) -> messages.State | None:
+        """The newest valid state that has a position."""
         found = None
-        for sample in network.received(handler):
-            try:
-                state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
-                validation.check_state(state, robot=name, now=self._clock.utc(), reach=self._reach)
-            except messages.Malformed as error:
-                self._count_malformed(error)
-                continue
+        check = partial(validation.check_state, now=self._clock.utc(), reach=self._reach)
+        for state in inbox.read(check):
             if state.position is not None:
                 found = state
         return found
 
-    def _heed(self, sample: zenoh.Sample, t: float) -> None:
-        """When the run began, for what moves by a plan."""
-        try:
-            status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
-        except messages.Malformed as error:
-            self._count_malformed(error)
-            return
+    def _update_start(self, status: messages.Status, t: float) -> None:
+        """Derives the start of the run from the robots' statuses, for obstacles that move by a plan."""
         if status.phase in UNDER_WAY and 0.0 < status.started < inf and status.robot in self._names:
             self._started[status.robot] = status.started
         else:
@@ -323,9 +315,9 @@ class Exchange:
             self._begun = begun
             self._population.begin(self._population.time + begun - (self.utc + t))
 
-    def _count_malformed(self, error: messages.Malformed) -> None:
+    def _count_malformed(self, _key: str, reason: str) -> None:
         self.malformed += 1
-        self.trouble = str(error)
+        self.trouble = reason
 
     # ------------------------------------------------------------------ what is said
 

@@ -1,0 +1,59 @@
+"""Typed inboxes: what is decoded, checked, counted and passed on."""
+
+from __future__ import annotations
+
+import pytest
+
+from agents.network import messages, pubsub
+from agents.network.keys import Keys
+from tests.fuzz.loopnet import Channel, Query, Sample, typed_orders
+
+KEYS = Keys("park")
+
+
+def stop(robot: str, seq: int = 1) -> bytes:
+    return messages.encode(messages.Command(robot, seq, 1.0, "stop"))
+
+
+def odd(command: messages.Command) -> None:
+    if command.seq % 2 == 0:
+        raise messages.Malformed("an even number")
+
+
+def test_an_inbox_passes_on_valid_messages_and_counts_the_others() -> None:
+    channel = Channel(KEYS.setpoint("*"))
+    refused: list[tuple[str, str]] = []
+    inbox = pubsub.Inbox(
+        channel, messages.Command, keys=KEYS, on_refusal=lambda key, reason: refused.append((key, reason))
+    )
+    assert list(inbox.read()) == []
+    for key, payload in (
+        ("park/A/setpoint", stop("A")),
+        ("park/A/setpoint", stop("B")),
+        ("park/B/setpoint", stop("B", 2)),
+        ("park/B/setpoint", b"{}"),
+        ("park/C/setpoint", b"not decoded"),
+        ("park/B/setpoint", stop("B", 3)),
+    ):
+        channel.add(Sample(key, messages.JSON, payload))
+    got = [
+        (command.robot, command.seq, str(sample.key_expr))
+        for command, sample in inbox.read_samples(odd, lambda key: key != "park/C/setpoint")
+    ]
+    assert got == [("A", 1, "park/A/setpoint"), ("B", 3, "park/B/setpoint")]
+    assert inbox.malformed == len(refused) == 3
+    assert [key for key, _ in refused] == ["park/A/setpoint", "park/B/setpoint", "park/B/setpoint"]
+    assert refused[0][1] == "command of 'B' on the key of 'A'"
+    assert refused[1][1] == "an even number"
+    assert inbox.trouble == refused[2][1]
+    assert list(inbox.read()) == []
+
+
+@pytest.mark.parametrize("payload", [b"{}", b"nonsense", b'{"order": "fly"}'])
+def test_a_malformed_order_is_answered_and_counted(payload: bytes) -> None:
+    channel = Channel(KEYS.order("A"), asked=True)
+    orders = typed_orders(channel, messages.Order)
+    channel.add(wrong := Query(KEYS.order("A"), messages.JSON, payload))
+    channel.add(right := Query(KEYS.order("A"), messages.JSON, b'{"order": "land"}'))
+    assert list(orders.read()) == [(right, messages.Order("land"))]
+    assert (wrong.answers, right.answers, orders.malformed) == (1, 0, 1)
