@@ -36,12 +36,12 @@ def test_a_position_stamped_ahead_counts_as_now_and_one_that_is_refused_is_told_
         assert np.isnan(heard.ahead).all()
         for ahead, taken in ((-0.02, [7.98]), (2.3, [8.0]), (3600.0, []), (-7.0, [1.0])):
             net.deliver(position(UTC + 8.0 + ahead))
-            assert [(row, when) for row, when, *_ in heard.take(UTC, 8.0)] == [
+            assert [(row, when) for row, when, *_ in heard.receive(UTC, 8.0)] == [
                 (1, pytest.approx(when, abs=1e-6)) for when in taken
             ]
             assert heard.ahead[1] == pytest.approx(ahead, abs=1e-6)
         net.deliver(position(UTC, robot="A"))
-        assert not list(heard.take(UTC, 8.0))
+        assert not list(heard.receive(UTC, 8.0))
         assert heard.ahead[1] == pytest.approx(-7.0, abs=1e-6), "of another robot"
         assert heard.malformed == [0, 2]
         assert heard.trouble[1] == "position of 'A' on the key of 'T'"

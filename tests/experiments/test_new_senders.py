@@ -72,9 +72,9 @@ def test_a_centre_whose_clock_is_behind_that_of_the_one_before_is_followed():
 def test_a_late_goal_does_not_bring_a_dead_centre_back():
     agent = Agent(Plan(pair(architecture="centralised")).assignment(("A",)))
     guidance, row, goal = agent.guidance, np.array([0]), np.zeros((1, 3))
-    guidance.hear(row, goal, np.zeros(1), np.array([1.0]))
+    guidance.receive(row, goal, np.zeros(1), np.array([1.0]))
     guidance.lose(2.0)
-    guidance.hear(row, goal, np.zeros(1), np.array([1.9]))
+    guidance.receive(row, goal, np.zeros(1), np.array([1.9]))
     assert guidance.lacking(2.1)[0]
-    guidance.hear(row, goal, np.zeros(1), np.array([2.2]))  # of another one, such as a tool of ROS
+    guidance.receive(row, goal, np.zeros(1), np.array([2.2]))  # of another one, such as a tool of ROS
     assert not guidance.lacking(2.3)[0]
