@@ -73,7 +73,7 @@ def test_a_late_goal_does_not_bring_a_dead_centre_back():
     agent = Agent(Plan(pair(architecture="centralised")).assignment(("A",)))
     guidance, row, goal = agent.guidance, np.array([0]), np.zeros((1, 3))
     guidance.receive(row, goal, np.zeros(1), np.array([1.0]))
-    guidance.lose(2.0)
+    guidance.mark_lost(2.0)
     guidance.receive(row, goal, np.zeros(1), np.array([1.9]))
     assert guidance.lacking(2.1)[0]
     guidance.receive(row, goal, np.zeros(1), np.array([2.2]))  # of another one, such as a tool of ROS
