@@ -22,7 +22,7 @@ from experiments.authoring.layouts import Layout, LayoutError
 from experiments.catalogue import index
 from experiments.check.ideal_run import closed
 from experiments.file import catalogue as entries
-from experiments.file.problems import DocumentError, Problem
+from experiments.file.problems import DocumentError, Problem, refusal
 
 PREFIX: Final = {"crazyflie": "CF", "tello": "DT", "khepera4": "KH", "turtlebot3": "TB"}
 LAWS: Final = ("distance", "displacement")
@@ -178,7 +178,7 @@ def command(what: str, size: str, target: str | None, wanted: Wanted, jumps: str
         text = experiment_file(made, wanted)
     except LayoutError as error:
         message, _, hint = str(error).partition(": ")
-        raise DocumentError([Problem(flag, 0, 0, message, hint)]) from None
+        raise refusal(flag, message, hint) from None
     path = entries.write_new(text, Path(target or f"{what}-{size.lower().replace('×', 'x')}.toml"))
     print(f"{path}: {made.title}, {len(made.pairs)} links; `zenpark check {path}`, `zenpark run {path} --virtual`")
     return 0

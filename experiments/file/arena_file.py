@@ -21,7 +21,7 @@ from experiments.file import structure
 from experiments.file import text as syntax
 from experiments.file.consistency import of_arena
 from experiments.file.overrides import merged
-from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places
+from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places, refusal
 from experiments.file.problems import Path as Keys
 
 LOOKED_AT: Final = 100  # files beside an experiment, for the one that was meant
@@ -106,14 +106,14 @@ def load(name: str, folder: Path) -> ArenaFile:
         file = index.FOLDER / name
     label = str(file)
     try:
-        text = syntax.decoded(syntax.content(file, label), label)
+        text = syntax.content(file, label)
     except FileNotFoundError:
         hint = did_you_mean(name, _others(folder))
         raise Misnamed(Fault(_HERE, f"there is no arena file {label}", hint or "write one beside this file")) from None
     try:
         content = syntax.parsed(text, label, json=False)
     except RecursionError:
-        raise DocumentError([Problem(label, 0, 0, "tables or lists are nested too deeply", "flatten them")]) from None
+        raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
     read = ArenaFile(name, label, text, content.get("arena", {}))
     _refuse(read, [*structure.storable(content), *_misshapen(content)])
     _refuse(read, list(of_arena(msgspec.convert(content, _Whole).arena)))

@@ -10,7 +10,7 @@ from experiments.catalogue import index
 from experiments.file import arena_file
 from experiments.file.arena_file import ArenaFile
 from experiments.file.json_schema import write_schema
-from experiments.file.problems import DocumentError, Problem
+from experiments.file.problems import DocumentError, Problem, refusal
 from experiments.file.text import reason
 
 
@@ -72,10 +72,10 @@ def write_new(text: str, target: Path, *, furnished: bool = False) -> Path:
             write_schema(target.parent / index.SCHEMA)
     except FileExistsError:
         hint = "choose another name; nothing was changed"
-        raise DocumentError([Problem(str(target), 0, 0, "exists already", hint)]) from None
+        raise refusal(str(target), "exists already", hint) from None
     except (OSError, ValueError) as error:
         hint = "choose a place that exists and may be written to"
-        raise DocumentError([Problem(str(target), 0, 0, f"cannot be written: {reason(error)}", hint)]) from error
+        raise refusal(str(target), f"cannot be written: {reason(error)}", hint) from error
     return target
 
 
@@ -91,7 +91,7 @@ def _arena_beside(text: str, folder: Path) -> ArenaFile | None:
     wanted, there = arena_file.load(name, index.FOLDER), folder / name
     if there.exists() and there.read_text("utf-8") != wanted.text:
         hint = "choose another folder, or rename that file; nothing was changed"
-        raise DocumentError([Problem(str(there), 0, 0, "is another arena than that of the entry", hint)])
+        raise refusal(str(there), "is another arena than that of the entry", hint)
     return wanted
 
 

@@ -11,7 +11,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 
@@ -20,8 +20,8 @@ from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.file import arena_file, catalogue, consistency, structure
 from experiments.file.arena_file import ArenaFile
-from experiments.file.overrides import Override, OverrideError, assign, merged, parse, used
-from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places
+from experiments.file.overrides import Override, assign, merged, parse, used
+from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places, refusal
 from experiments.file.problems import Path as Keys
 from experiments.file.text import content, decoded, parsed
 
@@ -80,7 +80,7 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
     file = catalogue.found(path)
     label = str(path) if file == Path(path) else str(file)
     try:
-        text = decoded(content(file, label), label)
+        text = content(file, label)
     except FileNotFoundError:
         raise DocumentError([catalogue.no_entry(label)]) from None
     return _document(file, label, text, overrides)
@@ -100,7 +100,7 @@ def _document(file: Path, label: str, text: str, overrides: Sequence[str]) -> Do
     try:
         return _Reading(file, label, text, is_json, parsed(text, label, json=is_json), tuple(overrides)).document()
     except RecursionError:
-        raise DocumentError([Problem(label, 0, 0, "tables or lists are nested too deeply", "flatten them")]) from None
+        raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
 
 
 def received(text: str, label: str) -> Document:
@@ -169,7 +169,7 @@ class _Reading:
         unused = set(of_all)
         for override in overrides:
             table = plain if override.case is None else _tables(plain).get(override.case, {})
-            if override not in late and self._assigned(table, override, part=override.case is not None):
+            if override not in late and assign(table, override, part=override.case is not None):
                 unused.discard(override)
         files: dict[str, ArenaFile] = {}
         base = self._furnished(plain, "", overrides, files)
@@ -179,17 +179,17 @@ class _Reading:
             mine = [*of_all, *(each for each in overrides if each.case == name)]
             for override in mine:
                 if override in above:
-                    self._assigned(own, override)
+                    assign(own, override)
             cases[name] = self._furnished(own, name, overrides, files)
             for override in mine:
-                if override not in above and self._assigned(cases[name], override):
+                if override not in above and assign(cases[name], override):
                     unused.discard(override)
         for override in late:
-            if self._assigned(base, override):
+            if assign(base, override):
                 unused.discard(override)
         if unused:
             known = [base, *cases.values()]
-            raise DocumentError([_nowhere(override, known) for override in of_all if override in unused])
+            raise DocumentError([_unused(override, known) for override in of_all if override in unused])
         return base, tables, cases, files
 
     def _furnished(
@@ -212,22 +212,15 @@ class _Reading:
         for flag in self.flags:
             try:
                 override = parse(flag, self.content)
-            except OverrideError as error:
-                problems.append(_of_flag(flag, str(error), error.hint))
+            except DocumentError as error:
+                problems += error.problems
                 continue
             overrides.append(override)
-            problems += [
-                _of_flag(flag, fault.message, fault.hint) for fault in structure.storable(override.value, override.path)
-            ]
+            for fault in structure.storable(override.value, override.path):
+                problems += override.refused(fault.message, fault.hint).problems
         if problems:
             raise DocumentError(problems)
         return overrides
-
-    def _assigned(self, document: dict[str, Any], override: Override, *, part: bool = False) -> bool:
-        try:
-            return assign(document, override, part=part)
-        except OverrideError as error:
-            raise DocumentError([_of_flag(override.flag, str(error), error.hint)]) from None
 
     def _refuse(
         self,
@@ -247,9 +240,9 @@ class _Reading:
         for override in reversed(overrides):
             whole = override.whole
             if path[: len(whole)] == whole or (override.case is None and inside[: len(whole)] == whole):
-                return _of_flag(override.flag, fault.message, fault.hint)
+                return override.refused(fault.message, fault.hint).problems[0]
             if whole[: len(path)] == path and path not in self._places:
-                return _of_flag(override.flag, fault.message, fault.hint)
+                return override.refused(fault.message, fault.hint).problems[0]
         stands, place = nearest(self._places, path)
         file = files.get("")
         if file is not None and len(nearest(file.places, path)[0]) > len(stands):
@@ -262,17 +255,13 @@ class _Reading:
         return places(self.text, json=self.is_json)
 
 
-def _of_flag(flag: str, message: str, hint: str) -> Problem:
-    return Problem(f"--set {flag}", 0, 0, message, hint)
-
-
-def _nowhere(override: Override, documents: Sequence[Mapping[str, Any]]) -> Problem:
+def _unused(override: Override, documents: Sequence[Mapping[str, Any]]) -> Problem:
     """A parameter that no trigger, law or plan of the experiment has."""
     end = next(end for end in range(1, len(override.path)) if structure.group_of(override.path[:end]))
     known = dict.fromkeys(name for document in documents for name in used(document, override.path[:end]))
     parameter = str(override.path[end])
     message = f"no {override.path[end - 1]} of this experiment has a parameter '{parameter}'"
-    return _of_flag(override.flag, message, did_you_mean(parameter, known))
+    return override.refused(message, did_you_mean(parameter, known)).problems[0]
 
 
 def _of_cases(
@@ -330,10 +319,6 @@ def chosen_case(read: Document, name: str | None) -> Experiment:
         hint = registry.did_you_mean(name, cases)
         raise DocumentError([Problem(str(read.path), 0, 0, f"no case '{name}' in this experiment", hint)])
     return cases[name]
-
-
-if TYPE_CHECKING:
-    pass
 
 
 def load(file: str | Path, *changes: str) -> Document:

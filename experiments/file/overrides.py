@@ -7,49 +7,27 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Final
 
-import msgspec
-
 from agents.plugins.registry import did_you_mean
-from experiments.definition.experiment import Experiment, Formation, World
+from experiments.definition.experiment import Experiment
 from experiments.definition.links import pairs
-from experiments.file.problems import Path
+from experiments.file.problems import DocumentError, Path, refusal
 from experiments.file.structure import group_of, parameters
-from experiments.file.text import endless
 
-DEEPEST: Final = 20  # names of a path; no value of an experiment lies deeper
 _PART: Final = re.compile(r"\s*+(?:\"([^\"]*)\"|'([^']*)'|([^.\"']++))\s*+(?:\.|$)")
 _SHAPES: Final = frozenset({"box", "radius", "wall"})
-_CHOICES: Final[Mapping[Path, type[msgspec.Struct]]] = {
-    ("trigger",): Experiment,
-    ("world", "engine"): World,
-    ("formation", "law"): Formation,
-}
-
-
-class OverrideError(ValueError):
-    """A `--set` that cannot be understood; `hint` says what to write."""
-
-    def __init__(self, message: str, hint: str) -> None:
-        super().__init__(message)
-        self.hint = hint
+_DEFAULTS: Final = Experiment(title="", robots={}, duration_s=1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Override:
-    """One `--set`.
-
-    Attributes:
-        flag: As it was written.
-        path: Into the document, or into the table of `case`.
-        value: Of the type that TOML gives it.
-        case: The only case that it is for, if it is for one.
-    """
+    """One `--set`: a path into the document, or into the table of the only `case` that it is for."""
 
     flag: str
     path: Path
-    value: Any
+    value: Any  # of the type that TOML gives it
     case: str | None
 
     @property
@@ -57,30 +35,34 @@ class Override:
         """From the top of the file."""
         return self.path if self.case is None else ("cases", self.case, *self.path)
 
+    def refused(self, message: str, hint: str) -> DocumentError:
+        return of_flag(self.flag, message, hint)
+
+
+def of_flag(flag: str, message: str, hint: str) -> DocumentError:
+    return refusal(f"--set {flag}", message, hint)
+
 
 def parse(flag: str, document: Mapping[str, Any]) -> Override:
     """`path=value`; the shell may have eaten the quotes of a key, so blanks are part of one.
 
     Raises:
-        OverrideError: If it is not of that form, or names a case that the document does not have.
+        DocumentError: If it is not of that form, or names a case that the document does not have.
     """
     key, equals, text = flag.partition("=")
     path = _path(key)
-    if len(path) > DEEPEST:
-        raise OverrideError(f"nothing lies {len(path)} tables deep", "leave out what is too much")
     if not equals or not path:
-        raise OverrideError("this is not of the form path=value", "write, for example, --set formation.gain=2.5")
+        raise of_flag(flag, "this is not of the form path=value", "write, for example, --set formation.gain=2.5")
     if not flag.isprintable():
-        raise OverrideError("this holds characters that are no text", "leave them out")
+        raise of_flag(flag, "this holds characters that are no text", "leave them out")
     case = None
     if path[0] == "cases" and len(path) > 2:
         cases = document.get("cases")
-        known = list(cases) if isinstance(cases, dict) else []
+        known = cases if isinstance(cases, dict) else {}
         case, path = str(path[1]), path[2:]
-        if not isinstance(cases, dict) or not isinstance(cases.get(case), dict):
-            raise OverrideError(
-                f"the file has no case '{case}'", did_you_mean(case, known) or "it has no [cases] at all"
-            )
+        if not isinstance(known.get(case), dict):
+            hint = did_you_mean(case, known) or "it has no [cases] at all"
+            raise of_flag(flag, f"the file has no case '{case}'", hint)
     if path[0] == "timeline" and len(path) > 1 and re.fullmatch(r"[0-9]{1,6}", str(path[1])):
         path = (path[0], int(path[1]), *path[2:])
     return Override(flag, path, _typed(text.strip()), case)
@@ -101,27 +83,26 @@ def assign(document: dict[str, Any], override: Override, *, part: bool = False) 
         Whether there was a place for it.
 
     Raises:
-        OverrideError: If the path leads nowhere.
+        DocumentError: If the path leads nowhere.
     """
     at: Any = document
     *way, last = override.path
     path: Path = ()
     for name in way:
         path = (*path, name)
-        step = _known(at, name, path, part=part)
-        inside = _as_table(at[int(step)] if isinstance(at, list) else at.get(step), path, part=part)
-        if inside is None:
-            inside = {}
+        step, below = _known(at, name, path, override, part=part), override.path[len(path)]
+        group = group_of(path)
+        inside = at[step] if isinstance(at, list) else at.get(step)
+        if inside is None and group and not part:
+            inside = _default(path)
+        inside = {} if inside is None else _as_table(inside, path)
         if not isinstance(inside, dict | list):
-            raise OverrideError(
-                f"'{step}' is no table, so it has no '{override.path[len(path)]}'", f"set {step} itself"
-            )
-        group, below = group_of(path), override.path[len(path)]
+            raise override.refused(f"'{step}' is no table, so it has no '{below}'", f"set {step} itself")
         if group and not part and isinstance(inside, dict) and below not in ("kind", *_own(inside, group)):
             return False
         at[step] = inside
         at = inside
-    last = _known(at, last, override.path, part=True)
+    last = _known(at, last, override.path, override, part=True)
     if group_of(path) and last == "kind" and at.get("kind") != override.value:
         at.clear()
     at[last] = deepcopy(override.value)
@@ -152,7 +133,7 @@ def used(document: Mapping[str, Any], path: Path) -> Iterable[str]:
     at: Any = document
     for step in path[:-1]:
         at = at.get(step, {}) if isinstance(at, dict) else at[int(step)]
-    choice = _as_table(at.get(path[-1]), path)
+    choice = _as_table(at.get(path[-1], _default(path)), path)
     group = group_of(path)
     return _own(choice, group) if group and isinstance(choice, dict) else []
 
@@ -161,37 +142,32 @@ def _own(choice: Mapping[str, Any], group: str) -> list[str]:
     return parameters(group, str(choice.get("kind")))
 
 
-def _known(at: dict[str, Any] | list[Any], step: str | int, path: Path, *, part: bool) -> str | int:
+def _known(at: Any, step: str | int, path: Path, override: Override, *, part: bool) -> Any:  # noqa: ANN401
     """The step as the document knows it.
 
     Raises:
-        OverrideError: If it leads nowhere.
+        DocumentError: If it leads nowhere.
     """
     if isinstance(at, list):
         if not re.fullmatch(r"[0-9]{1,6}", str(step)) or int(step) >= len(at):
-            raise OverrideError(f"there is no '{step}' in '{path[-2]}'", f"it is a list: 0 to {len(at) - 1}")
+            raise override.refused(f"there is no '{step}' in '{path[-2]}'", f"it is a list: 0 to {len(at) - 1}")
         return int(step)
     if path[:-1] == ("formation", "links"):
         return _same_link(str(step), at)
     if path[0] == "robots" and len(path) == 2 and not part and step not in at:
-        raise OverrideError(f"no robot is called '{step}'", did_you_mean(str(step), at))
+        raise override.refused(f"no robot is called '{step}'", did_you_mean(str(step), at))
     return str(step)
 
 
-def _default(path: Path) -> Any:  # noqa: ANN401 - whatever a document may say there
-    """What is chosen where nothing is said."""
-    struct = _CHOICES.get(path)
-    if struct is None:
-        return None
-    names = struct.__struct_fields__
-    return struct.__struct_defaults__[names.index(str(path[-1])) - len(names)]
+def _default(path: Path) -> object:
+    """The choice that holds where the file makes none; None of a plan, which has no default."""
+    return attrgetter(".".join(map(str, path)))(_DEFAULTS) if len(path) <= 2 else None
 
 
-def _as_table(value: object, path: Path, *, part: bool = False) -> object:
+def _as_table(value: object, path: Path) -> object:
     """The long form of what may be written short: a choice by its name, a link by its distance."""
-    if group_of(path):
-        value = _default(path) if value is None and not part else value
-        return {"kind": value} if isinstance(value, str) else value
+    if group_of(path) and isinstance(value, str):
+        return {"kind": value}
     if path[:-1] == ("formation", "links") and isinstance(value, int | float) and not isinstance(value, bool):
         return {"distance": value}
     return value
@@ -199,19 +175,16 @@ def _as_table(value: object, path: Path, *, part: bool = False) -> object:
 
 def _same_link(text: str, links: Mapping[str, Any]) -> str:
     """The key under which a document already has this link, or `text`."""
-    if text in links:
-        return text
+    ends = _ends(text)
+    return text if text in links or not ends else next((key for key in links if _ends(key) == ends), text)
+
+
+def _ends(link: str) -> set[tuple[str, str]]:
+    """Its pairs; none if it cannot be read, which is reported where links are checked."""
     try:
-        wanted = set(pairs(text))
+        return set(pairs(link))
     except ValueError:
-        return text
-    for key in links:
-        try:
-            if set(pairs(key)) == wanted:
-                return key
-        except ValueError:
-            continue  # it is reported where links are checked
-    return text
+        return set()
 
 
 def _path(key: str) -> Path:
@@ -229,8 +202,6 @@ def _path(key: str) -> Path:
 
 def _typed(text: str) -> object:
     """What TOML makes of a value; the bare text if it makes nothing of it."""
-    if endless(text):
-        return text
     try:
         values = tomllib.loads(f"value = {text}")
     except ValueError:

@@ -217,6 +217,11 @@ class DocumentError(ValueError):
         self.problems = list(problems)
 
 
+def refusal(file: str, message: str, hint: str = "") -> DocumentError:
+    """The error of one problem without a place in the text."""
+    return DocumentError([Problem(file, 0, 0, message, hint)])
+
+
 def at_offset(file: str, text: str, offset: int, message: str, hint: str = "") -> Problem:
     """A problem at an offset into the text."""
     line, column = line_column(text, offset)

@@ -18,7 +18,7 @@ import msgspec
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
-from experiments.file.problems import DocumentError, Fault, Path, Problem, shown
+from experiments.file.problems import DocumentError, Fault, Path, Problem, refusal, shown
 
 LARGEST: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
 _REMEDY: Final = {  # of what is missing
@@ -303,9 +303,9 @@ def table(flag: str, text: str, struct: type[msgspec.Struct] | None = None, path
         value = msgspec.json.decode(text)
     except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
         why = str(error).removeprefix("JSON is malformed: ")
-        raise DocumentError([Problem(place, 0, 0, f"is not JSON: {why}", OBJECT)]) from None
+        raise refusal(place, f"is not JSON: {why}", OBJECT) from None
     if not isinstance(value, dict):
-        raise DocumentError([Problem(place, 0, 0, "is no JSON object", OBJECT)])
+        raise refusal(place, "is no JSON object", OBJECT)
     found = [] if struct is None else faults(value, struct, path)
     if found:
         raise DocumentError([Problem(place, 0, 0, fault.message, fault.hint) for fault in found])

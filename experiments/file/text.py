@@ -9,11 +9,12 @@ from typing import Any, Final
 
 import msgspec
 
-from experiments.file.problems import DocumentError, Problem, at_offset
+from experiments.file.problems import DocumentError, Problem, at_offset, refusal
 
 LARGEST: Final = 4_000_000  # bytes; a hundred robots take ten thousand
-DEEPEST: Final = 50  # parts of a dotted key
-_PART: Final = re.compile(r"""["']?[\w-]+["']?""")
+BEGIN: Final = "zenpark new copies an experiment to begin with"
+# For a key of 20,000 parts `tomllib` takes 10 s, for one of 200,000 more memory than a machine has.
+_ENDLESS: Final = re.compile(r"""(?<![\w-])(?:["']?[\w-]++["']?[ \t]*+\.[ \t]*+){50}""")
 _AT: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _REMEDIES: Final = (
     ("Invalid value", 'text stands in quotes, as in kind = "crazyflie"; numbers have a point, not a comma'),
@@ -29,12 +30,12 @@ _REMEDIES: Final = (
 )
 
 
-def content(file: Path, label: str) -> bytes:
-    """The bytes of a file.
+def content(file: Path, label: str) -> str:
+    """The text of a file, with plain line ends.
 
     Raises:
         FileNotFoundError: If there is none.
-        DocumentError: If it is a folder, cannot be read, or is too long to be what it should be.
+        DocumentError: If it is a folder, cannot be read, is too long, or is no text.
     """
     try:
         with file.open("rb") as stream:
@@ -44,29 +45,27 @@ def content(file: Path, label: str) -> bytes:
     except IsADirectoryError:
         toml = sorted(each.name for each in file.glob("*.toml"))[:5]
         hint = f"name a file in it: {', '.join(toml)}" if toml else "name an experiment file"
-        raise DocumentError([Problem(label, 0, 0, "is a folder", hint)]) from None
+        raise refusal(label, "is a folder", hint) from None
     except (OSError, ValueError) as error:
-        hint = "check the name and who may read it"
-        raise DocumentError([Problem(label, 0, 0, f"cannot be read: {reason(error)}", hint)]) from error
+        raise refusal(label, f"cannot be read: {reason(error)}", "check the name and who may read it") from error
     if len(found) > LARGEST:
-        hint = "name the experiment file, not a recording"
-        raise DocumentError([Problem(label, 0, 0, f"is longer than {LARGEST // 1_000_000} MB", hint)])
-    return found
+        raise refusal(label, f"is longer than {LARGEST // 1_000_000} MB", "name the experiment file, not a recording")
+    return decoded(found, label)
 
 
 def reason(error: OSError | ValueError) -> str:
-    """What the system says is the matter."""
+    """The system's own words for an error."""
     return str(error.strerror) if isinstance(error, OSError) and error.strerror else str(error)
 
 
 def decoded(content: bytes, label: str) -> str:
-    """The text of a file, with plain line ends.
+    """Text, with plain line ends.
 
     Raises:
         DocumentError: If it is binary, empty or not UTF-8.
     """
     if b"\0" in content:
-        raise DocumentError([Problem(label, 0, 0, "is binary, no text", "name an experiment file (.toml or .json)")])
+        raise refusal(label, "is binary, no text", "name an experiment file (.toml or .json)")
     try:
         text = content.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
@@ -75,7 +74,7 @@ def decoded(content: bytes, label: str) -> str:
         found = at_offset(label, readable, readable.index("\ufffd"), message, "save the file as UTF-8")
         raise DocumentError([found]) from None
     if not text.strip():
-        raise DocumentError([Problem(label, 0, 0, "is empty", "zenpark new copies an experiment to begin with")])
+        raise refusal(label, "is empty", BEGIN)
     return text
 
 
@@ -86,31 +85,17 @@ def parsed(text: str, label: str, *, json: bool) -> dict[str, Any]:
         DocumentError: If it is not well-formed.
         RecursionError: If it is nested too deeply.
     """
-    return _json(text, label) if json else _toml(text, label)
-
-
-def _toml(text: str, label: str) -> dict[str, Any]:
-    if endless(text):
-        hint = "no value of an experiment lies so deep; leave out what is too much"
-        raise DocumentError([Problem(label, 0, 0, f"a key has more than {DEEPEST} parts", hint)])
+    if json:
+        return _json(text, label)
+    if _ENDLESS.search(text):
+        raise refusal(label, "a key has more than 50 parts", "no value of an experiment lies so deep; shorten it")
     try:
         document = tomllib.loads(text)
     except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits
         raise DocumentError([_toml_problem(text, label, str(error))]) from None
     if not document:
-        hint = "zenpark new copies an experiment to begin with"
-        raise DocumentError([Problem(label, 0, 0, "holds nothing but comments", hint)])
+        raise refusal(label, "holds nothing but comments", BEGIN)
     return document
-
-
-def endless(text: str) -> bool:
-    """Whether a TOML text holds a key of very many parts, for which `tomllib` takes seconds and gigabytes."""
-    run = 0
-    for part in text.split("."):
-        run = run + 1 if _PART.fullmatch(part.strip(" \t")) else 0
-        if run > DEEPEST:
-            return True
-    return False
 
 
 def _toml_problem(text: str, label: str, message: str) -> Problem:
@@ -118,50 +103,45 @@ def _toml_problem(text: str, label: str, message: str) -> Problem:
     if match is None:
         return Problem(label, 0, 0, f"is no TOML: {message}", "give a smaller number")
     lines = text.split("\n")
-    if match[1]:
-        line, column = int(match[1]), int(match[2])
-    else:
-        line = len(text.rstrip().split("\n"))
-        column = len(lines[line - 1].rstrip()) + 1
-    message = message[: match.start()]
-    if message.startswith("Cannot"):  # tomllib points behind the statement
-        return _twice(label, lines, line)
-    hint = next((remedy for beginning, remedy in _REMEDIES if message.startswith(beginning)), "")
-    return Problem(label, line, column, message, hint, lines[line - 1])
-
-
-def _twice(label: str, lines: list[str], line: int) -> Problem:
-    """The same table or key a second time: by far the most usual when robots are copied."""
+    line = int(match[1] or len(text.rstrip().split("\n")))
     source = lines[line - 1]
-    header = source.lstrip().startswith("[")
-    word = source.split("#")[0].strip() if header else source.partition("=")[0].strip()
-    first = None
+    column = int(match[2] or len(source.rstrip()) + 1)
+    message = message[: match.start()]
+    if message.startswith("Cannot"):  # a second time the same table or key; tomllib points behind it
+        word, first = _twice(lines, line)
+        message = f"{word} stands here a second time{f', first in line {first}' if first else ''}"
+        column = len(source) - len(source.lstrip()) + 1
+        return Problem(label, line, column, message, "rename or remove one of the two", source)
+    hint = next((remedy for beginning, remedy in _REMEDIES if message.startswith(beginning)), "")
+    return Problem(label, line, column, message, hint, source)
+
+
+def _twice(lines: list[str], line: int) -> tuple[str, int | None]:
+    """The header or key of a line, and the line above that has it too; a key is looked for in its own table."""
+    word = _word(lines[line - 1])
     for number in range(line - 1, 0, -1):
-        above = lines[number - 1].strip()
-        if (above.split("#")[0].strip() if header else above.partition("=")[0].strip()) == word:
-            first = number
+        above = _word(lines[number - 1])
+        if above == word:
+            return word, number
+        if above.startswith("[") and not word.startswith("["):
             break
-        if not header and above.startswith("["):
-            break
-    place = f", first in line {first}" if first else ""
-    column = len(source) - len(source.lstrip()) + 1
-    return Problem(
-        label, line, column, f"{word} stands here a second time{place}", "rename or remove one of the two", source
-    )
+    return word, None
+
+
+def _word(line: str) -> str:
+    return line.partition("#" if line.lstrip().startswith("[") else "=")[0].strip()
 
 
 def _json(text: str, label: str) -> dict[str, Any]:
     try:
         document = msgspec.json.decode(text)
     except msgspec.DecodeError as error:  # a ValidationError, for numbers out of range, is one of these
-        message = str(error)
-        match = re.search(r" \(byte (\d+)\)$", message)
-        end = len(text.rstrip().encode())
-        offset = len(text.encode()[: int(match[1]) if match else end].decode(errors="ignore"))
+        message, _, place = str(error).partition(" (byte ")
+        offset = int(place.rstrip(")") or len(text.rstrip().encode()))
         hint = "the file was cut short" if "truncated" in message else "write experiments by hand in TOML"
-        found = at_offset(label, text, offset, message[: match.start()] if match else message, hint)
-        raise DocumentError([found]) from None
+        at = len(text.encode()[:offset].decode(errors="ignore"))
+        raise DocumentError([at_offset(label, text, at, message, hint)]) from None
     if not isinstance(document, dict):
         message = "is JSON, but no experiment: its top must be a table { ... }"
-        raise DocumentError([Problem(label, 0, 0, message, "name a file that zenpark wrote")])
+        raise refusal(label, message, "name a file that zenpark wrote")
     return document

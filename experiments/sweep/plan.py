@@ -25,7 +25,7 @@ from agents.plugins.registry import TRIGGERS
 from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.file.document import Document, chosen
-from experiments.file.overrides import OverrideError, parse
+from experiments.file.overrides import parse
 from experiments.file.problems import DocumentError, Path, Problem
 from experiments.file.structure import group_of
 from experiments.sweep.runs import digest
@@ -278,8 +278,9 @@ def _parsed(axis: Axis, value: str, read: Document) -> _Parsed:
     """Path, value and case of an axis at a value."""
     try:
         override = parse(f"{axis.path}={value}", {"cases": read.experiment.cases})
-    except OverrideError as error:
-        raise wrong(axis.argument, str(error), error.hint.replace("--set ", "")) from None
+    except DocumentError as error:
+        (problem,) = error.problems
+        raise wrong(axis.argument, problem.message, problem.hint.replace("--set ", "")) from None
     return override.path, override.value, override.case
 
 

@@ -25,8 +25,8 @@ from experiments.authoring.robotic_park.yaml_reader import Tree
 from experiments.catalogue import index
 from experiments.file import catalogue as entries
 from experiments.file import document
-from experiments.file.problems import DocumentError, Problem
-from experiments.file.text import content, decoded
+from experiments.file.problems import refusal
+from experiments.file.text import content
 
 RATE_HZ: Final = 100.0  # of bodies: their position controllers run at that
 ROOM: Final = 0.6  # [m] around starts and shape
@@ -51,10 +51,10 @@ def command(file: str, target: str | None, duration_s: float, poses: str | None 
     """
     source = Path(file)
     try:
-        text = decoded(content(source, file), file)
+        text = content(source, file)
     except FileNotFoundError:
         hint = "name an experiment file of Robotic Park's authors (.yaml)"
-        raise DocumentError([Problem(file, 0, 0, "there is no such file", hint)]) from None
+        raise refusal(file, "there is no such file", hint) from None
     made, notes = imported(text, file, duration_s, poses)
     path = entries.write_new(made, Path(target) if target else Path(f"{source.stem}.toml"))
     document.read(path)

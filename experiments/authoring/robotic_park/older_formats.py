@@ -34,8 +34,8 @@ from experiments.authoring.robotic_park.file import (
     relations,
 )
 from experiments.authoring.robotic_park.yaml_reader import Item, Tree
-from experiments.file.problems import DocumentError, Problem
-from experiments.file.text import content, decoded
+from experiments.file.problems import DocumentError, Problem, refusal
+from experiments.file.text import content
 
 KNOWN: Final = ("config_path", "communication", "task", "agent_ip", "control_mode")  # a table with one is a robot
 GAIN: Final = 0.25
@@ -116,7 +116,7 @@ def _listed(tree: Tree, entry: Item, folder: Path) -> Listed:
     name = tree.words(where)
     file = folder / name
     try:
-        own = Tree(str(file), decoded(content(file, str(file)), str(file)))
+        own = Tree(str(file), content(file, str(file)))
     except OSError:
         tree.fault(where, f"there is no file '{name}' beside this one", "put the files of its robots beside the index")
         return Listed(tree, entry, tree, entry)
@@ -219,15 +219,15 @@ def starts_from(file: str) -> dict[str, Pose]:
         DocumentError: If the file cannot be read, or tells no start.
     """
     try:
-        text = decoded(content(Path(file), file), file)
+        text = content(Path(file), file)
     except FileNotFoundError:
         hint = "name an index of robots (.yaml), a Webots world (.wbt) or a table of name, x, y"
-        raise DocumentError([Problem(file, 0, 0, "there is no such file", hint)]) from None
+        raise refusal(file, "there is no such file", hint) from None
     kind = Path(file).suffix.lower()
     read = {".wbt": _world, ".yaml": _index, ".yml": _index}.get(kind, _table)
     found = read(file, text)
     if not found:
-        raise DocumentError([Problem(file, 0, 0, "tells the start of no robot", "a line of a table: dron01 0.5 -0.2")])
+        raise refusal(file, "tells the start of no robot", "a line of a table: dron01 0.5 -0.2")
     return found
 
 
@@ -298,5 +298,5 @@ def _numbers(file: str, words: list[str]) -> list[float]:
         found = []
     if len(found) < 3 or not all(map(math.isfinite, found)):
         hint = "name another file with --poses"
-        raise DocumentError([Problem(file, 0, 0, f"cannot be read near '{' '.join(words)}'", hint)])
+        raise refusal(file, f"cannot be read near '{' '.join(words)}'", hint)
     return [*found, 0.0][:4]
