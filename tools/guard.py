@@ -68,7 +68,7 @@ def main() -> None:
         sys.exit(2)
     try:
         _lean(sys.argv[1:])
-        from tools.cli.main import main as command_line  # noqa: PLC0415 (not before the check)
+        from tools.main import main as command_line  # noqa: PLC0415 (not before the check)
 
         command_line()
     except KeyboardInterrupt:

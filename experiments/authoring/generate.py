@@ -161,8 +161,8 @@ def experiment_file(made: Layout, wanted: Wanted) -> str:
     )
 
 
-def command(what: str, size: str, target: str | None, wanted: Wanted, jumps: str = "1,2") -> int:
-    """`zenpark new --WHAT SIZE [TARGET]`; returns the exit code.
+def generate(what: str, size: str, target: str | None, wanted: Wanted, jumps: str = "1,2") -> tuple[Path, Layout]:
+    """Write the experiment file of a formation; return its path and its layout.
 
     Raises:
         DocumentError: If there is no such formation, or the file cannot be written.
@@ -180,8 +180,7 @@ def command(what: str, size: str, target: str | None, wanted: Wanted, jumps: str
         message, _, hint = str(error).partition(": ")
         raise refusal(flag, message, hint) from None
     path = entries.write_new(text, Path(target or f"{what}-{size.lower().replace('×', 'x')}.toml"))
-    print(f"{path}: {made.title}, {len(made.pairs)} links; `zenpark check {path}`, `zenpark run {path} --virtual`")
-    return 0
+    return path, made
 
 
 def _rates(count: int) -> tuple[str, ...]:

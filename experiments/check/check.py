@@ -6,10 +6,6 @@ That a file can be read at all is for `experiments.file.document` to say; here t
 
 from __future__ import annotations
 
-import json
-import shutil
-import sys
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -21,23 +17,21 @@ from agents.network.messages import MAX_PAYLOAD
 from experiments.check import motion, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse, link_errors
-from experiments.check.findings import FORGIVEN, Claim, Severity, few, listed
+from experiments.check.findings import FORGIVEN, Claim, Severity, few
 from experiments.check.ideal_run import Prediction, message_rate, predict, undisturbed
 from experiments.definition import bodies, standby
 from experiments.definition.experiment import Channel, Experiment, Network
 from experiments.definition.plan import Plan
-from experiments.file import document
 from experiments.file.document import Document
 from experiments.file.overrides import parse
-from experiments.file.problems import DocumentError, Path, Problem, line_column, nearest, places
+from experiments.file.problems import Path, Problem, line_column, nearest, places
 from experiments.file.text import parsed
 
 NOT_RANDOM: Final = "not-random"
 HEARD_BYTES: Final = 200  # of one heard pose in telemetry
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
-ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}
-WIDEST: Final = 110  # columns of print
+ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 
 
 @dataclass(frozen=True)
@@ -178,37 +172,22 @@ def check(given: Document, settings: Sequence[str] = ()) -> list[Finding]:
     return _findings(given, settings, _analyses(given.cases()))
 
 
+def examine(given: Document, settings: Sequence[str] = ()) -> tuple[list[Finding], dict[str, Figures]]:
+    """Findings of all cases, as `check`, and the figures of each case by its name."""
+    analyses = _analyses(given.cases())
+    figures_of = {name: _figures(analysis) for name, analysis in analyses.items()}
+    return _findings(given, settings, analyses), figures_of
+
+
+def unreadable(problem: Problem) -> Finding:
+    """A problem of the file as a finding."""
+    where = f"{problem.file}:{problem.line}:{problem.column}" if problem.line else problem.file
+    return Finding("error", "document", problem.message, problem.hint, where)
+
+
 def figures(experiment: Experiment) -> Figures:
     """The numbers of one case."""
     return _figures(_analyses({"": experiment})[""])
-
-
-def command(file: str, *, settings: Sequence[str], as_json: bool) -> int:
-    """`zenpark check`; returns the exit code: 0, or 2 if there is an error.
-
-    Raises:
-        DocumentError: If the file cannot be read and `as_json` is false; the command line prints it.
-    """
-    try:
-        given = document.read(file, settings)
-    except DocumentError as error:
-        if not as_json:
-            raise
-        _print_json(file, [_unreadable(each) for each in error.problems], {})
-        return 2
-    analyses = _analyses(given.cases())
-    found = _findings(given, settings, analyses)
-    numbers = {name: _figures(analysis) for name, analysis in analyses.items()}
-    if as_json:
-        _print_json(str(given.path), found, numbers)
-    else:
-        _print_table(given, found, numbers)
-    return 2 if any(each.severity == "error" for each in found) else 0
-
-
-def _unreadable(problem: Problem) -> Finding:
-    where = f"{problem.file}:{problem.line}:{problem.column}" if problem.line else problem.file
-    return Finding("error", "document", problem.message, problem.hint, where)
 
 
 @QUIET
@@ -306,79 +285,6 @@ class _Index:
 def _finite(value: float) -> float | None:
     """JSON has no infinity."""
     return value if np.isfinite(value) else None
-
-
-def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
-    ok = all(each.severity != "error" for each in found)
-    said = msgspec.to_builtins({"file": file, "ok": ok, "findings": found, "figures": numbers})
-    print(json.dumps(said, indent=2))
-
-
-def _print_table(given: Document, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
-    width = min(WIDEST, shutil.get_terminal_size((WIDEST, 24)).columns)
-    lines = [f"{given.path}: {given.experiment.title}", ""]
-    for each in found:
-        lines += textwrap.wrap(each.message, width, initial_indent=f"{MARK[each.severity]} ", subsequent_indent="  ")
-        if each.severity != "note":
-            remedy = f"{each.where}: {each.remedy}" if each.where else each.remedy
-            lines += textwrap.wrap(
-                remedy, width, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False
-            )
-    lines += ["", *_rows(numbers), ""]
-    count = {severity: sum(each.severity == severity for each in found) for severity in ORDER}
-    lines.append(f"{_counted(count['error'], 'error')}, {_counted(count['warning'], 'warning')}")
-    encoding = sys.stdout.encoding or "utf-8"  # a terminal may know neither ticks nor Greek
-    print("\n".join(lines).encode(encoding, "replace").decode(encoding))
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count or 'no'} {what}{'s' * (count != 1)}"
-
-
-def _rows(numbers: Mapping[str, Figures]) -> list[str]:
-    """One line for each figure; where the cases differ, each with its name."""
-    said = {name: _worded(each) for name, each in numbers.items()}
-    lines = []
-    for label in next(iter(said.values())):
-        values = {name: words[label] for name, words in said.items()}
-        same = len(set(values.values())) == 1
-        shown = next(iter(values.values())) if same else ", ".join(f"{name} {word}" for name, word in values.items())
-        lines.append(f"  {label:<36}{shown}")
-    return lines
-
-
-def _worded(of: Figures) -> dict[str, str]:
-    """Figures as they are printed."""
-
-    def number(value: float | None, form: str, unit: str = "") -> str:
-        return "-" if value is None else f"{value:{form}}{unit}"
-
-    return {
-        "robots": f"{of.robots}, leader: {', '.join(of.leaders) or 'none'}",
-        "arena": f"{' × '.join(f'{length:g}' for length in of.arena)} m",
-        "obstacles": listed([f"{name} ({what})" for name, what in of.obstacles.items()]) or "none",
-        "links": f"{of.links} one-way, {of.edges} pairs",
-        "algebraic connectivity": number(of.algebraic_connectivity, ".3f"),
-        "rigidity rank, heights held": f"{number(of.rank, 'd')} of {number(of.rank_needed, 'd')}",
-        "rigidity rank in space": f"{number(of.rank_space, 'd')} of {number(of.rank_space_needed, 'd')}",
-        "smallest rigidity eigenvalue": number(of.smallest_eigenvalue, ".2g", " m²"),
-        "single links it can lose": _spared(of.spare_links, len(of.vital_links)),
-        "single robots it can lose": _spared(of.spare_robots, len(of.vital_robots)),
-        "distances met to": number(of.residual_mm, ".1f", " mm"),
-        "loop gain h·μ·λ, hunts at 2": number(of.loop_gain, ".3g"),
-        "slowest mode": number(of.slowest_mode_s, ".1f", " s")
-        + (f", {of.free_modes} slower than the run: free" if of.free_modes else ""),
-        "speed of the fastest plan": number(of.speed_needed, ".3f", " m/s"),
-        "speed of the slowest follower": number(of.speed_available, ".3f", " m/s"),
-        "formation acquired after": number(of.acquired_s, ".1f", " s"),
-        "worst link at the end": number(of.end_error_mm, ".1f", " mm"),
-        "all end inside the arena": "yes" if of.end_inside else "no",
-        "poses sent, estimated": number(of.messages_hz, ".1f", " per second"),
-    }
-
-
-def _spared(spare: int | None, vital: int) -> str:
-    return "-" if spare is None else f"{spare} of {spare + vital}"
 
 
 @QUIET

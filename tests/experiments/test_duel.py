@@ -6,7 +6,6 @@ import pytest
 
 from experiments.check.check import check
 from experiments.file.document import load, read
-from experiments.real_time.conductor.conduct import RunOptions
 from experiments.report import page
 from experiments.run import simulate
 from tools.commands import run as commands
@@ -46,8 +45,7 @@ def file(tmp_path):
 
 def test_it_runs_and_reports_without_links(file, tmp_path, capsys):
     assert commands.run(
-        str(file), RunOptions(), virtual=True, out=str(tmp_path / "run"), seed=None, settings=[], as_json=False,
-        seeds=1,        anyway=False, report=True, open_report=False,
+        str(file), virtual=True, out=str(tmp_path / "run")
     ) == 0  # fmt: skip
     said = capsys.readouterr().out
     assert "no link was measured" in said

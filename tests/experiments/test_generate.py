@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.authoring.generate import Wanted, command, experiment_file, layout
+from experiments.authoring.generate import Wanted, experiment_file, generate, layout
 from experiments.authoring.layouts import LayoutError
 from experiments.check.check import check, figures
 from experiments.definition import bodies
@@ -132,14 +132,14 @@ def test_what_cannot_be_had(what, size, wanted, said):
         experiment_file(layout(what, size, chosen), chosen)
 
 
-def test_the_command_writes_a_file_and_never_over_another(tmp_path, capsys):
+def test_the_command_writes_a_file_and_never_over_another(tmp_path):
     target = tmp_path / "nine.toml"
-    assert command("polygon", "9", str(target), Wanted()) == 0
-    assert "18 links" in capsys.readouterr().out
+    path, made = generate("polygon", "9", str(target), Wanted())
+    assert (path, len(made.pairs)) == (target, 18)
     assert (tmp_path / "zenpark.schema.json").exists()
     with pytest.raises(DocumentError, match="exists already"):
-        command("polygon", "9", str(target), Wanted())
+        generate("polygon", "9", str(target), Wanted())
     with pytest.raises(DocumentError, match="--jumps 1;2"):
-        command("circulant", "9", str(tmp_path / "other.toml"), Wanted(), "1;2")
+        generate("circulant", "9", str(tmp_path / "other.toml"), Wanted(), "1;2")
     with pytest.raises(DocumentError, match="cannot be written"):
-        command("polygon", "9", str(tmp_path / "no" / "where.toml"), Wanted())
+        generate("polygon", "9", str(tmp_path / "no" / "where.toml"), Wanted())

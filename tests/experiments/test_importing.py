@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.authoring.robotic_park.convert import command, imported
+from experiments.authoring.robotic_park.convert import convert, imported
 from experiments.authoring.robotic_park.older_formats import starts_from
 from experiments.check.check import check, figures
 from experiments.definition.plan import Plan
@@ -319,20 +319,19 @@ def test_a_table_within_itself_ends():
         imported("Robots: &r\n  Robot01: *r\n", "park.yaml", 20.0)
 
 
-def test_the_command(tmp_path, capsys):
+def test_the_command(tmp_path):
     source = tmp_path / "five.yaml"
     source.write_text(FILES[5]())
-    assert command(str(source), str(tmp_path / "five.toml"), 20.0) == 0
-    said = capsys.readouterr().out
-    assert "Not carried over" in said
-    assert "  - Operation: the simulator" in said
+    path, notes = convert(str(source), str(tmp_path / "five.toml"), 20.0)
+    assert path == tmp_path / "five.toml"
+    assert [note.partition(":")[0] for note in notes] == ["Operation"]
     with pytest.raises(DocumentError, match="exists already"):
-        command(str(source), str(tmp_path / "five.toml"), 20.0)
+        convert(str(source), str(tmp_path / "five.toml"), 20.0)
     with pytest.raises(DocumentError, match="no such file"):
-        command(str(tmp_path / "six.yaml"), None, 20.0)
+        convert(str(tmp_path / "six.yaml"), None, 20.0)
     source.write_bytes(b"\0\0")
     with pytest.raises(DocumentError, match="binary"):
-        command(str(source), None, 20.0)
+        convert(str(source), None, 20.0)
 
 
 FLAT = """{name}:

@@ -88,7 +88,7 @@ def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
     write(path, *whole_run())
     target = tmp_path / "whole.mcap"
     assert recover(path, target) == Recovered(60, ("TB01", "CF01"), complete=True)
-    assert commands.recover(str(path), None) == 0
+    commands.recover(str(path), None)
     assert capsys.readouterr().out == f"{path} is whole already: 60 messages of TB01, CF01\n"
     assert sorted(tmp_path.iterdir()) == [path]
 
@@ -96,7 +96,7 @@ def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
 def test_the_command_writes_beside_the_source(path, capsys):
     write(path, *whole_run())
     path.write_bytes(path.read_bytes()[:-1])
-    assert commands.recover(str(path), None) == 0
+    commands.recover(str(path), None)
     target = path.with_name("run-recovered.mcap")
     assert capsys.readouterr().out == f"{target}: 60 messages of TB01, CF01\n"
     assert read(target).complete

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from experiments.check.check import check, command, figures
+from experiments.check.check import check, figures
 from experiments.file.document import read
+from tools.commands import check as commands
 
 pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
 
@@ -164,7 +165,7 @@ def test_the_summary_names_the_obstacles(tmp_path, capsys):
     crate = "[arena.obstacles.crate]\nradius = 0.1\nat = [1.0, 1.0]\nmass = 2.0\n"
     fence = "[arena.obstacles.fence]\nwall = [[1.0, 0.0], [1.0, 1.0]]\nbottom = 1.0\n"
     file.write_text(HEAD + cart + crate + fence + ROBOTS)
-    assert command(str(file), settings=(), as_json=False) == 0
+    assert commands.check(str(file)) == 0
     printed = capsys.readouterr().out
     assert "cart (box 0.2 × 0.3 m, moves), crate (cylinder of radius 0.1 m, 2 kg), fence (wall, 1 m above" in printed
     assert "4 × 4 × 2.5 m" in printed

@@ -18,7 +18,7 @@ from experiments.sweep.pareto import curves, front, pareto
 from experiments.sweep.runs import Stuck
 from experiments.sweep.sweep import side_by_side, sweep
 from experiments.sweep.workers import Processes, SweepError, Work, workers
-from tools.commands.sweep import Request, command
+from tools.commands import sweep as commands
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -203,13 +203,12 @@ def test_a_figure_of_nothing_but_the_reference(done):
     pareto(done.rows[:1]).canvas.draw()
 
 
-def asked(folder, *given, **more):
-    plain = {"cases": [], "scheduler": None, "processes": 1, "optimize": None, "as_json": False, "anyway": False}
-    return Request("triangle", given, SHORT, out=str(folder), report=True, open_report=False, **{**plain, **more})
+def typed(folder, *given, **more):
+    return commands.sweep("triangle", given, settings=SHORT, out=str(folder), processes=1, **more)
 
 
 def test_the_command_writes_table_figures_and_page(done, capsys):
-    assert command(asked(done.folder, AXIS, "seeds=3")) == 0
+    assert typed(done.folder, AXIS, "seeds=3") == 0
     said = capsys.readouterr().out
     assert "event     threshold=0.02" in said
     assert (done.folder / "sweep.csv").read_text().startswith("case,trigger.threshold,reference,seeds,failed,f_hz,")
@@ -222,7 +221,7 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
     assert {file.name for file in (done.folder / "figures").iterdir()} == {
         f"pareto_{index}.{kind}" for index in ("iae", "itae") for kind in ("svg", "pdf")
     }
-    assert command(asked(done.folder, AXIS, "seeds=3", as_json=True)) == 0
+    assert typed(done.folder, AXIS, "seeds=3", as_json=True) == 0
     assert json.loads(capsys.readouterr().out)["cells"] == table["cells"]
 
 

@@ -6,7 +6,7 @@ from experiments.file.problems import DocumentError
 from experiments.metrics.statistics import Spread
 from experiments.sweep.optimise import BROKEN, Limit, Wish, searched, tune, wish_of
 from experiments.sweep.table import MEANS, RATIOS, Row
-from tools.commands.sweep import Request, command
+from tools.commands import sweep as commands
 
 SHORT = ["duration_s=4.0"]
 
@@ -86,10 +86,8 @@ def test_the_search_finds_the_fewest_messages_within_the_limit(tuned):
 @pytest.mark.nightly
 def test_the_command_tells_on_which_seeds(tuned, capsys):
     found, given, options = tuned
-    request = Request(
-        "triangle", given, SHORT, [], str(options["out"]), None, 1, "messages, iae<=1.02", False, False, True, False
-    )
-    assert command(request) == 0
+    wish, folder = "messages, iae<=1.02", str(options["out"])
+    assert commands.sweep("triangle", given, settings=SHORT, out=folder, processes=1, optimize=wish) == 0
     said = capsys.readouterr().out
     assert said.startswith("tuned on seeds 101 to 118, reported on seeds 1 to 6\n")
     assert f"{found.rows[1].label}: keeps IAE ratio <= 1.02" in said

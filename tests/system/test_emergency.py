@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from agents.network import endpoints
 from agents.runtime import run_registry
 from experiments.recording import playback
 from tests.system.lab import ENVIRONMENT, ROOT, Flight
@@ -51,10 +52,10 @@ def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
     )
     up = [[flight.endpoint()], [other.endpoint()]]
     assert [run.endpoints for run in run_registry.runs()] == up
-    monkeypatch.setattr(estop_command, "DEFAULT_ENDPOINT", flight.endpoint())  # whoever else uses this machine
-    assert estop_command.runs(as_json=True) == 0
+    monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", flight.endpoint())  # whoever else uses this machine
+    assert estop_command.runs(as_json=True) is None
     assert [run["robots"] for run in json.loads(capsys.readouterr().out)] == [{"CF01": "", "KH01": ""}] * 2
-    assert estop_command.command(connect=[], realm=None, reason="person in arena", who=None) == 0
+    assert estop_command.estop(reason="person in arena") == 0
     assert capsys.readouterr().out.splitlines() == [
         f"stopped: CF01, KH01 (two that stay together, {each.folder}, at {endpoint})"
         for each, (endpoint,) in zip((flight, other), up, strict=True)

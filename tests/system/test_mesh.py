@@ -74,7 +74,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
         assert all(not watcher.status[name].missing for name in begun if "CF02" not in hears[name])
     finally:
         watcher.close()
-    assert estop.command(connect=endpoints, realm="park", reason="a test", who="operator") == 0
+    assert estop.estop(connect=endpoints, realm="park", reason="a test", identity="operator") == 0
     assert capsys.readouterr().out == f"stopped: {', '.join(sorted(begun))}\n"
     flight.finish()
     run = reopen(flight.folder)

@@ -28,7 +28,7 @@ from experiments.run import reopen
 from tests.system import zenohd
 from tests.system.lab import Flight, assert_held_in_time, typed, until
 from tests.system.test_transports import SHORT, found
-from tools.commands import router
+from tools.commands.processes import of_zenohd
 
 pytestmark = pytest.mark.system
 Router = Callable[[Path], AbstractContextManager[None]]
@@ -93,7 +93,7 @@ def test_an_experiment_at_a_router_of_somebody_else(tmp_path: Path, start: Route
         (endpoint,) = lab.secured([plain], folder)
         options = ("--lab", str(folder))
     file = tmp_path / "zenohd.json5"
-    file.write_text(json.dumps(router.of_zenohd([endpoint], rights=rights)))
+    file.write_text(json.dumps(of_zenohd([endpoint], rights=rights)))
     with start(file):
         flight = Flight(tmp_path / "run", "triangle", *SHORT, *options, "--set", f'network.connect=["{plain}"]')
         code, _ = flight.finish()

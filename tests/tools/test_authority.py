@@ -8,8 +8,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from typer.testing import CliRunner
 
 from agents.network.lab import LabError, files, register
-from tools.cli.main import app
 from tools.commands import authority
+from tools.main import app
 
 ROBOTS = {"router": "router", "operator": "operator", "CF01": "robot", "CF02": "robot"}
 

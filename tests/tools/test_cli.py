@@ -9,7 +9,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from agents.network.endpoints import free_endpoint
-from tools.cli.main import EXPLAINED, app
+from tools.main import EXPLAINED, app
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = sorted(typer.main.get_command(app).commands)

@@ -58,7 +58,7 @@ def test_imports_nothing_of_ours_and_nothing_heavy():
         check=True,
     )
     loaded = set(done.stdout.split())
-    assert not loaded & {"agents", "bridges", "twins", "experiments", "tools.cli.main", "typer", "numpy", "zenoh"}
+    assert not loaded & {"agents", "bridges", "twins", "experiments", "tools.main", "typer", "numpy", "zenoh"}
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_what_a_run_starts_on_its_hosts_needs_no_typer(words, code):
     assert done.returncode == code, done.stderr[-500:]
     loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "experiments.real_time.hosts.station" in loaded or "experiments.real_time.processes.robot" in loaded
-    assert not loaded & {"typer", "pydantic", "tools.cli.main"}
+    assert not loaded & {"typer", "pydantic", "tools.main"}
 
 
 def test_a_robot_loads_no_openssl():

@@ -10,7 +10,7 @@ from experiments.definition.experiment import Host
 from experiments.real_time.hosts.hosts import HostError
 from tests.tools.test_hosts import FAKE
 from tools.commands import authority
-from tools.commands.host_files import send
+from tools.commands.hosts import send
 
 
 @pytest.fixture

@@ -15,8 +15,7 @@ from experiments.real_time.hosts import hosts
 from experiments.recording import playback, version
 from tests.system.lab import ROOT, Flight
 from tools.commands import hosts as tool
-from tools.commands.host_files import packed
-from tools.commands.hosts import HEADING, Row, choose, table
+from tools.commands.hosts import HEADING, Row, choose, packed, table
 
 FAKE = """\
 #!{python}
@@ -70,12 +69,12 @@ def test_check_makes_a_row_of_each(home, tmp_path, capsys):
         lab2={"address": "nobody", "robots": ["KH01"]},
         lab3={"robots": ["KH02"]},
     )
-    assert tool.check(file, settings=[], only=["radio"]) == 0
+    assert tool.check(file, on=["radio"]) == 0
     row = capsys.readouterr().out.splitlines()[1]
     assert row.startswith("lab1")
     assert row.count("✓") == 6
     assert version.digest()[:8] in row
-    assert tool.check(file, settings=[], only=[]) == 1
+    assert tool.check(file) == 1
     out, errors = capsys.readouterr()
     rows = {line.split()[0]: line for line in out.splitlines()[1:]}
     assert "✗" in rows["lab2"]
@@ -175,13 +174,13 @@ def test_install_puts_this_one_there_once(home, tmp_path, capsys, bootstrap):
     (home / "zenpark" / "agents").mkdir()
     (home / "zenpark" / "agents" / "removed.py").touch()
     prepared(home, bootstrap)
-    assert tool.install(file, settings=[], only=[]) == 0
+    assert tool.install(file) == 0
     out = capsys.readouterr().out
     assert f"({version.digest()[:8]}) installed" in out
     assert command.read_bytes() == (ROOT / "zenpark").read_bytes()
     assert not (home / "zenpark" / "agents" / "removed.py").exists()
     assert not (home / "zenpark" / ".incoming").exists()
-    assert tool.install(file, settings=[], only=[]) == 0
+    assert tool.install(file) == 0
     assert f"lab1: has it already ({version.digest()[:8]})" in capsys.readouterr().out
 
 
@@ -198,7 +197,7 @@ def test_install_leaves_alone_what_is_not_its_own(home, tmp_path, capsys, there,
         place.touch()
     address = "lab1" if there is not None else "nobody"
     file = experiment(tmp_path, lab1={"address": address, "robots": ["CF01"]})
-    assert tool.install(file, settings=[], only=[]) == 1
+    assert tool.install(file) == 1
     assert message in capsys.readouterr().err
     assert Path(home / "zenpark" / "zenpark").read_text().startswith("#!/bin/sh")
 

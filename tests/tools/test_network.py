@@ -140,10 +140,9 @@ def test_echo_prints_the_last_pose_and_then_what_comes(router):
 
 
 @pytest.mark.system
-def test_echo_ends_after_its_time(router):
-    lines = []
-    echo("park/**", [router.endpoint], seconds=0.1, out=lines.append)
-    assert lines == []
+def test_echo_ends_after_its_time(router, capsys):
+    echo("park/**", connect=[router.endpoint], seconds=0.1)
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.mechanism("echo: Ctrl-C")

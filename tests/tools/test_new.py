@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from tests.experiments.robotic_park_files import dome
-from tools.cli.main import app
+from tools.main import app
 
 
 def typed(tmp_path, monkeypatch, *words):

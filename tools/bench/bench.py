@@ -1,4 +1,4 @@
-"""What this machine can do: each figure with a ratio to a baseline that was measured in the same run.
+"""`zenpark bench`: speed of this machine; each figure with a ratio to a baseline that was measured in the same run.
 
 Machines are noisy and differ: a figure alone says little. CPU times are medians; the unit of work is a loop of small
 numpy operations, the kind of work that a tick is made of.
@@ -6,25 +6,26 @@ numpy operations, the kind of work that a tick is made of.
 
 from __future__ import annotations
 
-import json
-import statistics
-import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Annotated, Final
 
-import msgspec
+import typer
 
-from tools.bench import intruders, process, reactions, worlds
-from tools.bench.bench_figure import REPEATS, Figure, cpu
+from tools.commands.options import AsJson
+
+if TYPE_CHECKING:
+    from tools.bench.bench_figure import Figure
+
+
+app: Final = typer.Typer()
 
 
 def unit_of_work() -> float:
     """CPU time [s] of 10,000 small numpy operations: the yardstick."""
-    import numpy as np  # noqa: PLC0415
+    import numpy as np
 
     a, b = np.ones((7, 3)), np.full((7, 3), 0.5)
     begin = time.process_time()
@@ -35,8 +36,11 @@ def unit_of_work() -> float:
 
 def virtual() -> Iterator[Figure]:
     """The reference experiment in virtual time, with and without a recording."""
-    from experiments.file.document import load  # noqa: PLC0415
-    from experiments.run import simulate, simulate_seeds  # noqa: PLC0415
+    import tempfile
+
+    from experiments.file.document import load
+    from experiments.run import simulate, simulate_seeds
+    from tools.bench.bench_figure import Figure, cpu
 
     read = load("robotic-park")
     span = read.experiment.duration_s
@@ -60,7 +64,8 @@ def virtual() -> Iterator[Figure]:
 
 def codec() -> Iterator[Figure]:
     """A pose on the wire."""
-    from agents.network import messages  # noqa: PLC0415
+    from agents.network import messages
+    from tools.bench.bench_figure import Figure, cpu
 
     count = 20_000
     pose = messages.pose("CF01", 123456, 1.7e9 + 0.123456, [0.123456, -0.5, 0.8], [0.01, 0.02, 0.0], 0.1)
@@ -84,6 +89,10 @@ def codec() -> Iterator[Figure]:
 
 def start() -> Iterator[Figure]:
     """How long a command takes to answer."""
+    import statistics
+    import subprocess
+
+    from tools.bench.bench_figure import REPEATS, Figure
 
     def wall(*arguments: str) -> float:
         taken = []
@@ -99,27 +108,28 @@ def start() -> Iterator[Figure]:
     yield Figure("start", "zenpark --help", answer, "ms", answer / bare, "× bare python")
 
 
-BENCHMARKS: Final[dict[str, Callable[[], Iterator[Figure]]]] = {
-    "start": start,
-    "codec": codec,
-    "virtual": virtual,
-    "process": process.process,
-    "world": worlds.world,
-    "encounters": worlds.encounters,
-    "safety": reactions.safety,
-    "intruders": intruders.intruders,
-}
+@app.command()
+def bench(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME...]", help="start, codec, virtual, process, world, encounters, safety or intruders."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Measure what this machine can do, each figure beside a baseline."""
+    import json
 
+    import msgspec
 
-def command(names: Sequence[str], *, as_json: bool) -> int:
-    """`zenpark bench`: all benchmarks, or those named."""
-    unknown = [name for name in names if name not in BENCHMARKS]
-    if unknown:
-        print(f"zenpark: no benchmark '{unknown[0]}'; there are: {', '.join(BENCHMARKS)}", file=sys.stderr)
+    benchmarks = _benchmarks()
+    if unknown := [name for name in names or () if name not in benchmarks]:
+        print(f"zenpark: no benchmark '{unknown[0]}'; there are: {', '.join(benchmarks)}", file=sys.stderr)
         return 2
     figures = []
-    for name in names or BENCHMARKS:
-        for figure in BENCHMARKS[name]():
+    for name in names or benchmarks:
+        for figure in benchmarks[name]():
             figures.append(figure)
             if not as_json:
                 value = f"{figure.name:<50} {figure.value:10.3g} {figure.unit:<12}"
@@ -130,3 +140,19 @@ def command(names: Sequence[str], *, as_json: bool) -> int:
     if as_json:
         print(json.dumps(msgspec.to_builtins(figures)))
     return 0
+
+
+def _benchmarks() -> dict[str, Callable[[], Iterator[Figure]]]:
+    """All benchmarks by name, in the order in which they are made."""
+    from tools.bench import intruders, process, reactions, worlds
+
+    return {
+        "start": start,
+        "codec": codec,
+        "virtual": virtual,
+        "process": process.process,
+        "world": worlds.world,
+        "encounters": worlds.encounters,
+        "safety": reactions.safety,
+        "intruders": intruders.intruders,
+    }

@@ -1,1 +1,1 @@
-"""What commands do and print."""
+"""Commands, one file per subject: signatures and what they do. Imports everything below tools when a command runs."""

@@ -1,32 +1,30 @@
-"""The machines of an experiment: can each of them take part, and has it the zenpark that is here."""
+"""`zenpark hosts`: check whether the other machines of an experiment can take part, and install this zenpark there."""
 
 from __future__ import annotations
 
+import io
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import TYPE_CHECKING, Annotated, Final
 
-from msgspec.structs import replace
+import typer
 
-from agents.network.endpoints import Endpoint, free_endpoint
-from experiments.definition import endpoints
-from experiments.definition.experiment import Experiment, Host
-from experiments.file import document
-from experiments.file.document import Document
-from experiments.file.problems import DocumentError, Problem
-from experiments.real_time.conductor.conduct import enforced
-from experiments.real_time.conductor.support import start_router
-from experiments.real_time.hosts import certificates
-from experiments.real_time.hosts.hosts import HostError, Station
-from experiments.real_time.hosts.launcher import Launcher
-from experiments.real_time.hosts.station import Found, Question
-from experiments.recording import version
-from tools.commands.host_files import deliver, packed, send
+from tools.commands.options import File, Lab, Settings
+
+if TYPE_CHECKING:
+    from experiments.definition.experiment import Experiment, Host
+    from experiments.file.document import Document
+    from experiments.real_time.hosts.hosts import HostError, Station
+    from experiments.real_time.hosts.station import Found
+
+app: Final = typer.Typer(help="Other machines of an experiment.", no_args_is_help=True, rich_markup_mode=None)
+On = Annotated[
+    list[str] | None, typer.Option(metavar="HOST|TAG", help="Only this host, or those with this tag; may be repeated.")
+]
 
 YES, NO, DOUBTFUL, NOTHING = "✓", "✗", "!", "–"
 HEADING: Final = ("host", "reachable", "zenpark", "Python", "clock", "devices", "router")
@@ -38,7 +36,7 @@ INSTALL_S: Final = 900.0
 FILES: Final = ("zenpark", "pyproject.toml", "README.md", "LICENSE")
 
 # $0 is the folder, the rest is what to put there; a checkout or a folder of something else is not ours to change
-PUT: Final = """set -eu
+PUT_ZENPARK: Final = """set -eu
 folder=$0
 if [ -e "$folder/.git" ]; then
     echo "$folder is a git checkout: bring it up to date with git, there" >&2; exit 3
@@ -73,11 +71,15 @@ class Row:
         return not any(cell.startswith(NO) for cell in self.cells)
 
 
-def check(file: str, *, settings: Sequence[str], only: Sequence[str], lab: str | None = None) -> int:
-    """`zenpark hosts check`: a table; returns 1 if something stands in the way of a run, else 0."""
-    read = document.read(file, settings)
+@app.command()
+def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None) -> int:
+    """Say whether each host can take part: version, clock, devices, certificates, router."""
+    from experiments.definition import endpoints
+    from experiments.file import document
+
+    read = document.read(file, settings or [])
     experiment = read.experiment
-    chosen = choose(experiment.hosts, only)
+    chosen = choose(experiment.hosts, on or [])
     heading = HEADING if endpoints.folder(experiment, read.path, lab) is None else SECURED
     rows = [looked_at(name, experiment, heading) for name, host in chosen.items() if host.address is None]
     with stations(read, {name: host for name, host in chosen.items() if host.address is not None}, lab) as found:
@@ -90,15 +92,19 @@ def check(file: str, *, settings: Sequence[str], only: Sequence[str], lab: str |
     return 0 if all(row.well for row in rows) else 1
 
 
-def install(file: str, *, settings: Sequence[str], only: Sequence[str], lab: str | None = None) -> int:
-    """`zenpark hosts install`: puts this zenpark on every host that has another or none; returns 1 if one fails.
+@app.command()
+def install(file: File, settings: Settings = None, on: On = None, lab: Lab = None) -> int:
+    """Put this zenpark on every host that has another or none, and in a lab the certificates of its robots."""
+    from experiments.definition import endpoints
+    from experiments.file import document
+    from experiments.real_time.hosts import certificates
+    from experiments.real_time.hosts.hosts import HostError
+    from experiments.recording import version
 
-    In a lab, puts the certificates of its robots there as well, wherever they are not what counts.
-    """
-    read = document.read(file, settings)
+    read = document.read(file, settings or [])
     experiment = read.experiment
     folder = endpoints.folder(experiment, read.path, lab)
-    chosen = {name: host for name, host in choose(experiment.hosts, only).items() if host.address is not None}
+    chosen = {name: host for name, host in choose(experiment.hosts, on or []).items() if host.address is not None}
     code = 0
     with stations(read, chosen, lab, routed=False) as found:
         for (name, host), there in zip(chosen.items(), found, strict=True):
@@ -122,6 +128,8 @@ def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:
     Raises:
         DocumentError: If there is none, or a name means none.
     """
+    from experiments.file.problems import DocumentError, Problem
+
     known = {*hosts, *(tag for host in hosts.values() for tag in host.tags)}
     for name in only:
         if name not in known:
@@ -135,6 +143,8 @@ def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:
 
 def _trusted(there: Station, folder: Path, robots: Sequence[str]) -> bool:
     """Whether a host holds the certificates of its robots, and no others."""
+    from experiments.real_time.hosts import certificates
+
     holds = there.holds(robots)
     return not (holds.others or [*certificates.faults(holds, folder, time.time()), *certificates.ended(folder, robots)])
 
@@ -148,6 +158,15 @@ def stations(
     Raises:
         LabError: If a certificate is missing here.
     """
+    import tempfile
+
+    from agents.network.endpoints import free_endpoint
+    from experiments.definition import endpoints
+    from experiments.real_time.conductor.conduct import enforced
+    from experiments.real_time.conductor.support import start_router
+    from experiments.real_time.hosts.hosts import HostError, Station
+    from experiments.real_time.hosts.launcher import Launcher
+
     experiment = read.experiment
     with tempfile.TemporaryDirectory() as folder, Launcher(Path(folder)) as launcher:
         network, own = experiment.network, []
@@ -185,6 +204,8 @@ def looked_at(name: str, experiment: Experiment, heading: Sequence[str] = HEADIN
 
 def _row(there: Station | HostError, experiment: Experiment, heading: Sequence[str]) -> Row:
     """Everything about one host."""
+    from experiments.real_time.hosts.hosts import HostError
+
     if isinstance(there, HostError):
         name = str(there).partition(":")[0]
         return Row([name, NO, *[NOTHING] * (len(heading) - 2)], [str(there)])
@@ -198,6 +219,12 @@ def _row(there: Station | HostError, experiment: Experiment, heading: Sequence[s
 
 
 def _fill(row: Row, there: Station, experiment: Experiment) -> None:
+    from msgspec.structs import replace
+
+    from experiments.real_time.hosts import certificates
+    from experiments.real_time.hosts.station import Question
+    from experiments.recording import version
+
     here = version.digest()[: version.SHOWN]
     row.cells.append(f"{YES} {there.hello.machine}")
     if there.same_version:
@@ -239,6 +266,8 @@ def _fill(row: Row, there: Station, experiment: Experiment) -> None:
 
 def _mended(there: Station, router: Found, experiment: Experiment) -> str:
     """What to do about a router that a host does not reach."""
+    from agents.network.endpoints import Endpoint
+
     if "refuses the certificate" in router.text and Endpoint.parse(router.what).is_loopback:
         return f"ssh carries it, so look at the certificates: `zenpark keys show {there.lab}`"
     if experiment.network.connect is not None:
@@ -250,6 +279,8 @@ def _mended(there: Station, router: Found, experiment: Experiment) -> str:
 
 def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -> bool:
     """Adds what a host holds of the lab's certificates to its row; whether its robots would be let in."""
+    from experiments.real_time.hosts import certificates
+
     wrong = there.distrusted(there.host.robots)
     holds = there.holds(robots)
     strays = [f"{there.name}: {each}" for each in certificates.strays(holds, there.name)]
@@ -277,6 +308,9 @@ def put(name: str, host: Host) -> str:
     Raises:
         HostError: If there is no place for it, or it cannot be made ready there.
     """
+    from experiments.real_time.hosts.hosts import HostError
+    from experiments.recording import version
+
     place = PurePosixPath(host.zenpark.removeprefix("~/"))
     if place.name != "zenpark" or place.parent in (PurePosixPath(), PurePosixPath("/")):
         raise HostError(f"{name}: '{host.zenpark}' names no folder of its own; write zenpark = \"zenpark/zenpark\"")
@@ -287,7 +321,7 @@ def put(name: str, host: Host) -> str:
     said = deliver(
         name,
         host,
-        PUT,
+        PUT_ZENPARK,
         [place.parent, *names],
         packed(version.ROOT, names),
         limit_s=INSTALL_S,
@@ -295,3 +329,144 @@ def put(name: str, host: Host) -> str:
         failed="not installed",
     )
     return f"{said.strip()} ({version.digest()[: version.SHOWN]}) installed"
+
+
+def deliver(
+    name: str, host: Host, script: str, words: Sequence[object], cargo: bytes, *, limit_s: float, late: str, failed: str
+) -> str:
+    """Lets a script unpack something on a host; returns what it said.
+
+    Args:
+        name: Of the host.
+        host: Has an address.
+        script: For the plain shell there, which finds the cargo on its standard input.
+        words: Of the script, from $0 on.
+        cargo: A compressed tar.
+        limit_s: It must be over within this [s].
+        late: What to say if it is not.
+        failed: What to say before the reason if it cannot be done.
+
+    Raises:
+        HostError: If it was not done.
+    """
+    import subprocess
+
+    from experiments.real_time.hosts import ssh
+    from experiments.real_time.hosts.hosts import HostError
+
+    assert host.address is not None
+    try:
+        done = subprocess.run(
+            ssh.script(host.address, script, list(map(str, words))),
+            input=cargo,
+            capture_output=True,
+            check=False,
+            timeout=limit_s,
+        )
+    except subprocess.TimeoutExpired:
+        raise HostError(f"{name}: {late}") from None
+    said = done.stderr.decode(errors="replace").strip()
+    if done.returncode == ssh.BROKEN:
+        raise HostError(f"{name}: {ssh.explained(host.address, host.zenpark, said)}")
+    if done.returncode != 0:
+        raise HostError(f"{name}: {failed}: {said or 'it said nothing'}")
+    return done.stdout.decode(errors="replace")
+
+
+def packed(root: Path, names: Sequence[str], mode: int | None = None) -> bytes:
+    """What stands at a place, as a compressed tar that names nobody here; nothing that was made there by running it.
+
+    Args:
+        root: The place.
+        names: Of files and folders there.
+        mode: Of all files; None: as they have it.
+    """
+    import tarfile
+
+    sink = io.BytesIO()
+
+    def kept(member: tarfile.TarInfo) -> tarfile.TarInfo | None:
+        member.uid = member.gid = 0
+        member.uname = member.gname = ""
+        member.mode = member.mode if mode is None else mode
+        return None if "__pycache__" in PurePosixPath(member.name).parts else member
+
+    with tarfile.open(fileobj=sink, mode="w:gz", compresslevel=6) as tar:
+        for name in names:
+            tar.add(root / name, name, filter=kept)
+    return sink.getvalue()
+
+
+SEND_S: Final = 60.0
+
+# $0 is the folder, the rest is what it is to hold; a lab's own folder or one of something else is not ours to change
+PUT_CERTIFICATES: Final = """set -eu
+umask 077
+folder=$0
+if [ -e "$folder" ]; then
+    for each in $(ls -A "$folder"); do
+        case $each in
+            ca.key) echo "$folder is the lab's own folder: say in the file where certificates may go, such as \\
+lab = \\"zenpark-lab\\"" >&2; exit 3;;
+            *.pem|*.key|.incoming) ;;
+            *) echo "$folder holds something else ($each): say in the file where certificates may go, such as \\
+lab = \\"zenpark-lab\\"" >&2; exit 3;;
+        esac
+    done
+fi
+mkdir -p "$folder"
+chmod 700 "$folder"
+rm -rf "$folder/.incoming"
+mkdir "$folder/.incoming"
+tar -xzf - -C "$folder/.incoming"
+cd "$folder"
+for each in *.pem *.key; do
+    if [ -e "$each" ] && [ ! -e ".incoming/$each" ]; then
+        rm -f "$each"
+        echo "$each"
+    fi
+done
+for each in "$@"; do
+    mv ".incoming/$each" "$each"
+done
+rmdir .incoming
+"""
+
+
+def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
+    """Puts the certificates of some robots on a host, in place of what its folder held; returns what was done.
+
+    Args:
+        name: Of the host.
+        host: Has an address.
+        folder: Of the lab, here.
+        robots: Whose; nobody else's stay there.
+
+    Raises:
+        HostError: If some cannot be sent, or there is no place for them.
+        LabError: If the register of the lab cannot be read.
+    """
+    from agents.network.lab import AUTHORITY
+    from experiments.real_time.hosts import certificates
+    from experiments.real_time.hosts.hosts import HostError
+
+    if trouble := list(certificates.ended(folder, robots)):
+        raise HostError("\n".join(f"{name}: {each}" for each in trouble))
+    place = PurePosixPath(host.lab.removeprefix("~/"))
+    if place in (PurePosixPath(), PurePosixPath("/")) or ".." in place.parts:
+        raise HostError(f"{name}: '{host.lab}' names no folder of its own; write lab = \"zenpark-lab\"")
+    # the key before its certificate: who reads them in between finds that they do not fit, and tries again
+    files = [f"{AUTHORITY}.pem", *(f"{robot}.{end}" for robot in robots for end in ("key", "pem"))]
+    said = deliver(
+        name,
+        host,
+        PUT_CERTIFICATES,
+        [place, *files],
+        packed(folder, files, mode=0o600),
+        limit_s=SEND_S,
+        late=f"has not taken its certificates in {SEND_S:g} s; is it overloaded?",
+        failed="certificates not put there",
+    )
+    removed = said.split()
+    more = f"; removed {', '.join(removed)}" if removed else ""
+    return f"certificates of {', '.join(robots)} put into {place}{more}"

@@ -1,48 +1,42 @@
-"""Looking at the network: who is there (`keys`), what is said (`echo`), how often (`hz`)."""
+"""Commands that look at the network: members and their keys (`keys`), samples (`echo`), their rates (`hz`)."""
 
 from __future__ import annotations
 
-import json
 import math
-import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Annotated, Final
 
-import msgspec
-import zenoh
+import typer
 
-from agents.network.endpoints import DEFAULT_ENDPOINT
-from agents.network.messages import JSON, MSGPACK
-from agents.network.pubsub import pose_subscriber, subscriber
-from agents.network.session import open_session, received
+from tools.commands.options import As, Connect, KeyExpression, Lab, Seconds, routers
+
+if TYPE_CHECKING:
+    import zenoh
+
+app: Final = typer.Typer()
 
 WAIT_S: Final = 1.0  # for a router that is on this machine or not at all
 POLL_S: Final = 0.02
+WINDOW_S: Final = 1.0
 DEPTH: Final = 8192  # samples between two polls
-
-Printer = Callable[[str], None]
-
-
-def at_once(line: str) -> None:
-    """Prints a line without delay, into a pipe too."""
-    print(line, flush=True)
 
 
 class KeyExpressionError(ValueError):
     """Not a key expression of Zenoh."""
 
 
-class Member(msgspec.Struct):
+@dataclass
+class Member:
     """A session on the network: its name, its Zenoh id, and the keys that it holds."""
 
     name: str
     id: str
-    alive: list[str] = []
-    publishers: list[str] = []
-    subscribers: list[str] = []
-    queryables: list[str] = []
+    alive: list[str] = field(default_factory=list)
+    publishers: list[str] = field(default_factory=list)
+    subscribers: list[str] = field(default_factory=list)
+    queryables: list[str] = field(default_factory=list)
 
 
 _KINDS: Final = {"token": "alive", "publisher": "publishers", "subscriber": "subscribers", "queryable": "queryables"}
@@ -54,6 +48,8 @@ def key_expression(text: str) -> str:
     Raises:
         KeyExpressionError: If not, saying why.
     """
+    import zenoh
+
     try:
         return str(zenoh.KeyExpr(text))
     except zenoh.ZError as error:
@@ -109,6 +105,10 @@ def printable(text: str) -> str:
 
 def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[tuple[str, object]]:
     """Keys and JSON values in the admin space."""
+    import msgspec
+
+    from agents.network.messages import JSON
+
     for reply in session.get(selector, timeout=timeout_s):
         sample = reply.ok
         if sample is not None and str(sample.encoding) == JSON:
@@ -118,21 +118,24 @@ def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[
                 continue  # somebody else's idea of JSON
 
 
-def keys(
-    connect: Sequence[str] = (), *, as_json: bool = False, out: Printer = at_once, identity: str = "observer"
-) -> None:
-    """Prints who is on the network now.
+def print_members(connect: Sequence[str], *, as_json: bool, identity: str) -> None:
+    """Print the members of the network and the keys that they hold.
 
     Raises:
         Unreachable: If no router answers.
     """
+    import msgspec
+
+    from agents.network.endpoints import DEFAULT_ENDPOINT
+    from agents.network.session import open_session
+
     with open_session(connect or [DEFAULT_ENDPOINT], name="zenpark keys", wait_s=WAIT_S, identity=identity) as session:
         found = members(session)
     if as_json:
-        out(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
+        print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
         return
     for member in found:
-        out(f"{printable(member.name)}  ({member.id})")
+        print(f"{printable(member.name)}  ({member.id})")
         for title, held in (
             ("alive", member.alive),
             ("publishes", member.publishers),
@@ -140,7 +143,7 @@ def keys(
             ("listens to", member.subscribers),
         ):
             for place, key in enumerate(held):
-                out(f"  {'' if place else title:10}  {printable(key)}")
+                print(f"  {'' if place else title:10}  {printable(key)}")
 
 
 def readable(payload: bytes, mime: str) -> str:
@@ -148,6 +151,12 @@ def readable(payload: bytes, mime: str) -> str:
 
     Everything is decoded and encoded again, so that nothing in it can steer the terminal.
     """
+    import json
+
+    import msgspec
+
+    from agents.network.messages import JSON, MSGPACK
+
     try:
         if mime.startswith(MSGPACK):
             value = msgspec.msgpack.decode(payload)
@@ -160,48 +169,43 @@ def readable(payload: bytes, mime: str) -> str:
         return f"<{len(payload)} bytes, {printable(mime)}>"
 
 
+@app.command()
 def echo(
-    key: str,
-    connect: Sequence[str] = (),
+    key: KeyExpression,
     *,
-    count: int | None = None,
-    seconds: float | None = None,
-    out: Printer = at_once,
-    identity: str = "observer",
+    connect: Connect = None,
+    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after so many samples.")] = None,
+    seconds: Seconds = None,
+    lab: Lab = None,
+    identity: As = "observer",
 ) -> None:
-    """Prints `key payload` for each sample, the last value of every pose first.
+    """Print the samples of a key, the last poses first."""
+    import zenoh
 
-    Args:
-        key: Key expression.
-        connect: Routers.
-        count: How many samples [no end].
-        seconds: How long [s, no end].
-        out: Prints a line.
-        identity: Whose certificate is shown to the routers of a lab.
+    from agents.network.endpoints import DEFAULT_ENDPOINT
+    from agents.network.pubsub import pose_subscriber
+    from agents.network.session import open_session, received
 
-    Raises:
-        KeyExpressionError: If `key` is none.
-        Unreachable: If no router answers.
-    """
+    endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
     expression = key_expression(key)
     deadline = math.inf if seconds is None else time.monotonic() + seconds
     left = math.inf if count is None else count
     with (
-        open_session(connect or [DEFAULT_ENDPOINT], name="zenpark echo", wait_s=WAIT_S, identity=identity) as session,
+        open_session(endpoints, name="zenpark echo", wait_s=WAIT_S, identity=identity) as session,
         pose_subscriber(session, expression, DEPTH) as samples,
     ):
         while left > 0 and time.monotonic() < deadline:
             for sample in received(samples.handler):
                 deleted = sample.kind == zenoh.SampleKind.DELETE
                 text = "(deleted)" if deleted else readable(sample.payload.to_bytes(), str(sample.encoding))
-                out(f"{printable(str(sample.key_expr))} {text}")
+                print(f"{printable(str(sample.key_expr))} {text}", flush=True)
                 left -= 1
                 if left <= 0:
                     return
             time.sleep(POLL_S)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Rate:
     """How often a key was heard in a window: [1/s], [bytes/s], and its intervals [s] (NaN when there are none)."""
 
@@ -241,6 +245,8 @@ class Cadence:
 
     def window(self, length_s: float) -> list[Rate]:
         """The rates of the window of this length that ends now, by key; the next window begins."""
+        import statistics
+
         rates = []
         for key in sorted(self._last):
             gaps, sizes = self._intervals[key], self._sizes[key]
@@ -259,40 +265,38 @@ class Cadence:
         return rates
 
 
+@app.command()
 def hz(
-    key: str,
-    connect: Sequence[str] = (),
-    *,
-    seconds: float | None = None,
-    window_s: float = 1.0,
-    out: Printer = at_once,
-    identity: str = "observer",
+    key: KeyExpression,
+    connect: Connect = None,
+    seconds: Seconds = None,
+    lab: Lab = None,
+    identity: As = "observer",
 ) -> None:
-    """Prints rate, bytes and intervals of each key, window by window.
+    """Print the rate, bytes and intervals of each key, second by second."""
+    from agents.network.endpoints import DEFAULT_ENDPOINT
+    from agents.network.pubsub import subscriber
+    from agents.network.session import open_session, received
 
-    Intervals are those between the stamps that the router gives, which this process cannot delay.
-
-    Raises:
-        KeyExpressionError: If `key` is none.
-        Unreachable: If no router answers.
-    """
+    endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
     expression = key_expression(key)
     cadence = Cadence()
     with (
-        open_session(connect or [DEFAULT_ENDPOINT], name="zenpark hz", wait_s=WAIT_S, identity=identity) as session,
+        open_session(endpoints, name="zenpark hz", wait_s=WAIT_S, identity=identity) as session,
         subscriber(session, expression, DEPTH) as samples,
     ):
-        out(HEADING)
+        print(HEADING, flush=True)
         began = printed = time.monotonic()
         end = math.inf if seconds is None else began + seconds
         while printed < end:
             now = time.monotonic()
             for sample in received(samples.handler):
                 stamp = sample.timestamp
+                # the router's stamp, which this process cannot delay
                 at = now if stamp is None else stamp.get_time_as_ntp64().as_nanos() / 1e9
                 cadence.add(str(sample.key_expr), at, len(sample.payload))
-            if now - printed >= window_s or now >= end:
+            if now - printed >= WINDOW_S or now >= end:
                 for rate in cadence.window(now - printed):
-                    out(printable(str(rate)))
+                    print(printable(str(rate)), flush=True)
                 printed = now
             time.sleep(POLL_S)

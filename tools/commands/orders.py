@@ -1,54 +1,123 @@
-"""`zenpark world-order`: tells a running world what to do, by hand."""
+"""Orders to robots that were started by hand, to the robots of a run (`zenpark robot`) and to its world."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
-from typing import get_args
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Final, get_args
 
-from agents.network import messages
-from agents.network import session as network
-from agents.network.endpoints import DEFAULT_ENDPOINT
-from agents.network.keys import Keys
-from agents.plugins.registry import did_you_mean
-from experiments.file import structure
-from experiments.real_time.conductor import orders
-from tools.commands.network import printable
-from twins.scene import Obstacle
+import typer
 
-KINDS = ("pause", "resume", "step", "reset", "spawn", "remove")
+from tools.commands.options import As, Connect, Lab, Realm, routers
+
+if TYPE_CHECKING:
+    import zenoh
+
+    from agents.network import messages
+
+app: Final = typer.Typer()
+robot_app: Final = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False, no_args_is_help=True)
+
+Place = tuple[float, float]
+Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Robots of the run.")]
+
+WORLD_ORDERS: Final = ("pause", "resume", "step", "reset", "spawn", "remove")
+CHANGES: Final[Mapping[messages.ChangeKind, str]] = {
+    "pause": "Let robots hold where they are; the others go on.",
+    "resume": "Let robots go on that were paused.",
+    "remove": "Land robots and end their processes; the others go on without them.",
+    "restart": "Start robots again, whether they fly, were removed or crashed; they join the run under way.",
+    "add": "Let robots join that are on standby, were missing at the start, or were started by hand.",
+}
 
 
 class WorldOrderError(ValueError):
     """An order that makes no sense as it was written, with how to write it."""
 
 
-def world_order(
-    what: str,
-    name: str | None,
-    *,
-    steps: int,
-    kind: str | None,
-    at: tuple[float, float] | None,
-    yaw: float,
-    obstacle: str | None,
-    connect: Sequence[str],
-    realm: str,
-    identity: str = "operator",
-) -> int:
-    """Gives an order to the world and prints its reply.
-
-    Returns:
-        The exit code: 0, or 1 if it refused.
+@contextmanager
+def _session(name: str, connect: list[str] | None, lab: str | None, identity: str) -> Iterator[zenoh.Session]:
+    """A session that gives orders.
 
     Raises:
-        WorldOrderError: If there is no such order, or what is put in has no place.
-        DocumentError: If the obstacle is none.
         EndpointError, Unreachable: If no router can be reached.
     """
-    if what not in KINDS:
-        raise WorldOrderError(f"no order '{what}' to a world; {did_you_mean(what, KINDS)}")
+    from agents.network.endpoints import DEFAULT_ENDPOINT
+    from agents.network.session import open_session
+
+    endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
+    with open_session(endpoints, name=name, wait_s=2.0, identity=identity) as session:
+        yield session
+
+
+@app.command()
+def order(
+    what: Annotated[str, typer.Argument(metavar="ORDER", help="takeoff, start, hold, land or stop.")],
+    robots: Annotated[list[str] | None, typer.Argument(metavar="[ROBOT...]", help="All, if none is named.")] = None,
+    *,
+    connect: Connect = None,
+    realm: Realm = "park",
+    lab: Lab = None,
+    identity: As = "operator",
+) -> int:
+    """Give an order to robots that were started by hand."""
+    from agents.network import messages
+    from agents.network.keys import Keys
+    from experiments.real_time.conductor import orders
+
+    kinds = [kind for kind in get_args(messages.OrderKind) if kind not in ("get", "set")]
+    if what not in kinds:
+        print(f"zenpark: no order '{what}'; there are: {', '.join(kinds)}", file=sys.stderr)
+        return 2
+    keys = Keys(realm)
+    with _session("order", connect, lab, identity) as session:
+        alive = [
+            robot
+            for reply in session.liveliness().get(keys.alive("*"), timeout=2.0)
+            if reply.ok is not None and (robot := keys.whose(str(reply.ok.key_expr))) is not None
+        ]
+        if not alive:
+            print(f"zenpark: no robot is there in the realm '{realm}'; `zenpark keys` shows who is", file=sys.stderr)
+            return 2
+        receivers = robots or sorted(alive)
+        at = time.time() + orders.lead(len(receivers)) if what == "start" else None
+        replies = orders.give(session, keys, receivers, messages.Order(what, at=at))  # type: ignore[arg-type]
+    for robot, reply in replies.items():
+        print(f"{robot}: {'yes' if reply.ok else 'no'}, {reply.phase}" + (f": {reply.reason}" if reply.reason else ""))
+    return int(not all(reply.ok for reply in replies.values()))
+
+
+@app.command(name="world-order")
+def world_order(
+    what: Annotated[str, typer.Argument(metavar="ORDER", help="pause, resume, step, reset, spawn or remove.")],
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Of the robot or obstacle; reset without one resets all.")
+    ] = None,
+    *,
+    steps: Annotated[int, typer.Option(min=1, help="Ticks of a step.")] = 1,
+    kind: Annotated[str | None, typer.Option(help="Of a new robot.")] = None,
+    at: Annotated[Place | None, typer.Option(metavar="X Y", help="Where it is put [m].")] = None,
+    yaw: Annotated[float, typer.Option(help="Of a robot that is put in [rad].")] = 0.0,
+    obstacle: Annotated[
+        str | None, typer.Option(metavar="JSON", help='Puts in an obstacle, such as \'{"radius": 0.1, "at": [0, 1]}\'.')
+    ] = None,
+    connect: Connect = None,
+    realm: Realm = "park",
+    lab: Lab = None,
+    identity: As = "operator",
+) -> int:
+    """Give an order to a running world."""
+    from agents.network import messages
+    from agents.network.keys import Keys
+    from agents.plugins.registry import did_you_mean
+    from experiments.file import structure
+    from experiments.real_time.conductor import orders
+    from twins.scene import Obstacle
+
+    if what not in WORLD_ORDERS:
+        raise WorldOrderError(f"no order '{what}' to a world; {did_you_mean(what, WORLD_ORDERS)}")
     given = None
     if obstacle is not None:
         given = structure.table("--obstacle", obstacle, Obstacle, ("arena", "obstacles", name or "it"))
@@ -57,9 +126,7 @@ def world_order(
         if what == "spawn" and not given.keys() & {"at", "wall"}:
             raise WorldOrderError(f"{name or 'the obstacle'} has no place; say where, with --at X Y")
     order = messages.WorldOrder(what, steps=steps, name=name, kind=kind, at=at, yaw=yaw, obstacle=given)  # type: ignore[arg-type]
-    with network.open_session(
-        list(connect) or [DEFAULT_ENDPOINT], name="world-order", wait_s=2.0, identity=identity
-    ) as session:
+    with _session("world-order", connect, lab, identity) as session:
         reply = orders.give_world(session, Keys(realm), order)
     if not reply.ok:
         print(f"no: {reply.reason}", file=sys.stderr)
@@ -69,7 +136,7 @@ def world_order(
 
 
 def done(order: messages.WorldOrder) -> str:
-    """What a world did that obeyed."""
+    """The effect of an order that the world has obeyed."""
     match order.order:
         case "pause":
             return "paused"
@@ -86,19 +153,8 @@ def done(order: messages.WorldOrder) -> str:
     return f"{what} is in{where}"
 
 
-def robot_order(
-    what: messages.ChangeKind,
-    names: Sequence[str],
-    *,
-    connect: Sequence[str],
-    realm: str,
-    identity: str,
-    spare: str | None = None,
-    body: str | None = None,
-    at: tuple[float, float] | None = None,
-    yaw: float = 0.0,
-) -> int:
-    """Gives an order to the conductor, waits until it is done, and prints what became of each robot.
+def _change(order: messages.RunOrder, connect: list[str] | None, realm: str, lab: str | None) -> int:
+    """Give an order to the conductor, wait until it is done, and print the result for each robot.
 
     Returns:
         The exit code: 0, 1 if something was refused, 2 if the whole order was.
@@ -106,10 +162,11 @@ def robot_order(
     Raises:
         EndpointError, Unreachable: If no router can be reached.
     """
-    order = messages.RunOrder(what, list(names), who=identity, spare=spare, body=body, at=at, yaw=yaw)
-    with network.open_session(
-        list(connect) or [DEFAULT_ENDPOINT], name="zenpark robot", wait_s=2.0, identity=identity
-    ) as session:
+    from agents.network.keys import Keys
+    from experiments.real_time.conductor import orders
+    from tools.commands.network import printable
+
+    with _session("zenpark robot", connect, lab, order.who) as session:
         reply = orders.give_run(session, Keys(realm), order)
     if reply.reason:
         print(f"zenpark: {printable(reply.reason)}", file=sys.stderr)
@@ -121,40 +178,40 @@ def robot_order(
     return 1 if reply.refused else 0
 
 
-def order_by_hand(
-    what: str, robots: Sequence[str], *, connect: Sequence[str], realm: str, identity: str = "operator"
+def _command(what: messages.ChangeKind) -> Callable[..., int]:
+    """A command that asks for one change of the named robots."""
+
+    def change(
+        names: Names, *, connect: Connect = None, realm: Realm = "park", lab: Lab = None, identity: As = "operator"
+    ) -> int:
+        from agents.network.messages import RunOrder
+
+        return _change(RunOrder(what, names, who=identity), connect, realm, lab)
+
+    return change
+
+
+for _what, _help in CHANGES.items():
+    robot_app.command(name=_what, help=_help)(_command(_what))
+
+
+@robot_app.command()
+def replace(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A robot of the run.")],
+    *,
+    spare: Annotated[str | None, typer.Option("--with", metavar="SPARE", help="A spare of the file.")] = None,
+    body: Annotated[str | None, typer.Option(metavar="URI", help="Address of another body.")] = None,
+    at: Annotated[
+        Place | None, typer.Option(metavar="X Y", help="Where a twin starts [m]; else as the file says.")
+    ] = None,
+    yaw: Annotated[float, typer.Option(help="Of a twin that is put somewhere [rad].")] = 0.0,
+    connect: Connect = None,
+    realm: Realm = "park",
+    lab: Lab = None,
+    identity: As = "operator",
 ) -> int:
-    """Gives an order to robots, to all that are there if none is named, and prints their replies.
+    """Let another body take over a robot's name, links and plan; a spare of its kind if nothing else is said."""
+    from agents.network.messages import RunOrder
 
-    Returns:
-        The exit code: 0, or 1 if one refused.
-
-    Raises:
-        EndpointError, Unreachable: If no router can be reached.
-    """
-    kinds = [kind for kind in get_args(messages.OrderKind) if kind not in ("get", "set")]
-    if what not in kinds:
-        print(f"zenpark: no order '{what}'; there are: {', '.join(kinds)}", file=sys.stderr)
-        return 2
-    keys = Keys(realm)
-    with network.open_session(
-        list(connect) or [DEFAULT_ENDPOINT], name="order", wait_s=2.0, identity=identity
-    ) as session:
-        there = [
-            robot
-            for reply in session.liveliness().get(keys.alive("*"), timeout=2.0)
-            if reply.ok is not None and (robot := keys.whose(str(reply.ok.key_expr))) is not None
-        ]
-        if not there:
-            print(f"zenpark: no robot is there in the realm '{realm}'; `zenpark keys` shows who is", file=sys.stderr)
-            return 2
-        told = list(robots) or sorted(there)
-        at = time.time() + orders.lead(len(told)) if what == "start" else None
-        refused = False
-        order = messages.Order(what, at=at)  # type: ignore[arg-type]
-        for robot, reply in orders.give(session, keys, told, order).items():
-            refused |= not reply.ok
-            print(
-                f"{robot}: {'yes' if reply.ok else 'no'}, {reply.phase}" + (f": {reply.reason}" if reply.reason else "")
-            )
-    return 1 if refused else 0
+    order = RunOrder("replace", [name], who=identity, spare=spare, body=body, at=at, yaw=yaw)
+    return _change(order, connect, realm, lab)

@@ -51,8 +51,8 @@ class Table:
     """A live table of the robots, on standard error."""
 
     def __init__(self) -> None:
-        from rich.console import Console  # noqa: PLC0415 - 60 ms that only a terminal needs
-        from rich.live import Live  # noqa: PLC0415
+        from rich.console import Console
+        from rich.live import Live
 
         self._live = Live(console=Console(stderr=True), refresh_per_second=4, auto_refresh=False)
         self._news, self._next = News(), 0.0
@@ -81,10 +81,10 @@ def shown(*, quiet: bool) -> Shown:
 
 
 def _table(progress: Progress) -> RenderableType:
-    from rich import box  # noqa: PLC0415
-    from rich.console import Group  # noqa: PLC0415
-    from rich.table import Table as Grid  # noqa: PLC0415
-    from rich.text import Text  # noqa: PLC0415
+    from rich import box
+    from rich.console import Group
+    from rich.table import Table as Grid
+    from rich.text import Text
 
     elapsed = "" if progress.elapsed is None else f"  {progress.elapsed:5.1f} / {progress.duration:g} s"
     silence = _silence(progress) and f"; {_silence(progress)}"
@@ -184,8 +184,8 @@ class Bar:
 
 
 def _bar(*, transient: bool) -> Any:  # noqa: ANN401 - rich is imported only here
-    from rich.console import Console  # noqa: PLC0415 - 60 ms that only a terminal needs
-    from rich.progress import (  # noqa: PLC0415
+    from rich.console import Console
+    from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
         Progress,

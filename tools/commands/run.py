@@ -1,121 +1,149 @@
-"""What `zenpark run`, `report`, `export`, `recover`, `new` and `list` do and print."""
+"""Commands that run an experiment (`zenpark run`) and read its results (report, export, recover)."""
 
 from __future__ import annotations
 
-import json
 import sys
-import webbrowser
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from agents.plugins import registry
-from agents.runtime.command_line import Interrupts
-from experiments.definition.bodies import BODIES
-from experiments.file import catalogue, document
-from experiments.file.document import chosen, load
-from experiments.file.problems import DocumentError, Problem
-from experiments.metrics.statistics import across_seeds
-from experiments.real_time.conductor.conduct import RunOptions, conduct
-from experiments.real_time.conductor.run_view import Emergency
-from experiments.recording.reader import RecordingError
-from experiments.recording.run_folder import SOURCE, new_folder, remove_unused
-from experiments.report import metrics_files, verdict
-from experiments.run import Run, read_back, reopen, simulate_seeds
-from tools.commands.progress import Bar, shown
+import typer
+
+from tools.commands.options import Anyway, As, AsJson, Bodies, Cases, File, Lab, OpenReport, Out, Report, Settings
+
+if TYPE_CHECKING:
+    from experiments.file.document import Document
+    from experiments.real_time.conductor.conduct import RunOptions
+    from experiments.run import Run
+
+app: Final = typer.Typer()
 
 STOPPED: Final = 1  # exit code of a run that an emergency stop has ended
 
 
+@app.command()
 def run(
-    file: str,
-    staging: RunOptions,
+    file: File,
     *,
-    virtual: bool,
-    out: str | None,
-    seed: int | None,
-    settings: Sequence[str],
-    as_json: bool,
-    seeds: int,
-    anyway: bool,
-    report: bool,
-    open_report: bool,
+    virtual: Annotated[
+        bool, typer.Option("--virtual", help="In virtual time, in this process, as fast as it goes.")
+    ] = False,
+    case: Cases = None,
+    out: Out = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all randomness, instead of the file's.")] = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    seeds: Annotated[
+        int, typer.Option(min=1, max=100_000, help="Runs so many seeds: mean and 95 % interval (virtual only).")
+    ] = 1,
+    bodies: Bodies = None,
+    here: Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")] = False,
+    anyway: Anyway = False,
+    report: Report = True,
+    open_report: OpenReport = False,
+    lab: Lab = None,
+    identity: As = "operator",
 ) -> int:
-    """`zenpark run`; returns the exit code: 0, 1 after an emergency stop, 2 if the check finds errors, 130 if ended."""
-    changes = [*settings, *([] if seed is None else [f"seed={seed}"])]
+    """Run an experiment: one process per robot, or in virtual time."""
+    from experiments.file.document import chosen, load
+    from experiments.real_time.conductor.conduct import RunOptions
+    from experiments.recording.run_folder import SOURCE, new_folder, remove_unused
+
+    options = RunOptions(case or [], bodies, here, lab, identity)
+    changes = [*(settings or []), *([] if seed is None else [f"seed={seed}"])]
     read = load(file, *changes)
-    _refuse(staging, virtual=virtual, seeds=seeds)
-    chosen(read, staging.cases)
+    _refuse(options, virtual=virtual, seeds=seeds)
+    chosen(read, options.cases)
     if not sound(read, changes, seeds=seeds) and not anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     folder = new_folder(read, out)
     try:
-        again = _command(file, staging, virtual=virtual, changes=changes, seeds=seeds, anyway=anyway)
-        way = _Way(virtual, seeds, as_json=as_json, report=report, open_report=open_report, again=again)
-        return _fly(read, folder, staging, way)
+        read.keep(folder / SOURCE)
+        if virtual:
+            runs, stopped, code = _simulate(read, folder, options, seeds), "", 0
+        else:
+            runs, stopped, code = _conduct(read, folder, options, quiet=as_json)
+        if not runs:
+            return code
+        if not runs[0].traces:
+            why = stopped or "interrupted"
+            print(f"{why}, before the common start: there is nothing to report; logs: {folder / 'logs'}")
+            return code or 130
+        again = _command(file, options, virtual=virtual, changes=changes, seeds=seeds, anyway=anyway)
+        _write(runs, folder, again if report else None, as_json=as_json, open_report=open_report)
+        if stopped:
+            print(f"zenpark: {stopped}", file=sys.stderr)
+        return code
     finally:
         remove_unused(folder)
 
 
-@dataclass(frozen=True)
-class _Way:
-    """What to make of a run, and the command that makes it again."""
+def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int) -> list[Run]:
+    """Run in virtual time, one run for each seed from the file's on."""
+    from experiments.run import simulate_seeds
+    from tools.commands.progress import Bar
 
-    virtual: bool
-    seeds: int
-    as_json: bool
-    report: bool
-    open_report: bool
-    again: str
+    first = read.experiment.seed
+    with Bar(passing=True) as bar:
+        return simulate_seeds(
+            read,
+            range(first, first + seeds),
+            cases=options.cases,
+            folder=folder,
+            tell=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
+        )
 
 
-def _fly(read: document.Document, folder: Path, staging: RunOptions, way: _Way) -> int:
-    """Runs, writes and tells; returns the exit code."""
-    virtual, seeds, as_json = way.virtual, way.seeds, way.as_json
-    read.keep(folder / SOURCE)
-    interrupted, emergency = Interrupts(), Emergency()
-    if virtual:
-        first = read.experiment.seed
-        with Bar(passing=True) as bar:
-            runs = simulate_seeds(
+def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) -> tuple[list[Run], str, int]:
+    """Run in real time.
+
+    Returns:
+        The run, none if it was ended at once; the reason of an emergency stop, else empty; the exit code.
+    """
+    from agents.runtime.command_line import Interrupts
+    from experiments.real_time.conductor.conduct import conduct
+    from experiments.real_time.conductor.run_view import Emergency
+    from experiments.run import read_back
+    from tools.commands.progress import shown
+
+    emergency = Emergency()
+    with Interrupts() as interrupted:
+        try:
+            flown = conduct(
                 read,
-                range(first, first + seeds),
-                cases=staging.cases,
-                folder=folder,
-                tell=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
+                folder,
+                options,
+                show=shown(quiet=quiet),
+                interrupted=interrupted,
+                emergency=emergency,
+                tell=_warn,
             )
-    else:
-        with interrupted:
-            show = shown(quiet=as_json)
-            try:
-                flown = conduct(
-                    read, folder, staging, show=show, interrupted=interrupted, emergency=emergency, tell=_warn
-                )
-                runs = [read_back(folder, *flown)]
-            except KeyboardInterrupt:
-                print(f"\nended at once; `zenpark report {folder}` shows what was recorded", file=sys.stderr)
-                return 130
-    if not runs[0].traces:
-        why = emergency.words or "interrupted"
-        print(f"{why}, before the common start: there is nothing to report; logs: {folder / 'logs'}")
-        return STOPPED if emergency else 130
+            runs = [read_back(folder, *flown)]
+        except KeyboardInterrupt:
+            print(f"\nended at once; `zenpark report {folder}` shows what was recorded", file=sys.stderr)
+            return [], "", 130
+    return runs, emergency.words, STOPPED if emergency else 130 if interrupted.asked else 0
+
+
+def _write(runs: Sequence[Run], folder: Path, command: str | None, *, as_json: bool, open_report: bool) -> None:
+    """Write and print the results; with the command that repeats the run, write its report as well."""
+    import json
+    import webbrowser
+
+    from experiments.metrics.statistics import across_seeds
+
     _write_figures_of_merit(runs, folder)
-    page = _keep(runs, folder, way.again) if way.report else None
+    page = None if command is None else _write_report(runs, folder, command)
     summary: dict[str, Any] = runs[0].summary()
-    if seeds > 1:
+    if len(runs) > 1:
         summary["across"] = across_seeds([each.summary() for each in runs])
     if as_json:
         print(json.dumps(summary))
     else:
-        _tell(runs, summary, page)
-    if way.open_report and page is not None:
+        _print(runs, summary, page)
+    if open_report and page is not None:
         webbrowser.open(page.resolve().as_uri())
-    if emergency:
-        print(f"zenpark: {emergency.words}", file=sys.stderr)
-        return STOPPED
-    return 130 if interrupted.asked else 0
 
 
 def _warn(lines: Sequence[str]) -> None:
@@ -123,22 +151,25 @@ def _warn(lines: Sequence[str]) -> None:
         print(f"zenpark: {line}", file=sys.stderr)
 
 
-def _refuse(staging: RunOptions, *, virtual: bool, seeds: int) -> None:
+def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:
     """Raises DocumentError for options that do not go together."""
+    from experiments.definition.bodies import BODIES
+    from experiments.file.problems import DocumentError, Problem
+
     if seeds > 1 and not virtual:
         raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
-    if staging.bodies not in (None, *BODIES):
+    if options.bodies not in (None, *BODIES):
         raise DocumentError(
-            [Problem(f"--bodies {staging.bodies}", 0, 0, "is not known", f"there are: {', '.join(BODIES)}")]
+            [Problem(f"--bodies {options.bodies}", 0, 0, "is not known", f"there are: {', '.join(BODIES)}")]
         )
-    for option, given in (("--bodies", staging.bodies), ("--lab", staging.lab)):
+    for option, given in (("--bodies", options.bodies), ("--lab", options.lab)):
         if given is not None and virtual:
             raise DocumentError([Problem(option, 0, 0, "is for real time", "leave out --virtual")])
 
 
-def sound(read: document.Document, changes: Sequence[str], *, seeds: int) -> bool:
-    """Says on standard error what the check warns of, for a run of so many seeds; False if it finds errors."""
-    from experiments.check.check import NOT_RANDOM, check  # noqa: PLC0415
+def sound(read: Document, changes: Sequence[str], *, seeds: int) -> bool:
+    """Print the warnings and errors of the check of a run of so many seeds; False if there are errors."""
+    from experiments.check.check import NOT_RANDOM, check
 
     found = [finding for finding in check(read, changes) if finding.severity != "note"]
     if seeds == 1:
@@ -148,21 +179,27 @@ def sound(read: document.Document, changes: Sequence[str], *, seeds: int) -> boo
     return all(finding.severity != "error" for finding in found)
 
 
-def report(folders: Sequence[str], *, out: str | None) -> int:
-    """`zenpark report`: of one run again, or of several beside each other."""
-    from experiments.report import report as pages  # noqa: PLC0415 - matplotlib takes 0.6 s
+@app.command()
+def report(
+    runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs.")],
+    out: Annotated[str | None, typer.Option(metavar="FILE", help="Where the report goes. [the run's folder]")] = None,
+) -> int:
+    """Write the report of one run, or compare several."""
+    from experiments.recording.reader import RecordingError
+    from experiments.report import report as pages  # matplotlib takes 0.6 s
+    from experiments.run import reopen
 
-    runs = [reopen(Path(folder)) for folder in folders]
-    for folder, run in zip(folders, runs, strict=True):
+    read = [reopen(Path(folder)) for folder in runs]
+    for folder, run in zip(runs, read, strict=True):
         if not run.traces:
             raise RecordingError(f"{folder}: no case had begun; there is nothing to report")
-    target = Path(out or "comparison.html") if len(runs) > 1 else Path(out or folders[0])
+    target = Path(out or "comparison.html") if len(read) > 1 else Path(out or runs[0])
     try:
-        if len(runs) == 1:
-            _write_figures_of_merit(runs, target)
-            print(_keep(runs, target, ""))
+        if len(read) == 1:
+            _write_figures_of_merit(read, target)
+            print(_write_report(read, target, ""))
         else:
-            named = [(Path(f).name, list(r.traces.values())) for f, r in zip(folders, runs, strict=True)]
+            named = [(Path(f).name, list(r.traces.values())) for f, r in zip(runs, read, strict=True)]
             print(pages.compare(target, named))
     except OSError as error:
         raise RecordingError(
@@ -171,14 +208,17 @@ def report(folders: Sequence[str], *, out: str | None) -> int:
     return 0
 
 
-def export(folder: str, target: str | None, *, as_csv: bool) -> int:
-    """`zenpark export`: a run as `run.mat` or `run.csv` in its folder, or as the file `target`.
-
-    Raises:
-        ExportError: If the file cannot be written, or scipy is missing.
-        RecordingError: If the folder holds no recording, or one cannot be read.
-    """
-    from experiments.report.export import ExportError, require_savemat, write_csv, write_mat  # noqa: PLC0415
+@app.command()
+def export(
+    folder: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    target: Annotated[
+        str | None, typer.Argument(metavar="FILE", help="FILE.mat or FILE.csv. [run.mat in the run's folder]")
+    ] = None,
+    as_csv: Annotated[bool, typer.Option("--csv", help="A table of trajectories: case, time, robot, x, ...")] = False,
+) -> None:
+    """Write a run for MATLAB, or its trajectories as one table."""
+    from experiments.report.export import ExportError, require_savemat, write_csv, write_mat
+    from experiments.run import reopen
 
     file = Path(target) if target else Path(folder) / f"run{'.csv' if as_csv else '.mat'}"
     suffix = file.suffix.lower()
@@ -194,78 +234,51 @@ def export(folder: str, target: str | None, *, as_csv: bool) -> int:
     else:
         write_csv(found.traces, file)
     print(f"{file}: {', '.join(found.traces)}")
-    return 0
 
 
-def recover(file: str, target: str | None) -> int:
-    """`zenpark recover`: repairs `file` into `target`, beside it if left out, and prints the number of messages.
-
-    Raises:
-        RecordingError: If `file` is no recording, or `target` exists or cannot be written.
-    """
-    from experiments.recording.reader import recover as recovered  # noqa: PLC0415
+@app.command()
+def recover(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording that was cut off.")],
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Where the whole one goes.")] = None,
+) -> None:
+    """Repair a recording whose writer was killed."""
+    from experiments.recording.reader import recover as repair
 
     source = Path(file)
     chosen = Path(target) if target else source.with_name(f"{source.stem}-recovered.mcap")
-    found = recovered(source, chosen)
+    found = repair(source, chosen)
     what = f"{found.messages} messages of {', '.join(found.robots) or 'no robot'}"
     print(f"{source} is whole already: {what}" if found.complete else f"{chosen}: {what}")
-    return 0
 
 
-def new(name: str, target: str | None) -> int:
-    """`zenpark new`: copies a catalogue entry to begin from."""
-    path = catalogue.copy(name, Path(target) if target else Path(f"{name}.toml"))
-    print(f"{path}: a copy of {name}; change it, then `zenpark check {path}` and `zenpark run {path}`")
-    return 0
-
-
-def list_all() -> int:
-    """`zenpark list`: the catalogue, and the plug-ins that are installed."""
-    width = max(len(name) for name, _ in catalogue.names())
-    print("Experiments (zenpark run NAME, zenpark new NAME):")
-    for name, title in catalogue.names():
-        print(f"  {name:<{width}}  {title}")
-    for what, group in (
-        ("Bodies", registry.BODIES),
-        ("Protocol twins", registry.DEVICES),
-        ("Triggers", registry.TRIGGERS),
-        ("Predictors", registry.PREDICTORS),
-        ("Laws", registry.LAWS),
-        ("Planners", registry.PLANNERS),
-        ("Avoidances", registry.AVOIDANCES),
-        ("Engines", registry.ENGINES),
-    ):
-        print(f"{what}: {', '.join(registry.names(group))}")
-    return 0
-
-
-def _command(file: str, staging: RunOptions, *, virtual: bool, changes: Sequence[str], seeds: int, anyway: bool) -> str:
-    """What to type for the same run again."""
+def _command(file: str, options: RunOptions, *, virtual: bool, changes: Sequence[str], seeds: int, anyway: bool) -> str:
+    """The command that repeats the run."""
     parts = ["zenpark", "run", file, *(["--virtual"] if virtual else [])]
-    parts += [part for case in staging.cases for part in ("--case", case)]
+    parts += [part for case in options.cases for part in ("--case", case)]
     parts += [part for change in changes for part in ("--set", f"'{change}'")]
     parts += ["--seeds", str(seeds)] if seeds > 1 else []
-    parts += ["--bodies", staging.bodies] if staging.bodies is not None else []
-    parts += ["--here"] if staging.here else []
-    parts += ["--lab", staging.lab] if staging.lab is not None else []
-    parts += ["--as", staging.identity] if staging.identity != "operator" else []
+    parts += ["--bodies", options.bodies] if options.bodies is not None else []
+    parts += ["--here"] if options.here else []
+    parts += ["--lab", options.lab] if options.lab is not None else []
+    parts += ["--as", options.identity] if options.identity != "operator" else []
     return " ".join([*parts, *(["--anyway"] if anyway else [])])
 
 
 def _write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
     """Writes `metrics.csv` and `metrics.json` of a run into its folder."""
+    from experiments.report import metrics_files
+
     folder.mkdir(parents=True, exist_ok=True)
     every = [case for each in runs for case in each.metrics.values()]
     metrics_files.write_csv(folder / "metrics.csv", every)
     metrics_files.write_json(folder / "metrics.json", every)
 
 
-def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
+def _write_report(runs: Sequence[Run], folder: Path, command: str) -> Path:
     """Writes figures and report of a run into its folder; returns the report."""
-    from experiments.report import report as pages  # noqa: PLC0415
-    from experiments.report import style as figures  # noqa: PLC0415 - matplotlib takes 0.6 s
-    from experiments.report.page import date_of  # noqa: PLC0415
+    from experiments.report import report as pages
+    from experiments.report import style as figures
+    from experiments.report.page import date_of
 
     every = [case for each in runs for case in each.metrics.values()]
     traces = [trace for each in runs for trace in each.traces.values()]
@@ -283,8 +296,10 @@ def _keep(runs: Sequence[Run], folder: Path, command: str) -> Path:
     )
 
 
-def _tell(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> None:
-    """The result in a few lines."""
+def _print(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> None:
+    """Print the results in a few lines."""
+    from experiments.report import verdict
+
     for finding in verdict.interruptions([case for each in runs for case in each.metrics.values()]):
         print(finding.text)
     across = summary.get("across")

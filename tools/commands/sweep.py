@@ -1,28 +1,30 @@
-"""What `zenpark sweep` does and prints."""
+"""`zenpark sweep`: cases x values x seeds in virtual time, or a search for the best values."""
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
-import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from experiments.file.document import load
-from experiments.sweep import table as sweep_table
-from experiments.sweep.optimise import Tuned, tune
-from experiments.sweep.sweep import Found, sweep
-from experiments.sweep.table import Row
-from tools.commands.progress import Bar
-from tools.commands.run import sound
+import typer
+
+from tools.commands.options import Anyway, AsJson, Cases, File, OpenReport, Out, Report, Settings
+
+if TYPE_CHECKING:
+    from experiments.sweep.optimise import Tuned
+    from experiments.sweep.sweep import Found
+    from experiments.sweep.table import Row
 
 
-@dataclass(frozen=True)
-class Request:
-    """What stands on the command line; see `zenpark sweep --help`."""
+app: Final = typer.Typer()
+
+
+@dataclass
+class _Request:
+    """Arguments of the command."""
 
     file: str
     given: Sequence[str]
@@ -33,13 +35,12 @@ class Request:
     processes: int | None
     optimize: str | None
     as_json: bool
-    anyway: bool
     report: bool
     open_report: bool
 
     @property
     def line(self) -> str:
-        """How to do it again."""
+        """The command that repeats it."""
         parts = ["zenpark", "sweep", self.file, *self.given]
         parts += [part for case in self.cases for part in ("--case", case)]
         parts += [part for setting in self.settings for part in ("--set", setting)]
@@ -47,55 +48,114 @@ class Request:
         return shlex.join(parts)
 
 
-def command(asked: Request) -> int:
-    """Returns the exit code: 0, 1 if runs failed or no limits were kept, 2 if the check finds errors, 130 on Ctrl-C."""
-    if not sound(load(asked.file, *asked.settings), asked.settings, seeds=2) and not asked.anyway:
+@app.command()
+def sweep(
+    file: File,
+    given: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[PATH=VALUES...]",
+            help="What changes: trigger.threshold=0.002:0.05:log12, or lin12, or a list 1,2,3; several make a grid. "
+            "seeds=50 or seeds=101:150 [20 from the file's on]; tuning=1001:1060 for --optimize.",
+        ),
+    ] = None,
+    *,
+    case: Cases = None,
+    settings: Settings = None,
+    optimize: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WISH",
+            help="Seeks values in the ranges instead: 'messages, iae<=1.01' (relative to the first case).",
+        ),
+    ] = None,
+    out: Out = None,
+    processes: Annotated[int | None, typer.Option(min=1, help="How many at once. [one per core]")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="On the workers of this dask scheduler, tcp://HOST:PORT.")
+    ] = None,
+    as_json: AsJson = False,
+    anyway: Anyway = False,
+    report: Report = True,
+    open_report: OpenReport = False,
+) -> int:
+    """Run cases x values x seeds in virtual time on all cores; what is done is never run again."""
+    from experiments.file.document import load
+    from tools.commands.run import sound
+
+    changes = settings or []
+    if not sound(load(file, *changes), changes, seeds=2) and not anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
-    return _swept(asked) if asked.optimize is None else _tuned(asked, asked.optimize)
+    request = _Request(
+        file=file,
+        given=given or [],
+        settings=changes,
+        cases=case or [],
+        out=out,
+        scheduler=scheduler,
+        processes=processes,
+        optimize=optimize,
+        as_json=as_json,
+        report=report,
+        open_report=open_report,
+    )
+    return _sweep(request) if optimize is None else _optimise(request, optimize)
 
 
-def _swept(asked: Request) -> int:
+def _sweep(request: _Request) -> int:
+    import json
+
+    from experiments.sweep import table as sweep_table
+    from experiments.sweep.sweep import sweep
+    from tools.commands.progress import Bar
+
     with Bar() as bar:
         found = sweep(
-            asked.file,
-            asked.given,
-            settings=asked.settings,
-            cases=asked.cases,
-            out=asked.out,
-            scheduler=asked.scheduler,
-            processes=asked.processes,
+            request.file,
+            request.given,
+            settings=request.settings,
+            cases=request.cases,
+            out=request.out,
+            scheduler=request.scheduler,
+            processes=request.processes,
             tell=lambda done, of: bar.show("runs", done, of),
         )
     table = sweep_table.document(found.read.experiment.title, found.seeds, found.rows)
-    _keep(found.folder, found.rows, table)
-    page = _page(asked, found) if asked.report and found.rows else None
-    if asked.as_json:
+    _write_table(found.folder, found.rows, table)
+    page = _page(request, found) if request.report and found.rows else None
+    if request.as_json:
         print(json.dumps(table))
     else:
         print(found)
-        _tell(found.folder, found.notes, page)
+        _print(found.folder, found.notes, page)
     for failure in found.failures[:3]:
         print(f"failed: {failure}", file=sys.stderr)
     if found.missing:
         print(f"interrupted: {found.missing} runs are missing; the same command goes on from here", file=sys.stderr)
         return 130
-    _open(asked, page)
+    _open(request, page)
     return 1 if found.failures else 0
 
 
-def _tuned(asked: Request, wished: str) -> int:
+def _optimise(request: _Request, wished: str) -> int:
+    import json
+
+    from experiments.sweep import table as sweep_table
+    from experiments.sweep.optimise import tune
+    from tools.commands.progress import Bar
+
     try:
         with Bar() as bar:
             tuned = tune(
-                asked.file,
-                asked.given,
+                request.file,
+                request.given,
                 wished,
-                settings=asked.settings,
-                cases=asked.cases,
-                out=asked.out,
-                scheduler=asked.scheduler,
-                processes=asked.processes,
+                settings=request.settings,
+                cases=request.cases,
+                out=request.out,
+                scheduler=request.scheduler,
+                processes=request.processes,
                 tell=lambda case, done, of: bar.show(f"{case}: tried", done, of),
             )
     except KeyboardInterrupt:
@@ -104,10 +164,10 @@ def _tuned(asked: Request, wished: str) -> int:
     table = sweep_table.document(
         tuned.read.experiment.title, tuned.seeds, tuned.rows, tuning=list(tuned.tuning), wish=wished
     )
-    _keep(tuned.folder, tuned.rows, table)
+    _write_table(tuned.folder, tuned.rows, table)
     sweep_table.write_csv(tuned.folder / "tried.csv", tuned.tried)
-    page = _page(asked, tuned) if asked.report else None
-    if asked.as_json:
+    page = _page(request, tuned) if request.report else None
+    if request.as_json:
         print(json.dumps(table))
     else:
         print(f"tuned on seeds {_ends(tuned.tuning)}, reported on seeds {_ends(tuned.seeds)}")
@@ -115,23 +175,26 @@ def _tuned(asked: Request, wished: str) -> int:
         for row in (row for row in tuned.rows if not row.reference):
             limits = ", ".join(map(str, tuned.wish.limits))
             print(f"{row.label}: {'keeps' if tuned.wish.kept(row) else 'DOES NOT KEEP'} {limits}")
-        _tell(tuned.folder, tuned.notes, page)
-    _open(asked, page)
+        _print(tuned.folder, tuned.notes, page)
+    _open(request, page)
     return 0 if all(row.reference or tuned.wish.kept(row) for row in tuned.rows) else 1
 
 
-def _keep(folder: Path, rows: Sequence[Row], table: dict[str, Any]) -> None:
+def _write_table(folder: Path, rows: Sequence[Row], table: dict[str, Any]) -> None:
+    from experiments.sweep import table as sweep_table
+
     sweep_table.write_csv(folder / "sweep.csv", rows)
     sweep_table.write_json(folder / "sweep.json", table)
 
 
-def _page(asked: Request, found: Found | Tuned) -> Path:
-    from experiments.sweep import page as pages  # noqa: PLC0415 - matplotlib takes 0.6 s
+def _page(request: _Request, found: Found | Tuned) -> Path:
+    from experiments.sweep import page as pages
+    from experiments.sweep.sweep import Found
 
-    return pages.write(found, asked.line) if isinstance(found, Found) else pages.write_tuned(found, asked.line)
+    return pages.write(found, request.line) if isinstance(found, Found) else pages.write_tuned(found, request.line)
 
 
-def _tell(folder: Path, notes: Sequence[str], page: Path | None) -> None:
+def _print(folder: Path, notes: Sequence[str], page: Path | None) -> None:
     for note in notes:
         print(f"note: {note}")
     print(f"table: {folder / 'sweep.csv'}, {folder / 'sweep.json'}")
@@ -139,8 +202,10 @@ def _tell(folder: Path, notes: Sequence[str], page: Path | None) -> None:
         print(f"page: {page}")
 
 
-def _open(asked: Request, page: Path | None) -> None:
-    if asked.open_report and page is not None:
+def _open(request: _Request, page: Path | None) -> None:
+    import webbrowser
+
+    if request.open_report and page is not None:
         webbrowser.open(page.resolve().as_uri())
 
 

@@ -6,20 +6,19 @@ import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Annotated, Final
 
-import msgspec
+import typer
 
-from agents.plugins.registry import did_you_mean
-from agents.runtime.command_line import Interrupts
-from experiments.definition.experiment import Experiment
-from experiments.file.document import chosen, load
-from experiments.file.problems import DocumentError, Problem
-from experiments.recording.run_folder import SOURCE, new_folder
-from tools.reliability import chaos_report
-from tools.reliability.chaos_report import Ended, Outcome, Result
-from tools.reliability.chaos_round import Flight, Say, Setting
-from tools.reliability.fault_script import KINDS, Fault, Round, script
+from tools.commands.options import AsJson, File, Out, Settings
+
+if TYPE_CHECKING:
+    from experiments.definition.experiment import Experiment
+    from tools.reliability.chaos_report import Ended, Outcome, Result
+    from tools.reliability.chaos_round import Say, Setting
+    from tools.reliability.fault_script import Fault, Round
+
+app: Final = typer.Typer()
 
 BARREN: Final = 3  # rounds without any fault, and it gives up
 
@@ -35,6 +34,9 @@ def run(
         interrupted: Asked whether the user wants to end.
         say: Gets a line for each fault and each round.
     """
+    from tools.reliability.chaos_round import Flight
+    from tools.reliability.fault_script import Fault
+
     waiting, left = list(rounds), list[Fault]()
     outcomes: list[Outcome] = []
     ends: list[Ended] = []
@@ -52,10 +54,12 @@ def run(
 
 def again(faults: Sequence[Fault]) -> list[Round]:
     """Faults that had no time, in rounds of their own: those that need a stage of their own on that."""
+    from tools.reliability.fault_script import Round
+
     rounds = []
     for stage in dict.fromkeys(fault.nature.stage for fault in faults):
-        chosen = [fault for fault in faults if fault.nature.stage == stage]
-        rounds.append(Round(sorted(chosen, key=lambda fault: fault.kind == "conductor"), stage))
+        those = [fault for fault in faults if fault.nature.stage == stage]
+        rounds.append(Round(sorted(those, key=lambda fault: fault.kind == "conductor"), stage))
     return rounds
 
 
@@ -68,27 +72,36 @@ BODIES: Final = "world"
 SCRIPT: Final = "script.json"
 
 
-def command(
-    file: str,
+@app.command()
+def chaos(
+    file: File,
     *,
-    faults: int,
-    seed: int,
-    kinds: Sequence[str],
-    case: str | None,
-    out: str | None,
-    settings: Sequence[str],
-    as_json: bool,
+    faults: Annotated[int, typer.Option(min=1, help="How many.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Of the script; the same seed gives the same.")] = 1,
+    kinds: Annotated[
+        list[str] | None, typer.Option(metavar="KIND,KIND", help="Only these: kill, freeze, partition, ... [all]")
+    ] = None,
+    case: Annotated[str | None, typer.Option(metavar="NAME", help="A case of the file. [the last]")] = None,
+    out: Out = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
 ) -> int:
-    """`zenpark chaos`; returns the exit code: 0 if everything held, 1 if not, 130 after Ctrl-C.
+    """Run an experiment again and again while faults befall it, and say what did not hold."""
+    import msgspec
 
-    Raises:
-        DocumentError: If the file is wrong, or there is no such kind of fault.
-    """
-    changes = [*defaults(load(file).experiment), *settings]
+    from agents.runtime.command_line import Interrupts
+    from experiments.file.document import chosen, load
+    from experiments.recording.run_folder import SOURCE, new_folder
+    from tools.reliability import chaos_report
+    from tools.reliability.chaos_report import Result
+    from tools.reliability.chaos_round import Setting
+    from tools.reliability.fault_script import script
+
+    changes = [*defaults(load(file).experiment), *(settings or [])]
     read = load(file, *changes)
     name = case or list(read.cases())[-1]
     experiment = chosen(read, [name])[name]
-    rounds = script(list(experiment.robots), experiment.duration_s, faults, seed, _kinds(kinds))
+    rounds = script(list(experiment.robots), experiment.duration_s, faults, seed, _kinds(kinds or []))
     folder = new_folder(dataclasses.replace(read, path=Path(f"{read.path.stem}-chaos")), out)
     read.keep(folder / SOURCE)
     (folder / SCRIPT).write_bytes(msgspec.json.format(msgspec.json.encode(rounds), indent=1))
@@ -102,12 +115,12 @@ def command(
         outcomes, ends = run(setting, rounds, interrupted=interrupted, say=say)
     result = Result(read.experiment.title, seed, rounds, outcomes, ends)
     words = ["zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
-    words += [part for kind in kinds for part in ("--kinds", kind)]
+    words += [part for kind in kinds or () for part in ("--kinds", kind)]
     page = chaos_report.write(folder, result, " ".join(words))
     if as_json:
         print(msgspec.json.encode(result).decode())
     else:
-        _tell(result)
+        _print(result)
         print(f"report: {page}")
     if interrupted.asked:
         return 130
@@ -129,6 +142,10 @@ def defaults(experiment: Experiment) -> list[str]:
 
 def _kinds(given: Sequence[str]) -> list[str]:
     """The kinds that were asked for, all without any."""
+    from agents.plugins.registry import did_you_mean
+    from experiments.file.problems import DocumentError, Problem
+    from tools.reliability.fault_script import KINDS
+
     words = [word for part in given for word in part.split(",") if word]
     for word in words:
         if word not in KINDS:
@@ -137,7 +154,9 @@ def _kinds(given: Sequence[str]) -> list[str]:
     return words or list(KINDS)
 
 
-def _tell(result: Result) -> None:
+def _print(result: Result) -> None:
+    from tools.reliability import chaos_report
+
     made = chaos_report.table(result)
     rows = [made.head, *(tuple(map(str, row.cells)) for row in made.rows)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(made.head))]

@@ -6,33 +6,27 @@ what the robots count, and how long their poses take. Everything is written down
 
 from __future__ import annotations
 
-import csv
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Annotated, Final
 
-import msgspec
-import zenoh
+import typer
 
-from agents.clock import Clock
-from agents.network import messages, pubsub
-from agents.network import session as network
-from agents.network.endpoints import free_endpoint
-from agents.network.keys import Keys
-from agents.runtime.command_line import Interrupts
-from experiments.file.document import Document, chosen, load, loads
-from experiments.real_time.conductor.conductor import RunFailed
-from experiments.real_time.conductor.run_view import by_robots
-from experiments.real_time.hosts.launcher import Launcher
-from experiments.recording.run_folder import SOURCE, new_folder
-from tools.reliability import processes, soak_verdict
-from tools.reliability.run_process import Watched
-from tools.reliability.soak_verdict import COLUMNS, Row, Soaked
+from tools.commands.options import AsJson, Bodies, Case, Out, Settings
+
+if TYPE_CHECKING:
+    import zenoh
+
+    from agents.network import messages
+    from agents.network.keys import Keys
+    from experiments.file.document import Document
+    from tools.reliability.soak_verdict import Row, Soaked
+
+app: Final = typer.Typer()
 
 SPACING: Final = 2.0  # [m] between the leaders of neighbouring groups
 MEMBERS: Final = (  # kind, offset from the leader [m], links to members before it by place
@@ -132,12 +126,17 @@ class _Ear:
     """Takes in what robots say."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str]) -> None:
+        from agents.network import pubsub
+
         self._keys = keys
         self.robots = {name: _Counts() for name in robots}
         self._statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
         self._states = pubsub.subscriber(session, keys.state("*"), 16384)
 
     def listen(self) -> None:
+        from agents.network import messages
+        from experiments.real_time.conductor.run_view import by_robots
+
         for status in by_robots(self._statuses.handler, messages.Status, keys=self._keys, robots=self.robots):
             self.robots[status.robot].status = status
         for state in by_robots(self._states.handler, messages.State, keys=self._keys, robots=self.robots):
@@ -154,6 +153,11 @@ def rows(found: Mapping[int, str], robots: Mapping[str, _Counts], t: float, reco
         t: From the common start [s].
         recording: The file.
     """
+    import msgspec
+
+    from tools.reliability import processes
+    from tools.reliability.soak_verdict import Row
+
     for pid, name in found.items():
         usage = processes.usage(pid)
         if usage is None or name == processes.OTHER:
@@ -180,7 +184,7 @@ def rows(found: Mapping[int, str], robots: Mapping[str, _Counts], t: float, reco
         yield row
 
 
-def soak(  # noqa: PLR0915 - one loop that follows one run
+def measured(  # noqa: PLR0915 - one loop that follows one run
     read: Document,
     file: Path,
     folder: Path,
@@ -206,6 +210,18 @@ def soak(  # noqa: PLR0915 - one loop that follows one run
     Raises:
         RunFailed: If it does not begin.
     """
+    import csv
+
+    from agents.clock import Clock
+    from agents.network import session as network
+    from agents.network.endpoints import free_endpoint
+    from agents.network.keys import Keys
+    from experiments.file.document import chosen
+    from experiments.real_time.conductor.conductor import RunFailed
+    from experiments.real_time.hosts.launcher import Launcher
+    from tools.reliability.run_process import Watched
+    from tools.reliability.soak_verdict import COLUMNS, Soaked
+
     experiment = chosen(read, [case])[case]
     groups: dict[str, list[str]] = {}
     for name, robot in experiment.robots.items():
@@ -272,19 +288,29 @@ def _line(sampled: Sequence[Row], t: float, duration: float) -> str:
     )
 
 
-def command(
-    file: str | None,
+@app.command()
+def soak(
+    file: Annotated[
+        str | None, typer.Argument(metavar="[FILE]", help="Experiment file. [robots that move for ever]")
+    ] = None,
     *,
-    minutes: float,
-    robots: int,
-    case: str | None,
-    out: str | None,
-    settings: Sequence[str],
-    bodies: str | None,
-    as_json: bool,
+    minutes: Annotated[float, typer.Option(min=0.1, max=1440.0, help="How long.")] = 60.0,
+    robots: Annotated[int, typer.Option(min=2, help="Of the ready-made experiment.")] = 20,
+    case: Case = None,
+    out: Out = None,
+    settings: Settings = None,
+    bodies: Bodies = None,
+    as_json: AsJson = False,
 ) -> int:
-    """`zenpark soak`; returns the exit code: 0 if nothing is wrong, 1 if something is, 130 after Ctrl-C."""
-    changes = [*settings, f"duration_s={60.0 * minutes!r}"]
+    """Run an experiment for long and say whether anything grows, is lost, slows down or dies."""
+    import json
+
+    from agents.runtime.command_line import Interrupts
+    from experiments.file.document import chosen, load, loads
+    from experiments.recording.run_folder import SOURCE, new_folder
+    from tools.reliability import soak_verdict
+
+    changes = [*(settings or []), f"duration_s={60.0 * minutes!r}"]
     if file is None:
         read = replace(loads(text(robots, 60.0 * minutes), *changes), path=Path("soak.toml"))
     else:
@@ -294,7 +320,7 @@ def command(
     folder = new_folder(read, out)
     read.keep(folder / SOURCE)
     with Interrupts() as interrupted:
-        soaked = soak(
+        soaked = measured(
             read,
             folder / SOURCE,
             folder,

@@ -31,8 +31,8 @@ from experiments.file.text import content
 RATE_HZ: Final = 100.0  # of bodies: their position controllers run at that
 ROOM: Final = 0.6  # [m] around starts and shape
 PARK: Final = (4.0, 4.0, 2.5)  # [m] the arena, if there is room in it
-RADIO: Final = re.compile(r"radio://(\d+)/\d+/(?:250K|1M|2M)/[0-9A-Fa-f]{10}")
 WIDTH: Final = 110
+RADIO: Final = re.compile(r"radio://(\d+)/\d+/(?:250K|1M|2M)/[0-9A-Fa-f]{10}")
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class Rates:
     coordination_hz: float
 
 
-def command(file: str, target: str | None, duration_s: float, poses: str | None = None) -> int:
-    """`zenpark import`; returns the exit code.
+def convert(file: str, target: str | None, duration_s: float, poses: str | None = None) -> tuple[Path, list[str]]:
+    """Write the experiment file of one of theirs; return its path and what was not carried over.
 
     Raises:
         DocumentError: If the file cannot be read, is no experiment of theirs, or the new one cannot be written.
@@ -58,12 +58,7 @@ def command(file: str, target: str | None, duration_s: float, poses: str | None 
     made, notes = imported(text, file, duration_s, poses)
     path = entries.write_new(made, Path(target) if target else Path(f"{source.stem}.toml"))
     document.read(path)
-    print(f"{path}: from {file}; `zenpark check {path}`, `zenpark run {path} --virtual`")
-    if notes:
-        print("Not carried over, or not as it was:")
-        for note in notes:
-            print(textwrap.fill(note, WIDTH, initial_indent="  - ", subsequent_indent="    "))
-    return 0
+    return path, notes
 
 
 def imported(text: str, label: str, duration_s: float, poses: str | None = None) -> tuple[str, list[str]]:

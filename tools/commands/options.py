@@ -46,7 +46,7 @@ def routers(connect: list[str] | None, lab: str | None) -> list[str]:
         EndpointError: If a file of endpoints cannot be read.
         LabError: If one of them asks for no certificate.
     """
-    from agents.network.lab import secured  # noqa: PLC0415
-    from experiments.definition.endpoints import listed  # noqa: PLC0415
+    from agents.network.lab import secured
+    from experiments.definition.endpoints import listed
 
     return secured(listed(connect or []), lab)

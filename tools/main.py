@@ -1,4 +1,4 @@
-"""The command line: signatures and help only. What a command does is imported when it runs, so that help is quick."""
+"""The command line. A command imports its needs when it runs, so that help and the emergency stop are quick."""
 
 from __future__ import annotations
 
@@ -7,26 +7,35 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.cli import hosts, keys, network, processes, robot, runs
+from tools.bench import bench
+from tools.commands import check, estop, hosts, lab, network, orders, processes, run, sweep
+from tools.reliability import chaos, soak
+
+
+def _exit(code: object, **_: object) -> None:
+    """A command returns its exit code; None is 0."""
+    raise typer.Exit(code if isinstance(code, int) else 0)
+
 
 app: Final = typer.Typer(
     name="zenpark",
     help="Distributed experiments with several robots, on Zenoh.",
     no_args_is_help=True,
+    result_callback=_exit,
     rich_markup_mode=None,  # rich help costs 100 ms at every start
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _group in (runs, processes, network):
-    app.add_typer(_group.app)
+for _module in (run, sweep, check, soak, chaos, bench, processes, network, orders, estop):
+    app.add_typer(_module.app)
 app.add_typer(hosts.app, name="hosts")
-app.add_typer(keys.app, name="keys")
-app.add_typer(robot.app, name="robot", help="Change the robots of a run that is under way.")
+app.add_typer(lab.app, name="keys")
+app.add_typer(orders.robot_app, name="robot", help="Change the robots of a run that is under way.")
 
 # The errors that explain themselves, by the module that defines them: one that was raised has its module loaded,
 # so that nothing needs to be imported to recognise it.
 EXPLAINED: Final = (
-    ("agents.network.session", "EndpointError"),
+    ("agents.network.endpoints", "EndpointError"),
     ("agents.network.lab", "LabError"),
     ("agents.network.session", "Unreachable"),
     ("agents.body.interface", "BodyError"),

@@ -1,17 +1,16 @@
-"""`zenpark keys`: alone it shows who is on the network; behind it stand the commands for a lab's certificates."""
+"""`zenpark keys`: alone it lists the members of the network; its commands manage the certificates of a lab."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.cli.options import As, AsJson, Connect, Lab, routers
+from tools.commands.options import As, AsJson, Connect, Lab, routers
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from agents.network.lab import Register, Role
     from experiments.definition.experiment import Experiment
 
@@ -28,7 +27,7 @@ SOON_DAYS: Final = 14.0
 
 
 @app.callback(invoke_without_command=True)
-def _keys(
+def keys(
     context: typer.Context,
     connect: Connect = None,
     as_json: AsJson = False,
@@ -37,9 +36,9 @@ def _keys(
 ) -> None:
     """Show who is on the network and which keys they hold; make certificates (init, issue, renew, revoke, show)."""
     if context.invoked_subcommand is None:
-        from tools.commands.network import keys as show_keys  # noqa: PLC0415
+        from tools.commands.network import print_members
 
-        show_keys(routers(connect, lab), as_json=as_json, identity=identity)
+        print_members(routers(connect, lab), as_json=as_json, identity=identity)
 
 
 @app.command()
@@ -53,9 +52,7 @@ def init(
     authority_days: Annotated[float, typer.Option(min=0.01, help="For which the lab itself is valid.")] = 1826.0,
 ) -> None:
     """Found a lab: its authority, a certificate per robot, and those of router, operator, observer and helpers."""
-    from pathlib import Path  # noqa: PLC0415
-
-    from tools.commands.authority import SERVICES, create  # noqa: PLC0415
+    from tools.commands.authority import SERVICES, create
 
     place = Path(folder)
     identities: dict[str, Role] = {role: role for role in SERVICES}
@@ -63,7 +60,7 @@ def init(
     known = create(
         place, identities, hosts=host or [], listening=_listening(who or []), days=days, authority_days=authority_days
     )
-    _tell(place, known, list(known.identities))
+    _print(place, known, list(known.identities))
     typer.echo(
         f"{place}/ca.key makes new identities: keep it here. A robot's computer needs ca.pem and its own .pem and .key,"
         f" a router's ca.pem, lab.json and router.*\nNow: zenpark run FILE --lab {place}, or [network] lab in the file"
@@ -79,17 +76,15 @@ def issue(
     days: Days = 90.0,
 ) -> None:
     """Make certificates for more robots, people or routers."""
-    from pathlib import Path  # noqa: PLC0415
-
-    from agents.network.lab import ROLES, LabError  # noqa: PLC0415
-    from agents.plugins.registry import did_you_mean  # noqa: PLC0415
-    from tools.commands.authority import issue as made  # noqa: PLC0415
+    from agents.network.lab import ROLES, LabError
+    from agents.plugins.registry import did_you_mean
+    from tools.commands.authority import issue as made
 
     if role and role not in ROLES:
         raise LabError(f"no role '{role}' in a lab; {did_you_mean(role, ROLES)}")
     roles: dict[str, Role] = {each: each for each in ROLES}
     identities = {name: roles.get(role or name, "robot") for name in names}
-    _tell(Path(folder), made(Path(folder), identities, hosts=host or [], days=days), names)
+    _print(Path(folder), made(Path(folder), identities, hosts=host or [], days=days), names)
 
 
 @app.command()
@@ -103,22 +98,18 @@ def renew(
     ] = False,
 ) -> None:
     """Make new certificates for the same names; those before are valid until they end."""
-    from pathlib import Path  # noqa: PLC0415
-
-    from tools.commands.authority import renew as made  # noqa: PLC0415
+    from tools.commands.authority import renew as made
 
     known = made(Path(folder), names or [], hosts=host or [], days=days, authority=authority)
-    _tell(Path(folder), known, names or list(known.identities))
+    _print(Path(folder), known, names or list(known.identities))
 
 
 @app.command()
 def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
     """Take all rights from certificates that are lost or stolen, and make new ones."""
-    from pathlib import Path  # noqa: PLC0415
+    from tools.commands.authority import revoke as made
 
-    from tools.commands.authority import revoke as made  # noqa: PLC0415
-
-    _tell(Path(folder), made(Path(folder), names, days=days), names)
+    _print(Path(folder), made(Path(folder), names, days=days), names)
     typer.echo(
         "The old keys have no rights at a `zenpark router` that reads this lab.json: one that runs notices it in a "
         "second; copy the file to routers elsewhere. Their owners are no longer heard: give them the new files. "
@@ -128,30 +119,27 @@ def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
 
 
 @app.command()
-def show(folder: Folder, as_json: AsJson = False) -> None:
+def show(folder: Folder, as_json: AsJson = False) -> int:
     """Show who is in a lab and until when; exit code 1 if a certificate has ended."""
-    from pathlib import Path  # noqa: PLC0415
+    import msgspec
 
-    import msgspec  # noqa: PLC0415
-
-    from agents.network.lab import register  # noqa: PLC0415
+    from agents.network.lab import register
 
     known = register(Path(folder))
     if as_json:
         typer.echo(msgspec.json.format(msgspec.json.encode(known), indent=2).decode())
     else:
-        _tell(Path(folder), known, list(known.identities))
+        _print(Path(folder), known, list(known.identities))
     now = datetime.now(UTC)
-    raise typer.Exit(any(datetime.fromisoformat(each.until) < now for each in known.identities.values()))
+    return int(any(datetime.fromisoformat(each.until) < now for each in known.identities.values()))
 
 
 def _cases(each: str) -> list[Experiment] | None:
     """The cases of an experiment; None if it is a robot that is named."""
-    from difflib import get_close_matches  # noqa: PLC0415
-    from pathlib import Path  # noqa: PLC0415
+    from difflib import get_close_matches
 
-    from agents.network.lab import LabError  # noqa: PLC0415
-    from experiments.file import catalogue, document  # noqa: PLC0415
+    from agents.network.lab import LabError
+    from experiments.file import catalogue, document
 
     names = [name for name, _ in catalogue.names()]
     known = each in names or Path(each).suffix or Path(each).exists()
@@ -162,14 +150,14 @@ def _cases(each: str) -> list[Experiment] | None:
 
 def _listening(who: list[str]) -> dict[str, list[str]]:
     """Where identities of experiments listen that are meshes."""
-    from experiments.definition import mesh  # noqa: PLC0415
+    from experiments.definition import mesh
 
     return {name: at for each in who for case in _cases(each) or () for name, at in mesh.listeners(case).items()}
 
 
 def _robots(who: list[str], taken: set[str]) -> dict[str, Role]:
     """Robots of experiments, and those that are named themselves."""
-    from agents.network.lab import LabError  # noqa: PLC0415
+    from agents.network.lab import LabError
 
     found: dict[str, Role] = {}
     for each in who:
@@ -180,7 +168,7 @@ def _robots(who: list[str], taken: set[str]) -> dict[str, Role]:
     return found
 
 
-def _tell(folder: Path, known: Register, names: list[str]) -> None:
+def _print(folder: Path, known: Register, names: list[str]) -> None:
     now = datetime.now(UTC)
     width = max(map(len, names))
     for name in names:

@@ -1,1 +1,0 @@
-"""Signatures and help of every command; imports nothing heavy."""

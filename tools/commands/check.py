@@ -1,0 +1,224 @@
+"""Commands that deal with experiment files: check them, begin new ones, list those that are ready-made."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from tools.commands.options import AsJson, File, Settings
+
+if TYPE_CHECKING:
+    from experiments.check.check import Figures, Finding
+    from experiments.file.document import Document
+
+app: Final = typer.Typer()
+
+WIDEST: Final = 110  # columns of print
+
+
+@app.command()
+def check(file: File, settings: Settings = None, as_json: AsJson = False) -> int:
+    """Check an experiment file and say what theory says of it."""
+    from experiments.check.check import examine, unreadable
+    from experiments.file import document
+    from experiments.file.problems import DocumentError
+
+    changes = settings or []
+    try:
+        given = document.read(file, changes)
+    except DocumentError as error:
+        if not as_json:
+            raise
+        _print_json(file, [unreadable(each) for each in error.problems], {})
+        return 2
+    found, numbers = examine(given, changes)
+    if as_json:
+        _print_json(str(given.path), found, numbers)
+    else:
+        _print_table(given, found, numbers)
+    return 2 if any(each.severity == "error" for each in found) else 0
+
+
+def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
+    import json
+
+    import msgspec
+
+    ok = all(each.severity != "error" for each in found)
+    said = msgspec.to_builtins({"file": file, "ok": ok, "findings": found, "figures": numbers})
+    print(json.dumps(said, indent=2))
+
+
+def _print_table(given: Document, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
+    import shutil
+    import sys
+
+    from experiments.check.check import MARK, ORDER
+
+    width = min(WIDEST, shutil.get_terminal_size((WIDEST, 24)).columns)
+    lines = [f"{given.path}: {given.experiment.title}", ""]
+    for each in found:
+        lines += textwrap.wrap(each.message, width, initial_indent=f"{MARK[each.severity]} ", subsequent_indent="  ")
+        if each.severity != "note":
+            remedy = f"{each.where}: {each.remedy}" if each.where else each.remedy
+            lines += textwrap.wrap(
+                remedy, width, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False
+            )
+    lines += ["", *_rows(numbers), ""]
+    count = {severity: sum(each.severity == severity for each in found) for severity in ORDER}
+    lines.append(f"{_counted(count['error'], 'error')}, {_counted(count['warning'], 'warning')}")
+    encoding = sys.stdout.encoding or "utf-8"  # a terminal may know neither ticks nor Greek
+    print("\n".join(lines).encode(encoding, "replace").decode(encoding))
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count or 'no'} {what}{'s' * (count != 1)}"
+
+
+def _rows(numbers: Mapping[str, Figures]) -> list[str]:
+    """One line for each figure; where the cases differ, each with its name."""
+    said = {name: _worded(each) for name, each in numbers.items()}
+    lines = []
+    for label in next(iter(said.values())):
+        values = {name: words[label] for name, words in said.items()}
+        same = len(set(values.values())) == 1
+        shown = next(iter(values.values())) if same else ", ".join(f"{name} {word}" for name, word in values.items())
+        lines.append(f"  {label:<36}{shown}")
+    return lines
+
+
+def _worded(of: Figures) -> dict[str, str]:
+    """Figures as they are printed."""
+
+    from experiments.check.findings import listed
+
+    def number(value: float | None, form: str, unit: str = "") -> str:
+        return "-" if value is None else f"{value:{form}}{unit}"
+
+    return {
+        "robots": f"{of.robots}, leader: {', '.join(of.leaders) or 'none'}",
+        "arena": f"{' × '.join(f'{length:g}' for length in of.arena)} m",
+        "obstacles": listed([f"{name} ({what})" for name, what in of.obstacles.items()]) or "none",
+        "links": f"{of.links} one-way, {of.edges} pairs",
+        "algebraic connectivity": number(of.algebraic_connectivity, ".3f"),
+        "rigidity rank, heights held": f"{number(of.rank, 'd')} of {number(of.rank_needed, 'd')}",
+        "rigidity rank in space": f"{number(of.rank_space, 'd')} of {number(of.rank_space_needed, 'd')}",
+        "smallest rigidity eigenvalue": number(of.smallest_eigenvalue, ".2g", " m²"),
+        "single links it can lose": _spared(of.spare_links, len(of.vital_links)),
+        "single robots it can lose": _spared(of.spare_robots, len(of.vital_robots)),
+        "distances met to": number(of.residual_mm, ".1f", " mm"),
+        "loop gain h·μ·λ, hunts at 2": number(of.loop_gain, ".3g"),
+        "slowest mode": number(of.slowest_mode_s, ".1f", " s")
+        + (f", {of.free_modes} slower than the run: free" if of.free_modes else ""),
+        "speed of the fastest plan": number(of.speed_needed, ".3f", " m/s"),
+        "speed of the slowest follower": number(of.speed_available, ".3f", " m/s"),
+        "formation acquired after": number(of.acquired_s, ".1f", " s"),
+        "worst link at the end": number(of.end_error_mm, ".1f", " mm"),
+        "all end inside the arena": "yes" if of.end_inside else "no",
+        "poses sent, estimated": number(of.messages_hz, ".1f", " per second"),
+    }
+
+
+def _spared(spare: int | None, vital: int) -> str:
+    return "-" if spare is None else f"{spare} of {spare + vital}"
+
+
+@app.command()
+def new(
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="NAME", help="A ready-made experiment (`zenpark list`); TARGET behind a formation."),
+    ] = None,
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
+    *,
+    polygon: Annotated[int | None, typer.Option(metavar="N", help="Robots on a regular polygon.")] = None,
+    grid: Annotated[str | None, typer.Option(metavar="RxC", help="Robots on a grid, such as 5x8.")] = None,
+    hemisphere: Annotated[int | None, typer.Option(metavar="N", help="On a hemisphere, with Delaunay links.")] = None,
+    henneberg: Annotated[int | None, typer.Option(metavar="N", help="Minimally rigid: 2N - 3 links.")] = None,
+    circulant: Annotated[int | None, typer.Option(metavar="N", help="On a circle, linked by --jumps.")] = None,
+    jumps: Annotated[str, typer.Option(metavar="J,J", help="Of a circulant: i hears i ± J.")] = "1,2",
+    kind: Annotated[str, typer.Option(metavar="KIND", help="Of the robots of a formation.")] = "crazyflie",
+    spacing: Annotated[float, typer.Option(min=0.01, help="Between neighbours [m].")] = 0.6,
+    scatter: Annotated[
+        float | None, typer.Option(min=0.0, help="Starts are drawn this far around, by seed [m]. [0.3 spacing]")
+    ] = None,
+    law: Annotated[str, typer.Option(metavar="distance|displacement", help="Of a formation.")] = "distance",
+    seed: Annotated[int, typer.Option(min=0, help="Of the file.")] = 1,
+    duration: Annotated[float, typer.Option(min=1.0, help="[s]")] = 60.0,
+) -> None:
+    """Begin an experiment file from a ready-made one, or with a formation of any size."""
+    from experiments.authoring.generate import Wanted, generate
+    from experiments.file import catalogue
+
+    asked = {"polygon": polygon, "grid": grid, "hemisphere": hemisphere, "henneberg": henneberg, "circulant": circulant}
+    formations = [(what, str(size)) for what, size in asked.items() if size is not None]
+    if not formations:
+        if name is None:
+            raise typer.BadParameter("give a NAME (`zenpark list`), or a formation such as --hemisphere 40")
+        path = catalogue.copy(name, Path(target) if target else Path(f"{name}.toml"))
+        print(f"{path}: a copy of {name}; change it, then `zenpark check {path}` and `zenpark run {path}`")
+        return
+    if len(formations) > 1 or target is not None:
+        what = f"--{formations[1][0]}" if len(formations) > 1 else f"'{target}'"
+        raise typer.BadParameter(f"{what} is too much behind --{formations[0][0]}: one formation, one TARGET")
+    wanted = Wanted(kind=kind, spacing=spacing, scatter=scatter, seed=seed, duration_s=duration, law=law)
+    path, made = generate(*formations[0], name, wanted, jumps)
+    print(f"{path}: {made.title}, {len(made.pairs)} links; `zenpark check {path}`, `zenpark run {path} --virtual`")
+
+
+@app.command(name="import")
+def import_(
+    file: Annotated[str, typer.Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
+    duration: Annotated[float, typer.Option(min=1.0, help="Their files do not say how long [s].")] = 60.0,
+    poses: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), a Webots world (.wbt), or a table."),
+    ] = None,
+) -> None:
+    """Turn an experiment file of Robotic Park's authors into one of zenpark."""
+    from experiments.authoring.robotic_park.convert import convert
+
+    path, notes = convert(file, target, duration, poses)
+    print(f"{path}: from {file}; `zenpark check {path}`, `zenpark run {path} --virtual`")
+    if notes:
+        print("Not carried over, or not as it was:")
+        for note in notes:
+            print(textwrap.fill(note, WIDEST, initial_indent="  - ", subsequent_indent="    "))
+
+
+@app.command(name="list")
+def list_() -> None:
+    """List the ready-made experiments and the plugins."""
+    from agents.plugins import registry
+    from experiments.file import catalogue
+
+    width = max(len(name) for name, _ in catalogue.names())
+    print("Experiments (zenpark run NAME, zenpark new NAME):")
+    for name, title in catalogue.names():
+        print(f"  {name:<{width}}  {title}")
+    for what, group in (
+        ("Bodies", registry.BODIES),
+        ("Protocol twins", registry.DEVICES),
+        ("Triggers", registry.TRIGGERS),
+        ("Predictors", registry.PREDICTORS),
+        ("Laws", registry.LAWS),
+        ("Planners", registry.PLANNERS),
+        ("Avoidances", registry.AVOIDANCES),
+        ("Engines", registry.ENGINES),
+    ):
+        print(f"{what}: {', '.join(registry.names(group))}")
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of the experiment file."""
+    import json
+
+    from experiments.file import json_schema
+
+    print(json.dumps(json_schema.schema(), indent=2))

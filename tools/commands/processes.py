@@ -1,0 +1,213 @@
+"""Commands that are processes of an experiment: robot, router, central controller, world, protocol twin, bridge."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from tools.commands.options import As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, routers
+
+if TYPE_CHECKING:
+    from agents.network.access_control import Rights
+
+app: Final = typer.Typer()
+
+
+@app.command()
+def agent(
+    file: File,
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="The robots of this process.")],
+    *,
+    case: Case = None,
+    connect: Connect = None,
+    lifeline: Annotated[
+        bool, typer.Option("--lifeline", help="Land and end when standard input ends or falls silent.")
+    ] = False,
+    clock_correction: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Added to this machine's clock to get the conductor's.")
+    ] = 0.0,
+    once: Annotated[bool, typer.Option("--once", help="End when down after the experiment.")] = False,
+    realm: Realm = "park",
+    lab: Lab = None,
+) -> int:
+    """Be one robot of an experiment, or several that share a device.
+
+    FILE "join" waits for whatever is run next; "-" is a line of JSON on standard input.
+    """
+    from experiments.real_time.processes.robot import fly
+
+    return fly(
+        file,
+        names,
+        case=case,
+        connect=connect or [],
+        lifeline=lifeline,
+        clock_correction_s=clock_correction,
+        once=once,
+        realm=realm,
+        lab=lab,
+    )
+
+
+@app.command(hidden=True)
+def station() -> int:
+    """Answer the launcher of another machine; `zenpark run` starts it where robots of the experiment are."""
+    from experiments.real_time.hosts.station import serve
+
+    return serve()
+
+
+@app.command()
+def router(
+    file: Annotated[
+        str | None, typer.Argument(metavar="[FILE]", help="The experiment whose rights it enforces, in a lab.")
+    ] = None,
+    *,
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help="Without a lab on loopback; may be repeated. [tcp/127.0.0.1:7447]"),
+    ] = None,
+    connect: Annotated[
+        list[str] | None, typer.Option(metavar="ENDPOINT", help="Another router to be linked with; may be repeated.")
+    ] = None,
+    lifeline: Lifeline = False,
+    lab: Lab = None,
+    bodies: Bodies = None,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print the configuration for a zenohd that is to do the same.")
+    ] = False,
+) -> int:
+    """Run the Zenoh router that the robots meet at."""
+    import json
+
+    from agents.network.endpoints import DEFAULT_ENDPOINT
+    from agents.network.lab import LabError, secured
+    from agents.runtime.router import serve
+    from agents.runtime.run_registry import mine, registered
+
+    if file is None and lab is not None:
+        raise LabError(f"name the experiment too, from which the rights follow: zenpark router FILE --lab {lab}")
+    rights, folder = (None, None) if file is None else _rights(file, lab, bodies)
+    if folder is None:
+        endpoints, linked, rights = listen or [DEFAULT_ENDPOINT], connect or [], None
+    else:
+        endpoints, linked = secured(listen or [], folder), secured(connect, folder) if connect else []
+    if print_config:
+        print(json.dumps(of_zenohd(endpoints, linked, rights), indent=1))
+        return 0
+    with registered(mine("router", "a router by hand", _places(endpoints))) as why:
+        if why:
+            print(f"zenpark: {why}", file=sys.stderr)
+        return serve(endpoints, link=linked, lifeline=lifeline, rights=rights)
+
+
+def _places(endpoints: Sequence[str]) -> list[str]:
+    """Where this machine finds a router; not at a port that the system chooses, nor at what `serve` will refuse."""
+    from agents.network.endpoints import from_here
+
+    places = []
+    for endpoint in endpoints:
+        with suppress(ValueError):
+            places.append(from_here(endpoint))
+    return places
+
+
+def of_zenohd(endpoints: Sequence[str], link: Sequence[str] = (), rights: Rights | None = None) -> dict[str, Any]:
+    """The configuration with which a zenohd is the router that `serve` would be, as its file has it.
+
+    Raises:
+        EndpointError: As `serve`.
+    """
+    from agents.network.zenoh_config import settings
+
+    made: dict[str, Any] = {}
+    for path, value in settings("router", listen=endpoints, connect=link, name="router", rights=rights).items():
+        *above, last = path.split("/")
+        inner = made
+        for part in above:
+            inner = inner.setdefault(part, {})
+        inner[last] = value
+    return made
+
+
+def _rights(file: str, lab: str | None, bodies: str | None) -> tuple[Rights, Path | None]:
+    from experiments.definition import access_rights
+    from experiments.definition import endpoints as reach
+    from experiments.definition.bodies import choose_bodies
+    from experiments.file import document
+
+    read = document.read(file)
+    cases = [choose_bodies(case, bodies) for case in read.cases().values()]
+    return access_rights.rights(cases), reach.folder(read.experiment, read.path, lab)
+
+
+@app.command()
+def centre(
+    file: File,
+    *,
+    case: Case = None,
+    connect: Connect = None,
+    lifeline: Lifeline = False,
+    lab: Lab = None,
+) -> int:
+    """Be the centre of an experiment: decide for the robots that it guides."""
+    from experiments.real_time.processes.centre import serve
+
+    return serve(file, case=case, connect=connect or [], lifeline=lifeline, lab=lab)
+
+
+@app.command()
+def world(
+    file: File,
+    *,
+    case: Case = None,
+    connect: Connect = None,
+    engine: Annotated[str | None, typer.Option(metavar="NAME", help="What moves the twins. [the file's]")] = None,
+    lifeline: Annotated[
+        bool, typer.Option("--lifeline", help="End, after its robots, when standard input ends or falls silent.")
+    ] = False,
+    lab: Lab = None,
+) -> int:
+    """Be the world of an experiment: carry its twins, with obstacles, contacts and range sensors."""
+    from experiments.real_time.processes.world import serve
+
+    return serve(file, case=case, connect=connect or [], lifeline=lifeline, engine=engine, lab=lab)
+
+
+@app.command()
+def twin(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="crazyflie, tello, khepera4 or turtlebot3.")],
+    *,
+    count: Annotated[int, typer.Option(min=1, max=99, help="How many.")] = 1,
+    connect: Connect = None,
+    faults: Annotated[str, typer.Option(metavar="JSON", help="What goes wrong, such as '{\"loss\": 0.05}'.")] = "{}",
+    device: Annotated[str, typer.Option(metavar="JSON", help="Settings of the device.")] = "{}",
+    lab: Lab = None,
+    identity: As = "twin",
+) -> int:
+    """Stand in for hardware: protocol twins, to which vendor libraries connect."""
+    from experiments.real_time.processes.protocol_twins import command
+
+    endpoints = routers(connect, lab)
+    return command(kind, count, faults=faults, device=device, connect=endpoints, identity=identity)
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
+def bridge(
+    context: typer.Context,
+    what: Annotated[str, typer.Argument(metavar="vicon|ros2", help="`zenpark bridge vicon --help` says more.")],
+) -> int:
+    """Bring motion capture in (vicon), or show the robots to ROS 2 (ros2)."""
+    from importlib import import_module
+
+    if what in ("-h", "--help"):
+        typer.echo(context.get_help())
+        raise typer.Exit
+    if what not in ("vicon", "ros2"):
+        raise typer.BadParameter(f"'{what}' is neither vicon nor ros2")
+    return int(import_module(f"bridges.{what}").main(context.args))
