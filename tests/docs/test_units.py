@@ -31,6 +31,7 @@ def test_systemd_takes_it(tmp_path):
     assert not about, about
 
 
+@pytest.mark.slow
 def test_its_command_is_understood(tmp_path):
     (line,) = re.findall(r"^ExecStart=\S+ (.*)$", unit(), re.MULTILINE)
     words = shlex.split(line.replace("%i", "CF01"))

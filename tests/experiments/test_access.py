@@ -83,6 +83,7 @@ GUIDED = st.sampled_from([(), ("R0", "R1"), ("R0", "R1", "R2", "R3")])
 ARCHITECTURES = {0: "distributed", 2: Hybrid("hybrid", ["R0", "R1"]), 4: "centralised"}
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(links=LINKS, groups=GROUPS, guided=GUIDED)
 def test_every_right_is_the_wanted_one(links, groups, guided):

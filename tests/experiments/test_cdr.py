@@ -144,6 +144,7 @@ def expected(struct_):
     return struct_
 
 
+@pytest.mark.slow
 @given(everything)
 def test_both_libraries_read_what_was_meant(message):
     data = EVERYTHING.encode(message)

@@ -66,6 +66,7 @@ def test_the_links_of_a_hemisphere_are_those_of_the_convex_hull_of_its_points():
     assert {edge for edge in edges if inner[list(edge)].all()} <= own
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(st.integers(2, 60), st.integers(0, 2**32 - 1))
 def test_henneberg_constructions_are_minimally_rigid(count, seed):

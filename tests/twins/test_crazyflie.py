@@ -14,6 +14,8 @@ from tests.twins.crazyflie_wire import Wire
 from twins.devices.crazyflie.planner import Planner, evaluate, polynomial
 from twins.devices.crazyflie.supervisor import State
 
+pytestmark = pytest.mark.slow  # seconds of firmware, in steps of milliseconds
+
 numbers = st.floats(-3.0, 3.0)
 axis = st.tuples(numbers, numbers, numbers)
 
@@ -229,7 +231,6 @@ def test_after_a_setpoint_the_planner_is_not_heard():
     assert wire.position[2] == pytest.approx(0.5, abs=0.05)
 
 
-@pytest.mark.slow
 def test_closing_a_link_just_after_landing_locks():
     """The zero setpoint within two seconds after the motors stopped: it levels out, and locks."""
     wire = Wire().hovering(0.5)
@@ -276,7 +277,6 @@ def test_emergency_watchdog():
     assert wire.state == State.LOCKED
 
 
-@pytest.mark.slow
 def test_arming():
     """One that must be armed: not before, and not for longer than it says."""
     wire = Wire(device={"platform": "brushless"})
@@ -301,7 +301,6 @@ def test_refused_arming():
     assert wire.takeoff(0.5, 1.0) == Status.BUSY
 
 
-@pytest.mark.slow
 def test_battery():
     """It empties in flight only, as fast as told; empty, the motors stop."""
     wire = Wire(battery=0.5, drain=10.0)

@@ -22,6 +22,7 @@ from twins.engines.pymunk_space import MASSES
 # without contact
 
 
+@pytest.mark.slow
 def test_without_contact_it_is_the_point_mass_engine():
     kinds = (CRAZYFLIE, TELLO, KHEPERA4, TURTLEBOT3, CRAZYFLIE)
     flies = np.array([kind.flies for kind in kinds])

@@ -224,6 +224,7 @@ def test_a_ray_that_begins_inside_a_thing_does_not_see_it():
     np.testing.assert_allclose(seen[0], [3.0, 3.0 / math.sin(1.5), 3.0 / math.sin(2.0)], atol=1e-12)
 
 
+@pytest.mark.slow
 @given(
     x=st.floats(-1.9, 1.9),
     y=st.floats(-1.9, 1.9),
