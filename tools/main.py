@@ -49,8 +49,6 @@ EXPLAINED: Final = (
     ("experiments.virtual_time.simulation", "Stuck"),
     ("experiments.sweep.workers", "SweepError"),
     ("experiments.real_time.conductor.support", "StandInError"),
-    ("experiments.real_time.processes.world", "WorldTaken"),
-    ("experiments.real_time.processes.centre", "CentreTaken"),
     ("tools.commands.orders", "WorldOrderError"),
     ("tools.commands.network", "KeyExpressionError"),
 )

@@ -1,4 +1,4 @@
-"""What processes that stand by themselves have in common: arguments of the network, and how they are told to end."""
+"""Command line, signals and output of a process: options from the fields of a struct, SIGTERM, non-blocking stdout."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any, TypeVar, get_args, get_origin
+
+import msgspec
 
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
 from agents.network.keys import Keys
@@ -20,12 +22,12 @@ from agents.runtime.lifeline import SILENCE_S
 
 @contextmanager
 def told_to_end(end: Callable[[], object]) -> Iterator[None]:
-    """Inside, SIGINT and SIGTERM call `end`, as often as they come; afterwards they do what they did before."""
+    """Inside, each SIGINT and SIGTERM calls `end`; afterwards the former handlers hold."""
 
-    def heed(_signal: int, _frame: FrameType | None) -> None:
+    def handle(_signal: int, _frame: FrameType | None) -> None:
         end()
 
-    before = {number: signal.signal(number, heed) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
@@ -48,51 +50,105 @@ def reached(chosen: argparse.Namespace) -> list[str]:
     """The endpoints that were chosen by `--connect` and `--lab`.
 
     Raises:
+        EndpointError: As `secured_endpoints`.
+    """
+    return secured_endpoints(chosen.connect or [], chosen.lab)
+
+
+def secured_endpoints(connect: Sequence[str], folder: str | None) -> list[str]:
+    """Endpoints, the usual one if there are none, each with its lab if there is one.
+
+    Raises:
         EndpointError: If one asks for no certificates, and there is a lab.
     """
     try:
-        return secured(chosen.connect or [], chosen.lab) or [DEFAULT_ENDPOINT]
+        return secured(connect, folder) or [DEFAULT_ENDPOINT]
     except LabError as error:
         raise EndpointError(str(error)) from None
 
 
+L = TypeVar("L", bound=msgspec.Struct)
+
+
+def run(
+    prog: str,
+    kind: type[L],
+    serve: Callable[[L], int],
+    explained: tuple[type[BaseException], ...],
+    arguments: Sequence[str] | None = None,
+) -> int:
+    """Runs a process from its command line; errors that are `explained` are printed. Returns the exit code."""
+    launch = parse(prog, kind, arguments)
+    try:
+        return serve(launch)
+    except explained as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        return 2
+
+
+def parse(prog: str, kind: type[L], arguments: Sequence[str] | None = None) -> L:
+    """A struct from a command line: required fields are positional, the others options of the same name.
+
+    Description and metavar are those of `msgspec.Meta(description=..., title=...)`. Ends the process on a wrong
+    command line.
+    """
+    parser = argparse.ArgumentParser(prog=prog, description=(kind.__doc__ or "").partition("\n")[0])
+    for field in msgspec.structs.fields(kind):
+        annotated = get_origin(field.type) is Annotated
+        plain, meta = get_args(field.type)[:2] if annotated else (field.type, msgspec.Meta())
+        options: dict[str, Any] = {"help": meta.description}
+        if plain is bool:
+            options["action"] = "store_true"
+        elif meta.title is not None:
+            options["metavar"] = meta.title
+        if get_origin(plain) is list:
+            options |= {"nargs": "+"} if field.required else {"action": "append"}
+        if field.required:
+            parser.add_argument(field.encode_name, **options)
+        else:
+            parser.add_argument(f"--{field.encode_name}", dest=field.encode_name, default=argparse.SUPPRESS, **options)
+    try:
+        return msgspec.convert(vars(parser.parse_args(arguments)), kind, strict=False)
+    except msgspec.ValidationError as error:
+        parser.error(str(error))
+
+
 class Output(io.TextIOBase):
-    """Writes to a file descriptor what fits; the rest is lost: printing must neither stop nor end a flying robot."""
+    """Non-blocking stdout: output is dropped, never waited for, when the reader is slow or gone.
+
+    Printing must neither stop nor end a flying robot.
+    """
 
     def __init__(self, fd: int) -> None:
-        """Makes the descriptor one that does not block."""
+        """Makes the descriptor `fd` non-blocking."""
         super().__init__()
         self._fd = fd
         os.set_blocking(fd, False)
 
     def write(self, text: str) -> int:
-        """Writes at once, as far as that goes without waiting."""
+        """Writes the part that fits without waiting."""
         rest = text.encode(errors="replace")
         try:
             while rest:
                 rest = rest[os.write(self._fd, rest) :]
-        except OSError:  # nobody is there, or the pipe is full
+        except OSError:  # no reader, or the pipe is full
             pass
         return len(text)
 
     def writable(self) -> bool:
-        """It is."""
+        """True."""
         return True
 
 
 def detach() -> None:
-    """Puts such outputs in the place of standard output and standard error."""
+    """Replaces standard output and standard error by non-blocking ones."""
     sys.stdout, sys.stderr = Output(1), Output(2)
 
 
-if TYPE_CHECKING:
-    pass
-
-
 class Interrupts:
-    """Ctrl-C, SIGTERM and SIGHUP as a question: the first asks to land, the second ends at once.
+    """Ctrl-C, SIGTERM and SIGHUP, polled: the first asks to land, the second ends at once.
 
-    A SIGHUP that `nohup` has set aside stays so.
+    A SIGHUP that `nohup` ignores stays ignored.
     """
 
     def __init__(self) -> None:

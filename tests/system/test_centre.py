@@ -112,7 +112,7 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
     watcher.until(lambda: all(watcher.phase(name) == "ready" for name in watcher.status), "they are ready")
     second = subprocess.run(command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=20)
     assert second.returncode == 2
-    assert "a centre guides the robots of the realm 'park' already" in second.stderr
+    assert "a centre guides the robots in the realm 'park' already" in second.stderr
 
     for name in watcher.status:
         assert watcher.order(name, messages.Order("takeoff")).ok

@@ -83,7 +83,7 @@ def test_a_robot_loads_no_openssl():
     program = (
         "import atexit, runpy, sys; sys.argv = ['robot', '--help'];"
         "atexit.register(lambda: print('openssl:', sys.modules['_hashlib'], 'hashlib' in sys.modules));"
-        "runpy.run_module('experiments.real_time.processes.robot', run_name='__main__')"
+        "runpy.run_module('experiments.real_time.processes.robot', run_name='__main__', alter_sys=True)"
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.endswith("openssl: None True\n")

@@ -39,18 +39,20 @@ def agent(
 
     FILE "join" waits for whatever is run next; "-" is a line of JSON on standard input.
     """
-    from experiments.real_time.processes.robot import fly
+    from experiments.real_time.processes.robot import RobotLaunch, fly
 
     return fly(
-        file,
-        names,
-        case=case,
-        connect=connect or [],
-        lifeline=lifeline,
-        clock_correction_s=clock_correction,
-        once=once,
-        realm=realm,
-        lab=lab,
+        RobotLaunch(
+            file=file,
+            names=names,
+            case=case,
+            connect=connect or [],
+            lifeline=lifeline,
+            clock_correction=clock_correction,
+            once=once,
+            realm=realm,
+            lab=lab,
+        )
     )
 
 
@@ -157,8 +159,9 @@ def centre(
 ) -> int:
     """Be the centre of an experiment: decide for the robots that it guides."""
     from experiments.real_time.processes.centre import serve
+    from experiments.real_time.processes.joining import Launch
 
-    return serve(file, case=case, connect=connect or [], lifeline=lifeline, lab=lab)
+    return serve(Launch(file=file, case=case, connect=connect or [], lifeline=lifeline, lab=lab))
 
 
 @app.command()
@@ -174,9 +177,10 @@ def world(
     lab: Lab = None,
 ) -> int:
     """Be the world of an experiment: carry its twins, with obstacles, contacts and range sensors."""
-    from experiments.real_time.processes.world import serve
+    from experiments.real_time.processes.world import WorldLaunch, serve
 
-    return serve(file, case=case, connect=connect or [], lifeline=lifeline, engine=engine, lab=lab)
+    launch = WorldLaunch(file=file, case=case, connect=connect or [], lifeline=lifeline, engine=engine, lab=lab)
+    return serve(launch)
 
 
 @app.command()

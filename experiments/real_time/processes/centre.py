@@ -9,10 +9,8 @@ on. It runs where the conductor does, on the clock of the experiment: what robot
 
 from __future__ import annotations
 
-import argparse
 import gc
 import os
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -29,33 +27,26 @@ from agents.decision.lifecycle import IDLE, Phase
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.channel_model import Channel, Samples
-from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameTaken, claim
-from agents.network.shutdown import end, held
+from agents.network.name_ownership import NameTaken
+from agents.network.shutdown import end
 from agents.network.validation import reach_of
 from agents.plugins import registry
-from agents.runtime.command_line import told_to_end
-from agents.runtime.lifeline import Lifeline
+from agents.runtime import command_line
 from agents.runtime.pose_inbox import Coming, NeighbourSubscription, ReceivedPose
 from agents.runtime.telemetry import resident_mb
-from experiments.definition import link_conditions, mesh
-from experiments.definition.endpoints import routers
+from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
-from experiments.file import document
-from experiments.file.document import chosen_case
 from experiments.file.problems import DocumentError, Problem
+from experiments.real_time.processes.joining import Launch, joined
 
 REPORT_S: Final = 1.0
 DEPTH: Final = 64  # poses of a robot that may wait for the next decision
 ROUNDING_S: Final = 1e-5  # stamps are rounded
 PHASES: Final = {phase.word: int(phase) for phase in Phase}
-EXPLAINED: Final = (DocumentError, registry.PluginError, EndpointError, network.Unreachable)
-
-
-class CentreTaken(RuntimeError):
-    """A centre is on the network already."""
+EXPLAINED: Final = (DocumentError, registry.PluginError, EndpointError, NameTaken, network.Unreachable)
 
 
 class CentreProcess:
@@ -235,65 +226,47 @@ def _check_status(status: messages.Status) -> None:
         raise messages.Malformed(f"phase '{status.phase}' or start {status.started} is impossible")
 
 
-def serve(
-    file: str, *, case: str | None, connect: Sequence[str], lifeline: bool = False, lab: str | None = None
-) -> int:
+def serve(launch: Launch) -> int:
     """Runs the centre of an experiment until it is told to end; returns the exit code.
 
     Raises:
         DocumentError: If the file is wrong, has no such case, or no robot that is guided.
         PluginError: If a law, planner, trigger or predictor cannot be had.
-        CentreTaken: If a centre is on the network already.
+        NameTaken: If a centre is on the network already.
         Unreachable: If no router answers.
     """
-    began = Clock().utc()
-    read = document.read(file)
-    experiment = chosen_case(read, case)
+    experiment, endpoints = launch.read()
     steered = Plan(experiment).guided
     if not steered:
         hint = 'write architecture = "centralised" at the top of the file, or choose another case with --case'
-        raise DocumentError([Problem(file, 0, 0, "every robot of this experiment decides for itself", hint)])
-    endpoints = routers(experiment, read.path, connect, lab) or [DEFAULT_ENDPOINT]
+        raise DocumentError([Problem(launch.file, 0, 0, "every robot of this experiment decides for itself", hint)])
     over = threading.Event()
-    with told_to_end(over.set):
-        if lifeline:
-            Lifeline(over).start()
-        opened = network.open_session(endpoints, name="centre", stop=over, rights=mesh.rights(experiment, endpoints))
-        with held(opened) as (session, declared):
-            keys = Keys(experiment.network.realm)
-            try:
-                declared.append(claim(session, [keys.centre_alive], began=began, endpoints=endpoints, stop=over))
-            except NameTaken:
-                raise CentreTaken(
-                    f"a centre guides the robots of the realm '{keys.realm}' already: end it first, choose another "
-                    "router with --connect, or another network.realm in the experiment file"
-                ) from None
-            process = CentreProcess(experiment, session, keys, endpoints)
-            declared.append(process)
-            heard = [name for name in experiment.robots if name not in steered]
-            print(
-                f"centre ready: guides {', '.join(steered)} at {experiment.rates.coordination_hz:g} Hz"
-                + (f"; {', '.join(heard)} decide for themselves" if heard else "")
-                + f"; realm {experiment.network.realm} at {', '.join(endpoints)}",
-                flush=True,
-            )
-            process.run(over)
+    with joined(
+        experiment,
+        endpoints,
+        name="centre",
+        stop=over,
+        on_signal=over.set,
+        lost=over if launch.lifeline else None,
+        token=Keys(experiment.network.realm).centre_alive,
+        taken="a centre guides the robots",
+    ) as joint:
+        process = CentreProcess(experiment, joint.session, joint.keys, endpoints)
+        joint.declared.append(process)
+        heard = [name for name in experiment.robots if name not in steered]
+        print(
+            f"centre ready: guides {', '.join(steered)} at {experiment.rates.coordination_hz:g} Hz"
+            + (f"; {', '.join(heard)} decide for themselves" if heard else "")
+            + f"; realm {experiment.network.realm} at {', '.join(endpoints)}",
+            flush=True,
+        )
+        process.run(over)
     return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    parser = argparse.ArgumentParser(prog="zenpark centre", description="Decides for robots of an experiment.")
-    parser.add_argument("file", help="experiment file, or name in the catalogue")
-    parser.add_argument("--case", help="which case of the file; the first if left out")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
-    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent")
-    chosen = parser.parse_args(arguments)
-    try:
-        return serve(chosen.file, case=chosen.case, connect=chosen.connect, lifeline=chosen.lifeline)
-    except (*EXPLAINED, CentreTaken) as error:
-        print(f"zenpark: {error}", file=sys.stderr)
-        return 2
+    return command_line.run("zenpark centre", Launch, serve, EXPLAINED, arguments)
 
 
 if __name__ == "__main__":

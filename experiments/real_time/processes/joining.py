@@ -1,6 +1,7 @@
-"""A robot that was started by hand or at boot joins whatever is run next: the conductor tells everybody what that is.
+"""How a process of an experiment reads its case and joins its network; and robots that join whatever is run next.
 
-It has no lifeline of standard input; the conductor's token on the network stands for it.
+A robot that was started by hand or at boot has no lifeline on standard input; the token of the conductor, which
+publishes the experiment that is run, stands for it.
 """
 
 from __future__ import annotations
@@ -8,43 +9,126 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Final
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Annotated, Final, NamedTuple
 
+import msgspec
 import zenoh
 
-from agents.network import lab, pubsub
+from agents.clock import Clock
+from agents.network import pubsub
 from agents.network import session as network
-from agents.network.endpoints import EndpointError
+from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
-from agents.runtime.lifeline import SILENCE_S
+from agents.network.name_ownership import NameTaken, claim
+from agents.network.shutdown import held
+from agents.runtime.command_line import told_to_end
+from agents.runtime.lifeline import SILENCE_S, Lifeline
+from experiments.definition import mesh
+from experiments.definition.endpoints import routers
+from experiments.definition.experiment import Experiment
 from experiments.file import document
-from experiments.file.document import Document
+from experiments.file.document import Document, chosen_case
 from experiments.file.problems import DocumentError
 
 LOOK_S: Final = 0.1
 
 
+class Launch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
+    """How a process of an experiment is started."""
+
+    file: Annotated[str, msgspec.Meta(description="experiment file, or name in the catalogue")]
+    case: Annotated[str | None, msgspec.Meta(description="which case of the file; the first if left out")] = None
+    connect: Annotated[list[str], msgspec.Meta(title="ENDPOINT", description="router")] = []
+    lab: Annotated[str | None, msgspec.Meta(title="FOLDER", description="certificates; the file's if left out")] = None
+    lifeline: Annotated[bool, msgspec.Meta(description="end when standard input ends or is silent")] = False
+
+    def read(self) -> tuple[Experiment, list[str]]:
+        """The chosen case of the file, and the routers to use.
+
+        Raises:
+            DocumentError: If the file is wrong, or has no such case.
+            EndpointError: If a router cannot be used.
+        """
+        read = document.read(self.file)
+        experiment = chosen_case(read, self.case)
+        return experiment, routers(experiment, read.path, self.connect, self.lab) or [DEFAULT_ENDPOINT]
+
+
+class Network(NamedTuple):
+    """The network of an experiment, as one of its processes has joined it."""
+
+    session: zenoh.Session
+    keys: Keys
+    endpoints: list[str]
+    declared: list[object]  # kept until the session is closed, see `agents.network.shutdown.leave`
+
+
+@contextmanager
+def joined(
+    experiment: Experiment,
+    endpoints: list[str],
+    *,
+    name: str,
+    stop: threading.Event,
+    on_signal: Callable[[], object],
+    lost: threading.Event | None = None,
+    token: str = "",
+    taken: str = "",
+) -> Iterator[Network]:
+    """Inside, the network of an experiment is joined; at the end it is left.
+
+    Args:
+        experiment: The case.
+        endpoints: Routers.
+        name: Of the session, and of its certificate in a lab.
+        stop: Ends the wait for a router when it is set.
+        on_signal: Called by SIGINT and SIGTERM.
+        lost: Set when the lifeline is lost; None: standard input is no lifeline.
+        token: Liveliness key that only one process may own; empty: none.
+        taken: Says what to do if another process owns it.
+
+    Raises:
+        NameTaken: If another process owns `token`.
+        Unreachable: If no router answers.
+    """
+    began = Clock().utc()
+    if lost is not None:
+        Lifeline(lost).start()
+    with told_to_end(on_signal):
+        session = network.open_session(endpoints, name=name, stop=stop, rights=mesh.rights(experiment, endpoints))
+        with held(session) as (session, declared):
+            if token:
+                try:
+                    declared.append(claim(session, [token], began=began, endpoints=endpoints, stop=stop))
+                except NameTaken:
+                    raise NameTaken(
+                        f"{taken} in the realm '{experiment.network.realm}' already: end it first, choose another "
+                        "router with --connect, or another network.realm in the experiment file"
+                    ) from None
+            yield Network(session, Keys(experiment.network.realm), endpoints, declared)
+
+
 def offered(session: zenoh.Session, keys: Keys, names: Sequence[str]) -> Document:
-    """Waits until an experiment is run that has robots of these names, and returns it as it is run.
+    """Waits for a run that has robots of these names, and returns its experiment.
 
     Args:
         session: To listen on.
         keys: Of the realm.
         names: Of the robots.
     """
-    told = pubsub.pose_subscriber(session, keys.experiment, 1)
+    subscriber = pubsub.pose_subscriber(session, keys.experiment, 1)
     pause = threading.Event()
     while True:
-        for sample in network.received(told.handler):
+        for sample in network.received(subscriber.handler):
             try:
                 read = document.received(sample.payload.to_bytes().decode(errors="replace"), str(sample.key_expr))
             except DocumentError as error:
                 print(f"not joined: {error}", flush=True)
                 continue
             if set(names) <= set(read.experiment.robots):
-                told.undeclare()  # type: ignore[no-untyped-call]
+                subscriber.undeclare()  # type: ignore[no-untyped-call]
                 return read
             print(f"not joined: {read.experiment.title} has no {', '.join(names)}", flush=True)
         pause.wait(LOOK_S)
@@ -53,29 +137,29 @@ def offered(session: zenoh.Session, keys: Keys, names: Sequence[str]) -> Documen
 class ConductorWatch:
     """Ends this process, as SIGTERM does, when the conductor is gone: its robots land first.
 
-    Without a router every token is gone: then nobody knows, and the robots do what they do without a router.
+    Without a router every token is gone, which proves nothing; the robots do what they do without a router.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, silence_s: float = SILENCE_S) -> None:
-        """Watches from now on.
+        """Starts to watch.
 
         Args:
-            session: Of its own: open as long as this is to watch.
+            session: Open until `close`.
             keys: Of the realm.
             silence_s: A conductor that is gone for this long is gone [s].
         """
         self._session, self._silence_s = session, silence_s
         self._watch = pubsub.AliveWatch(session, keys.conductor)
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._look, name="tether", daemon=True)
+        self._thread = threading.Thread(target=self._watch_token, name="conductor watch", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Watches no more."""
+        """Stops watching."""
         self._over.set()
         self._thread.join()
 
-    def _look(self) -> None:
+    def _watch_token(self) -> None:
         there, gone_s = True, 0.0
         while not self._over.wait(LOOK_S):
             for _, alive in self._watch.changes():
@@ -85,15 +169,3 @@ class ConductorWatch:
                 print("the conductor is gone", flush=True)
                 os.kill(os.getpid(), signal.SIGTERM)
                 return
-
-
-def reached(connect: Sequence[str], folder: str | None) -> list[str]:
-    """The routers to ask, each with its lab if there is one.
-
-    Raises:
-        EndpointError: If a router of a lab asks for no certificates.
-    """
-    try:
-        return lab.secured(connect, None if folder is None else Path(folder).absolute())
-    except lab.LabError as error:
-        raise EndpointError(str(error)) from None

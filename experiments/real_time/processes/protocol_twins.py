@@ -7,14 +7,12 @@ never a robot, where they really are.
 
 from __future__ import annotations
 
-import argparse
 import selectors
-import sys
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 import zenoh
@@ -28,13 +26,14 @@ from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, end, held
 from agents.plugins import registry
+from agents.runtime import command_line
 from agents.runtime.command_line import told_to_end
 from agents.runtime.lifeline import Lifeline
 from experiments.definition import bodies
-from experiments.definition.endpoints import routers
 from experiments.definition.experiment import Experiment, Robot
-from experiments.file import document, structure
+from experiments.file import structure
 from experiments.file.problems import DocumentError, Problem
+from experiments.real_time.processes.joining import Launch
 from twins.devices.device import Device, DeviceRequest, Faults
 
 EXPLAINED: Final = (
@@ -103,25 +102,30 @@ class DeviceProcess:
             publisher.put(messages.encode(messages.position(name, stamp, where, toward)))
 
 
-def stand_in(file: str, names: Sequence[str], *, faults: Faults, connect: Sequence[str], lifeline: bool) -> int:
+class TwinLaunch(Launch, frozen=True, kw_only=True):
+    """Protocol twins of some robots."""
+
+    names: Annotated[list[str], msgspec.Meta(title="ROBOT")]
+    faults: Annotated[str, msgspec.Meta(title="JSON", description="such as '{\"loss\": 0.05}'")] = "{}"
+
+
+def stand_in(launch: TwinLaunch) -> int:
     """Runs the protocol twins of robots whose `body` asks for the same one; returns the exit code.
 
     Raises:
         DocumentError: If the file is wrong, or the robots do not ask for one and the same protocol twin.
         Unreachable: If no router answers.
     """
-    read = document.read(file)
-    experiment = read.experiment
+    experiment, endpoints = launch.read()
+    names = launch.names
     words = {experiment.robots[name].body if name in experiment.robots else "" for name in names}
     known = registry.names(registry.DEVICES)
     if len(words) != 1 or not words <= set(known):
         hint = f"their `body` must be one of {', '.join(known)}"
-        raise DocumentError([Problem(file, 0, 0, f"{', '.join(names)} cannot share a protocol twin", hint)])
-    endpoints = routers(experiment, read.path, connect) or [DEFAULT_ENDPOINT]
-    request = DeviceRequest(bodies.request(experiment, names, [experiment.seed], endpoints), faults)
-    word = words.pop()
+        raise DocumentError([Problem(launch.file, 0, 0, f"{', '.join(names)} cannot share a protocol twin", hint)])
+    request = DeviceRequest(bodies.request(experiment, names, [experiment.seed], endpoints), _faults(launch.faults))
     keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
-    return _serve(word, request, keys=keys, rate_hz=rate, connect=endpoints, lifeline=lifeline)
+    return _serve(words.pop(), request, keys=keys, rate_hz=rate, connect=endpoints, lifeline=launch.lifeline)
 
 
 def by_hand(
@@ -205,19 +209,7 @@ def _faults(text: str) -> Faults:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    parser = argparse.ArgumentParser(prog="zenpark twin", description="Protocol twins of some robots.")
-    parser.add_argument("file", help="experiment file, or name in the catalogue")
-    parser.add_argument("names", nargs="+", metavar="ROBOT")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
-    parser.add_argument("--faults", default="{}", help="JSON, such as '{\"loss\": 0.05}'")
-    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent")
-    chosen = parser.parse_args(arguments)
-    try:
-        faults = _faults(chosen.faults)
-        return stand_in(chosen.file, chosen.names, faults=faults, connect=chosen.connect, lifeline=chosen.lifeline)
-    except EXPLAINED as error:
-        print(f"zenpark: {error}", file=sys.stderr)
-        return 2
+    return command_line.run("zenpark twin", TwinLaunch, stand_in, EXPLAINED, arguments)
 
 
 if __name__ == "__main__":

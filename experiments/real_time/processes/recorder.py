@@ -5,15 +5,13 @@ A process of its own, so that the death of the conductor costs no recording: it 
 
 from __future__ import annotations
 
-import argparse
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Sequence
 from math import isfinite, remainder, tau
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 import zenoh
@@ -24,16 +22,16 @@ from agents.network import session as network
 from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
 from agents.network.messages import M
-from agents.network.shutdown import AFTER_S, end, held
-from agents.runtime.command_line import told_to_end
-from agents.runtime.lifeline import Lifeline
-from experiments.definition import mesh
+from agents.network.shutdown import AFTER_S, end
+from agents.runtime import command_line
 from experiments.file import document
 from experiments.file.problems import DocumentError
+from experiments.real_time.processes.joining import joined
 from experiments.recording.reader import RecordingError
 from experiments.recording.topics import DEPTH, TOPICS, Message, Topic
 from experiments.recording.writer import Recording
 
+EXPLAINED: Final = (DocumentError, RecordingError, EndpointError, network.Unreachable, OSError)
 POLL_S: Final = 0.02
 FLUSH_S: Final = 1.0
 FRESH_S: Final = 0.05  # a truth that is farther away in time does not belong to a state
@@ -166,35 +164,33 @@ def with_truth(state: messages.State, truths: Sequence[messages.Position]) -> me
     return msgspec.structs.replace(state, true_position=(x, y, z), true_yaw=yaw)
 
 
-def record(file: str, target: Path, *, case: str, source: Path, connect: Sequence[str]) -> None:
-    """Records one case until its lifeline is lost and the robots are gone, or until SIGTERM.
+class RecorderLaunch(msgspec.Struct, frozen=True, kw_only=True):
+    """Records one case of an experiment."""
 
-    Args:
-        file: The resolved case.
-        target: The recording.
-        case: Its name.
-        source: The experiment file as it was written, to be attached.
-        connect: Routers.
+    file: Annotated[str, msgspec.Meta(description="the resolved case")]
+    target: Annotated[str, msgspec.Meta(description="the recording")]
+    case: Annotated[str, msgspec.Meta(description="its name")] = ""
+    source: Annotated[str, msgspec.Meta(title="FILE", description="the experiment file to attach")] = ""
+    connect: Annotated[list[str], msgspec.Meta(title="ENDPOINT", description="router")] = []
+
+
+def record(launch: RecorderLaunch) -> int:
+    """Records one case until its lifeline is lost and the robots are gone, or until SIGTERM; returns the exit code.
 
     Raises:
         RecordingError: If the recording cannot be written.
     """
-    experiment = document.read(file).experiment
+    experiment = document.read(launch.file).experiment
+    text = Path(launch.source).read_text("utf-8")
     lost, asked = threading.Event(), threading.Event()
-    Lifeline(lost).start()
-    text = source.read_text("utf-8")
+    target, seed = Path(launch.target), experiment.seed
     with (
-        told_to_end(asked.set),
-        held(network.open_session(connect, name="recorder", stop=asked, rights=mesh.rights(experiment, connect))) as (
-            session,
-            declared,
-        ),
-        Recording(target, experiment, text, case=case, seed=experiment.seed, clock="real") as recording,
+        joined(experiment, launch.connect, name="recorder", stop=asked, on_signal=asked.set, lost=lost) as joint,
+        Recording(target, experiment, text, case=launch.case, seed=seed, clock="real") as recording,
     ):
-        keys = Keys(experiment.network.realm)
-        recorder = Recorder(session, keys, recording)
-        declared.append(recorder)
-        router = network.RouterWatch(session, keys.recorder, connect)
+        recorder = Recorder(joint.session, joint.keys, recording)
+        joint.declared.append(recorder)
+        router = network.RouterWatch(joint.session, joint.keys.recorder, launch.connect)
         flush_at = time.monotonic() + FLUSH_S
         last = float("inf")
         while not asked.wait(POLL_S):
@@ -207,27 +203,16 @@ def record(file: str, target: Path, *, case: str, source: Path, connect: Sequenc
                 flush_at = now + FLUSH_S
             if lost.is_set():
                 last = min(last, now + AFTER_S)
-                if recorder.alone or now > last or not network.connected(session):
+                if recorder.alone or now > last or not network.connected(joint.session):
                     break
         recorder.take(last=True)
         recorder.complain(last=True)
+    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    parser = argparse.ArgumentParser(prog="zenpark recorder", description="Records one case of an experiment.")
-    parser.add_argument("file", help="the resolved case")
-    parser.add_argument("target", type=Path)
-    parser.add_argument("--case", required=True)
-    parser.add_argument("--source", type=Path, required=True, help="the experiment file to attach")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[])
-    chosen = parser.parse_args(arguments)
-    try:
-        record(chosen.file, chosen.target, case=chosen.case, source=chosen.source, connect=chosen.connect)
-    except (DocumentError, RecordingError, EndpointError, network.Unreachable, OSError) as error:
-        print(f"zenpark: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return command_line.run("zenpark recorder", RecorderLaunch, record, EXPLAINED, arguments)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ if __name__ == "__main__":
     # OpenSSL is 3.5 MB in each robot; without it hashlib has the same functions of its own (numpy.random asks for them)
     sys.modules["_hashlib"] = None  # type: ignore[assignment]
 
-import argparse
 import os
 import select
 import socket
@@ -20,7 +19,9 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Final
+from typing import Annotated, Final
+
+import msgspec
 
 from agents.body.fleet import assemble
 from agents.body.interface import BodyError
@@ -45,77 +46,63 @@ from experiments.file import document
 from experiments.file.document import chosen_case
 from experiments.file.problems import DocumentError, Problem
 from experiments.real_time.processes import joining
+from experiments.real_time.processes.joining import Launch
 
 STDIN: Final = "-"
 JOIN: Final = "join"
 FAR: Final = ("external", "world")  # bodies that live in another process, their range sensors too
+EXPERIMENT_S: Final = 15.0  # how long an experiment may take to arrive on standard input
+EXPLAINED: Final = (DocumentError, BodyError, NameTaken, registry.PluginError, EndpointError, LabError, Unreachable)
 
 
-TOLD_S: Final = 15.0  # how long an experiment may take to come over standard input
+class RobotLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
+    """Robots of an experiment in one process.
+
+    FILE is "-" for the first line of standard input, as JSON, or "join" for the next run.
+    """
+
+    names: Annotated[list[str], msgspec.Meta(title="ROBOT")]
+    clock_correction: Annotated[float, msgspec.Meta(title="SECONDS", description="added to the clock")] = 0.0
+    realm: Annotated[str, msgspec.Meta(description="in which to join")] = "park"
+    once: Annotated[bool, msgspec.Meta(description="end when down after the experiment")] = False
 
 
-def fly(
-    file: str,
-    names: Sequence[str],
-    *,
-    case: str | None,
-    connect: Sequence[str],
-    lifeline: bool,
-    clock_correction_s: float = 0.0,
-    once: bool = False,
-    realm: str = "park",
-    lab: str | None = None,
-) -> int:
-    """Runs the robots `names` of an experiment in this process; returns its exit code.
-
-    Args:
-        file: The experiment; "-" for the first line of standard input, as JSON; "join" for what is run next.
-        names: Of the robots.
-        case: Of the file; the first if left out.
-        connect: Routers; the file's, or the one of this machine, if left out.
-        lifeline: Whether standard input is a lifeline.
-        clock_correction_s: What is added to this machine's clock to get that of the experiment [s].
-        once: Whether to end when the robots are down after the experiment.
-        realm: In which to join.
+def fly(launch: RobotLaunch) -> int:
+    """Runs robots of an experiment in this process; returns its exit code.
 
     Raises:
         DocumentError: If the file is wrong, or has no such robot or case.
         BodyError, UnknownPlugin: If a body cannot be had.
         Unreachable: If no router answers.
     """
-    if lifeline:
+    file, names = launch.file, launch.names
+    if launch.lifeline:
         command_line.detach()
     with ExitStack() as stack:
-        endpoints = list(connect)
+        endpoints: Sequence[str] = launch.connect
         if file == JOIN:
-            endpoints = joining.reached(connect or [DEFAULT_ENDPOINT], lab)
+            endpoints = command_line.secured_endpoints(launch.connect, launch.lab)
             session = stack.enter_context(network.open_session(endpoints, name=f"{names[0]} joins", identity=names[0]))
-            read = joining.offered(session, Keys(realm), names)
-            stack.callback(joining.ConductorWatch(session, Keys(realm)).close)
+            keys = Keys(launch.realm)
+            read = joining.offered(session, keys, names)
+            stack.callback(joining.ConductorWatch(session, keys).close)
         elif file == STDIN:
             print(f"{', '.join(names)}: on {socket.gethostname()}, process {os.getpid()}", flush=True)
-            read = document.received(told(), "standard input")
+            read = document.received(read_experiment(), "standard input")
         else:
             read = document.read(file)
-        experiment = chosen_case(read, case)
+        experiment = chosen_case(read, launch.case)
         unknown = [name for name in names if name not in experiment.robots]
         if unknown:
             hint = registry.did_you_mean(unknown[0], experiment.robots)
             raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
-        endpoints = routers(experiment, read.path, endpoints, lab) or [DEFAULT_ENDPOINT]
-        return _run(experiment, names, endpoints, lifeline=lifeline, clock=Clock(clock_correction_s), once=once)
+        endpoints = routers(experiment, read.path, endpoints, launch.lab) or [DEFAULT_ENDPOINT]
+        return _run(experiment, launch, endpoints)
 
 
-def _run(
-    experiment: Experiment,
-    names: Sequence[str],
-    endpoints: Sequence[str],
-    *,
-    lifeline: bool,
-    clock: Clock,
-    once: bool,
-) -> int:
+def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
     """Runs robots of a case until they end."""
+    names, clock = launch.names, Clock(launch.clock_correction)
     endpoints = mesh.near(experiment, names, endpoints)
     request = replace(bodies.request(experiment, names, [experiment.seed], endpoints), clock=clock)
     body = shadowed(assemble(request), request, bodies.shadows(experiment, names))
@@ -125,21 +112,21 @@ def _run(
         endpoints=endpoints,
         encoding=experiment.network.encoding,
         state_hz=experiment.rates.state_hz,
-        lifeline=lifeline,
+        lifeline=launch.lifeline,
         located=[experiment.robots[name].position == "external" for name in names],
         ranging=[_ranging(experiment.robots[name]) for name in names],
         conditions=link_conditions.at_listeners(experiment, assignment.links, names),
         goal_conditions=link_conditions.from_centre(experiment, names),
         clock=clock,
-        once=once,
+        once=launch.once,
         rights=mesh.rights(experiment, endpoints),
         loop_silence_s=experiment.safety.loop_silence_s,
     )
     return Runtime(assignment, body, setup).run()
 
 
-def told(fd: int = 0, limit_s: float = TOLD_S) -> str:
-    """The first line that comes in on a descriptor; what follows is the lifeline's.
+def read_experiment(fd: int = 0, limit_s: float = EXPERIMENT_S) -> str:
+    """The first line of a file descriptor; the following ones belong to the lifeline.
 
     Raises:
         DocumentError: If none comes in time.
@@ -156,7 +143,7 @@ def told(fd: int = 0, limit_s: float = TOLD_S) -> str:
             return text.decode(errors="replace")
         if not data:
             break
-    hint = "whoever starts a robot with FILE - writes the experiment there, as JSON in one line"
+    hint = "a robot with FILE - reads the experiment there, as JSON in one line"
     raise DocumentError([Problem("standard input", 0, 0, f"no experiment came within {limit_s:g} s", hint)])
 
 
@@ -169,32 +156,7 @@ def _ranging(robot: Robot) -> Ranging:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    parser = argparse.ArgumentParser(prog="zenpark agent", description="Robots of an experiment in one process.")
-    parser.add_argument("file", help="experiment file, or name in the catalogue; join: what is run next")
-    parser.add_argument("names", nargs="+", metavar="ROBOT")
-    parser.add_argument("--case", help="which case of the file; the first if left out")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
-    parser.add_argument("--lab", metavar="FOLDER", help="certificates; the file's if left out")
-    parser.add_argument("--lifeline", action="store_true", help="land and end when standard input ends or is silent")
-    parser.add_argument("--clock-correction", type=float, default=0.0, metavar="SECONDS", help="added to the clock")
-    parser.add_argument("--realm", default="park", help="in which to join")
-    parser.add_argument("--once", action="store_true", help="end when down after the experiment")
-    chosen = parser.parse_args(arguments)
-    try:
-        return fly(
-            chosen.file,
-            chosen.names,
-            case=chosen.case,
-            connect=chosen.connect,
-            lifeline=chosen.lifeline,
-            clock_correction_s=chosen.clock_correction,
-            once=chosen.once,
-            realm=chosen.realm,
-            lab=chosen.lab,
-        )
-    except (DocumentError, BodyError, NameTaken, registry.PluginError, EndpointError, LabError, Unreachable) as error:
-        print(f"zenpark: {error}", file=sys.stderr)
-        return 2
+    return command_line.run("zenpark agent", RobotLaunch, fly, EXPLAINED, arguments)
 
 
 if __name__ == "__main__":

@@ -9,47 +9,36 @@ start.
 
 from __future__ import annotations
 
-import argparse
 import gc
-import sys
 import threading
 import time
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 import zenoh
 
 from agents.body.interface import BodyError
-from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network import session as network
-from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameTaken, claim
-from agents.network.shutdown import Farewell, end, held
+from agents.network.name_ownership import NameTaken
+from agents.network.shutdown import Farewell, end
 from agents.plugins import registry
-from agents.runtime.command_line import told_to_end
-from agents.runtime.lifeline import Lifeline
-from experiments.definition import mesh
+from agents.runtime import command_line
 from experiments.definition.bodies import WORLD
-from experiments.definition.endpoints import routers
 from experiments.definition.experiment import Experiment
-from experiments.file import document
-from experiments.file.document import chosen_case
 from experiments.file.problems import DocumentError, Problem
+from experiments.real_time.processes.joining import Launch, joined
 from experiments.real_time.processes.world_network import Exchange
 from experiments.real_time.processes.world_population import Population, Refused
 
 REPORT_S: Final = 1.0
 SLIP_S: Final = 0.05  # what it makes up for when it was late; the rest of the time is lost, and the factor says so
 MOST_STEPS: Final = 1_000_000
-EXPLAINED: Final = (DocumentError, BodyError, registry.PluginError, EndpointError, network.Unreachable)
-
-
-class WorldTaken(RuntimeError):
-    """A world is on the network already."""
+EXPLAINED: Final = (DocumentError, BodyError, registry.PluginError, EndpointError, NameTaken, network.Unreachable)
 
 
 @dataclass
@@ -213,60 +202,52 @@ class WorldProcess:
         self._reports.put(messages.encode(state))
 
 
-def serve(
-    file: str,
-    *,
-    case: str | None,
-    connect: Sequence[str],
-    lifeline: bool = False,
-    engine: str | None = None,
-    lab: str | None = None,
-) -> int:
+class WorldLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
+    """The world of an experiment."""
+
+    engine: Annotated[str | None, msgspec.Meta(description="instead of the file's")] = None
+
+
+def serve(launch: WorldLaunch) -> int:
     """Runs the world of an experiment until it is told to end and its robots are down; returns the exit code.
 
     Raises:
         DocumentError: If the file is wrong, has no such case, or no robot for a world.
         BodyError, PluginError: If the engine cannot be had.
-        WorldTaken: If a world is on the network already.
+        NameTaken: If a world is on the network already.
         Unreachable: If no router answers.
     """
-    began = Clock().utc()
-    read = document.read(file)
-    experiment = chosen_case(read, case)
+    experiment, endpoints = launch.read()
     robots = experiment.robots.values()
     if not any(WORLD in (robot.body, robot.ranges) for robot in robots):
         hint = 'give robots `body = "world"` (or start it all with `zenpark run FILE --bodies world`)'
-        raise DocumentError([Problem(file, 0, 0, "no robot of this experiment lives in a world", hint)])
-    if engine is not None:
-        changed = msgspec.structs.replace(experiment.world, engine=engine)
+        raise DocumentError([Problem(launch.file, 0, 0, "no robot of this experiment lives in a world", hint)])
+    if launch.engine is not None:
+        changed = msgspec.structs.replace(experiment.world, engine=launch.engine)
         experiment = msgspec.structs.replace(experiment, world=changed)
-    endpoints = routers(experiment, read.path, connect, lab) or [DEFAULT_ENDPOINT]
     over, lost = threading.Event(), threading.Event()
 
     def leave() -> None:
-        (over if lost.is_set() else lost).set()  # asked a second time it does not wait for robots to land
+        (over if lost.is_set() else lost).set()  # a second signal does not wait for robots to land
 
-    if lifeline:
-        Lifeline(lost).start()
-    with told_to_end(leave):
-        population = Population(experiment)
-        opened = network.open_session(endpoints, name="world", stop=lost, rights=mesh.rights(experiment, endpoints))
-        with held(opened) as (session, declared):
-            keys = Keys(experiment.network.realm)
-            try:
-                declared.append(claim(session, [keys.world_alive], began=began, endpoints=endpoints, stop=lost))
-            except NameTaken:
-                raise WorldTaken(
-                    f"a world runs in the realm '{keys.realm}' already: end it first, choose another router with "
-                    "--connect, or another network.realm in the experiment file"
-                ) from None
-            # before anything watches those tokens: a session that has begun to watch answers from what it has heard
-            there = _alive(session, keys)
-            world = WorldProcess(experiment, population, session, lost, endpoints)
-            declared.append(world)
-            back = world.find(there)
-            print(_ready(experiment, population, endpoints, back), flush=True)
-            world.run(over)
+    population = Population(experiment)
+    with joined(
+        experiment,
+        endpoints,
+        name="world",
+        stop=lost,
+        on_signal=leave,
+        lost=lost if launch.lifeline else None,
+        token=Keys(experiment.network.realm).world_alive,
+        taken="a world runs",
+    ) as joint:
+        # before anything watches those tokens: a session that has begun to watch answers from what it has heard
+        there = _alive(joint.session, joint.keys)
+        world = WorldProcess(experiment, population, joint.session, lost, endpoints)
+        joint.declared.append(world)
+        back = world.find(there)
+        print(_ready(experiment, population, endpoints, back), flush=True)
+        world.run(over)
     return 0
 
 
@@ -291,20 +272,7 @@ def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    parser = argparse.ArgumentParser(prog="zenpark world", description="The world of an experiment.")
-    parser.add_argument("file", help="experiment file, or name in the catalogue")
-    parser.add_argument("--case", help="which case of the file; the first if left out")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="router")
-    parser.add_argument("--engine", help="instead of the file's")
-    parser.add_argument("--lifeline", action="store_true", help="end, after its robots, when standard input ends")
-    chosen = parser.parse_args(arguments)
-    try:
-        return serve(
-            chosen.file, case=chosen.case, connect=chosen.connect, lifeline=chosen.lifeline, engine=chosen.engine
-        )
-    except (*EXPLAINED, WorldTaken) as error:
-        print(f"zenpark: {error}", file=sys.stderr)
-        return 2
+    return command_line.run("zenpark world", WorldLaunch, serve, EXPLAINED, arguments)
 
 
 if __name__ == "__main__":
