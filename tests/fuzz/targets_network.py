@@ -168,6 +168,7 @@ def recorder() -> Iterator[Target]:
 
 def conductor() -> Iterator[Target]:
     """The conductor follows the robots' statuses, states and tokens, and changes robots when it is asked."""
+    from experiments.real_time.conductor.case_context import CaseContext  # noqa: PLC0415
     from experiments.real_time.conductor.conductor import Conductor  # noqa: PLC0415
     from experiments.real_time.hosts.hosts import Hosts  # noqa: PLC0415
 
@@ -186,13 +187,11 @@ def conductor() -> Iterator[Target]:
 
     def make():
         net.forget()
-        file = Path(folder) / "case.json"
-        file.write_bytes(document.write_json(experiment))
-        made = Conductor(
-            experiment, "only", file=file, source=file, folder=Path(folder), endpoints=["tcp/127.0.0.1:1"],
+        context = CaseContext(
+            experiment, "only", Path(folder), source=Path(folder) / "only.json", endpoints=["tcp/127.0.0.1:1"],
             launcher=Nobody(), hosts=Hosts(Nobody(), []),  # type: ignore[arg-type]
-            show=lambda _: None, interrupted=lambda: False,
         )  # fmt: skip
+        made = Conductor(context, lambda _: None)
         made._join(ExitStack())
         made._changes.begin(time.time())
 

@@ -113,8 +113,8 @@ def intruders() -> Iterator[Figure]:
 def _siege(protocol: str) -> Iterator[Figure]:
     from agents.network import lab  # noqa: PLC0415
     from agents.network.endpoints import free_endpoint  # noqa: PLC0415
-    from experiments.file import document  # noqa: PLC0415
     from experiments.file.document import load  # noqa: PLC0415
+    from experiments.real_time.conductor.case_context import CaseContext  # noqa: PLC0415
     from experiments.real_time.conductor.conductor import Conductor  # noqa: PLC0415
     from experiments.real_time.conductor.support import start_router  # noqa: PLC0415
     from experiments.real_time.hosts.hosts import Hosts  # noqa: PLC0415
@@ -138,28 +138,18 @@ def _siege(protocol: str) -> Iterator[Figure]:
         span = 1.0 + SPAN_S * len(phases) + 1.0
         read = load("robotic-park", f"duration_s={span}", "timeline=[]", "trigger.period_s=0.02")
         (folder / SOURCE).write_text(read.text, encoding="utf-8")
-        file = folder / "periodic.json"
         experiment = read.cases()["periodic"]
-        file.write_bytes(document.write_json(experiment))
         siege = Siege(phases)
         with Launcher(folder / "logs") as launcher:
             start_router(launcher, [real], rights)
             listen = ("--listen", decoy, "--rights", str(rights), "--lifeline")
             launcher.start("decoy", "agents.runtime.router", *listen)
             try:
-                Conductor(
-                    experiment,
-                    "periodic",
-                    file=file,
-                    source=folder / SOURCE,
-                    folder=folder,
-                    endpoints=[real],
-                    rights=rights,
-                    launcher=launcher,
-                    hosts=Hosts(launcher, [real]),
-                    show=siege.look,
-                    interrupted=lambda: False,
-                ).run()
+                hosts = Hosts(launcher, [real])
+                context = CaseContext(
+                    experiment, "periodic", folder, folder / SOURCE, [real], launcher, hosts, rights=rights
+                )
+                Conductor(context, siege.look).run()
             finally:
                 siege.end()
     for number, phase in enumerate(phases):

@@ -74,6 +74,7 @@ def process() -> Iterator[Figure]:
     from agents.network.endpoints import free_endpoint  # noqa: PLC0415
     from experiments.definition.plan import Plan  # noqa: PLC0415
     from experiments.file import document  # noqa: PLC0415
+    from experiments.real_time.conductor.case_context import CaseContext  # noqa: PLC0415
     from experiments.real_time.conductor.conductor import Conductor  # noqa: PLC0415
     from experiments.real_time.conductor.support import start_router  # noqa: PLC0415
     from experiments.real_time.hosts.hosts import Hosts  # noqa: PLC0415
@@ -101,8 +102,6 @@ def process() -> Iterator[Figure]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / SOURCE).write_text(read.text, encoding="utf-8")
-        file = folder / "periodic.json"
-        file.write_bytes(document.write_json(experiment))
         with Launcher(folder / "logs") as launcher:
             endpoints = [free_endpoint()]
             start_router(launcher, endpoints)
@@ -114,18 +113,10 @@ def process() -> Iterator[Figure]:
                     f"bare-{robot}", "tools.bench.bare_process", robot, rate, *speakers, "--connect", endpoints[0]
                 )
                 beside[robot] = started.handle.pid
-            result = Conductor(
-                experiment,
-                "periodic",
-                file=file,
-                source=folder / SOURCE,
-                folder=folder,
-                endpoints=endpoints,
-                launcher=launcher,
-                hosts=Hosts(launcher, endpoints),
-                show=look,
-                interrupted=lambda: False,
-            ).run()
+            context = CaseContext(
+                experiment, "periodic", folder, folder / SOURCE, endpoints, launcher, Hosts(launcher, endpoints)
+            )
+            result = Conductor(context, look).run()
     assert result.ready_s is not None
     yield Figure("process", "seven robots ready after", result.ready_s, "s", result.ready_s / 3.0, "× 3 s")
     of_robots, of_bare = robots.shares(), bare.shares()

@@ -26,9 +26,9 @@ from experiments.definition import access_rights, bodies, mesh
 from experiments.definition import endpoints as reach
 from experiments.definition.bodies import choose_bodies
 from experiments.definition.experiment import Experiment
-from experiments.file import document
 from experiments.file.document import Document, chosen
 from experiments.file.problems import DocumentError, Problem
+from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import Conductor, Result
 from experiments.real_time.conductor.run_view import Emergency, Shown
 from experiments.real_time.conductor.support import divided
@@ -133,23 +133,20 @@ def conduct(
             for name, experiment in embodied.items():
                 if interrupted() or emergency:
                     break
-                file = folder / f"{name}.json"
-                file.write_bytes(document.write_json(experiment))
-                results[name] = Conductor(
+                context = CaseContext(
                     experiment,
                     name,
-                    file=file,
+                    folder,
                     source=folder / SOURCE,
-                    folder=folder,
                     endpoints=endpoints,
-                    rights=rights,
-                    identity=staging.identity,
                     launcher=launcher,
                     hosts=hosts,
-                    show=show,
                     interrupted=interrupted,
+                    rights=rights,
+                    identity=staging.identity,
                     emergency=emergency,
-                ).run()
+                )
+                results[name] = Conductor(context, show).run()
         left = hosts.sweep()
     unflown = ", ".join(name for name in embodied if name not in results)
     stopped = [emergency.words + (f"; not run: {unflown}" if unflown else "")] if emergency else []

@@ -15,15 +15,15 @@ from typing import Final
 from agents.clock import Clock
 from agents.network import messages
 from agents.network.keys import Keys
-from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
+from experiments.file.document import write_json
+from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.crew import CaseProcesses
 from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
 from experiments.real_time.conductor.orders import lead
-from experiments.real_time.conductor.run_view import OUTPUT, Emergency, Overview, Progress, RobotView, Show
+from experiments.real_time.conductor.run_view import OUTPUT, Overview, Progress, RobotView, Show
 from experiments.real_time.hosts.clock_drift import Drift
-from experiments.real_time.hosts.hosts import Hosts
-from experiments.real_time.hosts.launcher import LAND_S, Launcher
+from experiments.real_time.hosts.launcher import LAND_S
 
 POLL_S: Final = 0.05
 TARDY_S: Final = 0.05  # who begins later than this after the common start is named
@@ -55,66 +55,29 @@ class Result:
 class Conductor:
     """Runs one case."""
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        case: str,
-        *,
-        file: Path,
-        source: Path,
-        folder: Path,
-        endpoints: Sequence[str],
-        rights: Path | None = None,
-        identity: str = "operator",
-        launcher: Launcher,
-        hosts: Hosts,
-        show: Show,
-        interrupted: Callable[[], bool],
-        emergency: Emergency | None = None,
-    ) -> None:
-        """Prepares a case; nothing is started yet.
+    def __init__(self, context: CaseContext, show: Show) -> None:
+        """Write the case as a file for its processes; nothing is started yet.
 
         Args:
-            experiment: The case, overrides applied.
-            case: Its name.
-            file: The same as a file, for the processes.
-            source: The experiment file as it was written, for the recording.
-            folder: Where the recording goes.
-            endpoints: Routers.
-            rights: Who may do what, for a router that is started again, in a lab.
-            identity: Whose certificate it shows, in a lab.
-            launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
-            hosts: Other machines, on which robots may be started.
+            context: Of the case.
             show: Called with the progress, about ten times a second.
-            interrupted: Asked whether the user wants to end it.
-            emergency: Hears emergency stops, which end it as well; one of its own if left out.
         """
-        self._experiment, self._case = experiment, case
-        self._file, self._identity = file, identity
-        self._recording = folder / f"{case}.mcap"
-        self._endpoints = list(endpoints)
-        self._hosts, self._show, self._asked = hosts, show, interrupted
-        self._emergency = Emergency() if emergency is None else emergency
+        self._context, self._show = context, show
+        self._experiment = experiment = context.experiment
+        context.file.write_bytes(write_json(experiment))
         self._keys = Keys(experiment.network.realm)
-        self._clock = launcher.clock = Clock()  # of each case, for all its processes here, however late they start
-        steered = Plan(experiment).guided
+        # of each case, for all its processes here, however late they start
+        self._clock = context.launcher.clock = Clock()
+        guided = Plan(experiment).guided
         self._robots = {
-            name: RobotView(error=None if name in steered else 0.0, left_because="standby" if robot.standby else "")
+            name: RobotView(error=None if name in guided else 0.0, left_because="standby" if robot.standby else "")
             for name, robot in experiment.robots.items()
         }
-        self._progress = Progress(case, "starting", None, experiment.duration_s, self._robots, clock=self._clock)
-        self._starting: set[str] = set()
-        self._crew = CaseProcesses(
-            experiment,
-            case,
-            file=file,
-            source=source,
-            recording=self._recording,
-            endpoints=self._endpoints,
-            rights=rights,
-            launcher=launcher,
-            hosts=hosts,
+        self._progress = Progress(
+            context.case, "starting", None, experiment.duration_s, self._robots, clock=self._clock
         )
+        self._starting: set[str] = set()
+        self._crew = CaseProcesses(context)
 
     def run(self) -> Result:
         """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
@@ -124,10 +87,10 @@ class Conductor:
         """
         began = time.monotonic()
         self._progress.phase = "connecting the hosts" if self._experiment.hosts else "starting"
-        clocks = self._hosts.join(self._experiment)
+        clocks = self._context.hosts.join(self._experiment)
         start = ready = None
         try:
-            self._crew.prepare(self._interrupted)
+            self._crew.prepare()
             with ExitStack() as stack:
                 self._join(stack)
                 self._adopt()
@@ -135,7 +98,7 @@ class Conductor:
                 if self._until("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
                     self._view.tell_clocks(clocks)
-                    self._drift = stack.enter_context(Drift(self._hosts.followed()))
+                    self._drift = stack.enter_context(Drift(self._context.hosts.followed()))
                     self._view.say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
                     if self._take_off():
                         start = self._start()
@@ -144,7 +107,7 @@ class Conductor:
                 if start is not None:
                     self._drift.close()
                     self._view.tell_drift(*self._drift.news())
-                    clocks, trouble = self._hosts.clocks()
+                    clocks, trouble = self._context.hosts.clocks()
                     self._view.tell_clocks(clocks)
                     for each in trouble:
                         self._view.say("clock", "conductor", each)
@@ -156,11 +119,7 @@ class Conductor:
         finally:
             self._crew.end()
         lost = tuple(name for name, seen in self._robots.items() if seen.left_because == "lost")
-        return Result(self._recording, self._interrupted(), start, ready, lost)
-
-    def _interrupted(self) -> bool:
-        """Whether somebody wants the run to end."""
-        return bool(self._emergency) or self._asked()
+        return Result(self._context.recording, self._context.ended(), start, ready, lost)
 
     def _adopt(self) -> None:
         """Finds robots that were started by hand or at boot, which nobody needs to start.
@@ -203,7 +162,7 @@ class Conductor:
         deadline = time.monotonic() + limit_s
         while True:
             self._look()
-            if self._interrupted():
+            if self._context.ended():
                 return False
             meanwhile()
             late = [name for name, seen in self._robots.items() if not (seen.reached(phase) or seen.gone)]
@@ -263,7 +222,7 @@ class Conductor:
         self._changes.begin(start)
         self._repeat_at = start
         self._progress.phase = "starting together"
-        while (now := self._clock.utc()) < end + LAND_S and not self._interrupted():
+        while (now := self._clock.utc()) < end + LAND_S and not self._context.ended():
             self._look()
             self._view.tell_drift(*self._drift.news())
             self._progress.elapsed = now - start
@@ -308,10 +267,10 @@ class Conductor:
         """Everybody down."""
         self._view.close_doors()
         self._changes.close()
-        self._progress.phase = "stopped" if self._emergency else "landing"
-        if self._emergency:
-            self._view.say("stop", "conductor", f"{self._emergency.words}; the run ends here")
-        how = "emergency stop" if self._emergency else "interrupted" if self._interrupted() else ""
+        self._progress.phase = "stopped" if self._context.emergency else "landing"
+        if self._context.emergency:
+            self._view.say("stop", "conductor", f"{self._context.emergency.words}; the run ends here")
+        how = "emergency stop" if self._context.emergency else "interrupted" if self._context.ended() else ""
         self._view.say("phase", "conductor", "landing" + (f" ({how})" if how else ""))
         if any(not (seen.gone or seen.reached("landing")) for seen in self._robots.values()):
             self._order(messages.Order("land"))
@@ -333,13 +292,13 @@ class Conductor:
         self._view = Overview(
             stack,
             self._experiment,
-            self._endpoints,
+            self._context.endpoints,
             self._progress,
-            self._recording.parent,
-            identity=self._identity,
+            self._context.folder,
+            identity=self._context.identity,
             clock=self._clock,
         )
-        stack.callback(self._emergency.listen(self._view.session, self._keys).close)
+        stack.callback(self._context.emergency.listen(self._view.session, self._keys).close)
         self._changes = HotChanges(self._experiment, self._crew, self._view, self._keys)
 
     def _look(self) -> None:

@@ -6,7 +6,7 @@ one of the experiment.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -20,9 +20,10 @@ from experiments.definition.experiment import Experiment, Robot
 from experiments.file import document
 from experiments.file.document import write_json
 from experiments.real_time.conductor import support
+from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.support import Servants
-from experiments.real_time.hosts.hosts import STATION, Hosts
-from experiments.real_time.hosts.launcher import LAND_S, Launcher, Process
+from experiments.real_time.hosts.hosts import STATION
+from experiments.real_time.hosts.launcher import LAND_S, Process
 
 ALONE_S: Final = 3.0  # a robot that joins a run under way does not wait longer for neighbours that say nothing
 
@@ -48,77 +49,41 @@ class CaseProcesses:
         away: Robots that are started on a host without address, and that host.
     """
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        case: str,
-        *,
-        file: Path,
-        source: Path,
-        recording: Path,
-        endpoints: Sequence[str],
-        rights: Path | None = None,
-        launcher: Launcher,
-        hosts: Hosts,
-    ) -> None:
-        """Nothing is started yet.
-
-        Args:
-            experiment: The case, overrides applied.
-            case: Its name, with which the names of the processes begin.
-            file: The same as a file, for the processes.
-            source: The experiment file as it was written, for the recording.
-            recording: Where it is recorded; the processes' output goes to `logs/` beside it.
-            endpoints: Routers.
-            rights: Who may do what, for a router that is started again, in a lab.
-            launcher: Starts the processes; the process "router", if it has one, is restarted when it dies.
-            hosts: Other machines, on which robots may be started; joined before robots are.
-        """
-        self._experiment, self._case = experiment, case
-        self._file, self._source, self._recording = file, source, recording
-        self._launcher, self._hosts = launcher, hosts
-        self._connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
+    def __init__(self, context: CaseContext) -> None:
+        """Nothing is started yet."""
+        self._context = context
+        self._launcher = context.launcher
         self._groups: dict[str, list[str]] = {}  # by process, without the case
-        for name, robot in experiment.robots.items():
+        for name, robot in context.experiment.robots.items():
             self._groups.setdefault(robot.process or name, []).append(name)
-        self._recorder = f"{case}-recorder"
         self._standins: tuple[str, ...] = ()
         self._centre: tuple[str, ...] = ()
-        self._servants = Servants(
-            experiment,
-            case,
-            file=file,
-            endpoints=endpoints,
-            routers=hosts.routers,
-            rights=rights,
-            launcher=launcher,
-        )
+        self._servants = Servants(context)
         self.adopted: set[str] = set()
-        self.away = standby.absent(experiment)
-        self._addressed, self._reached = file, experiment
-        self._joining = file.with_name(f"{case}-joining.json")
+        self.away = standby.absent(context.experiment)
+        self._addressed, self._reached = context.file, context.experiment
+        self._joining = context.folder / f"{context.case}-joining.json"
         self._abroad: dict[str, Process] = {}  # by host and group
 
-    def prepare(self, interrupted: Callable[[], bool]) -> None:
-        """Starts all but router and robots: the recorder, then what robots need.
-
-        Args:
-            interrupted: Asked while it waits whether the user wants to end it.
+    def prepare(self) -> None:
+        """Start all but router and robots: the recorder, then what robots need.
 
         Raises:
             StandInError: If a protocol twin or a positioning system does not start in time.
         """
-        case = ["--case", self._case, "--source", str(self._source)]
-        file = str(self._file)
-        self._launcher.start(
-            self._recorder,
+        context = self._context
+        context.start(
+            "recorder",
             "experiments.real_time.processes.recorder",
-            file,
-            str(self._recording),
-            *case,
-            *self._connect,
+            str(context.file),
+            str(context.recording),
+            "--case",
+            context.case,
+            "--source",
+            str(context.source),
+            *context.connect,
         )
-        self._stand_in(interrupted)
+        self._start_standins()
         self._centre = self._servants.start_centre()
 
     def adopt(self, there: Iterable[str]) -> list[str]:
@@ -128,7 +93,7 @@ class CaseProcesses:
 
     def start(self) -> None:
         """Starts all robots that are neither adopted nor on standby, on their machines."""
-        robots = self._experiment.robots
+        robots = self._context.experiment.robots
         for names in self._groups.values():
             if missing := [name for name in names if not (name in self.adopted or robots[name].standby)]:
                 self._start(missing, self._addressed, self._reached)
@@ -158,12 +123,12 @@ class CaseProcesses:
 
     def _start(self, names: Sequence[str], file: Path, told: Experiment) -> None:
         group = self._group(names[0])
-        station, process = self._hosts.of(names[0]), self._process(group)
+        station, process = self._context.hosts.of(names[0]), self._process(group)
         if station is not None:
             told_case = document.case_document(told)
             self._abroad[f"{station.name}/{group}"] = station.start(process, names, told_case, self._launcher)
         else:
-            arguments = [str(file), *names, *self._connect, "--lifeline"]
+            arguments = [str(file), *names, *self._context.connect, "--lifeline"]
             self._launcher.start(process, "experiments.real_time.processes.robot", *arguments)
 
     def robot(self, name: str) -> Robot:
@@ -174,7 +139,7 @@ class CaseProcesses:
         """Where a robot is put (2,) [m], or where `robot` would be under its name."""
         robots = self._reached.robots if robot is None else {**self._reached.robots, name: robot}
         position, _ = bodies.scattered(
-            msgspec.structs.replace(self._reached, robots=robots), [name], self._experiment.seed
+            msgspec.structs.replace(self._reached, robots=robots), [name], self._context.experiment.seed
         )
         return np.asarray(position[0, :2])
 
@@ -198,26 +163,26 @@ class CaseProcesses:
         """Ends all but the router: robots land first, and the recorder sees it."""
         self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
         self._launcher.end(self._centre, grace_s=2.0)  # its last word is recorded
-        self._launcher.end([self._recorder], grace_s=5.0)
+        self._launcher.end([self._context.process("recorder")], grace_s=5.0)
         self._launcher.end(self._standins, grace_s=2.0)
 
     def deaths(self) -> Iterator[Death]:
         """What has died since the last call; router, world, centre and positioning are started again, a few times."""
         for process in self._launcher.died():
-            again = self._servants.again(process, self._case)
+            again = self._servants.again(process)
             if again is not None:
                 yield Death(again[0], "conductor", again[1])
             elif process.name in self._standins:
-                what = process.name.removeprefix(f"{self._case}-")
+                what = process.name.removeprefix(self._context.process(""))
                 text = f"the {what} ended ({process.exit}); robots that need it hold, or land{_because(process)}"
                 yield Death("device", "conductor", text)
-            elif process.name == self._recorder:
+            elif process.name == self._context.process("recorder"):
                 yield Death("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
             elif process.name.startswith(STATION):
                 what = f"the connection to it ended ({process.exit}); without a router robots hold{_because(process)}"
                 yield Death("host", process.name.removeprefix(STATION), what)
             else:
-                for name in self._groups.get(process.name.removeprefix(f"{self._case}-"), []):
+                for name in self._groups.get(process.name.removeprefix(self._context.process("")), []):
                     yield Death("lost", name, f"its process ended ({process.exit}){_because(process)}")
 
     def output(self) -> Iterator[tuple[str, str]]:
@@ -229,30 +194,23 @@ class CaseProcesses:
     def last_line(self, robot: str) -> str:
         """The last line that the process of a robot wrote; empty if it wrote none."""
         group = self._group(robot)
-        log = self._recording.parent / "logs" / f"{self._process(group)}.log"
+        log = self._context.folder / "logs" / f"{self._process(group)}.log"
         return "".join(log.read_text(errors="replace").strip().splitlines()[-1:]) if log.exists() else ""
 
     def _group(self, robot: str) -> str:
         return next(group for group, members in self._groups.items() if robot in members)
 
     def _process(self, group: str) -> str:
-        return f"{self._case}-{group}"
+        return self._context.process(group)
 
-    def _stand_in(self, interrupted: Callable[[], bool]) -> None:
-        """Starts world, protocol twins and positioning, and writes down at which addresses robots are then."""
-        started = support.start(
-            self._experiment,
-            self._file,
-            prefix=self._case,
-            launcher=self._launcher,
-            connect=self._connect,
-            interrupted=interrupted,
-        )
+    def _start_standins(self) -> None:
+        """Start world, protocol twins and positioning, and write a file with the addresses of the robots."""
+        started = support.start(self._context)
         self._reached, self._standins = started.experiment, started.names
         if started.positioning is not None:
             self._servants.keep(*started.positioning)
         if self._standins:
-            self._addressed = self._file.with_name(f"{self._case}-addressed.json")
+            self._addressed = self._context.folder / f"{self._context.case}-addressed.json"
             self._addressed.write_bytes(write_json(self._reached))
 
 

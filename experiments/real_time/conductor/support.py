@@ -15,8 +15,9 @@ import msgspec
 from agents.network import endpoints as topology
 from agents.plugins import registry
 from experiments.definition import bodies
-from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
+from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.hosts.launcher import ROUTER, Launcher, Process, is_router
 
 READY_S: Final = 15.0
@@ -43,111 +44,80 @@ class StandIns:
     positioning: tuple[str, Callable[[], Process]] | None
 
 
-def start(
-    experiment: Experiment,
-    file: Path,
-    *,
-    prefix: str,
-    launcher: Launcher,
-    connect: Sequence[str],
-    interrupted: Callable[[], bool],
-) -> StandIns:
-    """Starts what the experiment asks for, and fills in at which address each robot is.
-
-    Args:
-        experiment: A case.
-        file: The same as a file.
-        prefix: Of the processes' names.
-        launcher: Starts them.
-        connect: `--connect` and its endpoints.
-        interrupted: Asked while it waits.
+def start(context: CaseContext) -> StandIns:
+    """Start the stand-ins that the experiment asks for, and fill in at which address each robot is.
 
     Raises:
         StandInError: If one does not start in time.
     """
-    world = start_world(experiment, file, prefix=prefix, launcher=launcher, connect=connect)
+    experiment = context.experiment
+    world = start_world(context)
     words = registry.names(registry.DEVICES)
     groups: dict[str, list[str]] = {}
     for name, robot in experiment.robots.items():
         if robot.body in words:
             groups.setdefault(robot.body, []).append(name)
     processes = {
-        word: launcher.start(
-            f"{prefix}-{word}",
+        word: context.start(
+            word,
             "experiments.real_time.processes.protocol_twins",
-            str(file),
+            str(context.file),
             *names,
-            *connect,
+            *context.connect,
             "--lifeline",
         )
         for word, names in groups.items()
     }
     addresses: dict[str, str] = {}
     for word, names in groups.items():
-        wanted = _said(processes[word], r"^address (\w+) (\S+)$", len(names), interrupted)
-        addresses.update(wanted)
+        addresses |= _announced(processes[word], r"^address (\w+) (\S+)$", len(names), context.ended)
     started = [process.name for process in processes.values()]
     if world is not None:
-        _said(world, r"^(world) (ready)\b", 1, interrupted)
+        _announced(world, r"^(world) (ready)\b", 1, context.ended)
         started.append(world.name)
     robots = {
         name: msgspec.structs.replace(robot, body=addresses.get(name, robot.body))
         for name, robot in experiment.robots.items()
     }
-    measuring, positioning = _positioning(
-        experiment, robots, prefix=prefix, launcher=launcher, connect=connect, interrupted=interrupted
-    )
-    return StandIns(msgspec.structs.replace(experiment, robots=robots), (*started, *measuring), positioning)
+    addressed = msgspec.structs.replace(experiment, robots=robots)
+    measuring, positioning = _start_positioning(context, addressed)
+    return StandIns(addressed, (*started, *measuring), positioning)
 
 
-def start_world(
-    experiment: Experiment, file: Path, *, prefix: str, launcher: Launcher, connect: Sequence[str]
-) -> Process | None:
-    """Starts the world of an experiment, for the first time or again; None if no robot asks for one."""
-    robots = experiment.robots.values()
-    if not any(bodies.WORLD in (robot.body, robot.ranges) for robot in robots):
+def start_world(context: CaseContext) -> Process | None:
+    """Start the world of an experiment, for the first time or again; None if no robot asks for one."""
+    if not any(bodies.WORLD in (robot.body, robot.ranges) for robot in context.experiment.robots.values()):
         return None
-    return launcher.start(
-        world_name(prefix), "experiments.real_time.processes.world", str(file), *connect, "--lifeline"
+    return context.start(
+        "world", "experiments.real_time.processes.world", str(context.file), *context.connect, "--lifeline"
     )
 
 
-def world_name(prefix: str) -> str:
-    """What the process of the world is called."""
-    return f"{prefix}-world"
-
-
-def _positioning(
-    experiment: Experiment,
-    robots: dict[str, Robot],
-    *,
-    prefix: str,
-    launcher: Launcher,
-    connect: Sequence[str],
-    interrupted: Callable[[], bool],
+def _start_positioning(
+    context: CaseContext, experiment: Experiment
 ) -> tuple[list[str], tuple[str, Callable[[], Process]] | None]:
-    """Who measures external positions: the names of the processes that were started for it; see `StandIns`."""
-    measured = Plan(msgspec.structs.replace(experiment, robots=robots)).externally_measured
+    """Start the motion capture of the case, whose robots have addresses: names of its processes; see `StandIns`."""
+    measured = Plan(experiment).externally_measured
     if experiment.positioning is None or not measured:
         return [], None
     started = []
-    network = [*connect, "--realm", experiment.network.realm, "--lifeline"]
+    network = [*context.connect, "--realm", experiment.network.realm, "--lifeline"]
     host = experiment.positioning.removeprefix(VICON)
     if experiment.positioning == bodies.VICON_TWIN:
         sigma = max(bodies.disturbance(experiment, name).position_sigma or 0.0 for name in measured)
         noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
         arguments = ["--listen", "127.0.0.1:0", "--robots", *measured, *noise, *network]
-        twin = launcher.start(f"{prefix}-{bodies.VICON_TWIN}", "twins.devices.vicon", *arguments)
+        twin = context.start(bodies.VICON_TWIN, "twins.devices.vicon", *arguments)
         started.append(twin.name)
-        host = _said(twin, r"^vicon (ready on) (\S+)$", 1, interrupted)["ready on"]
+        host = _announced(twin, r"^vicon (ready on) (\S+)$", 1, context.ended)["ready on"]
     maps = [part for name in measured for part in ("--map", f"{name}={name}")]
-    bridge = partial(launcher.start, f"{prefix}-vicon", "bridges.vicon.publisher", host, *maps, *network)
+    bridge = partial(context.start, "vicon", "bridges.vicon.publisher", host, *maps, *network)
     name = bridge().name
     return [*started, name], (name, bridge)
 
 
-def _said(process: Process, pattern: str, count: int, interrupted: Callable[[], bool]) -> dict[str, str]:
-    """Waits until a process has said so many lines of a form; the two groups of each."""
+def _announced(process: Process, pattern: str, count: int, interrupted: Callable[[], bool]) -> dict[str, str]:
+    """Wait until a process has printed so many lines of a form; the two groups of each."""
     deadline = time.monotonic() + READY_S
     while True:
         found = dict(re.findall(pattern, process.log.read_text(errors="replace"), re.MULTILINE))
@@ -174,50 +144,31 @@ class _Servant:
 
 
 class Servants:
-    """Those of one case."""
+    """Supervised processes of one case: routers, world, central controller, motion capture."""
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        case: str,
-        *,
-        file: Path,
-        endpoints: Sequence[str],
-        routers: Sequence[str],
-        rights: Path | None,
-        launcher: Launcher,
-    ) -> None:
-        """The router and the world are started by others, for the first time; the centre by `start_centre`.
-
-        Args:
-            experiment: The case.
-            case: Its name.
-            file: The same as a file.
-            endpoints: Routers as this machine reaches them.
-            routers: Where routers of our own listen, which other machines must find again.
-            rights: Who may do what, in a lab; None without one.
-            launcher: Starts them.
-        """
-        connect = [part for endpoint in endpoints for part in ("--connect", endpoint)]
-        self._centre = f"{case}-centre" if Plan(experiment).guided else None
-        several = experiment.network.routers > 1
+    def __init__(self, context: CaseContext) -> None:
+        """Others start the router and the world for the first time; `start_centre` starts the central controller."""
+        self._context = context
+        count = context.experiment.network.routers
         self._known = {
             each.name: _Servant(
-                partial(each.start, launcher, rights),
-                ": all go on at another meanwhile" if several else "",
-                ": no other takes its place" if several else ": the robots hold, and land at the end",
+                partial(each.start, context.launcher, context.rights),
+                ": all go on at another meanwhile" if count > 1 else "",
+                ": no other takes its place" if count > 1 else ": the robots hold, and land at the end",
             )
-            for each in divided(routers, experiment.network.routers)
-        } | {
-            world_name(case): _Servant(
-                lambda: start_world(experiment, file, prefix=case, launcher=launcher, connect=connect)
-            ),
-        }
-        if self._centre is not None:
-            name = self._centre
-            self._known[name] = _Servant(
-                lambda: launcher.start(
-                    name, "experiments.real_time.processes.centre", str(file), *connect, "--lifeline"
+            for each in divided(context.hosts.routers, count)
+        } | {context.process("world"): _Servant(partial(start_world, context))}
+        self._centre: tuple[str, ...] = ()
+        if Plan(context.experiment).guided:
+            self._centre = (context.process("centre"),)
+            self._known[self._centre[0]] = _Servant(
+                partial(
+                    context.start,
+                    "centre",
+                    "experiments.real_time.processes.centre",
+                    str(context.file),
+                    *context.connect,
+                    "--lifeline",
                 ),
                 given_up=": the robots that it guides hold, and land at the end",
             )
@@ -228,18 +179,17 @@ class Servants:
         self._known[name] = _Servant(start, hold, hold)
 
     def start_centre(self) -> tuple[str, ...]:
-        """Starts the centre, if robots are guided by one; the name of its process."""
-        if self._centre is None:
-            return ()
-        self._known[self._centre].start()
-        return (self._centre,)
+        """Start the central controller, if robots are guided by one; the names of its processes."""
+        for name in self._centre:
+            self._known[name].start()
+        return self._centre
 
-    def again(self, process: Process, case: str) -> tuple[str, str] | None:
+    def again(self, process: Process) -> tuple[str, str] | None:
         """Starts one again that has died; what kind it is, and what is to be said. None if it is no servant."""
         servant = self._known.get(process.name)
         if servant is None:
             return None
-        kind = process.name.removeprefix(f"{case}-")
+        kind = process.name.removeprefix(self._context.process(""))
         more = servant.starts < STARTS
         if more:
             servant.starts += 1

@@ -1,0 +1,56 @@
+"""The context of one case in real time: what its conductor, its processes and their restarts share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from experiments.definition.experiment import Experiment
+from experiments.real_time.conductor.run_view import Emergency
+from experiments.real_time.hosts.hosts import Hosts
+from experiments.real_time.hosts.launcher import Launcher, Process
+
+
+@dataclass(frozen=True)
+class CaseContext:
+    """One case of a run, where its files go, and the means to run it."""
+
+    experiment: Experiment  # overrides applied
+    case: str  # its name, with which the names of its processes and files begin
+    folder: Path  # for the recording, and for the processes' output in logs/
+    source: Path  # the experiment file as it was written, for the recording
+    endpoints: Sequence[str]  # routers as this machine reaches them
+    launcher: Launcher
+    hosts: Hosts  # other machines, on which robots may be started; it has the endpoints at which our routers listen
+    interrupted: Callable[[], bool] = lambda: False  # whether the user wants to end the run
+    rights: Path | None = None  # access rights for a router that is started again, in a lab
+    identity: str = "operator"  # whose certificate the conductor shows, in a lab
+    emergency: Emergency = field(default_factory=Emergency)  # emergency stops, which end the run as well
+
+    @property
+    def file(self) -> Path:
+        """The case as a file, for its processes."""
+        return self.folder / f"{self.case}.json"
+
+    @property
+    def recording(self) -> Path:
+        """The file of the recorder."""
+        return self.folder / f"{self.case}.mcap"
+
+    @property
+    def connect(self) -> list[str]:
+        """Arguments with which processes of this machine reach the routers."""
+        return [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
+
+    def ended(self) -> bool:
+        """Whether the user or an emergency stop ends the run."""
+        return bool(self.emergency) or self.interrupted()
+
+    def process(self, role: str) -> str:
+        """The name of a process of this case."""
+        return f"{self.case}-{role}"
+
+    def start(self, role: str, module: str, *arguments: str) -> Process:
+        """Start a process of this case on this machine."""
+        return self.launcher.start(self.process(role), module, *arguments)
