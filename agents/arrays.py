@@ -1,7 +1,11 @@
-"""The array types of the row-wise core: first axis is the robots (N) or the links (E)."""
+"""Array types of the row-wise core and the table of poses: first axis is robots (N), links (E) or poses (M)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any, Self
+
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,3 +43,50 @@ def span(rows: Index) -> Rows:
     if len(rows) and (np.diff(rows) == 1).all():
         return slice(int(rows[0]), int(rows[-1]) + 1)
     return rows
+
+
+class PoseTable(msgspec.Struct, frozen=True):
+    """Poses (M) of many robots: as they were sent, on their way, or as they were received.
+
+    In memory alone an array may have no columns, (M, 0), where its values are not kept.
+    """
+
+    link: Index  # directed link; in a table of sent poses, the sender's row
+    seq: Index  # running number of the sender
+    stamp: Array  # [s] when the pose was sent
+    arrival: Array  # [s]
+    position: Array  # (M, 3) [m]
+    velocity: Array  # (M, 3) [m/s]
+    yaw: Array | None = None  # [rad]
+    bytes: Index | None = None  # of the payload
+    extra: Array | None = None  # (M, k) transmitted with the pose
+
+    @classmethod
+    def joined(cls, tables: Sequence[Self]) -> Self:
+        """All rows of `tables`, which have the same columns."""
+        columns: Any = zip(*map(msgspec.structs.astuple, tables), strict=True)
+        joined: list[Any] = [None if column[0] is None else np.concatenate(column) for column in columns]
+        return cls(*joined)
+
+    def __len__(self) -> int:
+        return len(self.link)
+
+    def take(self, which: Index | Mask) -> Self:
+        """Some of the rows."""
+        kept: list[Any] = [None if column is None else column[which] for column in msgspec.structs.astuple(self)]
+        return type(self)(*kept)
+
+    def since(self, begin: float) -> Self:
+        """The same with times that count from `begin` [s]."""
+        return msgspec.structs.replace(self, stamp=self.stamp - begin, arrival=self.arrival - begin)
+
+    def between(self, first: int, end: int) -> Self:
+        """Rows of the links from `first` to before `end`, which then count from 0."""
+        kept = self.take((self.link >= first) & (self.link < end))
+        return msgspec.structs.replace(kept, link=kept.link - first)
+
+
+def no_poses() -> PoseTable:
+    """A table without rows."""
+    none, rows = np.zeros(0), np.zeros(0, dtype=np.intp)
+    return PoseTable(rows, rows, none, none, np.zeros((0, 3)), np.zeros((0, 3)), none, rows)

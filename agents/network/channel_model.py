@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from agents.arrays import Array, Index, Mask, every, some
+from agents.arrays import Array, Index, Mask, PoseTable, every, some
 
 Share = Annotated[float, Meta(ge=0, le=1)]
 Delay = Annotated[float, Meta(ge=0, le=60)]
@@ -148,36 +148,6 @@ class Conditions:
         return cls(**columns, outages=tuple(outages), duration=parts[0].duration)
 
 
-class Samples(msgspec.Struct, frozen=True):
-    """Poses on their way (M): link, arrival time, sample time [s], number, position and velocity (M, 3).
-
-    `extra` (M, k) is what else is told with them, for those who need it: with all that go over a channel, or with none.
-    """
-
-    link: Index
-    arrival: Array
-    stamp: Array
-    seq: Index
-    position: Array
-    velocity: Array
-    extra: Array | None = None
-
-    def take(self, which: Index | Mask) -> Samples:
-        """Some of them."""
-        return Samples(
-            self.link[which],
-            self.arrival[which],
-            self.stamp[which],
-            self.seq[which],
-            self.position[which],
-            self.velocity[which],
-            None if self.extra is None else self.extra[which],
-        )
-
-
-COLUMNS: Final = tuple(name for name in Samples.__struct_fields__ if name != "extra")
-
-
 class Channel:
     """Carries samples over links (E).
 
@@ -204,7 +174,7 @@ class Channel:
         self._in_order = isinstance(self._delay, float) and not (self._jitters or self.limited)
         self._enter, self._leave = _thresholds(conditions)
         self._free = np.full(len(conditions), -np.inf)  # when each link has sent all that it has taken
-        self._flying: list[Samples] = []
+        self._flying: list[PoseTable] = []
 
     def send(
         self,
@@ -219,7 +189,7 @@ class Channel:
         now: float = -np.inf,
         extra: Array | None = None,
     ) -> None:
-        """Samples set out, on each link at most one.
+        """PoseTable set out, on each link at most one.
 
         Before the common start nothing is lost and no link is too slow: no run begins before everybody has heard his
         neighbours, and the real network repeats a first pose until it arrives. Nor is anything after the end.
@@ -251,9 +221,9 @@ class Channel:
         if now > -np.inf:
             arrival, self._in_order = np.maximum(arrival, now), False  # speakers are asked one after the other
         if len(link):
-            self._flying.append(Samples(link, arrival, stamp, seq, position, velocity, extra))
+            self._flying.append(PoseTable(link, seq, stamp, arrival, position, velocity, extra=extra))
 
-    def due(self, t: float) -> Samples | None:
+    def due(self, t: float) -> PoseTable | None:
         """What gets through by `t` [s], in order of arrival."""
         if not self._flying:
             return None
@@ -337,12 +307,10 @@ class Channel:
         self._free[link[occupies]] = (stamp + waits)[occupies]
         return waits, taken
 
-    def _pool(self) -> Samples:
+    def _pool(self) -> PoseTable:
         if len(self._flying) == 1:
             return self._flying[0]
-        pool = Samples(*(np.concatenate([getattr(each, column) for each in self._flying]) for column in COLUMNS))
-        extra = [each.extra for each in self._flying if each.extra is not None]
-        return msgspec.structs.replace(pool, extra=np.concatenate(extra)) if extra else pool
+        return PoseTable.joined(self._flying)
 
 
 def _thresholds(conditions: Conditions) -> tuple[Array, Array]:

@@ -13,9 +13,9 @@ import numpy as np
 import zenoh
 
 from agents.agent import Agent, links_by_speaker
-from agents.arrays import Index
+from agents.arrays import Index, PoseTable
 from agents.network import messages, pubsub, validation
-from agents.network.channel_model import Channel, Conditions, Samples
+from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
 
 LATE_S: Final = 3.0  # a network delays no pose longer: Zenoh holds one back for 2 s where another is missing
@@ -265,14 +265,14 @@ class Neighbours:
         """Gives poses, each with the link on which it arrived, to the modelled network, all of a tick at once."""
         poses = [heard.pose for _, heard in arrived]
         measured = np.array([[heard.measured - utc] for _, heard in arrived])
-        got = Samples(
+        got = PoseTable(
             np.array([link for link, _ in arrived]),
-            np.array([t] * len(arrived)),
-            np.array([pose.stamp - utc for pose in poses]),
             np.array([pose.seq for pose in poses]),
+            np.array([pose.stamp - utc for pose in poses]),
+            np.array([t] * len(arrived)),
             np.array([pose.position for pose in poses]),
             np.array([pose.velocity or messages.STILL for pose in poses]),
-            measured,
+            extra=measured,
         )
         if self._channel.ideal:
             self._believe(got, utc)
@@ -286,7 +286,7 @@ class Neighbours:
                 start=start[one], size=sizes[one], now=t, extra=measured[one],
             )  # fmt: skip
 
-    def _believe(self, got: Samples, utc: float) -> None:
+    def _believe(self, got: PoseTable, utc: float) -> None:
         """Poses have got through."""
         assert got.extra is not None  # all bring along when they were measured; what is recorded keeps its own stamp
         self._agent.receive(got.link, got.position, got.velocity, got.extra[:, 0], got.arrival)

@@ -57,15 +57,15 @@ def goals_to(trace: Trace) -> tuple[Index, Index]:
     rows, goals = len(trace.robots), trace.goals
     if goals is None:
         return np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
-    size = np.bincount(goals.robot, weights=goals.bytes, minlength=rows)
-    return np.bincount(goals.robot, minlength=rows), size.astype(np.intp)
+    size = np.bincount(goals.sent.link, weights=goals.sent.bytes, minlength=rows)
+    return np.bincount(goals.sent.link, minlength=rows), size.astype(np.intp)
 
 
 def deliveries(trace: Trace, sent: Index) -> int:
     """Messages counted once for everybody who listens, when robots `sent` (N,) poses: to each other, to the centre, and
     the goals."""
     listeners = np.bincount(trace.plan.heard_links.speaker, minlength=len(sent)) + centre_hears(trace)
-    return int(sent @ listeners) + (0 if trace.goals is None else len(trace.goals.time))
+    return int(sent @ listeners) + (0 if trace.goals is None else len(trace.goals.sent))
 
 
 def guidance(trace: Trace) -> Guidance | None:
@@ -79,11 +79,11 @@ def guidance(trace: Trace) -> Guidance | None:
     missed = [report.missed for report in goals.reports]
     return Guidance(
         guided=trace.plan.guided,
-        goals=len(goals.time),
-        goals_hz=len(goals.time) / duration,
-        goal_bytes=int(goals.bytes.sum()),
-        goals_lost=max(0, len(goals.time) - int(goals.reached.sum())),
-        heard=int(goals.heard.sum()),
+        goals=len(goals.sent),
+        goals_hz=len(goals.sent) / duration,
+        goal_bytes=int(goals_to(trace)[1].sum()),
+        goals_lost=max(0, len(goals.sent) - int(goals.reached.sum())),
+        heard=int(goals.received.sum()),
         poses_lost=int(goals.lost.sum() + goals.dropped.sum()),
         delay_mean_s=all_of_them.mean,
         delay_p95_s=all_of_them.p95,

@@ -180,15 +180,16 @@ def _robots(
     unsettled = ~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0))
     settled = after_last(unsettled & (there[:, None] | np.isfinite(total)), time)
     sent, recorded = transmissions(trace)
-    size = np.bincount(trace.sent.robot, weights=trace.sent.bytes, minlength=rows)
+    size = np.bincount(trace.sent.link, weights=trace.sent.bytes, minlength=rows)
     linked = np.zeros((rows, rows), dtype=bool)  # what only avoidance listens to does not belong to the formation
     told = centralised.guided_rows(trace)[errors.net.listener]  # what they would listen to, the centre hears
     linked[errors.net.listener[~told], errors.net.speaker[~told]] = True
-    by_listeners = linked[trace.heard.listener, trace.heard.speaker]
-    heard = np.bincount(trace.heard.speaker[by_listeners], minlength=rows)
+    net, received = trace.plan.heard_links, trace.received.link
+    counted = linked[net.listener, net.speaker][received]
+    heard = np.bincount(net.speaker[received[counted]], minlength=rows)
     listeners = np.bincount(errors.net.speaker[~told], minlength=rows) + centralised.centre_hears(trace)
     if trace.goals is not None:
-        heard += trace.goals.heard
+        heard += trace.goals.received
     goals, goal_bytes, late = *centralised.goals_to(trace), centralised.delays(trace)
     waits = [(wait.min(), float(np.median(wait)), wait.max()) if len(wait) else (np.nan,) * 3 for wait in gaps(trace)]
     own = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]

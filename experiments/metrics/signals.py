@@ -204,10 +204,10 @@ def beliefs(trace: Trace, net: Links) -> Array:
 
     NaN before the first pose, and after a death.
     """
-    rows, heard = len(trace.robots), trace.heard
+    rows, heard, links = len(trace.robots), trace.received, trace.plan.heard_links
     number = np.full((rows, rows), -1)
     number[net.listener, net.speaker] = np.arange(len(net))
-    link = number[heard.listener, heard.speaker]
+    link = number[links.listener, links.speaker][heard.link]
     error = np.full((len(trace.time), len(net)), np.nan)
     order = np.argsort(link, kind="stable")
     ends = np.searchsorted(link[order], np.arange(len(net) + 1))
@@ -216,7 +216,7 @@ def beliefs(trace: Trace, net: Links) -> Array:
         mine = mine[heard.stamp[mine] >= np.maximum.accumulate(heard.stamp[mine])]  # overtaken samples are ignored
         if not len(mine):
             continue
-        at = np.searchsorted(heard.time[mine], trace.time, side="right") - 1
+        at = np.searchsorted(heard.arrival[mine], trace.time, side="right") - 1
         newest = mine[at]
         age = np.maximum(trace.time - heard.stamp[newest], 0.0)
         believed = trace.plan.predictor.position(heard.position[newest], heard.velocity[newest], age)
@@ -246,33 +246,22 @@ def outside_arena(trace: Trace) -> Array:
 
 def gaps(trace: Trace) -> list[Array]:
     """Times between transmissions, per robot [s]."""
-    order = np.lexsort((trace.sent.time, trace.sent.robot))
-    ends = np.searchsorted(trace.sent.robot[order], np.arange(1, len(trace.robots)))
-    return [np.diff(times) for times in np.split(trace.sent.time[order], ends)]
+    return [np.diff(np.sort(trace.sent_by(row).stamp)) for row in range(len(trace.robots))]
 
 
 def transmissions(trace: Trace) -> tuple[Index, Index]:
     """Per robot: how many poses it sent, by its running numbers, and how many of them are in the recording."""
-    sent, rate = trace.sent, trace.experiment.rates.pose_hz
-    own: list[list[tuple[float, int]]] = [[] for _ in trace.robots]
-    for row, time, seq in zip(sent.robot.tolist(), sent.time.tolist(), sent.seq.tolist(), strict=True):
-        own[row].append((time, seq))
-    recorded = np.array([len(poses) for poses in own], dtype=np.intp)
-    return recorded + np.array([unrecorded(poses, rate) for poses in own], dtype=np.intp), recorded
+    tables, rate = [trace.sent_by(row) for row in range(len(trace.robots))], trace.experiment.rates.pose_hz
+    missing = [unrecorded(zip(own.stamp.tolist(), own.seq.tolist(), strict=True), rate) for own in tables]
+    recorded = np.array([len(own) for own in tables], dtype=np.intp)
+    return recorded + np.array(missing, dtype=np.intp), recorded
 
 
 def passages(trace: Trace) -> tuple[Passage, ...]:
     """Of every link on which something may be heard, those that only avoidance needs included."""
-    links, rows = trace.plan.heard_links, len(trace.robots)
-    count = len(links)
+    links, received = trace.plan.heard_links, trace.received
+    count, link, took = len(links), received.link, received.arrival - received.stamp
     dropped = np.zeros(count, dtype=np.intp) if trace.dropped is None else trace.dropped
-    ends = links.listener * rows + links.speaker
-    order = np.argsort(ends)
-    asked = trace.heard.listener * rows + trace.heard.speaker
-    at = np.searchsorted(ends, asked, sorter=order)
-    known = at < count
-    known[known] = ends[order[at[known]]] == asked[known]
-    link, took = order[at[known]], (trace.heard.time - trace.heard.stamp)[known]
     heard = np.bincount(link, minlength=count)
     total = np.bincount(link, weights=took, minlength=count)
     longest = np.full(count, -np.inf)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import Final, Literal
 
@@ -12,7 +12,6 @@ import numpy as np
 from agents.arrays import Index
 from agents.network.messages import Status
 from agents.network.validation import missed, said_within
-from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
@@ -64,24 +63,34 @@ def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float
     return max(0, min(last.sent - number, said_within(last.stamp - stamp, rate)))
 
 
-def dropped(experiment: Experiment, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
+def dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
     """(E,) what the modelled network dropped on each of `Plan.heard_links`; `statuses` of each robot."""
-    links, robots = Plan(experiment).heard_links, list(experiment.robots)
+    links, robots = plan.heard_links, plan.names
     found = [_by_speaker(said, run, "dropped") for said in statuses]
     ends = zip(links.listener.tolist(), links.speaker.tolist(), strict=True)
     return np.array([found[i][robots[j]] for i, j in ends], dtype=np.intp)
 
 
 def _by_speaker(statuses: list[Status], run: tuple[float, float], what: Literal["lost", "dropped"]) -> Counter[str]:
-    """What one listener's process, or several after each other, counted in the run, by speaker."""
+    """Poses lost or dropped in the run by one receiver, by sender."""
+    return growth(((status.pid, status.stamp, getattr(status, what)) for status in statuses), *run)
+
+
+def growth(counts: Iterable[tuple[int, float, Mapping[str, int]]], start: float, end: float) -> Counter[str]:
+    """How much counters grew in a run, by their names.
+
+    Args:
+        counts: Reports in order of time: process, stamp [s], and what the process has counted since it began.
+        start: Of the run [s].
+        end: Of the run [s]; a report at most `STATUS_S` later counts.
+    """
     total: Counter[str] = Counter()
-    before: dict[str, int] = {}
+    before: Mapping[str, int] = {}
     process = None
-    for status in statuses:
-        if status.pid != process:
-            before, process = {}, status.pid
-        if run[0] < status.stamp <= run[1] + STATUS_S:
-            now: dict[str, int] = getattr(status, what)
-            total.update({speaker: max(0, count - before.get(speaker, 0)) for speaker, count in now.items()})
-        before = getattr(status, what)
+    for pid, stamp, now in counts:
+        if pid != process:  # started again: counts from 0
+            before, process = {}, pid
+        if start < stamp <= end + STATUS_S:
+            total.update({name: max(0, count - before.get(name, 0)) for name, count in now.items()})
+        before = now
     return total

@@ -12,19 +12,18 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agents.arrays import Array, Index
+from agents.arrays import Array, Index, PoseTable
 from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, State, Status, WorldState
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.recording.cdr import Codec, Undecodable, codec
-from experiments.recording.centre_goals import of_recording
 from experiments.recording.clocks import Correction
-from experiments.recording.losses import STATUS_S, dropped, lost
+from experiments.recording.losses import STATUS_S, dropped, growth, lost
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
 from experiments.recording.topics import JSON, METADATA, TOPICS, SentGoal, SentPose
-from experiments.recording.trace import ROUNDING_S, HeardPoses, Sent, Trace, looked_for, within
+from experiments.recording.trace import ROUNDING_S, Goals, Trace, looked_for, received_in_run, sent_in_run, within
 
 HOLD_PERIODS: Final = 2.0  # for so many state periods a robot is where it last said; then nobody knows
 EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the whole run are not that much early
@@ -203,10 +202,8 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
     turned = any(state.attitude is not None for state in content[State])
     shadowed = any(state.shadow_position is not None for state in content[State])
     contacts, world = within(content[Contact], start, duration), within(content[WorldState], start, duration)
-    goals = None
-    if Plan(experiment).guided:
-        told = dict(zip(robots, states, strict=True))
-        goals = of_recording(content[SentGoal], told, content[CentreState], start, duration)
+    plan = Plan(experiment)
+    goals = _goals(content, states, robots, start, duration) if plan.guided else None
     return Trace(
         case=about[0],
         experiment=experiment,
@@ -220,10 +217,10 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         goal=column("goal"),
         setpoint=column("setpoint"),
         sent=_sent(poses, start, duration),
-        heard=_heard(states, robots, start, duration),
+        received=_received(states, plan, start, duration),
         lost=lost(robots, poses, statuses, (start, start + duration), experiment.rates.pose_hz)
         + (0 if goals is None else goals.lost),
-        dropped=dropped(experiment, statuses, (start, start + duration)),
+        dropped=dropped(plan, statuses, (start, start + duration)),
         missed_deadlines=_counted(last, "missed"),
         ticks=_counted(last, "ticks"),
         decisions=_counted(last, "decisions"),
@@ -300,61 +297,75 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def _sent(poses: list[list[SentPose]], start: float, duration: float) -> Sent:
-    table = _in_run(
-        [
-            (
-                *(pose.stamp, row, pose.seq, *pose.position),
-                *(*(pose.velocity or NOWHERE), _number(pose.yaw), pose.size),
-            )
-            for row, own in enumerate(poses)
-            for pose in own
-        ],
-        (11, start, duration),
+def _sent(poses: list[list[SentPose]], start: float, duration: float) -> PoseTable:
+    rows = [
+        (
+            row,
+            pose.seq,
+            pose.stamp,
+            pose.stamp,
+            *pose.position,
+            *(pose.velocity or NOWHERE),
+            _number(pose.yaw),
+            pose.size,
+        )
+        for row, own in enumerate(poses)
+        for pose in own
+    ]
+    return sent_in_run(_table(rows).since(start), duration)
+
+
+def _received(states: list[list[State]], plan: Plan, start: float, duration: float) -> PoseTable:
+    """On the links of the plan; other poses that a robot received count nowhere."""
+    ends, names = plan.heard_links, plan.names
+    pairs = zip(ends.listener.tolist(), ends.speaker.tolist(), strict=True)
+    links = {(receiver, names[sender]): link for link, (receiver, sender) in enumerate(pairs)}
+    rows = [
+        (links[row, each.speaker], each.seq, each.stamp, each.arrived, *each.position, *each.velocity, math.nan, 0)
+        for row, own in enumerate(states)
+        for state in own
+        for each in state.heard
+        if (row, each.speaker) in links
+    ]
+    return received_in_run(replace(_table(rows), yaw=None, bytes=None).since(start), duration)
+
+
+def _goals(content: _Content, states: list[list[State]], robots: Sequence[str], start: float, duration: float) -> Goals:
+    """What the central controller and the robots that it guides sent each other."""
+    row = {name: number for number, name in enumerate(robots)}
+    goals = sorted((g for g in content[SentGoal] if g.robot in row), key=lambda goal: (goal.stamp, row[goal.robot]))
+    sent = [(row[g.robot], g.seq, g.stamp, g.received, *g.position, *NOWHERE, _number(g.yaw), g.size) for g in goals]
+    receipts = sorted(
+        (each.acted, row, each.pose, each.seq, each.stamp)
+        for row, own in enumerate(states)
+        for state in own
+        for each in state.followed
     )
-    return Sent(
-        time=table[:, 0],
-        robot=table[:, 1].astype(np.intp),
-        seq=table[:, 2].astype(np.intp),
-        position=table[:, 3:6],
-        velocity=table[:, 6:9],
-        yaw=table[:, 9],
-        bytes=table[:, 10].astype(np.intp),
+    acted = _table([(row, seq, stamp, at, *NOWHERE, *NOWHERE, math.nan, 0) for at, row, _, seq, stamp in receipts])
+    pose = np.array([pose for _, _, pose, *_ in receipts], dtype=float).reshape(-1, 1) - start
+    reports = sorted(content[CentreState], key=lambda each: each.stamp)
+    counts = (
+        growth(((each.pid, each.stamp, getattr(each, what)) for each in reports), start, start + duration)
+        for what in ("heard", "lost", "dropped")
+    )
+    received, lost_poses, dropped_poses = (np.array([each[name] for name in row], dtype=np.intp) for each in counts)
+    return Goals.of_run(
+        _table(sent).since(start),
+        replace(acted.since(start), extra=pose),
+        duration,
+        received=received,
+        lost=lost_poses,
+        dropped=dropped_poses,
+        reports=tuple(
+            replace(each, stamp=each.stamp - start)
+            for each in reports
+            if 0.0 < each.stamp - start <= duration + STATUS_S
+        ),
     )
 
 
-def _heard(states: list[list[State]], robots: tuple[str, ...], start: float, duration: float) -> HeardPoses:
-    row = {robot: index for index, robot in enumerate(robots)}
-    table = _in_run(
-        [
-            (
-                *(heard.arrived, listener, row[heard.speaker], heard.seq, heard.stamp - start),
-                *(*heard.position, *heard.velocity),
-            )
-            for listener, own in enumerate(states)
-            for state in own
-            for heard in state.heard
-            if heard.speaker in row
-        ],
-        (11, start, duration),
-    )
-    return HeardPoses(
-        time=table[:, 0],
-        listener=table[:, 1].astype(np.intp),
-        speaker=table[:, 2].astype(np.intp),
-        seq=table[:, 3].astype(np.intp),
-        stamp=table[:, 4],
-        position=table[:, 5:8],
-        velocity=table[:, 8:11],
-    )
-
-
-def _in_run(rows: list[tuple[float, ...]], shape: tuple[int, float, float]) -> Array:
-    """The rows whose first column, a UTC time, lies in the run: in order of time, which then counts from the start."""
-    width, start, duration = shape
-    table = np.array(rows, dtype=np.float64).reshape(-1, width)
-    table[:, 0] -= start
-    # the end belongs to the landing: 50 Hz for 45 s are 2250 messages
-    table = table[(table[:, 0] >= -ROUNDING_S) & (table[:, 0] < duration - ROUNDING_S)]
-    np.maximum(table[:, 0], 0.0, out=table[:, 0])
-    return table[np.argsort(table[:, 0], kind="stable")]
+def _table(rows: Sequence[tuple[float, ...]]) -> PoseTable:
+    """From link, seq, stamp, arrival, position, velocity, yaw and bytes of each pose."""
+    table = np.array(rows, dtype=np.float64).reshape(-1, 12)
+    link, seq, size = (table[:, column].astype(np.intp) for column in (0, 1, 11))
+    return PoseTable(link, seq, table[:, 2], table[:, 3], table[:, 4:7], table[:, 7:10], table[:, 10], size)

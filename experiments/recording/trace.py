@@ -10,7 +10,7 @@ from typing import Final, TypeVar
 import msgspec
 import numpy as np
 
-from agents.arrays import Array, Index, Mask
+from agents.arrays import Array, Index, Mask, PoseTable
 from agents.network import messages
 from agents.network.messages import Contact, Event, WorldState
 from agents.plugins import registry
@@ -19,8 +19,6 @@ from experiments.definition.plan import Plan
 from experiments.recording.clocks import ClockOffset
 
 EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
-
-
 ROUNDING_S: Final = 1e-6  # UTC seconds in a float are exact to a quarter of a microsecond
 WALL: Final = "wall"  # of the arena, in contacts
 
@@ -58,33 +56,57 @@ class Goals:
     A robot's delay is from the measurement of its pose to the moment at which it acts on the first goal that rests on
     that pose: both ways through the network, and the wait for the next decision. Goals that rest on a pose that was
     answered before (a robot that has nothing new to say) have none.
-
-    Attributes:
-        time: (M,) when each was sent, since the common start [s].
-        robot: (M,) row of its robot.
-        bytes: (M,) size of the payload.
-        reached: (N,) how many reached each robot.
-        acted: (A,) when a first answer was acted on, since the common start [s].
-        follower: (A,) row of its robot.
-        delay: (A,) see above [s].
-        heard: (N,) poses of each robot that the centre heard.
-        lost: (N,) and those that never came, by their numbers.
-        dropped: (N,) and those that the modelled network dropped.
-        reports: What the centre said of itself, stamps in seconds since the common start; of no meaning in virtual
-            time, where it takes no time.
     """
 
-    time: Array
-    robot: Index
-    bytes: Index
-    reached: Index
-    acted: Array
-    follower: Index
-    delay: Array
-    heard: Index
-    lost: Index
-    dropped: Index
-    reports: tuple[messages.CentreState, ...] = ()
+    sent: PoseTable  # goals in the place of positions; `link` is the row of the robot
+    reached: Index  # (N,) goals that reached each robot
+    acted: Array  # (A,) [s] since the common start, when a first answer was acted on
+    follower: Index  # (A,) row of its robot
+    delay: Array  # (A,) [s], see above
+    received: Index  # (N,) poses of each robot that the central controller received
+    lost: Index  # (N,) poses of each robot that never came, by their numbers
+    dropped: Index  # (N,) poses of each robot that the modelled network dropped
+    reports: tuple[messages.CentreState, ...] = ()  # stamps since the common start; none in virtual time
+
+    @classmethod
+    def of_run(
+        cls,
+        sent: PoseTable,
+        receipts: PoseTable,
+        duration: float,
+        *,
+        received: Index,
+        lost: Index,
+        dropped: Index,
+        reports: tuple[messages.CentreState, ...] = (),
+    ) -> Goals:
+        """The goals of a run of `duration` [s], with times since the common start.
+
+        Args:
+            sent: All goals.
+            receipts: Goals that robots acted on: their row, when (`arrival`), and the stamp of the pose on which the
+                goal rests (`extra`).
+            duration: Length of the run [s].
+            received: See the field.
+            lost: See the field.
+            dropped: See the field.
+            reports: See the field.
+        """
+        assert receipts.extra is not None
+        acted, row, pose = receipts.arrival, receipts.link, receipts.extra[:, 0]
+        reached, first = _in_run(acted, duration), _first(acted, row, pose)
+        first &= reached
+        return cls(
+            sent=sent.take(_in_run(sent.stamp, duration)),
+            reached=np.bincount(row[reached], minlength=len(received)),
+            acted=acted[first],
+            follower=row[first],
+            delay=(acted - pose)[first],
+            received=received,
+            lost=lost,
+            dropped=dropped,
+            reports=reports,
+        )
 
 
 def _first(time: Array, row: Index, pose: Array) -> Mask:
@@ -97,119 +119,62 @@ def _first(time: Array, row: Index, pose: Array) -> Mask:
     return first
 
 
-@dataclass(frozen=True)
-class Sent:
-    """Every pose that was sent, in order of time.
-
-    Attributes:
-        time: (M,) since the common start [s].
-        robot: (M,) row of the sender.
-        seq: (M,) running number per sender.
-        position: (M, 3) as sent [m].
-        velocity: (M, 3) as sent [m/s].
-        yaw: (M,) as sent [rad].
-        bytes: (M,) size of the payload.
-    """
-
-    time: Array
-    robot: Index
-    seq: Index
-    position: Array
-    velocity: Array
-    yaw: Array
-    bytes: Index
+def _in_run(time: Array, duration: float) -> Mask:
+    """The end belongs to the landing: 50 Hz for 45 s are 2250 messages."""
+    return np.asarray((time >= -ROUNDING_S) & (time < duration - ROUNDING_S))
 
 
-@dataclass(frozen=True)
-class HeardPoses:
-    """Every pose that was heard, in order of arrival.
+def sent_in_run(table: PoseTable, duration: float) -> PoseTable:
+    """Poses that were sent in a run of `duration` [s], in order of time."""
+    kept = table.take(_in_run(table.stamp, duration))
+    kept = msgspec.structs.replace(kept, stamp=np.maximum(kept.stamp, 0.0))
+    return kept.take(np.argsort(kept.stamp, kind="stable"))
 
-    Attributes:
-        time: (H,) arrival at the listener, since the common start [s].
-        listener: (H,) row of the listener.
-        speaker: (H,) row of the speaker.
-        seq: (H,) the speaker's number.
-        stamp: (H,) when the pose was taken, since the common start [s].
-        position: (H, 3) as heard [m].
-        velocity: (H, 3) as heard [m/s].
-    """
 
-    time: Array
-    listener: Index
-    speaker: Index
-    seq: Index
-    stamp: Array
-    position: Array
-    velocity: Array
+def received_in_run(table: PoseTable, duration: float) -> PoseTable:
+    """Poses that were received in a run of `duration` [s], in order of arrival."""
+    kept = table.take(_in_run(table.arrival, duration))
+    kept = msgspec.structs.replace(kept, arrival=np.maximum(kept.arrival, 0.0))
+    return kept.take(np.argsort(kept.arrival, kind="stable"))
 
 
 @dataclass(frozen=True)
 class Trace:
-    """One case of a run.
-
-    Attributes:
-        case: Name of the case.
-        experiment: The experiment of this case, overrides applied.
-        seed: Seed of this run.
-        robots: (N) names, in the order of the rows.
-        clock: "real" or "virtual".
-        time: (T,) common, uniform grid since the common start [s].
-        position: (T, N, 3) measured [m].
-        yaw: (T, N) measured [rad].
-        true_position: (T, N, 3) the truth where there is one (twins), else as measured [m].
-        goal: (T, N, 3) [m].
-        setpoint: (T, N, 4) as sent to the body, see `agents.network.messages.State`.
-        sent: Poses sent from the common start on.
-        heard: Poses heard from the common start on.
-        lost: (N,) samples of each robot that the sequence numbers prove were sent and that never came to a listener or
-            the recorder; those that the modelled network dropped are not among them.
-        missed_deadlines: (N,) ticks that began more than one period late.
-        ticks: (N,) ticks in all, from the common start on.
-        decisions: (N,) how often it computed its goal, from the common start on.
-        events: What happened, stamps in seconds since the common start.
-        interventions: (N,) ticks on which safety changed what had been decided, from the common start on.
-        avoided: (N,) ticks on which avoidance did.
-        contacts: What touched in the world from the common start to the end, stamps in seconds since then; None if
-            nobody looked: there was no world, or its engine finds no contacts.
-        world: What the world said of itself in that time, stamps in seconds since the common start.
-        attitude: (T, N, 4) unit quaternions w, x, y, z from robot to room, NaN where unknown; None if none was told.
-        shadow_position: (T, N, 3) of the twin beside each robot [m], NaN for robots without one; None if there is none.
-        shadow_yaw: (T, N) of those twins [rad].
-        dropped: (E,) samples that the modelled network dropped on each of `plan.heard_links`, in their order; None
-            if that is not known.
-        goals: What the centre told robots, and heard of them; None if every robot decides for itself.
-        clocks: Of the other machines on which robots ran; what they stamped is set right by it.
-    """
+    """One case of a run. Arrays over samples (T) and robots (N); times since the common start [s]."""
 
     case: str
-    experiment: Experiment
+    experiment: Experiment  # of this case, overrides applied
     seed: int
-    robots: tuple[str, ...]
-    clock: str
-    time: Array
-    position: Array
-    yaw: Array
-    true_position: Array
-    goal: Array
-    setpoint: Array
-    sent: Sent
-    heard: HeardPoses
-    lost: Index
-    missed_deadlines: Index
-    ticks: Index
-    decisions: Index
+    robots: tuple[str, ...]  # names, in the order of the rows
+    clock: str  # "real" or "virtual"
+    time: Array  # (T,) [s] common, uniform grid
+    position: Array  # (T, N, 3) [m] measured
+    yaw: Array  # (T, N) [rad] measured
+    true_position: Array  # (T, N, 3) [m] of twins, else as measured
+    goal: Array  # (T, N, 3) [m]
+    setpoint: Array  # (T, N, 4) as sent to the body, see `agents.network.messages.State`
+    sent: PoseTable  # by the robots, in order of time; `link` is the row of the sender
+    received: PoseTable  # in order of arrival; `link` is one of `plan.heard_links`
+    lost: Index  # (N,) poses of each robot that by their numbers were sent and never came to a receiver or the recorder
+    missed_deadlines: Index  # (N,) ticks that began more than one period late
+    ticks: Index  # (N,)
+    decisions: Index  # (N,) goals computed anew
     events: tuple[Event, ...]
-    interventions: Index
-    avoided: Index
-    contacts: tuple[Contact, ...] | None = None
+    interventions: Index  # (N,) ticks on which safety changed the decision
+    avoided: Index  # (N,) ticks on which avoidance changed the decision
+    contacts: tuple[Contact, ...] | None = None  # None: no world, or its engine finds no contacts
     world: tuple[WorldState, ...] = ()
-    attitude: Array | None = None
-    shadow_position: Array | None = None
-    shadow_yaw: Array | None = None
-    dropped: Index | None = None
-    goals: Goals | None = None
-    clocks: tuple[ClockOffset, ...] = ()
+    attitude: Array | None = None  # (T, N, 4) unit quaternions w, x, y, z from robot to room, NaN where unknown
+    shadow_position: Array | None = None  # (T, N, 3) [m] of the twins beside robots, NaN for robots without one
+    shadow_yaw: Array | None = None  # (T, N) [rad] of those twins
+    dropped: Index | None = None  # (E,) by the modelled network on each of `plan.heard_links`; None if unknown
+    goals: Goals | None = None  # of the central controller; None if each robot decides for itself
+    clocks: tuple[ClockOffset, ...] = ()  # of the other machines; stamps made there are corrected
 
     @cached_property
     def plan(self) -> Plan:
         return Plan(self.experiment)
+
+    def sent_by(self, row: int) -> PoseTable:
+        """Poses that one robot sent."""
+        return self.sent.take(self.sent.link == row)

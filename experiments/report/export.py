@@ -146,7 +146,11 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
         "error": formation_errors(trace),
         "tolerance": experiment.tolerance,
         "phase_start": phase_starts(trace),
-        "sent": {name: getattr(sent, name) + (name == "robot") for name in UNITS["sent"]},
+        "sent": {
+            "time": sent.stamp,
+            "robot": sent.link + 1,
+            **{name: getattr(sent, name) for name in ("position", "velocity", "yaw", "bytes")},
+        },
         "links": {name: column for name, column in links.items() if column is not None},
         "adjacency": adjacency(net, len(trace.robots)),
         "metrics": {

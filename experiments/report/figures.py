@@ -178,7 +178,7 @@ def events(traces: Sequence[Trace]) -> Figure:
         columns = 900 if rows * len(traces) <= 40 else 450  # a printed column shows no more
         pixel = max(float(trace.time[-1] - trace.time[0]), SHORTEST_S) / columns
         for i in range(len(trace.robots)):
-            begin, end = merged(np.sort(trace.sent.time[trace.sent.robot == i]), pixel)
+            begin, end = merged(np.sort(trace.sent_by(i).stamp), pixel)
             axes.add_patch(PathPatch(boxes(begin, end + pixel, i), facecolor=colours[i], linewidth=0.0))
         mark_phases(axes, trace)
         every = math.ceil(len(trace.robots) / max(1.0, height / 0.11))

@@ -24,7 +24,8 @@ from experiments.file.problems import Path as Keys
 from experiments.file.structure import group_of
 from experiments.metrics.measure import KNOWN, WINDOW_S, bounds_of
 from experiments.metrics.signals import LinkErrors, gaps, integrals, leaders, transmissions
-from experiments.recording.trace import ROUNDING_S, HeardPoses, Sent, Trace
+from experiments.recording.trace import Trace
+from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import Log, Stuck, simulate
 
 PACKAGES: Final = ("agents", "twins", "experiments")  # whose code decides what a run comes to
@@ -132,8 +133,7 @@ def _choices(value: Any, path: Keys) -> Iterator[tuple[str, Any]]:  # noqa: ANN4
 
 def figures_of(log: Log, experiment: Experiment) -> list[Figures]:
     """The figures of each repetition in a log, which may be a lean one."""
-    return [_figures(_trace(log, experiment, copy), int(log.lost.reshape(len(log.seeds), -1)[copy].sum()))
-            for copy in range(len(log.seeds))]  # fmt: skip
+    return [_figures(Logbook(log, experiment, "", copy).trace()) for copy in range(len(log.seeds))]
 
 
 def _flown(experiment: Experiment, seeds: tuple[int, ...]) -> tuple[list[Figures], dict[int, str]]:
@@ -154,40 +154,7 @@ def _flown(experiment: Experiment, seeds: tuple[int, ...]) -> tuple[list[Figures
     return runs, failed
 
 
-def _trace(log: Log, experiment: Experiment, copy: int) -> Trace:
-    """A repetition as far as its figures need it; what they do not need is empty."""
-    rows, duration = len(log.names), experiment.duration_s
-    mine = slice(copy * rows, (copy + 1) * rows)
-    run = (log.time >= -ROUNDING_S) & (log.time <= duration + ROUNDING_S)
-    at, row, seq, *_ = log.sent
-    own = (row >= mine.start) & (row < mine.stop) & (at >= -ROUNDING_S) & (at < duration - ROUNDING_S)
-    none, nobody, unknown = np.zeros(0), np.zeros(0, dtype=np.intp), np.zeros((0, 0))
-    zeros = np.zeros(rows, dtype=np.intp)
-    return Trace(
-        case="",
-        experiment=experiment,
-        seed=log.seeds[copy],
-        robots=log.names,
-        clock="virtual",
-        time=np.round(log.time[run], 9),
-        position=unknown,
-        yaw=unknown,
-        true_position=log.true_position[run, mine],
-        goal=unknown,
-        setpoint=unknown,
-        sent=Sent(at[own], row[own] - mine.start, seq[own], unknown, unknown, none, nobody),
-        heard=HeardPoses(none, nobody, nobody, nobody, none, unknown, unknown),
-        lost=zeros,
-        missed_deadlines=zeros,
-        ticks=zeros,
-        decisions=log.updates[mine],
-        events=(),
-        interventions=zeros,
-        avoided=zeros,
-    )
-
-
-def _figures(trace: Trace, dropped: int) -> Figures:
+def _figures(trace: Trace) -> Figures:
     errors = LinkErrors.of(trace)
     _, begin, end = bounds_of(trace)[0]
     window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0])))
@@ -208,7 +175,7 @@ def _figures(trace: Trace, dropped: int) -> Figures:
         acquired_s=None if None in arrived else _mean([when for when in arrived if when is not None]),
         gap_min_s=min(waits, default=None),
         updates=_mean(trace.decisions[kept].astype(float).tolist()),
-        dropped=dropped,
+        dropped=0 if trace.dropped is None else int(trace.dropped.sum()),
     )
 
 

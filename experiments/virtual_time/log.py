@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from agents.arrays import Array, Index, Mask
 from agents.decision.lifecycle import Phase
@@ -24,12 +25,11 @@ from experiments.recording.trace import (
     ROUNDING_S,
     WALL,
     Goals,
-    HeardPoses,
-    Sent,
     Trace,
-    _first,
     finds_contacts,
     looked_for,
+    received_in_run,
+    sent_in_run,
     within,
 )
 from experiments.recording.writer import Recording
@@ -45,10 +45,11 @@ def goal_messages(steered: Steered, names: Sequence[str], first: int) -> Iterato
         names: Of the robots.
         first: Row of the first of them.
     """
-    time, row, seq, goal, toward, rests = steered.sent
-    own = (row >= first) & (row < first + len(names))
-    columns = (column[own].tolist() for column in (time, row - first, seq, goal.round(6), toward.round(6), rests))
-    for t, robot, number, place, yaw, pose in zip(*columns, strict=True):
+    own = steered.sent.between(first, first + len(names))
+    assert own.yaw is not None
+    assert own.extra is not None
+    columns = (own.stamp, own.link, own.seq, own.position.round(6), own.yaw.round(6), own.extra[:, 0])
+    for t, robot, number, place, yaw, pose in zip(*(column.tolist() for column in columns), strict=True):
         stamps = round(EPOCH + t, 6), round(EPOCH + pose, 6)
         yield (
             t,
@@ -60,30 +61,29 @@ def centre_receipts(
     steered: Steered, sample: Array, first: int, rows: int
 ) -> dict[tuple[int, int], list[messages.GoalReceipt]]:
     """Goals that reached the robots of one repetition, by the number of the `sample` (T,) that tells of it, and row."""
-    time, row, seq, stamp, pose = steered.followed
-    own = (row >= first) & (row < first + rows)
-    at = np.searchsorted(sample, time[own] - ROUNDING_S)
+    own = steered.followed.between(first, first + rows)
+    assert own.extra is not None
+    at = np.searchsorted(sample, own.arrival - ROUNDING_S)
     found: dict[tuple[int, int], list[messages.GoalReceipt]] = {}
-    columns = (column.tolist() for column in (at, row[own] - first, seq[own], stamp[own], pose[own], time[own]))
+    columns = (column.tolist() for column in (at, own.link, own.seq, own.stamp, own.extra[:, 0], own.arrival))
     for k, robot, number, sent, taken, acted in zip(*columns, strict=True):
         news = messages.GoalReceipt(number, EPOCH + sent, EPOCH + taken, EPOCH + acted)
         found.setdefault((k, robot), []).append(news)
     return found
 
 
-def centre_report(steered: Steered, names: Sequence[str], first: int, duration: float) -> messages.CentreState:
-    """What the centre of one repetition in virtual time would say of itself at the end of the run."""
-    goals = of_log(steered, names, first, duration, "json")
+def centre_report(goals: Goals, names: Sequence[str], duration: float) -> messages.CentreState:
+    """The report of the central controller of one repetition in virtual time at the end of the run."""
     return messages.CentreState(
         stamp=EPOCH + duration,
         robots=[name for name, reached in zip(names, goals.reached, strict=True) if reached],
         missing=[],
         load=0.0,
         late_s=0.0,
-        decisions=len(np.unique(goals.time)),
+        decisions=len(np.unique(goals.sent.stamp)),
         missed=0,
-        goals=len(goals.time),
-        heard=dict(zip(names, goals.heard.tolist(), strict=True)),
+        goals=len(goals.sent),
+        heard=dict(zip(names, goals.received.tolist(), strict=True)),
         lost=dict.fromkeys(names, 0),
         dropped=dict(zip(names, goals.dropped.tolist(), strict=True)),
         malformed=0,
@@ -93,34 +93,18 @@ def centre_report(steered: Steered, names: Sequence[str], first: int, duration: 
     )
 
 
-def of_log(steered: Steered, names: Sequence[str], first: int, duration: float, encoding: messages.Encoding) -> Goals:
-    """Of one repetition in virtual time, whose first row is `first`."""
-    rows = len(names)
-
-    def within(t: Any) -> Any:  # noqa: ANN401 - a number, or many
-        return (t >= -ROUNDING_S) & (t < duration - ROUNDING_S)
-
-    def mine(row: Index) -> Mask:
-        return np.asarray((row >= first) & (row < first + rows))
-
-    sent = within(steered.sent[0]) & mine(steered.sent[1])
-    heard = within(steered.heard[0]) & mine(steered.heard[1])
-    sizes = [len(messages.encode(goal, encoding)) for t, goal in goal_messages(steered, names, first) if within(t)]
-    own = mine(steered.followed[1])
-    time, row, pose = steered.followed[0][own], steered.followed[1][own], steered.followed[4][own]
-    reached, anew = within(time), _first(time, row, pose)
-    anew &= reached
-    return Goals(
-        time=steered.sent[0][sent],
-        robot=steered.sent[1][sent] - first,
-        bytes=np.array(sizes, dtype=np.intp),
-        reached=np.bincount(row[reached] - first, minlength=rows),
-        acted=time[anew],
-        follower=row[anew] - first,
-        delay=(time - pose)[anew],
-        heard=np.bincount(steered.heard[1][heard] - first, minlength=rows),
+def goals_of(steered: Steered, names: Sequence[str], first: int, duration: float, encoding: messages.Encoding) -> Goals:
+    """Goals of one repetition in virtual time, whose first row is `first`."""
+    rows, end = len(names), first + len(names)
+    sizes = [len(messages.encode(goal, encoding)) for _, goal in goal_messages(steered, names, first)]
+    received = received_in_run(steered.received.between(first, end), duration)
+    return Goals.of_run(
+        replace(steered.sent.between(first, end), bytes=np.array(sizes, dtype=np.intp)),
+        steered.followed.between(first, end),
+        duration,
+        received=np.bincount(received.link, minlength=rows),
         lost=np.zeros(rows, dtype=np.intp),
-        dropped=steered.lost_poses[first : first + rows],
+        dropped=steered.lost_poses[first:end],
     )
 
 
@@ -135,29 +119,22 @@ class Logbook:
         self._seed = log.seeds[copy]
         self._scene = bodies.scene(experiment)
         self._links: Links = Plan(experiment).heard_links
-        time, row, seq, position, velocity, yaw = log.sent
-        own = (row >= copy * rows) & (row < (copy + 1) * rows)
-        self._sent = (time[own], row[own] - copy * rows, seq[own], position[own], velocity[own], yaw[own])
+        self._sent = log.sent.between(copy * rows, (copy + 1) * rows)
+        if not log.lean:
+            sizes = [len(messages.encode(pose, self._encoding)) for pose in self._poses()]
+            self._sent = replace(self._sent, bytes=np.array(sizes, dtype=np.intp))
         per_copy = len(self._links)
-        time, link, seq, stamp, position, velocity = log.heard
-        own = (link >= copy * per_copy) & (link < (copy + 1) * per_copy)
-        self._heard = (time[own], link[own] - copy * per_copy, seq[own], stamp[own], position[own], velocity[own])
+        self._received = log.received.between(copy * per_copy, (copy + 1) * per_copy)
         self._dropped: Index = log.lost[copy * per_copy : (copy + 1) * per_copy]
         self._goals: Goals | None = None
-        if log.steered is not None:
+        if log.steered is not None and not log.lean:
             encoding = experiment.network.encoding
-            self._goals = of_log(log.steered, log.names, copy * rows, experiment.duration_s, encoding)
+            self._goals = goals_of(log.steered, log.names, copy * rows, experiment.duration_s, encoding)
 
     def trace(self) -> Trace:
         """The run from the common start on, as arrays."""
         log, mine, duration = self._log, self._mine, self._experiment.duration_s
         run = (log.time >= -ROUNDING_S) & (log.time <= duration + ROUNDING_S)
-        sent = self._within(self._sent[0])
-        time, row, seq, position, velocity, yaw = self._sent
-        sizes = np.array([len(messages.encode(pose, self._encoding)) for pose in self._poses(sent)], dtype=np.intp)
-        got = self._within(self._heard[0])
-        heard_time, link, heard_seq, stamp, heard_position, heard_velocity = self._heard
-        link = link[got]
         rows = len(log.names)
         contacts, world = within(self._contacts(), EPOCH, duration), within(self._world(), EPOCH, duration)
         return Trace(
@@ -172,16 +149,8 @@ class Logbook:
             true_position=log.true_position[run, mine],
             goal=log.goal[run, mine],
             setpoint=log.setpoint[run, mine],
-            sent=Sent(time[sent], row[sent], seq[sent], position[sent], velocity[sent], yaw[sent], sizes),
-            heard=HeardPoses(
-                heard_time[got],
-                self._links.listener[link],
-                self._links.speaker[link],
-                heard_seq[got],
-                stamp[got],
-                heard_position[got],
-                heard_velocity[got],
-            ),
+            sent=sent_in_run(self._sent, duration),
+            received=received_in_run(self._received, duration),
             lost=np.zeros(rows, dtype=np.intp),
             missed_deadlines=np.zeros(rows, dtype=np.intp),
             ticks=np.full(rows, log.ticks, dtype=np.intp),
@@ -221,21 +190,20 @@ class Logbook:
         ) as recording:
             for t, kind, source, text in self._events():
                 recording.write(messages.Event(EPOCH + t, kind, source, text))
-            every = np.ones(len(self._sent[0]), dtype=bool)
-            said = zip(self._sent[0].tolist(), self._poses(every), strict=True)
-            pending = next(said, None)
+            assert self._sent.bytes is not None
+            sent = zip(self._sent.stamp.tolist(), self._poses(), self._sent.bytes.tolist(), strict=True)
+            pending = next(sent, None)
             for t, states in self._states():
                 while pending is not None and pending[0] <= t + ROUNDING_S:
-                    size = len(messages.encode(pending[1], self._encoding))
-                    recording.write(pending[1], pending[1].stamp, size)
-                    pending = next(said, None)
+                    _, pose, size = pending
+                    recording.write(pose, pose.stamp, size)
+                    pending = next(sent, None)
                 for state in states:
                     recording.write(state)
-            for t, goal in self._told():
-                recording.write(goal, EPOCH + t, len(messages.encode(goal, self._encoding)))
-            if self._log.steered is not None:
-                steered, end = self._log.steered, self._experiment.duration_s
-                recording.write(centre_report(steered, self._log.names, self._mine.start, end))
+            if self._log.steered is not None and self._goals is not None:
+                for t, goal in goal_messages(self._log.steered, self._log.names, self._mine.start):
+                    recording.write(goal, EPOCH + t, len(messages.encode(goal, self._encoding)))
+                recording.write(centre_report(self._goals, self._log.names, self._experiment.duration_s))
             for status in self._statuses():
                 recording.write(status)
             for report in self._world():
@@ -247,20 +215,12 @@ class Logbook:
     def _encoding(self) -> messages.Encoding:
         return self._experiment.network.encoding
 
-    def _within(self, time: Array) -> Mask:
-        """The end belongs to the landing: 50 Hz for 45 s are 2250 messages."""
-        return (time >= -ROUNDING_S) & (time < self._experiment.duration_s - ROUNDING_S)
-
-    def _poses(self, which: Mask) -> Iterator[messages.Pose]:
-        names = self._log.names
-        columns = (column[which].tolist() for column in self._sent)
-        for t, row, seq, position, velocity, yaw in zip(*columns, strict=True):
+    def _poses(self) -> Iterator[messages.Pose]:
+        names, sent = self._log.names, self._sent
+        assert sent.yaw is not None
+        columns = (sent.stamp, sent.link, sent.seq, sent.position, sent.velocity, sent.yaw)
+        for t, row, seq, position, velocity, yaw in zip(*(column.tolist() for column in columns), strict=True):
             yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw)
-
-    def _told(self) -> Iterator[tuple[float, messages.Goal]]:
-        """What the centre told robots, and when."""
-        if self._log.steered is not None:
-            yield from goal_messages(self._log.steered, self._log.names, self._mine.start)
 
     def _states(self) -> Iterator[tuple[float, list[messages.State]]]:
         """Telemetry, sample by sample, with the poses that each robot heard since the sample before."""
@@ -304,12 +264,11 @@ class Logbook:
             )
 
     def _heard_by_sample(self) -> dict[tuple[int, int], list[messages.Heard]]:
-        time, link, seq, stamp, position, velocity = self._heard
-        names = self._log.names
-        sample = np.searchsorted(self._log.time, time - ROUNDING_S)
-        listener, speaker = self._links.listener[link], self._links.speaker[link]
+        names, got = self._log.names, self._received
+        sample = np.searchsorted(self._log.time, got.arrival - ROUNDING_S)
+        listener, speaker = self._links.listener[got.link], self._links.speaker[got.link]
         found: dict[tuple[int, int], list[messages.Heard]] = {}
-        columns = (sample, listener, speaker, seq, stamp, time, position, velocity)
+        columns = (sample, listener, speaker, got.seq, got.stamp, got.arrival, got.position, got.velocity)
         for k, row, whose, number, taken, arrived, where, moves in zip(*(c.tolist() for c in columns), strict=True):
             news = messages.Heard(names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where), tuple(moves))
             found.setdefault((k, row), []).append(news)
@@ -318,8 +277,8 @@ class Logbook:
     def _statuses(self) -> Iterator[messages.Status]:
         """The counters at the end of the run and at the end of everything."""
         log = self._log
-        sent = self._counts(self._sent[1], self._sent[0])
-        heard = self._counts(self._links.listener[self._heard[1]], self._heard[0])
+        sent = self._counts(self._sent.link, self._sent.stamp)
+        heard = self._counts(self._links.listener[self._received.link], self._received.arrival)
         unsafe = {each.row - self._mine.start: each.text for each in self._incidents() if each.outcome >= Outcome.LAND}
         for end, phase, done in ((self._experiment.duration_s, "landing", 0), (log.ended, "done", 1)):
             for row, name in enumerate(log.names):
@@ -352,7 +311,7 @@ class Logbook:
                 )
 
     def _contacts(self) -> Iterator[messages.Contact]:
-        """What touched in this repetition, take-off and landing included."""
+        """Contacts of this repetition, take-off and landing included."""
         rows, names = len(self._log.names), self._log.names
         first = self._mine.start
         for touch in self._log.touches:
@@ -368,7 +327,7 @@ class Logbook:
     def _world(self) -> Iterator[messages.WorldState]:
         """What a world would say of itself at 1 Hz; nothing where robots are alone in an empty place."""
         log, chosen, scene = self._log, self._experiment.world.engine, self._scene
-        if not (scene.names or log.touches or finds_contacts(chosen)):
+        if log.lean or not (scene.names or log.touches or finds_contacts(chosen)):
             return
         touched = np.sort([contact.stamp - EPOCH for contact in self._contacts()])
         moved = log.obstacles[:, self._mine.start // len(log.names)]

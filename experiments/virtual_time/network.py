@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from agents.agent import Agent
-from agents.arrays import Array, Index
+from agents.arrays import Array, Index, PoseTable, no_poses
 from agents.body.interface import BodyState
 from agents.decision.centralised import Centre
 from agents.decision.transmission import Transmission
 from agents.formation.graph import Links, links
 from agents.network import channel_model, messages
-from agents.network.channel_model import Samples
 from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
 from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE
@@ -79,7 +78,7 @@ class Channel:
             extra=None if extra is None else extra[who],
         )
 
-    def due(self, t: float) -> Samples | None:
+    def due(self, t: float) -> PoseTable | None:
         """What has arrived by `t` [s], in order of arrival."""
         return self._channel.due(t)
 
@@ -95,21 +94,16 @@ class Channel:
 
 @dataclass(frozen=True)
 class Steered:
-    """What went between robots and centre in all repetitions, in the time of the experiment [s].
+    """Messages between robots and the central controller in all repetitions, in the time of the experiment [s].
 
-    Attributes:
-        sent: Goals: time, row, number, goal (K, 3), yaw, time of the pose on which it rests.
-        followed: Goals that reached their robots: time, row, number, time sent, time of the pose.
-        heard: Poses that the centre heard: time, row.
-        lost_poses: (R,) of each row, that did not reach the centre, from the common start to the end of the experiment.
-        lost_goals: (R,) goals that did not reach their rows.
+    `link` is the row of the robot in each table.
     """
 
-    sent: tuple[Array, Index, Index, Array, Array, Array]
-    followed: tuple[Array, Index, Index, Array, Array]
-    heard: tuple[Array, Index]
-    lost_poses: Index
-    lost_goals: Index
+    sent: PoseTable  # goals; `extra` is the stamp of the pose on which each rests
+    followed: PoseTable  # goals that robots acted on (`arrival`), with the same `extra`
+    received: PoseTable  # poses, as the central controller received them
+    lost_poses: Index  # (R,) of each robot, from the common start to the end of the experiment
+    lost_goals: Index  # (R,) to each robot
 
 
 class Steering:
@@ -125,9 +119,9 @@ class Steering:
     def __init__(self, experiment: Experiment, seeds: Sequence[int]) -> None:
         self.centre = Centre(Plan(experiment).centre_assignment(len(seeds)))
         self.centre.mark_alive(self.centre.listens)  # all robots are there from the beginning
-        self._sent: list[tuple[Any, ...]] = []
-        self._followed: list[tuple[Any, ...]] = []
-        self._heard: list[tuple[Any, ...]] = []
+        self._sent: list[PoseTable] = []
+        self._followed: list[PoseTable] = []
+        self._received: list[PoseTable] = []
         rows = len(self.centre.guided)
         told = np.flatnonzero(self.centre.guided)
         ends = [[(row, row) for row in group.tolist()] for group in (self.centre.listens, told)]
@@ -159,7 +153,7 @@ class Steering:
             self.centre.receive(
                 rows, arrived.position, arrived.velocity, arrived.extra[:, 0], arrived.stamp, arrived.arrival
             )
-            self._heard.append((arrived.arrival, rows))
+            self._received.append(_bare(rows, arrived.seq, arrived.stamp, arrived.arrival))
         arrived = self._goals.due(t)
         if arrived is not None and arrived.extra is not None:
             # of several for one robot the newest counts
@@ -171,8 +165,8 @@ class Steering:
             toward, rests = arrived.extra.T
             news = agent.hear_goal(rows, arrived.position, toward, arrived.stamp)
             if news.any():
-                now = np.full(int(news.sum()), t)
-                self._followed.append((now, rows[news], arrived.seq[news], arrived.stamp[news], rests[news]))
+                accepted = _bare(rows, arrived.seq, arrived.stamp, np.full(len(rows), t), rests[:, None])
+                self._followed.append(accepted.take(news))
 
     def decide(self, t: float, agent: Agent) -> None:
         """On a tick on which goals are decided: those of the robots that are guided."""
@@ -184,30 +178,36 @@ class Steering:
         self._goal[rows], self._extra[rows, 0], self._extra[rows, 1] = told.goal, told.yaw, told.pose_stamp
         start, yaw = float(agent.life.start_at.min()), self._extra[:, 0]
         self._goals.send(t, rows, self._seq, self._goal, self._still, yaw=yaw, start=start, extra=self._extra)
-        self._sent.append((np.full(len(rows), t), rows, self._seq[rows], told.goal, told.yaw, told.pose_stamp))
+        now, still = np.full(len(rows), t), np.zeros((len(rows), 0))
+        sent = PoseTable(rows, self._seq[rows], now, now, told.goal, still, told.yaw, extra=told.pose_stamp[:, None])
+        self._sent.append(sent)
 
     def logged(self, begin: float) -> Steered:
         """All of it, when the common start was at `begin` [s]."""
-        time, row, seq, goal, toward, rests = joined(self._sent, (0,), (0,), (0,), (0, 3), (0,), (0,))
-        at, who, number, stamp, pose = joined(self._followed, (0,), (0,), (0,), (0,), (0,))
-        heard, speaker = joined(self._heard, (0,), (0,))
         return Steered(
-            sent=(time - begin, row.astype(np.intp), seq.astype(np.intp), goal, toward, rests - begin),
-            followed=(at - begin, who.astype(np.intp), number.astype(np.intp), stamp - begin, pose - begin),
-            heard=(heard - begin, speaker.astype(np.intp)),
+            sent=_goals(self._sent, begin),
+            followed=_goals(self._followed, begin),
+            received=_joined(self._received, begin),
             lost_poses=self._counted(self._poses, self._poses_of),
             lost_goals=self._counted(self._goals, self._goals_of),
         )
 
 
-def joined(columns: list[tuple[Any, ...]], *empty: tuple[int, ...]) -> tuple[Any, ...]:
-    """Concatenated; `empty` gives the shapes of columns when nothing was added."""
-    if not columns:
-        return tuple(np.zeros(shape) for shape in empty)
-    return tuple(np.concatenate(column) for column in zip(*columns, strict=True))
+def _bare(link: Index, seq: Index, stamp: Array, arrival: Array, extra: Array | None = None) -> PoseTable:
+    """Poses of which only numbers and times are kept."""
+    nothing = np.zeros((len(link), 0))
+    return PoseTable(link, seq, stamp, arrival, nothing, nothing, extra=extra)
 
 
-Heard = tuple[Array, Index, Index, Array, Array, Array]
+def _joined(tables: list[PoseTable], begin: float) -> PoseTable:
+    """One table, with times since the common start at `begin` [s]."""
+    return (PoseTable.joined(tables) if tables else no_poses()).since(begin)
+
+
+def _goals(tables: list[PoseTable], begin: float) -> PoseTable:
+    """The same for goals."""
+    found = _joined(tables, begin)
+    return replace(found, extra=np.zeros((0, 1)) if found.extra is None else found.extra - begin)
 
 
 class VirtualNetwork:
@@ -220,10 +220,9 @@ class VirtualNetwork:
         self._channel = Channel(experiment, assignment.links, seeds)
         self._steering = None if assignment.guided is None else Steering(experiment, seeds)
         self._seq: Index = np.zeros(rows, dtype=np.intp)
-        self._nothing = np.zeros((rows, 0))
         agent.mark_alive(np.arange(len(assignment.links)))  # all robots are there from the beginning
-        self._sent: list[tuple[Any, ...]] = []
-        self._heard: list[tuple[Any, ...]] = []
+        self._sent: list[PoseTable] = []
+        self._received: list[PoseTable] = []
 
     def carry(self, t: float, state: BodyState) -> Transmission:
         """The first half of the tick at `t` [s]: what has arrived is heard, and robots speak.
@@ -247,9 +246,12 @@ class VirtualNetwork:
         """Robots speak to those who listen. Before the common start nothing is lost."""
         speak, start = said.rows, float(self._agent.life.start_at.min())
         self._seq[speak] += 1
-        told = (said.position[speak], said.velocity[speak], yaw[speak])
-        told = (self._nothing[speak],) * 3 if self._lean else told
-        self._sent.append((np.full(len(speak), t), speak, self._seq[speak], *told))
+        now = np.full(len(speak), t)
+        if self._lean:
+            self._sent.append(_bare(speak, self._seq[speak], now, now))
+        else:
+            told = (said.position[speak], said.velocity[speak], yaw[speak])
+            self._sent.append(PoseTable(speak, self._seq[speak], now, now, *told))
         self._channel.send(t, speak, self._seq, said.position, said.velocity, yaw=yaw, start=start)
         if self._steering is not None:
             self._steering.say(t, speak, self._seq, said.position, said.velocity, yaw, start=start)
@@ -260,20 +262,17 @@ class VirtualNetwork:
         if heard is not None:
             self._agent.receive(heard.link, heard.position, heard.velocity, heard.stamp, heard.arrival)
             if not self._lean:
-                news = (heard.arrival, heard.link, heard.seq, heard.stamp, heard.position, heard.velocity)
-                self._heard.append(news)
+                self._received.append(heard)
         if self._steering is not None:
             self._steering.deliver(t, self._agent)
 
-    def sent(self, begin: float) -> Heard:
-        """Columns time, row, seq, position, velocity, yaw; times from the common start at `begin` [s]."""
-        at, row, number, position, velocity, yaw = joined(self._sent, (0,), (0,), (0,), (0, 3), (0, 3), (0,))
-        return at - begin, row.astype(np.intp), number.astype(np.intp), position, velocity, yaw
+    def sent(self, begin: float) -> PoseTable:
+        """Poses of all rows, which `link` holds; times since the common start at `begin` [s]."""
+        return _joined(self._sent, begin)
 
-    def heard(self, begin: float) -> Heard:
-        """Columns time, link, seq, stamp, position, velocity; likewise."""
-        at, link, number, stamp, position, velocity = joined(self._heard, (0,), (0,), (0,), (0,), (0, 3), (0, 3))
-        return at - begin, link.astype(np.intp), number.astype(np.intp), stamp - begin, position, velocity
+    def received(self, begin: float) -> PoseTable:
+        """Poses that arrived on the links of all repetitions; likewise."""
+        return _joined(self._received, begin)
 
     @property
     def lost(self) -> Index:

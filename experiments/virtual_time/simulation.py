@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from agents.agent import Agent
-from agents.arrays import Array, Index, Mask, some
+from agents.arrays import Array, Index, Mask, PoseTable, some
 from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
 from agents.decision.lifecycle import Phase
@@ -44,13 +44,14 @@ class Log:
     Attributes:
         names: Of the rows of one repetition (N).
         seeds: One for each repetition; R = N × repetitions, the rows of the first seed first.
+        lean: Only `true_position`, and of poses only numbers and times, are kept.
         time: (K,) at state_hz, from before take-off (negative) to the end.
         phase: (K, R) `agents.decision.lifecycle.Phase`.
         position: (K, R, 3), `velocity` (K, R, 3), `yaw` (K, R): measured.
         true_position: (K, R, 3), `true_yaw` (K, R).
         goal: (K, R, 3), `setpoint` (K, R, 4), `error` (K, R).
-        sent: Columns time, row, seq, position, velocity, yaw.
-        heard: Columns time, link, seq, stamp, position, velocity.
+        sent: Poses of all robots; `link` is the row.
+        received: Poses on all links, those of the first repetition first.
         lost: (E,) samples lost on each link of all repetitions, from the common start to the landing.
         decisions: Coordination decisions of each row.
         updates: (R,) of these, those at which the row computed its goal anew.
@@ -71,6 +72,7 @@ class Log:
 
     names: tuple[str, ...]
     seeds: tuple[int, ...]
+    lean: bool
     time: Array
     phase: Index
     position: Array
@@ -81,8 +83,8 @@ class Log:
     goal: Array
     setpoint: Array
     error: Array
-    sent: tuple[Array, Index, Index, Array, Array, Array]
-    heard: tuple[Array, Index, Index, Array, Array, Array]
+    sent: PoseTable
+    received: PoseTable
     lost: Index
     decisions: int
     updates: Index
@@ -188,6 +190,7 @@ def simulate(
     return Log(
         names=names,
         seeds=tuple(seeds),
+        lean=lean,
         time=time - begin,
         phase=phase.astype(np.intp),
         position=position,
@@ -199,7 +202,7 @@ def simulate(
         setpoint=setpoint,
         error=error,
         sent=network.sent(begin),
-        heard=network.heard(begin),
+        received=network.received(begin),
         lost=network.lost,
         decisions=agent.decisions,
         updates=agent.updates,

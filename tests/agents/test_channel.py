@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.network.channel_model import LOSS, USES, Channel, Conditions, Outage, Samples, key, uniform
+from agents.arrays import no_poses
+from agents.network.channel_model import LOSS, USES, Channel, Conditions, Outage, key, uniform
 
 MANY = 40_000
 
@@ -32,8 +33,7 @@ def say(channel, link, seq, stamp, *, start=0.0, size=100, now=-np.inf):
 
 def heard(channel, t=np.inf):
     got = channel.due(t)
-    nothing = Samples(*(np.zeros(0, dtype=np.intp),) * 4, np.zeros((0, 3)), np.zeros((0, 3)))
-    return nothing if got is None else got
+    return no_poses() if got is None else got
 
 
 def lost(made, link=0, count=MANY):

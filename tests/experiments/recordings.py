@@ -3,7 +3,7 @@
 import numpy as np
 
 from agents.network.messages import Contact, Event, Heard, ObstaclePose, Pose, State, Status, WorldState
-from experiments.definition.experiment import Experiment, Rates, Robot
+from experiments.definition.experiment import Experiment, Formation, Rates, Robot
 from experiments.recording.writer import Recording
 
 START = 1_760_000_000.0
@@ -16,6 +16,7 @@ PAIR = Experiment(
     title="pair",
     robots={"TB01": Robot("turtlebot3", [0.0, 0.0]), "CF01": Robot("crazyflie", [1.0, 0.0], hover=0.8)},
     duration_s=1.0,
+    formation=Formation(links={"TB01 - CF01": 1.0}),
     rates=Rates(state_hz=10.0),
 )
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agents.arrays import PoseTable
 from agents.formation.graph import links
 from agents.network import messages
-from agents.network.channel_model import Samples
 from experiments.definition.experiment import Channel as Parameters
 from experiments.definition.experiment import Experiment, LinkChannel, Network, Outage, Robot
 from experiments.recording.trace import EPOCH
@@ -54,8 +54,7 @@ class Talk:
     def all(self):
         """Everything that arrived, in order: when it was taken in, and the samples."""
         when = np.concatenate([np.full(len(got.link), t) for t, got in self.heard])
-        columns = ("link", "arrival", "stamp", "seq", "position", "velocity")
-        return when, Samples(*(np.concatenate([getattr(got, c) for _, got in self.heard]) for c in columns))
+        return when, PoseTable.joined([got for _, got in self.heard])
 
 
 def test_nothing_said_nothing_heard():

@@ -53,8 +53,8 @@ def test_arrays_come_back_as_they_were(flown, mat, case):
 
 def test_who_spoke_and_who_listens_count_from_one(flown, mat):
     trace, read = flown[1].traces["event"], mat["event"]
-    assert read["sent"]["time"] == pytest.approx(trace.sent.time, abs=1e-6)
-    assert read["sent"]["robot"].tolist() == (trace.sent.robot + 1.0).tolist()
+    assert read["sent"]["time"] == pytest.approx(trace.sent.stamp, abs=1e-6)
+    assert read["sent"]["robot"].tolist() == (trace.sent.link + 1.0).tolist()
     assert read["sent"]["position"] == pytest.approx(trace.sent.position, abs=1e-6)
     net = links_of(trace)
     assert read["links"]["listener"].tolist() == (net.listener + 1.0).tolist()

@@ -243,7 +243,7 @@ def test_a_dead_zone_ends_the_rotation_of_an_event_triggered_ring():
         late = (log.time > 30.0) & (log.time < 60.0)
         turns = [net_rotation(log.true_position[late][:, 5 * k : 5 * k + 5], log.time[late]) for k in range(3)]
         rates.append(np.abs(turns).max())
-        sent.append(len(log.sent[0]))
+        sent.append(len(log.sent))
     assert rates[0] > 1e-4
     assert rates[1] < 1e-6
     assert sent[1] < sent[0] / 2

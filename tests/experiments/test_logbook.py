@@ -62,6 +62,9 @@ def equal(one, other, name):
         for a, b in zip(one, other, strict=True):
             assert a.stamp == pytest.approx(b.stamp, abs=1e-6), name
             assert msgspec.structs.replace(a, stamp=0.0) == msgspec.structs.replace(b, stamp=0.0)
+    elif isinstance(one, msgspec.Struct):
+        for field in one.__struct_fields__:
+            equal(getattr(one, field), getattr(other, field), f"{name}.{field}")
     elif hasattr(one, "__dataclass_fields__"):
         for field in fields(one):
             equal(getattr(one, field.name), getattr(other, field.name), f"{name}.{field.name}")

@@ -51,18 +51,19 @@ def test_a_run_is_read_back(path):
         trace.setpoint[:, 1], np.column_stack([-along, along * 0, along * 0 + 0.5, along * 0 + 0.25])
     )
     before_the_end = along[:-1]
-    np.testing.assert_allclose(trace.sent.time, before_the_end, atol=1e-6)
+    np.testing.assert_allclose(trace.sent.stamp, before_the_end, atol=1e-6)
     assert trace.sent.seq.tolist() == list(range(1, 11))
     assert trace.sent.bytes.tolist() == [150] * 10
     np.testing.assert_allclose(trace.sent.position[:, :2], np.column_stack([before_the_end, before_the_end * 0 + 0.5]))
     np.testing.assert_allclose(trace.sent.velocity, np.tile([0.1, 0.2, 0.3], (10, 1)))
     np.testing.assert_allclose(trace.sent.yaw, 0.4)
-    np.testing.assert_allclose(trace.heard.time, along[1:] - 0.04, atol=1e-6)
-    np.testing.assert_allclose(trace.heard.stamp, along[1:] - 0.05, atol=1e-6)
-    assert set(zip(trace.heard.listener.tolist(), trace.heard.speaker.tolist(), strict=True)) == {(1, 0)}
-    assert trace.heard.seq.tolist() == list(range(1, 11))
-    np.testing.assert_allclose(trace.heard.position[:, 0], along[1:] - 0.05)
-    np.testing.assert_array_equal(trace.heard.velocity, np.tile([1.0, 0.0, 0.0], (10, 1)))
+    np.testing.assert_allclose(trace.received.arrival, along[1:] - 0.04, atol=1e-6)
+    np.testing.assert_allclose(trace.received.stamp, along[1:] - 0.05, atol=1e-6)
+    net = trace.plan.heard_links
+    assert {(net.listener[link], net.speaker[link]) for link in trace.received.link} == {(1, 0)}
+    assert trace.received.seq.tolist() == list(range(1, 11))
+    np.testing.assert_allclose(trace.received.position[:, 0], along[1:] - 0.05)
+    np.testing.assert_array_equal(trace.received.velocity, np.tile([1.0, 0.0, 0.0], (10, 1)))
     assert trace.lost.tolist() == [1, 0]
     assert trace.ticks.tolist() == [100, 99]
     assert trace.missed_deadlines.tolist() == [3, 0]
@@ -237,7 +238,7 @@ def test_what_the_modelled_network_dropped_is_no_loss(path):
 def test_only_poses_of_the_run_are_sent(path):
     write(path, begun(), *[pose(seq=k + 5, at=k / 2) for k in range(-2, 5)], pose("XX99", at=0.5))
     sent = read(path).trace.sent
-    assert sent.time.tolist() == [0.0, 0.5]  # the pose at the end, 1.0, belongs to the landing
+    assert sent.stamp.tolist() == [0.0, 0.5]  # the pose at the end, 1.0, belongs to the landing
     assert sent.seq.tolist() == [5, 6]
 
 
@@ -255,9 +256,9 @@ def test_what_a_drifting_clock_stamped_is_set_right(path):
     asked = [600, 1800, 3600]
     np.testing.assert_allclose(trace.position[asked, 1, 0], [0.6, 1.8, 3.6], atol=1e-6)
     np.testing.assert_allclose(trace.position[asked, 0, 0], trace.position[asked, 1, 0], atol=1e-6)
-    assert trace.sent.time[0] == pytest.approx(1800.0, abs=1e-4)
-    assert trace.heard.stamp[0] == pytest.approx(1800.0, abs=1e-4), "on the speaker's clock"
-    assert trace.heard.time[0] == pytest.approx(1800.01, abs=1e-4), "on the listener's"
+    assert trace.sent.stamp[0] == pytest.approx(1800.0, abs=1e-4)
+    assert trace.received.stamp[0] == pytest.approx(1800.0, abs=1e-4), "on the speaker's clock"
+    assert trace.received.arrival[0] == pytest.approx(1800.01, abs=1e-4), "on the listener's"
     (lie,) = trace.clocks
     assert lie.drift == pytest.approx(50e-6)
 
@@ -342,7 +343,7 @@ def test_a_run_without_any_message_of_a_robot(path):
     trace = read(path).trace
     assert trace.position.shape == (11, 2, 3)
     assert np.isnan(trace.position).all()
-    assert (len(trace.sent.time), len(trace.heard.time), trace.lost.tolist()) == (0, 0, [0, 0])
+    assert (len(trace.sent.stamp), len(trace.received.arrival), trace.lost.tolist()) == (0, 0, [0, 0])
 
 
 def test_what_cannot_be_a_message_is_counted_and_left_out(path):

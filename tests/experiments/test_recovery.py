@@ -58,7 +58,7 @@ def test_a_killed_recorder_leaves_a_recording(path, tmp_path, recorded):
     wanted = read(whole).trace
     for trace in (playback.trace, again.trace):
         np.testing.assert_array_equal(trace.position[:, 0], wanted.position[:, 0])
-        np.testing.assert_array_equal(trace.sent.time, wanted.sent.time)
+        np.testing.assert_array_equal(trace.sent.stamp, wanted.sent.stamp)
         assert trace.lost.tolist() == wanted.lost.tolist()
 
 

@@ -372,7 +372,7 @@ def test_proof_adds_up(run):
     counts = [[int(cell.replace("\u202f", "")) for cell in row.cells[2:]] for row in rows]
     assert counts[-1] == [sum(column) for column in zip(*counts[:-1], strict=True)]
     assert counts[-1][2] == counts[-1][3]
-    assert counts[-1][0] == len(run[1].sent.time)
+    assert counts[-1][0] == len(run[1].sent.stamp)
 
 
 def test_robot_table_has_means_by_kind(run):

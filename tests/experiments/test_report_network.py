@@ -1,7 +1,5 @@
 """What a report says of a modelled network: how much it dropped, how long the rest took, link by link."""
 
-import dataclasses
-
 import msgspec
 import numpy as np
 import pytest
@@ -78,13 +76,6 @@ def test_without_a_modelled_network_nothing_is_said_of_it():
     assert network_tables([measured]) == ()
     assert proof_tables([measured])[0].head[-1] == "Lost"
     assert not any("modelled" in each.text for each in findings([measured]))
-
-
-def test_what_was_heard_on_no_link_of_the_file_counts_nowhere():
-    known = pair(np.ones(100), sent={"L": [0.1, 0.2], "F": [0.3]}, delay=0.01)
-    odd = dataclasses.replace(known.heard, listener=1 - known.heard.listener, speaker=1 - known.heard.speaker)
-    assert [each.heard for each in measure(known).passages] == [2]
-    assert [each.heard for each in measure(dataclasses.replace(known, heard=odd)).passages] == [0]
 
 
 def test_a_recording_keeps_it(tmp_path, run):

@@ -38,9 +38,10 @@ def test_a_lean_log_gives_the_figures_of_the_report_to_the_bit(park):
 def test_a_lean_log_is_small(park):
     lean = simulate(park, [1], lean=True)
     assert lean.true_position.shape == (len(lean.time), 7, 3)
-    for column in (lean.position, lean.velocity, lean.goal, lean.setpoint, lean.error, lean.phase, lean.heard[0]):
+    for column in (lean.position, lean.velocity, lean.goal, lean.setpoint, lean.error, lean.phase):
         assert column.size == 0
-    assert len(lean.sent[0]) > 50
+    assert len(lean.received) == 0
+    assert len(lean.sent) > 50
 
 
 def flown(experiment, seeds):

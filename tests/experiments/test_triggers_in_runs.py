@@ -106,37 +106,39 @@ def test_what_is_heard_is_what_was_said_velocity_and_all(flown):
     sent = {
         (robot, seq): (*place, *moves)
         for robot, seq, place, moves in zip(
-            trace.sent.robot.tolist(), trace.sent.seq.tolist(), trace.sent.position.tolist(),
+            trace.sent.link.tolist(), trace.sent.seq.tolist(), trace.sent.position.tolist(),
             trace.sent.velocity.tolist(), strict=True,
         )
     }  # fmt: skip
-    heard = trace.heard
-    known = [k for k in range(len(heard.seq)) if (heard.speaker[k], heard.seq[k]) in sent]
+    heard = trace.received
+    speaker = trace.plan.heard_links.speaker[heard.link]
+    known = [k for k in range(len(heard.seq)) if (speaker[k], heard.seq[k]) in sent]
     assert len(known) > 30
     for k in known:
-        assert sent[heard.speaker[k], heard.seq[k]] == (*heard.position[k].tolist(), *heard.velocity[k].tolist())
-    assert np.abs(trace.heard.velocity).max() > 0.05
+        assert sent[speaker[k], heard.seq[k]] == (*heard.position[k].tolist(), *heard.velocity[k].tolist())
+    assert np.abs(trace.received.velocity).max() > 0.05
 
 
 def test_what_is_said_is_smoothed(flown):
     log, trace = flown
     drone = trace.robots.index("CF02")
-    mine = trace.sent.robot == drone
-    at = np.searchsorted(trace.time, trace.sent.time[mine] - 1e-9)
-    off = trace.sent.position[mine] - trace.position[at, drone]
+    mine = trace.sent_by(drone)
+    at = np.searchsorted(trace.time, mine.stamp - 1e-9)
+    off = mine.position - trace.position[at, drone]
     assert 0.002 < np.sqrt((off[:, :2] ** 2).mean()) < 0.03
-    assert log.sent[3].shape == log.sent[4].shape
+    assert log.sent.position.shape == log.sent.velocity.shape
 
 
 def test_belief_error_is_that_of_the_prediction(flown):
     _, trace = flown
     net = signals.links_of(trace)
     found = signals.beliefs(trace, net)
-    listener, speaker, heard = net.listener, net.speaker, trace.heard
+    listener, speaker, heard, ends = net.listener, net.speaker, trace.received, trace.plan.heard_links
     for link in np.flatnonzero(speaker > 0)[::5]:  # the leader stands, and says nothing after the start
-        mine = np.flatnonzero((heard.listener == listener[link]) & (heard.speaker == speaker[link]))
+        asked = (ends.listener == listener[link]) & (ends.speaker == speaker[link])
+        mine = np.flatnonzero(asked[heard.link])
         for k in (150, 300, 399):
-            last = mine[heard.time[mine] <= trace.time[k]][-1]
+            last = mine[heard.arrival[mine] <= trace.time[k]][-1]
             ahead = heard.position[last] + heard.velocity[last] * (trace.time[k] - heard.stamp[last])
             wanted = math.dist(ahead, trace.true_position[k, speaker[link]])
             assert found[k, link] == pytest.approx(wanted, abs=1e-12)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
 
 import msgspec
 import numpy as np
 
-from agents.arrays import Array, norm
+from agents.arrays import Array, PoseTable, norm
 from agents.formation.graph import links
 from agents.network.messages import Event
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.definition.plan import Plan
-from experiments.recording.trace import HeardPoses, Sent, Trace
+from experiments.recording.trace import Trace
 
-Said = TypeVar("Said", Sent, HeardPoses)
 STEP = 0.02
 TIMED = ("position", "yaw", "true_position", "goal", "setpoint")
 
@@ -68,10 +66,8 @@ def trace(
     who = np.array([i for _, i, _ in sends], dtype=np.intp)
     number = np.array([k for _, _, k in sends], dtype=np.intp)
     place = position[np.clip(np.round(when / step).astype(int), 0, count - 1), who].reshape(-1, 3)
-    listeners: dict[int, list[int]] = {}
-    for listener, speaker, _, _ in parse_links(what):
-        listeners.setdefault(row[speaker], []).append(row[listener])
-    pairs = [(k, i) for k, j in enumerate(who) for i in listeners.get(int(j), [])]
+    speaker = Plan(what).heard_links.speaker
+    pairs = [(k, link) for k, j in enumerate(who) for link in np.flatnonzero(speaker == j)]
     take = np.array([k for k, _ in pairs], dtype=np.intp)
     rows = len(names)
     return Trace(
@@ -86,13 +82,14 @@ def trace(
         true_position=position,
         goal=position,
         setpoint=np.zeros((count, rows, 4)),
-        sent=Sent(when, who, number, place, np.zeros_like(place), np.zeros(len(when)), np.full(len(when), 100)),
-        heard=HeardPoses(
-            when[take] + delay,
-            np.array([i for _, i in pairs], dtype=np.intp),
-            who[take],
+        sent=PoseTable(
+            who, number, when, when, place, np.zeros_like(place), np.zeros(len(when)), np.full(len(when), 100)
+        ),
+        received=PoseTable(
+            np.array([link for _, link in pairs], dtype=np.intp),
             number[take],
             when[take],
+            when[take] + delay,
             place[take],
             np.zeros_like(place[take]),
         ),
@@ -111,13 +108,12 @@ def cut(whole: Trace, end: float) -> Trace:
     count = int(np.searchsorted(whole.time, end + 1e-9))
     parts = {name: getattr(whole, name)[:count] for name in TIMED}
     return dataclasses.replace(
-        whole, **parts, sent=_until(whole.sent, end), heard=_until(whole.heard, end), time=whole.time[:count]
+        whole,
+        **parts,
+        sent=whole.sent.take(whole.sent.stamp < end - 1e-9),
+        received=whole.received.take(whole.received.arrival < end - 1e-9),
+        time=whole.time[:count],
     )
-
-
-def _until(said: Said, end: float) -> Said:
-    kept = said.time < end - 1e-9
-    return dataclasses.replace(said, **{each.name: getattr(said, each.name)[kept] for each in dataclasses.fields(said)})
 
 
 def pair(distance: Array, *, legs: Sequence[float] = (), target: float = 1.0, **rest: object) -> Trace:

@@ -71,7 +71,7 @@ def test_robots_hold_while_the_centre_is_dead_and_go_on_when_it_is_back(tmp_path
     run = reopen(folder)
     case = run.metrics["default"]
     died = killed - playback.read(folder / "default.mcap").started
-    back = trace.goals.time[trace.goals.time > died + 0.15].min()  # of the centre that was started again
+    back = trace.goals.sent.stamp[trace.goals.sent.stamp > died + 0.15].min()  # of the centre that was started again
     assert back - died > 0.2
     # they hold at the decision after they noticed it: a moment later, or many where the machine is loaded
     quiet = (trace.time > (died + back) / 2.0) & (trace.time < back)

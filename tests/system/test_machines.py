@@ -127,7 +127,7 @@ def test_a_centre_here_guides_robots_elsewhere_and_all_stamp_by_one_clock(lab: M
     until(lambda: not busy(lab), f"nothing is left: {busy(lab)}")
     trace = playback.read(folder / "periodic.mcap").trace
     assert trace.goals is not None
-    sent = np.bincount(trace.goals.robot, minlength=len(trace.robots))
+    sent = np.bincount(trace.goals.sent.link, minlength=len(trace.robots))
     assert (sent >= 25).all()
     assert (trace.goals.reached >= sent - 2).all(), "none is refused, neither as old nor as of tomorrow"
     for robot in trace.robots:

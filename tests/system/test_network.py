@@ -26,9 +26,10 @@ MARGIN_S = 0.2  # what was said so shortly before the end may still be under way
 
 def sent_and_heard(trace: Trace, listener: int, speaker: int, end: float) -> tuple[Index, Index]:
     """Running numbers of the run that a robot said, and those of them that another one heard."""
-    said = trace.sent.seq[(trace.sent.robot == speaker) & (trace.sent.time < end - MARGIN_S)]
-    mine = (trace.heard.listener == listener) & (trace.heard.speaker == speaker)
-    return said, np.intersect1d(said, trace.heard.seq[mine])
+    said = trace.sent.seq[(trace.sent.link == speaker) & (trace.sent.stamp < end - MARGIN_S)]
+    net = trace.plan.heard_links
+    mine = trace.received.link == np.flatnonzero((net.listener == listener) & (net.speaker == speaker))
+    return said, np.intersect1d(said, trace.received.seq[mine])
 
 
 def virtual(duration_s: float) -> Trace:
@@ -50,7 +51,8 @@ def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Pat
     real, other = playback.read(folder / "periodic.mcap").trace, virtual(15.0)
     transmits_at_50_hz(real)
     shares, sent = [], 0
-    pairs = sorted({*zip(real.heard.listener.tolist(), real.heard.speaker.tolist(), strict=True)})
+    net = real.plan.heard_links
+    pairs = sorted({(int(net.listener[link]), int(net.speaker[link])) for link in real.received.link})
     assert len(pairs) == len(real.dropped if real.dropped is not None else ())
     for listener, speaker in pairs:
         said, heard = sent_and_heard(real, listener, speaker, 3.0)
@@ -59,10 +61,10 @@ def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Pat
         assert len(both) > 50
         np.testing.assert_array_equal(np.intersect1d(heard, both), np.intersect1d(heard_there, both))
         shares.append(1.0 - len(heard) / len(said))
-        sent += int((real.sent.robot == speaker).sum())
+        sent += int((real.sent.link == speaker).sum())
     assert np.mean(shares) == pytest.approx(0.3, abs=0.06)
 
-    delay = real.heard.time - real.heard.stamp
+    delay = real.received.arrival - real.received.stamp
     assert delay.min() >= 0.05 - 1e-5
     assert real.dropped is not None
     assert real.dropped.sum() == pytest.approx(0.3 * sent, rel=0.15)

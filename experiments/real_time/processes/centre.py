@@ -20,13 +20,13 @@ from typing import Final
 import numpy as np
 import zenoh
 
-from agents.arrays import Index
+from agents.arrays import Index, PoseTable
 from agents.clock import Clock
 from agents.decision.centralised import Centre, CentreGoals
 from agents.decision.lifecycle import IDLE, Phase
 from agents.network import messages, pubsub
 from agents.network import session as network
-from agents.network.channel_model import Channel, Samples
+from agents.network.channel_model import Channel
 from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken
@@ -159,7 +159,7 @@ class CentreProcess:
             extra=np.array([[nan if pose.yaw is None else pose.yaw, said.measured - self._utc]]),
         )
 
-    def _believe(self, got: Samples) -> None:
+    def _believe(self, got: PoseTable) -> None:
         """Poses have got through."""
         assert got.extra is not None  # all bring along their yaw, and when they were measured
         rows = self.centre.listens[got.link]
