@@ -10,7 +10,7 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -20,8 +20,7 @@ from agents.body.kinds import KINDS
 from experiments.authoring.robotic_park.file import Park, Robot, Threshold, read
 from experiments.authoring.robotic_park.heights import Heights, heights_of
 from experiments.authoring.robotic_park.links import Described, Notes, described, named, tasks
-from experiments.authoring.robotic_park.older_formats import is_older, read_older, starts_from
-from experiments.authoring.robotic_park.yaml_reader import Tree
+from experiments.authoring.robotic_park.starts import starts_from
 from experiments.catalogue import index
 from experiments.file import catalogue as entries
 from experiments.file import document
@@ -71,16 +70,10 @@ def imported(text: str, label: str, duration_s: float, poses: str | None = None)
         poses: A file with starts, see `starts_from`; they go before those of theirs.
 
     Raises:
-        DocumentError: With everything that is wrong with theirs, each with its place.
+        DocumentError: With what is wrong with theirs, by the path of the key.
     """
-    tree, notes = Tree(label, text), Notes()
-    starts = {} if poses is None else starts_from(poses)
-    if is_older(tree, tree.root()):
-        park = read_older(tree, Path(label).parent, starts)
-    else:
-        park = read(tree)
-        robots = tuple(replace(robot, pose=starts.get(robot.name, robot.pose)) for robot in park.robots)
-        park = replace(park, robots=robots)
+    notes = Notes()
+    park = read(label, text, {} if poses is None else starts_from(poses))
     _tools(park, notes)
     rates = _rates(park, notes)
     trigger, update = _trigger(park, rates, notes), _update(park, notes)
@@ -198,7 +191,7 @@ def _tools(park: Park, notes: Notes) -> None:
         notes.say("real robots keep their addresses; try the file with --virtual or --bodies twin first")
     if any(robot.external for robot in park.robots):
         notes.say("positioning Extern: the motion capture's address is not in their file; positioning is a twin of it")
-    gated = [robot.name for robot in park.robots if robot.control.event]
+    gated = [robot.name for robot in park.robots if robot.gated]
     if gated:
         notes.say(f"{named(gated)}: position controllers that act on events; zenpark's run at every tick")
     roles = Counter(task.role for _, task in tasks(park) if task.role != "consensus")

@@ -1,20 +1,32 @@
 """Experiment files of Robotic Park's authors (organisation Robotic-Park-Lab), as typed records.
 
-What their launcher and drivers have read of them since December 2023: sections Operation, Architecture and Robots; for
-each robot its pose, address, communication and task. Periods named T are milliseconds, the others seconds.
+Three formats. *Sections* (since December 2023): Operation, Architecture and Robots; periods named T are milliseconds,
+the others seconds. Two of 2023: *flat*, whose keys are robots, each with its communication and task; and an *index*,
+whose keys are robots with a start and the flat file (`config_path`) of that one robot. In those of 2023 gain and limit
+of the law stand in the programs of that time: 0.25 and 0.08 m (0.32 m, divided by 4) per decision.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final, TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar
+
+import msgspec
+import yaml
+from msgspec import Meta, Struct
 
 from agents.plugins.registry import did_you_mean
-from experiments.authoring.robotic_park.yaml_reader import Item, Tree
+from experiments.file.problems import DocumentError, at_offset, refusal
+from experiments.file.text import content
 
+T = TypeVar("T")
+Pose: TypeAlias = tuple[float, float, float]
+Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Positive = Annotated[float, Meta(gt=0, le=1e12)]
 KINDS: Final = (  # their launcher knows robots by their names as well
     ("dron", "crazyflie"),
     ("crazyflie", "crazyflie"),
@@ -23,20 +35,21 @@ KINDS: Final = (  # their launcher knows robots by their names as well
     ("burger", "turtlebot3"),
     ("tello", "tello"),
 )
-PLACES: Final = ("physical", "virtual", "digital_twin")
-MODES: Final = ("physical", "virtual", "hybrid")
 CENTRAL: Final = "centralized"
 CENTRES: Final = ("origin", "sphere")
 NOTHING: Final = ("none", "null")  # a relationship with nobody
 SURFACES: Final = ("cone", "ellipsoid")
+PLACES: Final = ("origin", "line", *SURFACES)  # relations that are no robots
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-Pose: TypeAlias = tuple[float, float, float]
 FORM: Final = "write name_d, name_x_y_z or origin_R, separated by commas"
+OLDER: Final = ("config_path", "communication", "task", "agent_ip", "control_mode")  # a table with one is a robot
+OLDER_GAIN: Final = 0.25
+OLDER_CLAMP: Final = 0.08  # [m]
 
 
 @dataclass(frozen=True)
 class Threshold:
-    """When something is sent or computed: always (`event` false), or beyond c0 + a·|·|."""
+    """Event trigger of theirs, beyond c0 + a·|·|; always if `event` is false."""
 
     event: bool
     constant: float
@@ -46,187 +59,323 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Relation:
-    """What a robot keeps to another, or to a place.
-
-    Attributes:
-        name: Of the other robot; origin, line, or a surface.
-        values: Its numbers.
-        centre: Of an origin that is told where it is.
-    """
+    """Link of a robot to another, or to a place: origin, line or a surface."""
 
     name: str
     values: tuple[float, ...]
-    centre: tuple[float, float, float] | None = None
+    centre: Pose | None = None  # of an origin that is told where it is
 
 
 @dataclass(frozen=True)
 class Task:
-    """What a robot does in the formation.
+    """Part of a robot in the formation."""
 
-    Attributes:
-        kind: distance or pose.
-        relations: To whom.
-        law: gradient, pid, or what else they have.
-        gain: Of the law, per decision.
-        clamp: Largest step of a decision [m].
-        period: Of it [s].
-        update: When it is computed.
-        role: Of the robot.
-    """
-
-    kind: str
+    kind: str  # distance or pose
     relations: tuple[Relation, ...]
-    law: str
-    gain: float
-    clamp: float
-    period: float
+    law: str  # gradient, pid, or another of theirs
+    gain: float  # per decision
+    clamp: float  # largest step of a decision [m]
+    period: float  # [s]
     update: Threshold
     role: str
 
 
 @dataclass(frozen=True)
 class Robot:
-    """One of their robots.
-
-    Attributes:
-        name: As they call it.
-        kind: As zenpark calls it.
-        place: physical, virtual or digital_twin.
-        pose: x, y [m] and z [m]; of robots on wheels the yaw [rad] instead of z. None: the file does not say.
-        uri: Of a Crazyflie.
-        host: Of a robot on Wi-Fi, with its port if there is one.
-        external: Whether its position is measured from outside.
-        speaks: When it sends its pose.
-        pose_s: How often it looks at its pose [s].
-        control: Of its own position controller.
-        task: None if it has none, or one that is switched off.
-        idle: Relations of a task that is switched off.
-    """
+    """One of their robots."""
 
     name: str
-    kind: str
-    place: str
-    pose: Pose | None
-    uri: str
-    host: str
-    external: bool
+    kind: str  # as zenpark calls it
+    place: str  # physical, virtual or digital_twin
+    pose: Pose | None  # x, y [m] and z [m]; on wheels the yaw [rad] instead of z; None: not in the file
+    uri: str  # of a Crazyflie
+    host: str  # of a robot on Wi-Fi, with its port if there is one
+    external: bool  # position measured from outside
     speaks: Threshold
-    pose_s: float
-    control: Threshold
-    task: Task | None
-    idle: int = 0
+    pose_s: float  # period of its pose [s]
+    gated: bool  # its position controller acts on events
+    task: Task | None  # None without one, or if it is switched off
+    idle: int = 0  # relations of a task that is switched off
 
 
 @dataclass(frozen=True)
 class Park:
-    """One of their experiments.
+    """One of their experiments."""
 
-    Attributes:
-        mode: physical, virtual or hybrid.
-        tool: Of the simulation, with its world.
-        kind: Of the experience.
-        architecture: centralized, distributed_ros2 or distributed.
-        robots: In the order of the file.
-        others: Sections that are switched on and are about their own tools.
-        recent: Written for the drivers of 2024 on, which read `mars_data`.
-        remarks: What the reader found out about the file itself, for its user.
-    """
-
-    mode: str
-    tool: str
-    kind: str
-    architecture: str
+    mode: str  # physical, virtual or hybrid
+    tool: str  # of the simulation, with its world
+    kind: str  # of the experience
+    architecture: str  # centralized, distributed_ros2 or distributed
     robots: tuple[Robot, ...]
-    others: tuple[str, ...] = ()
-    recent: bool = False
-    remarks: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()  # sections that are switched on and are about their own tools
+    recent: bool = False  # for the drivers of 2024 on, which read `mars_data`
+    remarks: tuple[str, ...] = ()  # on the file itself, for its user
 
 
-def read(tree: Tree) -> Park:
-    """The file with sections, the format since December 2023.
+class _Threshold(Struct, frozen=True):
+    type: str = "Constant"
+    co: Number | None = None
+    threshold: Number | None = None  # for `co`, in 2023
+    ai: Number | str = 0.0
+
+
+class _Communication(Struct, frozen=True):
+    type: Literal["Continuous", "EventBased", "EvenBased"] = "Continuous"  # both are written
+    threshold: _Threshold = _Threshold()
+
+
+class _Control(Struct, frozen=True):
+    protocol: Literal["Continuous", "EventBased"] = "Continuous"
+    threshold: _Threshold = _Threshold()
+
+
+class _Law(_Control, frozen=True):
+    type: str = "gradient"
+    period: Positive = 0.1
+    gain: Positive = 0.1
+    upperLimit: Number = 0.1  # noqa: N815 - theirs
+    lowerLimit: Number = -0.1  # noqa: N815
+
+
+class _Task(Struct, frozen=True):
+    type: Literal["distance", "pose", "relative_pose"] = "distance"
+    relationship: str = ""
+    role: str = "consensus"
+    controller: _Law = _Law()
+    T: Positive = 100.0
+
+
+class _TaskHead(Struct, frozen=True):
+    enable: bool = True
+    relationship: str = ""
+
+
+class _LocalPose(Struct, frozen=True):
+    T: Positive = 20.0
+
+
+class _Robot(Struct, frozen=True):
+    """Settings of a robot, those of all formats."""
+
+    name: str = ""
+    id: str = ""
+    type: Literal["physical", "virtual", "digital_twin"] = "virtual"
+    pose: str | list[Number] | dict[str, Number] | None = None
+    uri: str = ""
+    agent_ip: str = ""
+    ip: str = ""
+    port_number: str | int = ""
+    positioning: Literal["Intern", "Extern", "MoCap"] = "Intern"
+    communication: Any = None
+    local_pose: _LocalPose = _LocalPose()
+    controller: _Control = _Control()
+    controller_type: str = ""
+    init_theta: Number = 0.0
+    config_path: str = ""
+
+
+class _Switch(Struct, frozen=True):
+    enable: bool = False
+
+
+class _Operation(Struct, frozen=True):
+    mode: Literal["physical", "virtual", "hybrid"] = "virtual"
+    tool: str = ""
+    world: str = ""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A value of a YAML file, with the file and the path of its key."""
+
+    file: str
+    key: str
+    value: Any
+
+    @property
+    def name(self) -> str:
+        return self.key.rpartition(".")[2]
+
+    def has(self, key: str) -> bool:
+        return isinstance(self.value, dict) and key in self.value
+
+    def get(self, key: str) -> Entry:
+        """The value of a key; an empty table if there is none."""
+        path = f"{self.key}.{key}" if self.key else key
+        return Entry(self.file, path, self.value[key] if self.has(key) else {})
+
+    def tables(self) -> list[Entry]:
+        """Its values that are tables."""
+        return [self.get(key) for key, value in self.typed(dict[str, Any]).items() if isinstance(value, dict)]
+
+    def refused(self, message: str, hint: str = "") -> DocumentError:
+        return refusal(self.file, f"{self.key or 'the file'}: {message}", hint)
+
+    def typed(self, kind: type[T]) -> T:
+        """The value as `kind`; numbers and truth values may stand in quotes.
+
+        Raises:
+            DocumentError: With the path of the key that does not fit.
+        """
+        try:
+            return msgspec.convert(self.value, kind, strict=False)
+        except msgspec.ValidationError as error:
+            message, _, below = str(error).partition(" - at `$")
+            raise replace(self, key=(self.key + below.rstrip("`")).strip(".")).refused(message) from None
+
+
+class _Loader(yaml.SafeLoader):  # type: ignore[misc] # PyYAML has no types
+    """PyYAML's safe loader, which refuses a key that stands twice."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:  # noqa: ANN401 - as PyYAML has it
+        seen = set()
+        for key, _ in node.value:
+            if key.value in seen and isinstance(key, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"'{key.value}' stands twice in its table", key.start_mark
+                )
+            seen.add(str(key.value))
+        return super().construct_mapping(node, deep)
+
+
+def load(file: str, text: str) -> Entry:
+    """The table that a YAML file holds; nothing in it is ever executed.
 
     Raises:
-        DocumentError: With everything that is wrong with it, each with its place.
+        DocumentError: If it is no YAML, or no table.
     """
-    root = tree.root()
-    robots = tree.need(root, "Robots", "an experiment of Robotic Park lists them as Robot01, Robot02, ...")
-    operation = tree.get(root, "Operation")
-    architecture = tree.words(tree.get(tree.get(root, "Architecture"), "mode"), "distributed")
+    try:
+        value = yaml.load(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        words = " ".join(part for part in (error.context, error.problem) if part)
+        hint = "check the indentation, the colons and the quotes there"
+        raise DocumentError([at_offset(file, text, mark.index if mark else 0, words, hint)]) from None
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:  # a character, nesting, a date, a key
+        raise refusal(file, f"is no YAML: {error}", "write it out in plain tables") from None
+    if not isinstance(value, dict):
+        hint = "an experiment of Robotic Park has sections such as Operation and Robots"
+        raise refusal(file, "is no table of sections", hint)
+    return Entry(file, "", _given(value, {}))
+
+
+def _given(value: Any, done: dict[int, Any]) -> Any:  # noqa: ANN401 - whatever YAML holds
+    """A value without keys that hold nothing; keys are text. A table that stands in several places stays one."""
+    if isinstance(value, list):
+        return [_given(each, done) for each in value]
+    if not isinstance(value, dict):
+        return value
+    if id(value) not in done:
+        made = done[id(value)] = {}
+        made.update({str(key): _given(each, done) for key, each in value.items() if each is not None})
+    return done[id(value)]
+
+
+def read(file: str, text: str, poses: Mapping[str, Pose]) -> Park:
+    """An experiment, in whichever of the formats.
+
+    Args:
+        file: Its name: `config_path` is meant from its folder.
+        text: Its content.
+        poses: Of robots by name, from elsewhere; they go before those of the file.
+
+    Raises:
+        DocumentError: With what is wrong with it or the files that it names, by the paths of the keys.
+    """
+    root = load(file, text)
+    older = [] if root.has("Robots") else [each for each in root.tables() if any(map(each.has, OLDER))]
+    park = _older(file, older) if older else _sections(root)
+    robots = tuple(replace(robot, pose=poses.get(robot.name, robot.pose)) for robot in park.robots)
+    return replace(park, robots=robots)
+
+
+def _sections(root: Entry) -> Park:
+    """The format since December 2023."""
+    if not root.has("Robots"):
+        raise root.refused("'Robots' is missing", "an experiment of Robotic Park lists them as Robot01, Robot02, ...")
+    operation = root.get("Operation").typed(_Operation)
+    architecture = str(root.get("Architecture").value.get("mode", "distributed"))
     central = architecture.lower() == CENTRAL
-    entries = list(tree.entries(robots))
-    listed = tuple(_robot(tree, each, central=central) for each in entries)
-    if robots.there and not listed:
-        tree.fault(robots, "'Robots' has none", "list them as Robot01, Robot02, ...")
-    check_names(tree, entries, listed)
-    others, remarks = _others(tree, root)
+    entries = root.get("Robots").tables()
+    if not entries:
+        raise root.get("Robots").refused("has none", "list them as Robot01, Robot02, ...")
+    robots = _each(entries, lambda entry: _section_robot(entry, central=central))
+    _check_names(entries, robots)
+    others, remarks = _others(root)
     if central and architecture != CENTRAL:
         remarks.append(f"Architecture: {architecture}; their launcher starts a centre for '{CENTRAL}' alone, and for"
                        " this spelling nobody moves there; taken as centralized")  # fmt: skip
-    park = Park(
-        mode=tree.one_of(tree.get(operation, "mode"), MODES, "virtual"),
-        tool=" ".join(tree.words(tree.get(operation, key)) for key in ("tool", "world")).strip(),
-        kind=tree.words(tree.get(tree.get(root, "Experience"), "type"), "formation"),
+    return Park(
+        mode=operation.mode,
+        tool=f"{operation.tool} {operation.world}".strip(),
+        kind=str(root.get("Experience").value.get("type", "formation")),
         architecture=CENTRAL if central else architecture,
-        robots=listed,
+        robots=tuple(robots),
         others=tuple(others),
-        recent=any(tree.get(entry, "mars_data").there for entry in entries),
+        recent=any(entry.has("mars_data") for entry in entries),
         remarks=tuple(remarks),
     )
-    tree.refuse()
-    return park
 
 
-def _others(tree: Tree, root: Item) -> tuple[list[str], list[str]]:
+def _others(root: Entry) -> tuple[list[str], list[str]]:
     """Sections about their own tools that are switched on, and remarks on those that change the experiment."""
     sections = ("CPU_Monitoring", "Interface", "Data_Logging", "Supervisor")
-    found = [name for name in sections if tree.truth(tree.get(tree.get(root, name), "enable"), False)]
+    found = [name for name in sections if root.get(name).typed(_Switch).enable]
+    on = [each.name for each in root.get("Other").tables() if each.typed(_Switch).enable]
     remarks = []
-    others = tree.get(root, "Other")
-    for each in tree.entries(others) if others.there else ():
-        if not tree.truth(tree.get(each, "enable"), False):
-            continue
-        if each.path[-1] == "Reconfiguration":
-            remarks.append("Other.Reconfiguration: the shape changes in flight there, by a program of theirs; the first"
-                           " shape is imported, and [[formation.changes]] can tell the others")  # fmt: skip
-        else:
-            found.append(f"Other.{each.path[-1]}")
-    return found, remarks
+    if "Reconfiguration" in on:
+        remarks.append("Other.Reconfiguration: the shape changes in flight there, by a program of theirs; the first"
+                       " shape is imported, and [[formation.changes]] can tell the others")  # fmt: skip
+    return [*found, *(f"Other.{name}" for name in on if name != "Reconfiguration")], remarks
 
 
-def check_names(tree: Tree, entries: Sequence[Item], listed: Sequence[Robot]) -> None:
-    """Reports names that are given twice, and relations to robots that are not there."""
-    names = [robot.name for robot in listed]
-    for entry, robot in zip(entries, listed, strict=True):
-        if names.count(robot.name) > 1:
-            tree.fault(tree.get(entry, "name"), f"two robots are called '{robot.name}'", "rename one of them")
-        relationship = tree.get(tree.get(entry, "task"), "relationship")
-        for relation in robot.task.relations if robot.task else ():
-            if relation.name == robot.name:
-                tree.fault(relationship, f"'{robot.name}' cannot keep a distance to itself", "name another robot")
-            elif relation.name not in (*names, *CENTRES, *SURFACES, "line"):
-                hint = did_you_mean(relation.name, [*names, "origin"])
-                tree.fault(relationship, f"no robot is called '{relation.name}'", hint)
+def _each(entries: Sequence[Entry], made: Callable[[Entry], Robot]) -> list[Robot]:
+    """A robot from each entry; the problems of all of them at once."""
+    robots, problems = [], []
+    for entry in entries:
+        try:
+            robots.append(made(entry))
+        except DocumentError as error:
+            problems += error.problems
+    if problems:
+        raise DocumentError(problems)
+    return robots
 
 
-def _robot(tree: Tree, item: Item, *, central: bool) -> Robot:
-    named = tree.need(item, "name", "such as dron01")
-    name, kind = name_and_kind(tree, named, tree.words(named))
-    speaks, control, task = (tree.get(item, key) for key in ("communication", "controller", "task"))
+def _section_robot(entry: Entry, *, central: bool) -> Robot:
+    missing = [key for key in ("name", "type", "pose") if not entry.has(key)]
+    if missing:
+        raise entry.refused(f"'{missing[0]}' is missing", "such as name: dron01, type: virtual, pose: 1.2, -0.5, 0.7")
+    given, task = entry.typed(_Robot), entry.get("task")
+    head = task.typed(_TaskHead)
     # their central controller reads the relations of all robots, whatever `enable` says
-    on = tree.truth(tree.get(task, "enable"), True) or (central and bool(parts(tree, task)))
+    on = entry.has("task") and (head.enable or (central and bool(_parts(head.relationship))))
+    if on and not (task.has("type") and task.has("relationship")):
+        raise task.refused("type or relationship is missing", f"write distance or pose; {FORM}")
+    return _robot(entry, given, entry, given, _task(task) if on else None)
+
+
+def _robot(entry: Entry, listed: _Robot, own: Entry, given: _Robot, task: Task | None) -> Robot:
+    """A robot; an index keeps what it lists apart from the robot's own settings."""
+    name = listed.name or listed.id or entry.name
+    host, port = given.agent_ip or given.ip, given.port_number
+    at = own.get("communication")
+    word = isinstance(given.communication, str)  # in 2023
+    speaks = replace(at, value={"type": at.value} if word else at.value).typed(_Communication)
+    relations = _parts(own.get("task").typed(_TaskHead).relationship)
     return Robot(
         name=name,
-        kind=kind,
-        place=tree.one_of(tree.need(item, "type", "one of: " + ", ".join(PLACES)), PLACES, "virtual"),
-        pose=pose_of(tree, tree.need(item, "pose", "such as pose: 1.2, -0.5, 0.7")),
-        uri=tree.words(tree.get(item, "uri")),
-        host=host_of(tree, item),
-        external=tree.one_of(tree.get(item, "positioning"), ("Intern", "Extern"), "Intern") == "Extern",
-        speaks=_threshold(tree, speaks, tree.get(speaks, "type")),
-        pose_s=1e-3 * positive(tree, tree.get(tree.get(item, "local_pose"), "T"), 20.0),
-        control=_threshold(tree, control, tree.get(control, "protocol")),
-        task=_task(tree, task) if on else None,
-        idle=0 if on else len(parts(tree, task)),
+        kind=_kind(entry, name),
+        place=listed.type,
+        pose=_pose(entry, listed, given),
+        uri=listed.uri,
+        host=f"{host}:{port}" if host and port else host,
+        external=given.positioning != "Intern",
+        speaks=_threshold(at, speaks.threshold, event=speaks.type != "Continuous"),
+        pose_s=1e-3 * given.local_pose.T,
+        gated=given.controller.protocol == "EventBased" or "EventBased" in given.controller_type,
+        task=task,
+        idle=0 if task else len(relations),
     )
 
 
@@ -235,86 +384,67 @@ def kind_of(name: str) -> str:
     return next((kind for part, kind in KINDS if part in name.lower()), "")
 
 
-def name_and_kind(tree: Tree, item: Item, name: str) -> tuple[str, str]:
-    """The name of a robot, checked, and its kind; `item` is where the name stands."""
+def _kind(entry: Entry, name: str) -> str:
     kind = kind_of(name)
-    if name and not kind:
-        known = ", ".join(dict.fromkeys(part for part, _ in KINDS))
-        tree.fault(item, f"what kind of robot is '{name}'?", f"a name holds one of: {known}")
-    if name and not NAME.fullmatch(name):
+    if not kind:
+        known = ", ".join(part for part, _ in KINDS)
+        raise entry.refused(f"what kind of robot is '{name}'?", f"a name holds one of: {known}")
+    if not NAME.fullmatch(name):
         hint = "use letters, digits and _, beginning with a letter"
-        tree.fault(item, f"{name!r} cannot be the name of a robot", hint)
-    return name, kind
+        raise entry.refused(f"{name!r} cannot be the name of a robot", hint)
+    return kind
 
 
-def pose_of(tree: Tree, item: Item) -> Pose:
-    """The numbers of a pose; those that are left out are 0."""
-    pose = tree.numbers(item)
-    if pose and len(pose) not in (2, 3):
-        tree.fault(item, f"'pose' has {len(pose)} numbers", "give x, y and, if wanted, z or the yaw")
-    x, y, z = (*pose, 0.0, 0.0, 0.0)[:3]
+def _pose(entry: Entry, listed: _Robot, given: _Robot) -> Pose | None:
+    """The start; Kheperas of 2023 have their yaw apart."""
+    if listed.pose is None:
+        return None
+    if isinstance(listed.pose, dict):
+        return listed.pose.get("x", 0.0), listed.pose.get("y", 0.0), given.init_theta
+    x, y, third = pose_of(entry.get("pose"), listed.pose)
+    return x, y, third or given.init_theta
+
+
+def pose_of(entry: Entry, pose: str | list[float]) -> Pose:
+    """x, y and z or yaw of a text or a list; what is left out is 0."""
+    parts = [part for part in re.split(r"[,\s]+", pose) if part] if isinstance(pose, str) else pose
+    values = replace(entry, value=parts).typed(list[Number])
+    if len(values) not in (2, 3):
+        raise entry.refused(f"has {len(values)} numbers", "give x, y and, if wanted, z or the yaw")
+    x, y, z = (*values, 0.0)[:3]
     return x, y, z
 
 
-def host_of(tree: Tree, item: Item) -> str:
-    """The network address of a robot on Wi-Fi, with its port if one is given; empty if there is none."""
-    host = next((found for key in ("agent_ip", "ip") if (found := tree.words(tree.get(item, key)))), "")
-    port = tree.words(tree.get(item, "port_number"))
-    return f"{host}:{port}" if host and port else host
-
-
-def parts(tree: Tree, task: Item) -> list[str]:
-    """The relations of a task, as they are written."""
-    written = (part.strip() for part in tree.words(tree.get(task, "relationship")).split(","))
-    return [part for part in written if part and part.lower() not in NOTHING]
-
-
-def relations(tree: Tree, task: Item, kind: str) -> tuple[Relation, ...]:
-    """The relations of a task of a kind, distance or pose."""
-    item = tree.get(task, "relationship")
-    found = (_relation(tree, item, part, kind) for part in parts(tree, task))
-    return tuple(each for each in found if each is not None)
-
-
-def _threshold(tree: Tree, item: Item, how: Item) -> Threshold:
-    table = tree.get(item, "threshold")
-    event = tree.one_of(how, ("Continuous", "EventBased"), "Continuous") == "EventBased"
-    constant = tree.number(tree.get(table, "co"), 0.01)
+def _threshold(entry: Entry, given: _Threshold, *, event: bool) -> Threshold:
+    constant = next((each for each in (given.co, given.threshold) if each is not None), 0.01)
     if event and constant <= 0.0:
-        tree.fault(tree.get(table, "co"), "a threshold of 0 or less is crossed always", "give metres, such as 0.01")
-    return Threshold(
-        event, constant, tree.number(tree.get(table, "ai"), 0.0), tree.words(tree.get(table, "type"), "Constant")
-    )
+        raise entry.refused("a threshold of 0 or less is crossed always", "give metres, such as 0.01")
+    relative = 0.0 if str(given.ai).lower() in NOTHING else replace(entry, value=given.ai).typed(Number)
+    return Threshold(event, constant, relative, given.type)
 
 
-def _task(tree: Tree, item: Item) -> Task | None:
-    if not item.there:
-        return None
-    kind = tree.one_of(tree.need(item, "type", "distance or pose"), ("distance", "pose"), "distance")
-    law = tree.get(item, "controller")
-    name, _, signal = tree.words(tree.get(law, "type"), "gradient").partition("_")
-    period = positive(tree, tree.get(law, "period"), 0.1)
-    step = period if signal == "v" else 1.0  # their laws named _v give a velocity, the others a step
-    high, low = tree.number(tree.get(law, "upperLimit"), 0.1), tree.number(tree.get(law, "lowerLimit"), -0.1)
-    clamp = min(high, -low)
+def _task(entry: Entry, *, older: bool = False) -> Task:
+    given, law = entry.typed(_Task), entry.typed(_Task).controller
+    kind = "distance" if given.type == "distance" else "pose"
+    relations = tuple(_relation(entry, part, kind) for part in _parts(given.relationship))
+    if older:
+        always = Threshold(False, 0.0, 0.0, "Constant")
+        return Task(kind, relations, "gradient", OLDER_GAIN, OLDER_CLAMP, 1e-3 * given.T, always, given.role)
+    name, _, signal = law.type.partition("_")
+    step = law.period if signal == "v" else 1.0  # their laws named _v give a velocity, the others a step
+    clamp = min(law.upperLimit, -law.lowerLimit)
     if clamp <= 0.0:
-        tree.fault(
-            tree.get(law, "upperLimit"), "no step lies between lowerLimit and upperLimit", "such as -0.1 and 0.1"
-        )
-    tree.need(item, "relationship", FORM)
-    return Task(
-        kind=kind,
-        relations=relations(tree, item, kind),
-        law=name,
-        gain=step * positive(tree, tree.get(law, "gain"), 0.1),
-        clamp=step * clamp,
-        period=period,
-        update=_threshold(tree, law, tree.get(law, "protocol")),
-        role=tree.words(tree.get(item, "role"), "consensus"),
-    )
+        raise entry.refused("no step lies between lowerLimit and upperLimit", "such as -0.1 and 0.1")
+    update = _threshold(entry, law.threshold, event=law.protocol == "EventBased")
+    return Task(kind, relations, name, step * law.gain, step * clamp, law.period, update, given.role)
 
 
-def _relation(tree: Tree, item: Item, part: str, kind: str) -> Relation | None:
+def _parts(relationship: str) -> list[str]:
+    """The relations of a task, as they are written."""
+    return [part for each in relationship.split(",") if (part := each.strip()) and part.lower() not in NOTHING]
+
+
+def _relation(entry: Entry, part: str, kind: str) -> Relation:
     name, *rest = part.split("_")
     try:
         if name in CENTRES and len(rest) == 1 and re.fullmatch(r"[\d.]+(-[\d.]+){3}", rest[0]):
@@ -328,18 +458,79 @@ def _relation(tree: Tree, item: Item, part: str, kind: str) -> Relation | None:
     name = "origin" if name in CENTRES else "line" if name.startswith("line") else name
     counts = {"origin": (1, 3), "line": (6,)}.get(name, (3,) if kind == "pose" else (1,))
     if len(values) not in counts or not all(map(math.isfinite, values)):
-        tree.fault(item, f"'{part}' is no relation of a {kind} task", FORM)
-        return None
+        raise entry.refused(f"'{part}' is no relation of a {kind} task", FORM)
     if len(values) == 1 and values[0] <= 0.0:
-        tree.fault(item, f"'{part}' asks for a distance that is not positive", "give metres, such as 0.8")
-        return None
+        raise entry.refused(f"'{part}' asks for a distance that is not positive", "give metres, such as 0.8")
     return Relation(name, values)
 
 
-def positive(tree: Tree, item: Item, default: float) -> float:
-    """A number above 0."""
-    found = tree.number(item, default)
-    if found <= 0.0:
-        tree.fault(item, f"'{item.name}' must be more than 0, not {found:g}")
-        return default
-    return found
+def _check_names(entries: Sequence[Entry], robots: Sequence[Robot]) -> None:
+    """Refuses names that are given twice, and relations to robots that are not there."""
+    names = [robot.name for robot in robots]
+    for entry, robot in zip(entries, robots, strict=True):
+        if names.count(robot.name) > 1:
+            raise entry.refused(f"two robots are called '{robot.name}'", "rename one of them")
+        for relation in robot.task.relations if robot.task else ():
+            if relation.name == robot.name:
+                raise entry.refused(f"'{robot.name}' cannot keep a distance to itself", "name another robot")
+            if relation.name not in (*names, *PLACES):
+                hint = did_you_mean(relation.name, [*names, "origin"])
+                raise entry.refused(f"no robot is called '{relation.name}'", hint)
+
+
+def _older(file: str, entries: Sequence[Entry]) -> Park:
+    """The flat files and the indices of 2023."""
+    listed = [(entry, _settings(entry, Path(file).parent)) for entry in entries]
+    keys = [entry.name for entry in entries]
+    # entries that only let the drones' driver publish where another robot of the file is
+    marks = [
+        entry.name
+        for entry, own in listed
+        if own.typed(_Robot).name not in ("", entry.name)
+        and own.typed(_Robot).name in keys
+        and not own.get("task").typed(_TaskHead).enable
+    ]
+    settings = {entry.key: own for entry, own in listed if entry.name not in marks}
+    entries = [entry for entry in entries if entry.name not in marks]
+    robots = _each(entries, lambda entry: _older_robot(entry, settings[entry.key]))
+    task = robots[0].task if len(robots) == 1 else None
+    if task and any(relation.name not in PLACES for relation in task.relations):
+        hint = "import the file that lists the robots of the experiment: an index names this one as config_path"
+        raise entries[0].refused(f"'{robots[0].name}' is one robot of an experiment", hint)
+    _check_names(entries, robots)
+    remarks = [
+        "law: gain and limit are not in files of 2023; 0.25 and 0.08 m per decision, as in the programs of that time"
+    ]
+    if marks:
+        remarks.append(f"{', '.join(marks)}: the marker of a robot that stands in the file already")
+    addresses = [f"{robot.name} {robot.host}" for robot in robots if robot.host]
+    if addresses and not any(entry.has("config_path") for entry in entries):
+        remarks.append(
+            "the file does not say which robots are real: all are twins here; addresses in it: " + ", ".join(addresses)
+        )
+    kinds = {robot.place for robot in robots}
+    mode = kinds.pop() if len(kinds) == 1 else "hybrid"
+    return Park(mode, "", "formation", "distributed", tuple(robots), remarks=tuple(remarks))
+
+
+def _settings(entry: Entry, folder: Path) -> Entry:
+    """The settings of a robot: its entry, or what the file that an index names for it holds."""
+    name = entry.typed(_Robot).config_path
+    if not name:
+        return entry
+    file = folder / name
+    try:
+        tables = load(str(file), content(file, str(file))).tables()
+    except OSError:
+        hint = "put the files of its robots beside the index"
+        raise entry.refused(f"there is no file '{name}' beside this one", hint) from None
+    own = next((each for each in tables if each.name == entry.name), None) or next(iter(tables), None)
+    if own is None:
+        raise refusal(str(file), "has no robot", f"write its settings under '{entry.name}:'")
+    return own
+
+
+def _older_robot(entry: Entry, own: Entry) -> Robot:
+    on = own.has("task") and own.get("task").typed(_TaskHead).enable
+    task = _task(own.get("task"), older=True) if on else None
+    return _robot(entry, entry.typed(_Robot), own, own.typed(_Robot), task)

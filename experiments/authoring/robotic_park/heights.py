@@ -25,23 +25,14 @@ TINY: Final = 1e-12
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is asked of N robots.
+    """Links of N robots, and distances that they keep to points."""
 
-    Attributes:
-        pairs: (M, 2) i, j.
-        distance: (M,) ‖p_i − p_j‖ [m]; NaN where a relative position is asked for.
-        relative: (M, 3) p_i − p_j [m].
-        row: (A,) robots that keep a distance to a point.
-        point: (A, 3) [m].
-        radius: (A,) [m].
-    """
-
-    pairs: Index
-    distance: Array
-    relative: Array
-    row: Index
-    point: Array
-    radius: Array
+    pairs: Index  # (M, 2) i, j
+    distance: Array  # (M,) ‖p_i − p_j‖ [m]; NaN where a relative position is asked for
+    relative: Array  # (M, 3) p_i − p_j [m]
+    row: Index  # (A,) robots that keep a distance to a point
+    point: Array  # (A, 3) [m]
+    radius: Array  # (A,) [m]
 
     def without_points(self) -> Wanted:
         """The same without distances to points."""
@@ -128,39 +119,30 @@ def _fitted(wanted: Wanted, guess: Array, climbs: Mask) -> Placed:
             damping *= 10.0
         if damping > 1e9 or before < FOUND**2 or 0.0 <= before - after < 1e-10 * before:
             break
-    points = len(wanted.row)
-    off = np.abs(value)
-    links = off[: len(off) - points] if points else off
-    return Placed(position, float(links.max(initial=0.0)), float(off[len(off) - points :].max(initial=0.0)))
+    off, lengths = np.abs(value), int(np.isfinite(wanted.distance).sum())
+    points = slice(lengths, lengths + len(wanted.row))
+    return Placed(position, float(np.delete(off, points).max(initial=0.0)), float(off[points].max(initial=0.0)))
 
 
 def _residuals(wanted: Wanted, position: Array) -> tuple[Array, Array]:
-    """What is off (K,) and its slope (K, N, 3): distances, then relative positions, then points."""
+    """Equations (K,) and their slope (K, N, 3): distances to robots, then to points, then relative positions."""
     rows = len(position)
-    i, j = wanted.pairs[:, 0], wanted.pairs[:, 1]
-    apart = position[i] - position[j]
+    place = np.concatenate([position, wanted.point])  # a point is a robot that does not move
     by_distance, by_place = np.flatnonzero(np.isfinite(wanted.distance)), np.flatnonzero(np.isnan(wanted.distance))
-    length = norm(apart[by_distance]) + TINY
-    number = np.arange(len(by_distance))
-    lengths = np.zeros((len(by_distance), rows, 3))
-    lengths[number, i[by_distance]] = apart[by_distance] / length[:, None]
-    lengths[number, j[by_distance]] = -apart[by_distance] / length[:, None]
-    vectors = np.zeros((len(by_place), 3, rows, 3))
-    number = np.arange(len(by_place))
-    for axis in range(3):
-        vectors[number, axis, i[by_place], axis], vectors[number, axis, j[by_place], axis] = 1.0, -1.0
-    away = position[wanted.row] - wanted.point
-    far = norm(away) + TINY
-    points = np.zeros((len(wanted.row), rows, 3))
-    points[np.arange(len(wanted.row)), wanted.row] = away / far[:, None]
-    value = np.concatenate(
-        [
-            length - wanted.distance[by_distance],
-            (apart[by_place] - wanted.relative[by_place]).ravel(),
-            far - wanted.radius,
-        ]
-    )
-    return value, np.concatenate([lengths, vectors.reshape(-1, rows, 3), points])
+    to_point = np.column_stack([wanted.row, rows + np.arange(len(wanted.row))])
+    i, j = np.concatenate([wanted.pairs[by_distance], to_point]).T
+    length = norm(place[i] - place[j]) + TINY
+    direction = [(place[i] - place[j]) / length[:, None], np.tile(np.eye(3), (len(by_place), 1))]
+    k, m = wanted.pairs[by_place].T
+    value = [
+        length - np.concatenate([wanted.distance[by_distance], wanted.radius]),
+        (position[k] - position[m] - wanted.relative[by_place]).ravel(),
+    ]
+    tail, head = np.concatenate([i, np.repeat(k, 3)]), np.concatenate([j, np.repeat(m, 3)])
+    slope = np.zeros((len(tail), len(place), 3))
+    slope[np.arange(len(tail)), tail] = np.concatenate(direction)
+    slope[np.arange(len(tail)), head] = -np.concatenate(direction)
+    return np.concatenate(value), slope[:, :rows]
 
 
 SHAPE_MET: Final = 0.01  # [m] what is missed by more is another shape
@@ -184,21 +166,13 @@ class Notes:
 
 @dataclass(frozen=True)
 class Heights:
-    """Where N robots start and are to be.
+    """Start and goal of N robots."""
 
-    Attributes:
-        start: (N, 3) [m]; z is where drones were to begin.
-        shape: (N, 3) [m].
-        hover: (N,) heights that are held [m]; 0 on the floor.
-        anchored: Whether distances to the origin agree with the others, and are carried over.
-        centre: What becomes of the origin [m].
-    """
-
-    start: Array
-    shape: Array
-    hover: Array
-    anchored: bool
-    centre: tuple[float, float, float]
+    start: Array  # (N, 3) [m]; z is where drones were to begin
+    shape: Array  # (N, 3) [m]
+    hover: Array  # (N,) heights that are held [m]; 0 on the floor
+    anchored: bool  # distances to the origin agree with the others, and are carried over
+    centre: tuple[float, float, float]  # place of the origin [m]
 
 
 def tasks(park: Park) -> Iterator[tuple[Robot, Task]]:
