@@ -23,7 +23,7 @@ READING: Final = "ZENPARK_CLOCK"  # environment: UTC at which the machine's mono
 _WORD: Final = b"clock "
 
 
-def said(correction_s: float) -> bytes:
+def correction_line(correction_s: float) -> bytes:
     """The line by which a process is told its correction."""
     return _WORD + f"{correction_s:.6f}\n".encode()
 
@@ -58,8 +58,8 @@ class Clock:
         """The environment of processes on this machine that are to read this clock."""
         return {READING: repr(self.at(0.0))}
 
-    def heed(self, line: bytes) -> None:
-        """Takes a line of `said` up, from any thread; what is none, or too far off to be drift, is refused."""
+    def follow(self, line: bytes) -> None:
+        """Follow a correction line, from any thread; an unreadable one, or one too far off to be drift, is refused."""
         try:
             wanted = float(line.removeprefix(_WORD))
         except ValueError:

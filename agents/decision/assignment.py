@@ -27,7 +27,7 @@ class Assignment:
         names: Of the rows (N).
         kinds: Of the rows (N).
         hover: (N,) height that a flying row holds [m]; NaN for ground robots.
-        speakers: Names of all robots of the experiment; `links.speaker` points here.
+        robots: Names of all robots of the experiment; `links.speaker` points here.
         links: On which the rows listen.
         law: Formation law.
         trigger: Who speaks when.
@@ -38,8 +38,8 @@ class Assignment:
         legs: Plans: rows, and the legs that they follow.
         limits: For `agents.safety.setpoint_filter`.
         avoidance: How the rows keep clear of what they see and hear; None: they do not.
-        speaker_kinds: Kinds of all robots of the experiment.
-        watched: (E,) links that are only for avoidance: the law knows nothing of them; None: there are none.
+        robot_kinds: Kinds of all robots of the experiment.
+        avoidance_only: (E,) links that are only for avoidance: the law knows nothing of them; None: there are none.
         avoids: (N,) rows that keep clear at all; None: all.
         anchors: Distances that the rows keep to what stands still; None: none.
         changes: What becomes of the links' targets, over all links.
@@ -51,13 +51,13 @@ class Assignment:
         decide_every: A goal is decided on every so many ticks.
         duration: Of the experiment [s].
         patience_s: A row that misses a neighbour for this long is ready without it; None: never.
-        waited_for: (E,) links without which a row is not ready; None: all.
+        awaited: (E,) links without which a row is not ready; None: all.
     """
 
     names: tuple[str, ...]
     kinds: tuple[Kind, ...]
     hover: Array
-    speakers: tuple[str, ...]
+    robots: tuple[str, ...]
     links: Links
     law: laws.Law
     trigger: Trigger
@@ -70,19 +70,19 @@ class Assignment:
     decide_every: int
     duration: float
     patience_s: float | None = None
-    waited_for: Mask | None = None
+    awaited: Mask | None = None
     predictor: Predictor = HOLD
     update: Trigger | None = None
     avoidance: Avoidance | None = None
-    speaker_kinds: tuple[Kind, ...] = ()
-    watched: Mask | None = None
+    robot_kinds: tuple[Kind, ...] = ()
+    avoidance_only: Mask | None = None
     avoids: Mask | None = None
     anchors: Anchors | None = None
     changes: tuple[Change, ...] = ()
     presence: Presence | None = None
     guided: Mask | None = None
 
-    def lacking(self, stamp: Array) -> Mask:
+    def unreceived(self, stamp: Array) -> Mask:
         """Links (E,) that are waited for and on which nothing was heard yet: the last `stamp` (E,) is not finite."""
         unheard: Mask = ~np.isfinite(stamp)
-        return unheard if self.waited_for is None else unheard & self.waited_for
+        return unheard if self.awaited is None else unheard & self.awaited

@@ -14,7 +14,7 @@ from agents.arrays import Array, Index, Mask, some
 from agents.decision.assignment import Assignment
 from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, RUNNING
-from agents.decision.neighbours import Heard
+from agents.decision.neighbours import NeighbourPoses
 
 ROUNDING_S = 1e-6  # instants of decisions are multiples of a period that binary fractions miss by less than this
 
@@ -42,8 +42,8 @@ class Centre:
     Attributes:
         poses: What was last heard of each robot (N).
         yaw: (N,) and where it looked [rad].
-        listens: Rows whose poses it needs: those that it guides, and those to whom they listen.
-        deciding: Computes the goals.
+        needed: Rows whose poses it needs: those that it guides, and those to whom they listen.
+        goal_computer: Computes the goals.
         decisions: Since the first robot that it guides began.
         updates: (N,) of these, those at which each row's goal was computed anew.
     """
@@ -53,16 +53,16 @@ class Centre:
         assert assignment.guided is not None
         rows = len(assignment.names)
         self.assignment, self.guided = assignment, assignment.guided
-        self.deciding = GoalComputer(assignment, self.guided)
-        self.poses, self.yaw = Heard.nothing(rows), np.zeros(rows)
-        self._holding = StationKeeping(self.deciding.ground)
-        self.goal, self.toward = np.full((rows, 3), np.nan), np.full(rows, np.nan)
+        self.goal_computer = GoalComputer(assignment, self.guided)
+        self.poses, self.yaw = NeighbourPoses.none_received(rows), np.zeros(rows)
+        self._holding = StationKeeping(self.goal_computer.ground)
+        self.goal, self.goal_yaw = np.full((rows, 3), np.nan), np.full(rows, np.nan)
         self._rests, self._sent = np.full(rows, -np.inf), np.full(rows, -np.inf)
         self.decisions = 0
         self.updates: Index = np.zeros(rows, dtype=np.intp)
         speaks = np.zeros(rows, dtype=bool)
-        speaks[assignment.links.speaker] = True
-        self.listens: Index = np.flatnonzero(self.guided | speaks)
+        speaks[assignment.links.sender] = True
+        self.needed: Index = np.flatnonzero(self.guided | speaks)
 
     def receive(  # noqa: PLR0917 - as `Hearing.hear`
         self, rows: Index, position: Array, velocity: Array, yaw: Array, stamp: Array, arrived: Array
@@ -73,39 +73,39 @@ class Centre:
         order = order[stamp[order] > poses.stamp[rows[order]]]
         mine = rows[order]
         poses.position[mine], poses.velocity[mine], self.yaw[mine] = position[order], velocity[order], yaw[order]
-        poses.stamp[mine], poses.arrived[mine] = stamp[order], arrived[order]
+        poses.stamp[mine], poses.arrival[mine] = stamp[order], arrived[order]
         links = self._links(mine)
-        who = self.assignment.links.speaker[links]
-        self.deciding.hearing.receive(
-            links, poses.position[who], poses.velocity[who], poses.stamp[who], poses.arrived[who]
+        who = self.assignment.links.sender[links]
+        self.goal_computer.neighbours.receive(
+            links, poses.position[who], poses.velocity[who], poses.stamp[who], poses.arrival[who]
         )
 
-    def begin(self, row: int, origin: tuple[float, float, float, float]) -> None:
+    def begin_plan(self, row: int, origin: tuple[float, float, float, float]) -> None:
         """A robot began at `origin`, x, y, z [m] and yaw [rad]: its plan does too, though this centre was not there."""
         x, y, z, yaw = origin
-        self.deciding.begin(np.array([row]), np.array([[x, y, z]]), np.array([yaw]))
+        self.goal_computer.begin_plans(np.array([row]), np.array([[x, y, z]]), np.array([yaw]))
 
     def mark_lost(self, rows: Index, t: float) -> None:
         """The tokens of these robots are gone since `t` [s]."""
-        self.poses.gone[rows] = np.minimum(self.poses.gone[rows], t)
-        self.deciding.hearing.mark_lost(self._links(rows), t)
+        self.poses.lost_since[rows] = np.minimum(self.poses.lost_since[rows], t)
+        self.goal_computer.neighbours.mark_lost(self._links(rows), t)
 
     def mark_alive(self, rows: Index) -> None:
         """The tokens of these robots are there: they live, whether or not they have something to say."""
-        self.poses.gone[rows] = np.inf
-        self.deciding.hearing.mark_alive(self._links(rows))
+        self.poses.lost_since[rows] = np.inf
+        self.goal_computer.neighbours.mark_alive(self._links(rows))
 
-    def forget(self, rows: Index) -> None:
+    def discard_poses(self, rows: Index) -> None:
         """These robots begin a new life: poses of the one before are of another robot."""
         poses = self.poses
         poses.position[rows], poses.velocity[rows] = np.nan, 0.0
-        poses.stamp[rows] = poses.arrived[rows] = -np.inf
-        self.deciding.hearing.forget(self._links(rows))
+        poses.stamp[rows] = poses.arrival[rows] = -np.inf
+        self.goal_computer.neighbours.discard_poses(self._links(rows))
 
-    def missing(self) -> Index:
+    def missing_robots(self) -> Index:
         """Rows that it needs and never heard, or that are gone."""
-        poses, rows = self.poses, self.listens
-        return rows[~np.isfinite(poses.stamp[rows]) | (poses.gone[rows] < np.inf)]
+        poses, rows = self.poses, self.needed
+        return rows[~np.isfinite(poses.stamp[rows]) | (poses.lost_since[rows] < np.inf)]
 
     def decide(self, t: float, phase: Index, start: Array) -> CentreGoals:
         """Goals at `t` [s].
@@ -118,44 +118,44 @@ class Centre:
             phase: (N,) of the robots, as far as is known.
             start: (N,) when each began [s].
         """
-        deciding, poses, limits = self.deciding, self.poses, self.assignment.limits
+        deciding, poses, limits = self.goal_computer, self.poses, self.assignment.limits
         deciding.update_links(t)
         # a status that says so may still be on its way, but the start was known before
         phase = np.where((phase == AIRBORNE) & (t >= start - ROUNDING_S), RUNNING, phase)
-        known = self.guided & np.isfinite(poses.stamp) & (poses.gone == np.inf)
+        known = self.guided & np.isfinite(poses.stamp) & (poses.lost_since == np.inf)
         running, waiting = known & (phase == RUNNING), known & (phase <= AIRBORNE) & self._complete(t)
         position = np.full((len(known), 3), np.nan)
-        position[known] = poses.believed(self.assignment.predictor, t, np.flatnonzero(known))
-        held = anew = (running & deciding.alone()) | waiting
+        position[known] = poses.extrapolate_position(self.assignment.predictor, t, np.flatnonzero(known))
+        held = anew = (running & deciding.without_neighbours()) | waiting
         if running.any():
             self.decisions += 1
             new = deciding.decide(t, position, poses.velocity, self.yaw, start=start, running=running)
             self.goal = np.where(new.due[:, None], new.goal, self.goal)
-            self.toward = np.where(new.due, new.toward, self.toward)
+            self.goal_yaw = np.where(new.due, new.yaw, self.goal_yaw)
             self.updates += new.due
-            held = (running & deciding.alone()) | waiting  # links may have come or gone by the decision
+            held = (running & deciding.without_neighbours()) | waiting  # links may have come or gone by the decision
             anew = held | new.due
-        self.goal, self.toward = self._holding.stay(held, position, self.goal, self.toward)
+        self.goal, self.goal_yaw = self._holding.hold_position(held, position, self.goal, self.goal_yaw)
         self._rests = np.where(anew, poses.stamp, self._rests)
-        deciding.forget(np.flatnonzero(~running | held))
+        deciding.require_update(np.flatnonzero(~running | held))
         again = running & (t - self._sent >= 0.5 * limits.link_silence_s)
         rows = np.flatnonzero((anew | again) & np.isfinite(self.goal).all(axis=1))
         self._sent[rows] = t
-        return CentreGoals(rows, self.goal[rows], self.toward[rows], self._rests[rows])
+        return CentreGoals(rows, self.goal[rows], self.goal_yaw[rows], self._rests[rows])
 
     def _complete(self, t: float) -> Mask:
         """Rows (N,) whose neighbours were all heard once, or waited for long enough."""
         complete = np.ones(len(self.guided), dtype=bool)
-        patience, stamp = self.assignment.patience_s, self.deciding.hearing.greeted
+        patience, stamp = self.assignment.patience_s, self.goal_computer.neighbours.stamp_once_alive
         if patience is None or t <= patience:
-            complete[self.assignment.links.listener[self.assignment.lacking(stamp)]] = False
+            complete[self.assignment.links.receiver[self.assignment.unreceived(stamp)]] = False
         return complete
 
     def _links(self, rows: Index) -> Index:
         """All links on which `rows` are heard."""
         spoke = np.zeros(len(self.guided), dtype=bool)
         spoke[rows] = True
-        return np.flatnonzero(spoke[self.assignment.links.speaker])
+        return np.flatnonzero(spoke[self.assignment.links.sender])
 
 
 class Guidance:
@@ -164,10 +164,10 @@ class Guidance:
     Attributes:
         guided: (N,) which rows it decides for.
         goal: (N, 3) told last [m].
-        toward: (N,) yaw wanted there [rad], NaN for any.
+        goal_yaw: (N,) yaw wanted there [rad], NaN for any.
         stamp: (N,) when it was decided [s]; minus infinity before the first.
         fresh: (N,) goals that nobody has acted on yet.
-        gone: Since when the centre is known to be dead [s]; infinity while it lives.
+        lost_since: Since when the centre is known to be dead [s]; infinity while it lives.
     """
 
     def __init__(self, guided: Mask, flies: Mask, silence_s: float) -> None:
@@ -180,35 +180,37 @@ class Guidance:
         """
         rows = len(guided)
         self.guided, self._flies, self._silence_s = guided, flies, silence_s
-        self.goal, self.toward = np.full((rows, 3), np.nan), np.full(rows, np.nan)
-        self.stamp, self.gone = np.full(rows, -np.inf), np.inf
+        self.goal, self.goal_yaw = np.full((rows, 3), np.nan), np.full(rows, np.nan)
+        self.stamp, self.lost_since = np.full(rows, -np.inf), np.inf
         self.fresh: Mask = np.zeros(rows, dtype=bool)
 
     def receive(self, rows: Index, goal: Array, toward: Array, stamp: Array) -> Mask:
         """Goals (H, 3) of `rows` (H,), each once, that arrived: decided at `stamp` (H,) [s]. Which were news."""
         newer = np.asarray((stamp > self.stamp[rows]) & self.guided[rows] & np.isfinite(goal).all(axis=1))
         rows = rows[newer]
-        self.goal[rows], self.toward[rows], self.stamp[rows] = goal[newer], toward[newer], stamp[newer]
+        self.goal[rows], self.goal_yaw[rows], self.stamp[rows] = goal[newer], toward[newer], stamp[newer]
         self.goal[rows, 2] = np.where(self._flies[rows], self.goal[rows, 2], 0.0)
         self.fresh[rows] = True
-        if self.gone < np.inf and some(self.stamp[rows] > self.gone):  # decided after that: there is another
-            self.gone = np.inf
+        if self.lost_since < np.inf and some(
+            self.stamp[rows] > self.lost_since
+        ):  # decided after that: there is another
+            self.lost_since = np.inf
         return newer
 
     def mark_lost(self, t: float) -> None:
         """The centre is gone since `t` [s]; a goal that was decided later is of another one."""
-        self.gone = min(self.gone, t)
+        self.lost_since = min(self.lost_since, t)
 
     def mark_alive(self) -> None:
         """The centre is back, though it may have nothing to say yet."""
-        self.gone = np.inf
+        self.lost_since = np.inf
 
-    def unheard(self) -> Mask:
+    def rows_without_goal(self) -> Mask:
         """Guided rows (N,) that were never told anything."""
         return np.asarray(self.guided & (self.stamp == -np.inf))
 
-    def lacking(self, t: float) -> Mask:
+    def unguided(self, t: float) -> Mask:
         """Guided rows (N,) that nobody guides at `t` [s]: the centre is dead, or their goal is old, or not there."""
-        if self.gone < np.inf:
+        if self.lost_since < np.inf:
             return self.guided
         return np.asarray(self.guided & ~(t - self.stamp <= self._silence_s))

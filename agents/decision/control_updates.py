@@ -8,13 +8,13 @@ from functools import cached_property
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm, some
-from agents.decision.transmission import asked
+from agents.decision.transmission import due_rows
 from agents.formation.graph import Links
 from agents.plugins.predictors import HOLD
 from agents.plugins.triggers import LastEvent, Trigger, View
 
 
-class Input(View):
+class ControlView(View):
     """What a trigger sees in the place of control: ε is how far the input of the law has moved since it was computed.
 
     The input of a row are the relative positions p_i − p̂_j on its links, as it believes them, and p_i if it keeps a
@@ -27,7 +27,7 @@ class Input(View):
         t: float,
         position: Array,
         velocity: Array,
-        told: LastEvent,
+        last_event: LastEvent,
         start: Array,
         links: Links,
         kept: tuple[Array, Array],
@@ -42,7 +42,7 @@ class Input(View):
             t: Now [s].
             position: (N, 3) own [m].
             velocity: (N, 3) own [m/s].
-            told: The last computation of each row.
+            last_event: The last computation of each row.
             start: (N,) when each row began [s].
             links: That are live.
             kept: Relative positions (E, 3) [m] from which the law was last computed, and their rates (E, 3) [m/s] then.
@@ -51,7 +51,7 @@ class Input(View):
             law: Gives the offset (N, 3) as it would be now [m].
             errors: Gives error (N,) [m] and energy (N,) [m²].
         """
-        self.t, self.position, self.velocity, self.told, self.start = t, position, velocity, told, start
+        self.t, self.position, self.velocity, self.last_event, self.start = t, position, velocity, last_event, start
         self.predictor, self._anchored = HOLD, anchored
         self.links, self._kept, self.now, self._law, self._errors = links, kept, now, law, errors
 
@@ -77,35 +77,35 @@ class Input(View):
     @cached_property
     def deviation(self) -> Array:
         """(N,) ‖ε‖ [m]."""
-        gap = self.links.most_of_listeners(norm(self.now[0] - self._kept[0]), len(self.position))
+        gap = self.links.max_by_receiver(norm(self.now[0] - self._kept[0]), len(self.position))
         if some(self._anchored):
-            gap = np.where(self._anchored, np.maximum(gap, norm(self.position - self.told.position)), gap)
+            gap = np.where(self._anchored, np.maximum(gap, norm(self.position - self.last_event.position)), gap)
         return gap
 
     @property
     def drift(self) -> Array:
         """(N,) how fast ε began to grow after the law was computed, as was known then [m/s]."""
-        drift = self.links.most_of_listeners(norm(self._kept[1]), len(self.position))
+        drift = self.links.max_by_receiver(norm(self._kept[1]), len(self.position))
         if some(self._anchored):
-            drift = np.where(self._anchored, np.maximum(drift, norm(self.told.velocity)), drift)
+            drift = np.where(self._anchored, np.maximum(drift, norm(self.last_event.velocity)), drift)
         return drift
 
 
-class Updating:
+class ControlUpdates:
     """Of N rows: decides whose law is computed anew, and remembers from what.
 
     Attributes:
-        told: The last computation of each row.
+        last_event: The last computation of each row.
     """
 
     def __init__(self, trigger: Trigger, rows: int, links: Links) -> None:
         """With all `links` (E) on which the rows listen."""
-        self.told = LastEvent.nothing(rows)
+        self.last_event = LastEvent.none(rows)
         self._trigger, self._state = trigger, trigger.state(rows)
         self._apart, self._rate = np.zeros((2, len(links), 3))
         self._live: Index = np.zeros(0, dtype=np.intp)
 
-    def input(
+    def view(
         self,
         t: float,
         position: Array,
@@ -119,24 +119,26 @@ class Updating:
         rate: Array,
         law: Callable[[], Array],
         errors: Callable[[], tuple[Array, Array]],
-    ) -> Input:
-        """What the trigger sees; `live` (L,) are the links among all that `links` are, for the rest see `Input`."""
+    ) -> ControlView:
+        """View of the trigger; `live` (L,): indices of `links` among all links. For the rest see `ControlView`."""
         self._live = live
         kept = (self._apart[live], self._rate[live])
-        return Input(t, position, velocity, self.told, start, links, kept, (apart, rate), anchored, law, errors)
+        return ControlView(
+            t, position, velocity, self.last_event, start, links, kept, (apart, rate), anchored, law, errors
+        )
 
-    def due(self, view: Input) -> Mask:
+    def due(self, view: ControlView) -> Mask:
         """Which rows (N,) compute the law now; those that do not know where they are do not."""
-        rows = asked(self._trigger, view, self._state)
+        rows = due_rows(self._trigger, view, self._state)
         due = np.zeros(len(view.position), dtype=bool)
         due[rows] = np.isfinite(view.position[rows]).all(axis=1)
         if some(due):
-            self.told.tell(np.flatnonzero(due), view)
-            anew = due[view.links.listener]
+            self.last_event.record(np.flatnonzero(due), view)
+            anew = due[view.links.receiver]
             at = self._live[anew]
             self._apart[at], self._rate[at] = view.now[0][anew], view.now[1][anew]
         return due
 
-    def forget(self, rows: Index) -> None:
+    def require_update(self, rows: Index) -> None:
         """These rows compute the law at the next decision, whatever the trigger says."""
-        self.told.time[rows] = -np.inf
+        self.last_event.time[rows] = -np.inf

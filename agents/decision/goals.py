@@ -11,7 +11,7 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, some
 from agents.decision.assignment import Assignment
-from agents.decision.control_updates import Input, Updating
+from agents.decision.control_updates import ControlUpdates, ControlView
 from agents.decision.neighbours import NeighbourStates
 from agents.formation.changes import Reshaping
 from agents.plugins import laws
@@ -19,27 +19,27 @@ from agents.plugins.planners import Itinerary
 from agents.plugins.registry import FAILURES, PluginError
 
 
-class Decided(msgspec.Struct, frozen=True):
+class GoalDecision(msgspec.Struct, frozen=True):
     """What a decision says of all rows; of those that are not `due` it means nothing.
 
     Attributes:
         due: (N,) rows that have a new goal.
         goal: (N, 3) [m].
         offset: (N, 3) of the law, before it was clamped [m].
-        toward: (N,) yaw wanted at the goal [rad], NaN for any.
+        yaw: (N,) yaw wanted at the goal [rad], NaN for any.
     """
 
     due: Mask
     goal: Array
     offset: Array
-    toward: Array
+    yaw: Array
 
 
 class GoalComputer:
     """Goals of some of N rows.
 
     Attributes:
-        hearing: What was heard on each link, and who takes part in the law.
+        neighbours: What was heard on each link, and who takes part in the law.
         clamp: Largest step of a goal per axis and decision [m].
         tracking_gain: k of (7) [1/(m² decision)].
         ground: (N,) heights that rows hold [m]; 0 for ground robots.
@@ -49,21 +49,21 @@ class GoalComputer:
         """Of the rows `mine` (N,); links, anchors and plans of the others are none of its business."""
         rows = len(assignment.names)
         self._assignment, links = assignment, assignment.links
-        self.hearing = NeighbourStates(links, assignment.watched, assignment.limits.link_silence_s)
+        self.neighbours = NeighbourStates(links, assignment.avoidance_only, assignment.limits.link_silence_s)
         self.clamp, self.tracking_gain = assignment.clamp, assignment.tracking_gain
-        self._updating = None if assignment.update is None else Updating(assignment.update, rows, links)
+        self._updating = None if assignment.update is None else ControlUpdates(assignment.update, rows, links)
         self._flies = np.array([kind.flies for kind in assignment.kinds])
         self.ground = np.where(self._flies, assignment.hover, 0.0)
         self._anchored = np.zeros(rows, dtype=bool)
         if assignment.anchors is not None:
             self._anchored[assignment.anchors.row] = True
         self._listens = self._anchored.copy()
-        watched = assignment.watched
-        self._listens[links.listener if watched is None else links.listener[~watched]] = True
+        watched = assignment.avoidance_only
+        self._listens[links.receiver if watched is None else links.receiver[~watched]] = True
         changing = bool(assignment.changes) or assignment.presence is not None
         self._reshaping = Reshaping(links, assignment.changes, assignment.presence) if changing else None
         if self._reshaping is not None:
-            self.hearing.reshape(self._reshaping.links, self._reshaping.there)
+            self.neighbours.set_targets(self._reshaping.links, self._reshaping.present)
         planned = np.zeros(rows, dtype=bool)
         itineraries = []
         for group, legs in assignment.legs:
@@ -80,19 +80,19 @@ class GoalComputer:
 
     def update_links(self, t: float) -> None:
         """Takes in who is there and who is gone at `t` [s]."""
-        if self.hearing.unsettled:
-            self._links_changed(self.hearing.choose(t))
+        if self.neighbours.incomplete:
+            self._links_changed(self.neighbours.update_active(t))
 
-    def alone(self) -> Mask:
+    def without_neighbours(self) -> Mask:
         """Rows (N,) that the law has no answer for: all their neighbours are gone."""
-        hearing = self.hearing
-        if len(hearing.live) == len(self._assignment.links):
+        hearing = self.neighbours
+        if len(hearing.active) == len(self._assignment.links):
             return np.zeros(len(self._listens), dtype=bool)
         hears = self._anchored.copy()
-        hears[hearing.links.listener] = True
+        hears[hearing.links.receiver] = True
         return self._listens & ~hears
 
-    def begin(self, rows: Index, place: Array, yaw: Array, elapsed_s: float = 0.0) -> None:
+    def begin_plans(self, rows: Index, place: Array, yaw: Array, elapsed_s: float = 0.0) -> None:
         """Plans of `rows` (K,) that have not begun do so where these were when they did: (K, 3) [m] and (K,) [rad].
 
         Legs that are due `elapsed_s` after the common start follow from there [s].
@@ -109,12 +109,14 @@ class GoalComputer:
         """x, y, z [m] and yaw [rad] where the plan of a row began; None if it has none, or it has not begun."""
         return next(filter(None, (itinerary.origin(row) for itinerary in self._itineraries)), None)
 
-    def forget(self, rows: Index) -> None:
+    def require_update(self, rows: Index) -> None:
         """Rows whose goals are old compute the law at the next decision, whatever a trigger says."""
         if self._updating is not None:
-            self._updating.forget(rows)
+            self._updating.require_update(rows)
 
-    def decide(self, t: float, position: Array, velocity: Array, yaw: Array, *, start: Array, running: Mask) -> Decided:
+    def decide(
+        self, t: float, position: Array, velocity: Array, yaw: Array, *, start: Array, running: Mask
+    ) -> GoalDecision:
         """New goals of rows that are under way.
 
         Args:
@@ -127,11 +129,11 @@ class GoalComputer:
         """
         follows, due, view = self._listens, running, None
         if self._reshaping is not None:
-            everywhere = self.hearing.everywhere(self._assignment.predictor, t)
-            self._reshaping.move(t - start, position, everywhere)
-            self._links_changed(self.hearing.reshape(self._reshaping.links, self._reshaping.there))
+            everywhere = self.neighbours.extrapolate_all(self._assignment.predictor, t)
+            self._reshaping.advance(t - start, position, everywhere)
+            self._links_changed(self.neighbours.set_targets(self._reshaping.links, self._reshaping.present))
         if self._updating is not None:
-            view = self.input(t, position, velocity, start)
+            view = self.control_view(t, position, velocity, start)
             due = running & (~self._gated | self._updating.due(view))
         if view is None:
             offset = self.law_offset(t, position)
@@ -148,15 +150,15 @@ class GoalComputer:
             if leads.all():
                 goal[rows] = target
             else:
-                offset[rows] += laws.tracking(position[rows], target, self.tracking_gain)
-        goal = np.where(follows[:, None], laws.goal(position, offset, self.clamp), goal)
+                offset[rows] += laws.tracking_offset(position[rows], target, self.tracking_gain)
+        goal = np.where(follows[:, None], laws.goal_position(position, offset, self.clamp), goal)
         goal[:, 2] = np.where(follows | ~self._flies, self.ground, goal[:, 2])
-        return Decided(due, goal, offset, toward)
+        return GoalDecision(due, goal, offset, toward)
 
     def law_offset(self, t: float, position: Array) -> Array:
         """The offset of all rows (N, 3) [m]; a law that fails is named, for it may be somebody's first."""
-        law, hearing, anchors = self._assignment.law, self.hearing, self._assignment.anchors
-        believed = hearing.heard.believed(self._assignment.predictor, t, hearing.live)
+        law, hearing, anchors = self._assignment.law, self.neighbours, self._assignment.anchors
+        believed = hearing.poses.extrapolate_position(self._assignment.predictor, t, hearing.active)
         try:
             offset = law.offset(position, believed, hearing.links)
         except FAILURES as error:
@@ -165,26 +167,26 @@ class GoalComputer:
 
     def errors(self, t: float, position: Array) -> tuple[Array, Array]:
         """Σ|e| [m] and Σ ½e² [m²] of each row's links, as it sees them."""
-        hearing = self.hearing
-        believed = hearing.heard.believed(self._assignment.predictor, t, hearing.live)
+        hearing = self.neighbours
+        believed = hearing.poses.extrapolate_position(self._assignment.predictor, t, hearing.active)
         error = self._assignment.law.error(position, believed, hearing.links)
-        both = hearing.links.onto_listeners(_error_and_energy(error), len(position))
+        both = hearing.links.sum_by_receiver(_error_and_energy(error), len(position))
         anchors = self._assignment.anchors
         if anchors is not None:
             np.add.at(both, anchors.row, _error_and_energy(anchors.error(position)))
         return both[:, 0], both[:, 1]
 
-    def input(self, t: float, position: Array, velocity: Array, start: Array) -> Input:
+    def control_view(self, t: float, position: Array, velocity: Array, start: Array) -> ControlView:
         """What the trigger of the control place sees; see `decide`."""
         assert self._updating is not None
-        hearing, predictor = self.hearing, self._assignment.predictor
-        listener = hearing.links.listener
-        believed = hearing.heard.believed(predictor, t, hearing.live)
-        moves = hearing.heard.believed_velocity(predictor, t, hearing.live)
-        return self._updating.input(
+        hearing, predictor = self.neighbours, self._assignment.predictor
+        listener = hearing.links.receiver
+        believed = hearing.poses.extrapolate_position(predictor, t, hearing.active)
+        moves = hearing.poses.extrapolate_velocity(predictor, t, hearing.active)
+        return self._updating.view(
             t, position, velocity,
             start=start,
-            live=hearing.live,
+            live=hearing.active,
             links=hearing.links,
             anchored=self._anchored,
             apart=position[listener] - believed,
@@ -196,7 +198,7 @@ class GoalComputer:
     def _links_changed(self, rows: Index) -> None:
         """Rows that got or lost a link, or whose links ask for something else, compute the law at once."""
         if len(rows):
-            self.forget(rows)
+            self.require_update(rows)
 
 
 class StationKeeping:
@@ -211,7 +213,7 @@ class StationKeeping:
         self._ground, self._at = ground, np.full((len(ground), 3), np.nan)
         self.held: Mask = np.zeros(len(ground), dtype=bool)
 
-    def stay(self, held: Mask, position: Array, goal: Array, toward: Array) -> tuple[Array, Array]:
+    def hold_position(self, held: Mask, position: Array, goal: Array, toward: Array) -> tuple[Array, Array]:
         """Goals (N, 3) [m] and yaws (N,) [rad] when rows `held` (N,) must stay and the others have those given."""
         before, self.held = self.held, held
         if not some(held):

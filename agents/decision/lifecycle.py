@@ -104,7 +104,7 @@ class Lifecycle:
         if row in self._due[what]:
             self._due[what].remove(row)
 
-    def wait(self, row: int, reason: str) -> None:
+    def set_missing(self, row: int, reason: str) -> None:
         """Says why an idle row is not ready, or why a ready one will not be any more on this tick."""
         self._waits[row] = reason
         if self.phase[row] == IDLE:

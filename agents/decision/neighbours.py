@@ -12,7 +12,7 @@ from agents.plugins.predictors import HOLD, Predictor
 
 
 @dataclass
-class Heard:
+class NeighbourPoses:
     """What was last heard on each link (E): positions and velocities (E, 3), sample and arrival times (E,) [s].
 
     A sample time is when the pose was measured as far as its stamp can be true, see `agents.runtime.pose_inbox.Said`.
@@ -24,23 +24,23 @@ class Heard:
     position: Array
     velocity: Array
     stamp: Array
-    arrived: Array
-    gone: Array
+    arrival: Array
+    lost_since: Array
 
     @classmethod
-    def nothing(cls, count: int) -> Heard:
+    def none_received(cls, count: int) -> NeighbourPoses:
         """Before anything was heard."""
         never = np.full(count, -np.inf)
         return cls(np.full((count, 3), np.nan), np.zeros((count, 3)), never, never.copy(), never.copy())
 
-    def believed(self, predictor: Predictor, t: float, which: Index) -> Array:
+    def extrapolate_position(self, predictor: Predictor, t: float, which: Index) -> Array:
         """Where (K, 3) [m] the speakers of links `which` (K,), all heard once, are believed to be at `t` [s]."""
         if predictor is HOLD:
             return self.position if len(which) == len(self.position) else self.position[which]
         position = self.position[which]
         return predictor.position(position, self.velocity[which], t - self.stamp[which])
 
-    def believed_velocity(self, predictor: Predictor, t: float, which: Index) -> Array:
+    def extrapolate_velocity(self, predictor: Predictor, t: float, which: Index) -> Array:
         """How fast (K, 3) [m/s] these beliefs move."""
         return predictor.velocity(self.velocity[which], t - self.stamp[which])
 
@@ -49,12 +49,12 @@ class NeighbourStates:
     """The links on which rows listen.
 
     Attributes:
-        heard: What was heard on each link (E).
-        live: Links that take part in the law: heard once, the speaker lives or is not gone for long, not only for
+        poses: What was heard on each link (E).
+        active: Links that take part in the law: heard once, the speaker lives or is not gone for long, not only for
             avoidance, and there at all in a formation whose links come and go.
         links: Those, with what they ask for now.
-        behind: (E,) age of poses on arrival [s] where clocks of speakers are behind, 0 elsewhere; None: there are none.
-        unsettled: Some speaker was never heard or is gone, so that time alone can change what is live.
+        clock_lag: (E,) age of poses on arrival [s] where clocks of senders are behind, else 0; None: none is.
+        incomplete: Some speaker was never heard or is gone, so that time alone can change what is live.
     """
 
     def __init__(self, links: Links, watched: Mask | None, silence_s: float) -> None:
@@ -65,18 +65,18 @@ class NeighbourStates:
             watched: (E,) those that only avoidance needs; None: there are none.
             silence_s: A speaker that is gone for this long is left out [s].
         """
-        self.heard = Heard.nothing(len(links))
-        self.unsettled = True
-        self.behind: Array | None = None
+        self.poses = NeighbourPoses.none_received(len(links))
+        self.incomplete = True
+        self.clock_lag: Array | None = None
         self._all, self._watched, self._silence_s = links, watched, silence_s
         self._there: Mask = np.ones(len(links), dtype=bool) if watched is None else ~watched
         self._taking_part = self._heard_of = np.zeros(len(links), dtype=bool)
-        self.live: Index = np.zeros(0, dtype=np.intp)
-        self.links = links.take(self.live)
+        self.active: Index = np.zeros(0, dtype=np.intp)
+        self.links = links.select(self.active)
 
     def receive(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
         """Poses that arrived on links `at` (H,), in order of arrival; older samples than known are left out."""
-        heard = self.heard
+        heard = self.poses
         if some(stamp[1:] < stamp[:-1]):  # of several on one link the newest stays, whichever came last
             order = np.argsort(stamp, kind="stable")
             at, position, velocity = at[order], position[order], velocity[order]
@@ -86,50 +86,50 @@ class NeighbourStates:
             at, position, velocity = at[newer], position[newer], velocity[newer]
             stamp, arrived = stamp[newer], arrived[newer]
         heard.position[at], heard.velocity[at] = position, velocity
-        heard.stamp[at], heard.arrived[at] = stamp, arrived
+        heard.stamp[at], heard.arrival[at] = stamp, arrived
 
     def mark_lost(self, at: Index, t: float) -> None:
         """The tokens of the speakers of links `at` are gone since `t` [s]."""
-        self.heard.gone[at] = np.minimum(self.heard.gone[at], t)
-        self.unsettled = True
+        self.poses.lost_since[at] = np.minimum(self.poses.lost_since[at], t)
+        self.incomplete = True
 
     def mark_alive(self, at: Index) -> None:
         """The tokens of the speakers of links `at` are there: these live, whether or not they have something to say."""
-        self.heard.gone[at] = np.inf
-        self.unsettled = True
+        self.poses.lost_since[at] = np.inf
+        self.incomplete = True
 
-    def forget(self, at: Index) -> None:
+    def discard_poses(self, at: Index) -> None:
         """The speakers of links `at` begin a new life: poses of the one before are of another robot."""
-        heard = self.heard
+        heard = self.poses
         heard.position[at], heard.velocity[at] = np.nan, 0.0
-        heard.stamp[at] = heard.arrived[at] = -np.inf
-        self.unsettled = True
+        heard.stamp[at] = heard.arrival[at] = -np.inf
+        self.incomplete = True
 
-    def distrust(self, at: Index, behind: float) -> None:
+    def mark_clock_lag(self, at: Index, behind: float) -> None:
         """The clocks of the speakers of links `at` are behind, poses `behind` [s] old on arrival; 0: no longer."""
-        age = np.zeros(len(self._all)) if self.behind is None else self.behind
+        age = np.zeros(len(self._all)) if self.clock_lag is None else self.clock_lag
         age[at] = behind
-        self.behind = age if age.any() else None
+        self.clock_lag = age if age.any() else None
 
     @property
-    def greeted(self) -> Array:
+    def stamp_once_alive(self) -> Array:
         """(E,) time of the last sample on links whose speaker was there once [s]; minus infinity on the others."""
-        return np.where(self.heard.gone == -np.inf, -np.inf, self.heard.stamp)
+        return np.where(self.poses.lost_since == -np.inf, -np.inf, self.poses.stamp)
 
-    def missing(self, row: int) -> Index:
+    def missing_senders(self, row: int) -> Index:
         """Speakers that a row has never heard, or that are gone."""
-        lacks = ~np.isfinite(self.heard.stamp) | (self.heard.gone < np.inf)
-        return np.asarray(self._all.speaker[(self._all.listener == row) & lacks])
+        lacks = ~np.isfinite(self.poses.stamp) | (self.poses.lost_since < np.inf)
+        return np.asarray(self._all.sender[(self._all.receiver == row) & lacks])
 
-    def choose(self, t: float) -> Index:
+    def update_active(self, t: float) -> Index:
         """Decides at `t` [s] which links are live; gives the rows for which that has changed."""
-        heard = self.heard
-        known, here = np.isfinite(heard.stamp), heard.gone == np.inf
-        self.unsettled = not (known & here).all()
-        self._heard_of = known & (t - heard.gone <= self._silence_s)
+        heard = self.poses
+        known, here = np.isfinite(heard.stamp), heard.lost_since == np.inf
+        self.incomplete = not (known & here).all()
+        self._heard_of = known & (t - heard.lost_since <= self._silence_s)
         return self._select()
 
-    def reshape(self, links: Links, there: Mask) -> Index:
+    def set_targets(self, links: Links, there: Mask) -> Index:
         """All `links` with what they ask for from now on, and which are `there` (E,); rows for which that is new."""
         before = self._all
         self._all, self._there = links, there if self._watched is None else there & ~self._watched
@@ -139,17 +139,17 @@ class NeighbourStates:
             if old is not None and new is not None and old is not new:
                 same = (old == new) | (np.isnan(old) & np.isnan(new))
                 asks |= ~same.reshape(len(links), -1).all(axis=1)
-        return np.concatenate([self._select(), links.listener[asks]])
+        return np.concatenate([self._select(), links.receiver[asks]])
 
-    def everywhere(self, predictor: Predictor, t: float) -> Array:
+    def extrapolate_all(self, predictor: Predictor, t: float) -> Array:
         """Where (E, 3) [m] the speakers of all links are believed to be at `t` [s], NaN where nothing was heard."""
-        heard = self.heard
+        heard = self.poses
         age = np.where(np.isfinite(heard.stamp), t - heard.stamp, 0.0)
         return predictor.position(heard.position, heard.velocity, age)
 
     def _select(self) -> Index:
         live = self._heard_of & self._there
-        changed: Index = self._all.listener[live != self._taking_part]
-        self._taking_part, self.live = live, np.flatnonzero(live)
-        self.links = self._all if live.all() else self._all.take(live)
+        changed: Index = self._all.receiver[live != self._taking_part]
+        self._taking_part, self.active = live, np.flatnonzero(live)
+        self.links = self._all if live.all() else self._all.select(live)
         return changed

@@ -14,10 +14,10 @@ from agents.body.kinds import Kind
 from agents.body.limits import Limits
 from agents.formation.graph import Links
 from agents.network.validation import MAX_SPEED
-from agents.plugins.avoidance import Nearby, Self
+from agents.plugins.avoidance import Nearby, OwnState
 
 if TYPE_CHECKING:
-    from agents.decision.neighbours import Heard
+    from agents.decision.neighbours import NeighbourPoses
 
 REACH: Final = 3.0  # [m] between axes; what is farther away is nobody's concern yet
 AHEAD_S: Final = 0.1  # heard positions are carried on for so long: who is silent for longer may as well have stopped
@@ -61,14 +61,14 @@ class Perception:
         self._turn_rate, self._response = _column(kinds, "turn_rate"), _column(kinds, "response")
         self._lag = _column(kinds, "lag")
         self._flies = np.array([kind.flies for kind in kinds], dtype=bool)
-        self._listener = links.listener
-        speaks = [speaker_kinds[speaker] for speaker in links.speaker.tolist()]
+        self._listener = links.receiver
+        speaks = [speaker_kinds[speaker] for speaker in links.sender.tolist()]
         self._their_radius, self._their_lag = _column(speaks, "radius"), _column(speaks, "lag")
         self._their_height = _column(speaks, "height")
         self._rays: Rays | None = None
         self._points = _Points.nothing()
 
-    def sense(self, t: float, state: BodyState, heard: Heard) -> tuple[Self, Nearby]:
+    def sense(self, t: float, state: BodyState, heard: NeighbourPoses) -> tuple[OwnState, Nearby]:
         """What rows know of themselves and of what is near at `t` [s].
 
         Rows whose own position is missing or old know of nothing. A robot that was heard is where it was then, carried
@@ -77,7 +77,7 @@ class Perception:
         velocity = state.velocity
         if not every(known := np.abs(velocity) <= MAX_SPEED):  # of an estimator that diverged, or not a number
             velocity = np.where(known, velocity, 0.0)
-        own = Self(
+        own = OwnState(
             state.position, velocity, state.yaw, self._radius, self._height, self._speed, self._turn_rate,
             self._response, self._lag, self._takes, self._by_position, self._by_twist, self._flies,
         )  # fmt: skip
@@ -88,10 +88,10 @@ class Perception:
         if state.rays is not self._rays:
             self._look(state, heard)
         if state.rays is not None:
-            near = near.and_then(self._seen(t, state, aware))
+            near = near.append(self._seen(t, state, aware))
         return own, near
 
-    def _others(self, t: float, state: BodyState, heard: Heard, aware: Mask) -> Nearby:
+    def _others(self, t: float, state: BodyState, heard: NeighbourPoses, aware: Mask) -> Nearby:
         """The robots that were heard, where they are near; those that are gone stay where they were heard last."""
         row = self._listener
         age = np.maximum(t - heard.stamp, 0.0)
@@ -99,7 +99,7 @@ class Perception:
         apart = state.position[row] - position
         near = (np.vecdot(apart[:, :2], apart[:, :2]) <= REACH**2) & aware[row]
         # who is gone hangs there still, has come down, or falls: it is in the way from the floor up
-        lost = t - heard.gone > self._limits.link_silence_s
+        lost = t - heard.lost_since > self._limits.link_silence_s
         sinking = np.where((heard.velocity[:, 2] < -DESCENT) & (age <= BELIEVED_S), heard.velocity[:, 2], 0.0)
         low = position[:, 2] + DESCENT_S * sinking
         # their lower end under my upper one, and the other way round; `apart` is how much higher I am
@@ -118,7 +118,7 @@ class Perception:
             self._their_lag[which],
         )
 
-    def _look(self, state: BodyState, heard: Heard) -> None:
+    def _look(self, state: BodyState, heard: NeighbourPoses) -> None:
         """Where in the room the rays ended that are new: by the pose that the robot had when they were measured."""
         before, rays = self._rays, state.rays
         self._rays = rays
@@ -149,7 +149,7 @@ class Perception:
         height = eye[:, 2] + 0.5 * self._height[row] + distance * np.sin(rays.elevation[ray])
         return _Points(ray, row, time, distance, place, height)
 
-    def _known(self, found: _Points, heard: Heard, position: Array) -> Mask:
+    def _known(self, found: _Points, heard: NeighbourPoses, position: Array) -> Mask:
         """Which points (P,) lie on a robot that was heard, for rows at `position` (N, 3)."""
         known = np.zeros(len(found.ray), dtype=bool)
         if not len(found.ray) or not len(self._listener):

@@ -29,19 +29,19 @@ class Transmitter:
 
     Attributes:
         trigger: Who speaks when; may be replaced by one of the same kind.
-        told: What the neighbours were told.
+        last_event: What the neighbours were told.
     """
 
     def __init__(
         self, trigger: Trigger, rows: int, predictor: Predictor = HOLD, *, kinds: Sequence[Kind] | None = None
     ) -> None:
         """Without `kinds` rows are smoothed as robots on wheels are."""
-        self.trigger, self.told = trigger, LastEvent.nothing(rows)
+        self.trigger, self.last_event = trigger, LastEvent.none(rows)
         self._kinds = kinds
         self._predictor, self._state = predictor, trigger.state(rows)
         self._smoothed: LowPass | None = None
 
-    def speak(
+    def transmit(
         self,
         t: float,
         position: Array,
@@ -72,24 +72,24 @@ class Transmitter:
         if trigger.smoothing_s > 0.0:
             if self._smoothed is None:
                 self._smoothed = LowPass(len(position), self._kinds)
-            position, velocity = self._smoothed.after(t, position, velocity, trigger.smoothing_s, setpoint)
+            position, velocity = self._smoothed.smooth(t, position, velocity, trigger.smoothing_s, setpoint)
         view = View(
-            t, position, velocity, self.told,
+            t, position, velocity, self.last_event,
             error=error, energy=energy, start=start, offset=offset, predictor=self._predictor,
         )  # fmt: skip
-        rows = asked(trigger, view, self._state)
+        rows = due_rows(trigger, view, self._state)
         if len(rows):
             seen = np.isfinite(position if len(rows) == len(position) else position[rows])
             if not every(seen):
                 rows = rows[seen.all(axis=1)]
-            self.told.tell(rows, view)
+            self.last_event.record(rows, view)
         if unknown is not None:
             velocity = velocity.copy()  # what neighbours were told of stays with them
             velocity[unknown] = np.nan
         return Transmission(rows, position, velocity)
 
 
-def asked(trigger: Trigger, view: View, state: Array) -> Index:
+def due_rows(trigger: Trigger, view: View, state: Array) -> Index:
     """`Trigger.due`; a trigger that fails is named.
 
     Raises:
@@ -128,7 +128,7 @@ class LowPass:
         )
         self._driven = np.full((len(flies), 2), np.nan)
 
-    def after(
+    def smooth(
         self, t: float, position: Array, velocity: Array, constant_s: float, setpoint: Array | None = None
     ) -> tuple[Array, Array]:
         """Smoothed position [m] and velocity [m/s] (N, 3) at `t` [s], after these measured ones and this setpoint.
@@ -152,7 +152,7 @@ class LowPass:
     def _drive(self, step: float, measured: Array, setpoint: Array) -> Array:
         """Horizontal velocity (F, 2) that setpoints make of the rows that fly; without setpoints the measured one."""
         toward = self._response * (setpoint - self._position[self._flies, :2])
-        asked = clamp(np.where(self._by_place, toward, setpoint), -self._speed, self._speed)
-        driven = self._driven + step / (self._lag + step) * (asked - self._driven)
+        due_rows = clamp(np.where(self._by_place, toward, setpoint), -self._speed, self._speed)
+        driven = self._driven + step / (self._lag + step) * (due_rows - self._driven)
         self._driven = np.where(np.isnan(driven), measured, driven)
         return self._driven

@@ -34,7 +34,7 @@ class Anchors:
     def __len__(self) -> int:
         return len(self.row)
 
-    def of(self, rows: Index) -> Anchors:
+    def of_rows(self, rows: Index) -> Anchors:
         """Those of these rows, which are renumbered from 0."""
         mine = np.flatnonzero(np.isin(self.row, rows))
         order = np.argsort(rows)
@@ -50,7 +50,7 @@ class Anchors:
 
         For points as the authors' controllers pull to the origin; −g x because the cube of a small x never gets there.
         """
-        away = self.away(position)
+        away = self.displacement(position)
         square = np.vecdot(away, away)
         share = np.where(self.distance > 0.0, 0.5 * (self.distance**2 - square), -1.0)
         total = np.zeros_like(position)
@@ -59,9 +59,9 @@ class Anchors:
 
     def error(self, position: Array) -> Array:
         """|d − ‖x‖| (A,) [m]."""
-        return np.abs(self.distance - norm(self.away(position)))
+        return np.abs(self.distance - norm(self.displacement(position)))
 
-    def away(self, position: Array) -> Array:
+    def displacement(self, position: Array) -> Array:
         """x (A, 3): from the nearest point of each point, line or plane to its robot [m]."""
         apart = position[self.row] - self.point
         part = np.vecdot(apart, self.axis) * self.along

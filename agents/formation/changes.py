@@ -41,7 +41,7 @@ class Change:
     turn: float
     rise: Array
 
-    def take(self, which: Index) -> Change:
+    def select(self, which: Index) -> Change:
         """Of some links."""
         return replace(
             self,
@@ -71,7 +71,7 @@ def progress(elapsed: Array, at: float, over: float) -> Array:
     return np.asarray(share**3 * (10.0 + share * (6.0 * share - 15.0)))
 
 
-def wanted(links: Links, changes: Sequence[Change], elapsed: Array) -> Links:
+def changed_targets(links: Links, changes: Sequence[Change], elapsed: Array) -> Links:
     """The links with the targets of now, `elapsed` (E,) seconds after the common start."""
     distance, relative, bearing = links.distance, links.relative, links.bearing
     for change in changes:
@@ -139,7 +139,7 @@ class Presence:
     reach: Array
     release: Array
 
-    def take(self, which: Index) -> Presence:
+    def select(self, which: Index) -> Presence:
         """Of some links."""
         return Presence(self.since[which], self.until[which], self.reach[which], self.release[which])
 
@@ -149,15 +149,15 @@ class Presence:
         columns = ((self.since, -ever), (self.until, ever), (self.reach, ever), (self.release, ever))
         return Presence(*(np.concatenate(both) for both in columns))
 
-    def at_first(self) -> Mask:
+    def present_at_start(self) -> Mask:
         """Which links are there before anybody knows how far the others are."""
-        return self.planned(0.0)
+        return self.planned_at(0.0)
 
-    def planned(self, elapsed: float) -> Mask:
+    def planned_at(self, elapsed: float) -> Mask:
         """Which links are there at a time [s], however far apart the robots are."""
         return (self.since <= elapsed + ROUNDING_S) & (self.until > elapsed + ROUNDING_S) & np.isinf(self.reach)
 
-    def now(self, elapsed: Array, apart: Array, were: Mask) -> Mask:
+    def present_now(self, elapsed: Array, apart: Array, were: Mask) -> Mask:
         """Which links are there (E,), `elapsed` (E,) [s] after the start, between robots that are `apart` (E,) [m].
 
         Args:
@@ -177,13 +177,13 @@ class Reshaping:
         """`links` (E) with the targets of the beginning."""
         self._given, self._changes, self._presence = links, tuple(changes), presence
         self.links = links
-        self.there: Mask = np.ones(len(links), dtype=bool) if presence is None else presence.at_first()
+        self.present: Mask = np.ones(len(links), dtype=bool) if presence is None else presence.present_at_start()
 
-    def move(self, since_start: Array, position: Array, heard: Array) -> None:
+    def advance(self, since_start: Array, position: Array, heard: Array) -> None:
         """On to now: `since_start` (N,) [s] of the rows, their `position` (N, 3), and what they `heard` (E, 3)."""
-        elapsed = np.maximum(since_start[self._given.listener], 0.0)
+        elapsed = np.maximum(since_start[self._given.receiver], 0.0)
         if self._changes:
-            self.links = wanted(self._given, self._changes, elapsed)
+            self.links = changed_targets(self._given, self._changes, elapsed)
         if self._presence is not None:
-            apart = norm(position[self._given.listener] - heard)
-            self.there = self._presence.now(elapsed, apart, self.there)
+            apart = norm(position[self._given.receiver] - heard)
+            self.present = self._presence.present_now(elapsed, apart, self.present)

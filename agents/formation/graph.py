@@ -22,8 +22,8 @@ class Links:
     have in the experiment.
 
     Attributes:
-        listener: (E,) rows i.
-        speaker: (E,) rows j.
+        receiver: (E,) rows i.
+        sender: (E,) rows j.
         distance: (E,) d_ij [m]; NaN where only a direction is wanted.
         gain: (E,) of the law.
         relative: (E, 3) wanted p_i − p_j [m], NaN where only a distance or a direction is; None: nowhere any.
@@ -32,8 +32,8 @@ class Links:
         wants: (E,) BY_DISTANCE, BY_RELATIVE or BY_BEARING, as the file has it; None, as both before: all by distance.
     """
 
-    listener: Index
-    speaker: Index
+    receiver: Index
+    sender: Index
     distance: Array
     gain: Array
     relative: Array | None = None
@@ -41,18 +41,18 @@ class Links:
     wants: Index | None = None
 
     def __len__(self) -> int:
-        return len(self.listener)
+        return len(self.receiver)
 
     @cached_property
     def _starts(self) -> Index:
         """Where each listener that has links begins; the links are sorted by listener."""
-        return np.flatnonzero(np.diff(self.listener, prepend=-1))
+        return np.flatnonzero(np.diff(self.receiver, prepend=-1))
 
     @cached_property
     def _heads(self) -> Index:
-        return self.listener[self._starts]
+        return self.receiver[self._starts]
 
-    def onto_listeners(self, per_link: Array, rows: int) -> Array:
+    def sum_by_receiver(self, per_link: Array, rows: int) -> Array:
         """Sum of a quantity (E, ...) over each listener's links -> (rows, ...)."""
         if len(self._heads) == rows > 0:
             return np.asarray(np.add.reduceat(per_link, self._starts, axis=0))
@@ -61,37 +61,37 @@ class Links:
             total[self._heads] = np.add.reduceat(per_link, self._starts, axis=0)
         return total
 
-    def take(self, which: Index | Mask) -> Links:
+    def select(self, which: Index | Mask) -> Links:
         """Some of them, or the same in another order."""
         return Links(*(None if column is None else column[which] for column in self._columns()))  # type: ignore[arg-type]
 
-    def most_of_listeners(self, per_link: Array, rows: int) -> Array:
+    def max_by_receiver(self, per_link: Array, rows: int) -> Array:
         """Largest of a quantity (E,) over each listener's links -> (rows,), 0 without links."""
         most = np.zeros(rows)
         if len(self):
             most[self._heads] = np.maximum.reduceat(per_link, self._starts)
         return most
 
-    def of(self, rows: Index) -> Links:
+    def to_receivers(self, rows: Index) -> Links:
         """The links on which these rows listen; listeners renumbered 0..len(rows)-1, speakers keep their numbers."""
-        at, listener = self.heard_by(rows)
-        return replace(self.take(at), listener=listener)
+        at, listener = self.indices_to_receivers(rows)
+        return replace(self.select(at), receiver=listener)
 
-    def heard_by(self, rows: Index) -> tuple[Index, Index]:
+    def indices_to_receivers(self, rows: Index) -> tuple[Index, Index]:
         """Which links these rows listen on, in the order of `of`, and the new number of each one's listener."""
-        mine = np.flatnonzero(np.isin(self.listener, rows))
+        mine = np.flatnonzero(np.isin(self.receiver, rows))
         order = np.argsort(rows)
-        listener = order[np.searchsorted(rows, self.listener[mine], sorter=order)]
+        listener = order[np.searchsorted(rows, self.receiver[mine], sorter=order)]
         by_listener = np.argsort(listener, kind="stable")
         return mine[by_listener], listener[by_listener]
 
     def repeated(self, times: int, rows: int) -> Links:
         """The same links in `times` copies of an experiment of `rows` robots, one copy behind the other."""
         shift = np.repeat(np.arange(times) * rows, len(self))
-        many = self.take(np.tile(np.arange(len(self)), times))
-        return replace(many, listener=many.listener + shift, speaker=many.speaker + shift)
+        many = self.select(np.tile(np.arange(len(self)), times))
+        return replace(many, receiver=many.receiver + shift, sender=many.sender + shift)
 
-    def and_then(self, others: Links) -> Links:
+    def append(self, others: Links) -> Links:
         """These and others behind them: no longer sorted, so only a sorted part of it may be summed."""
         if others.wants is None and self.wants is None:
             ours, theirs = self, others
@@ -108,7 +108,7 @@ class Links:
         return replace(self, relative=blank, bearing=blank, wants=np.full(len(self), BY_DISTANCE))
 
     def _columns(self) -> tuple[Array | Index | None, ...]:
-        return self.listener, self.speaker, self.distance, self.gain, self.relative, self.bearing, self.wants
+        return self.receiver, self.sender, self.distance, self.gain, self.relative, self.bearing, self.wants
 
 
 def links(
@@ -127,7 +127,7 @@ def links(
 def adjacency(net: Links, rows: int) -> Array:
     """A (N, N): a_ij = 1 if i listens to j (paper, eq. (11))."""
     matrix = np.zeros((rows, rows))
-    matrix[net.listener, net.speaker] = 1.0
+    matrix[net.receiver, net.sender] = 1.0
     return matrix
 
 
@@ -143,11 +143,11 @@ def laplacian(net: Links, rows: int) -> Array:
 
 def edges(net: Links) -> Index:
     """The undirected edges (M, 2), smaller row first, each once."""
-    pairs = np.sort(np.stack([net.listener, net.speaker], axis=1), axis=1)
+    pairs = np.sort(np.stack([net.receiver, net.sender], axis=1), axis=1)
     return np.unique(pairs, axis=0).astype(np.intp).reshape(-1, 2)
 
 
-def reached(net: Links, rows: int, sources: Index) -> Mask:
+def reachable(net: Links, rows: int, sources: Index) -> Mask:
     """Which rows (N,) hear of the sources, directly or through others."""
     hears = adjacency(net, rows) > 0
     known = np.zeros(rows, dtype=bool)

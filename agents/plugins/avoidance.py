@@ -36,7 +36,7 @@ class Nearby:
         radius: (K,) [m]
         low: (K,) lower end [m].
         high: (K,) upper end [m].
-        heard: (K,) a robot of this experiment that was heard, which may avoid as well; else what a ray saw.
+        is_robot: (K,) a robot of this experiment that was heard, which may avoid as well; else what a ray saw.
         lag: (K,) time constant with which its velocity follows its commands [s]; 0 for what a ray saw.
     """
 
@@ -46,17 +46,17 @@ class Nearby:
     radius: Array
     low: Array
     high: Array
-    heard: Mask
+    is_robot: Mask
     lag: Array
 
     def __len__(self) -> int:
         return len(self.row)
 
-    def of(self, which: Mask) -> Nearby:
+    def select(self, which: Mask) -> Nearby:
         """Some of the things (K,)."""
         return Nearby(*(getattr(self, field.name)[which] for field in fields(Nearby)))
 
-    def and_then(self, others: Nearby) -> Nearby:
+    def append(self, others: Nearby) -> Nearby:
         """These things and others."""
         if not len(others):
             return self
@@ -65,7 +65,7 @@ class Nearby:
         both = (np.concatenate([getattr(self, field.name), getattr(others, field.name)]) for field in fields(Nearby))
         return Nearby(*both)
 
-    def bearing(self, own: Self) -> tuple[Array, Array]:
+    def bearing(self, own: OwnState) -> tuple[Array, Array]:
         """Unit vectors (K, 2) from each thing to who knows it, and the distances (K,) of their axes [m].
 
         Two axes in one place, which only wrong measurements can give, are told apart along x.
@@ -79,7 +79,7 @@ class Nearby:
 
 
 @dataclass(frozen=True)
-class Self:
+class OwnState:
     """What rows know of themselves (N).
 
     Attributes:
@@ -124,11 +124,11 @@ class Avoidance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         Meta(description="things farther above or below than this are in nobody's way [m]; more against downwash"),
     ] = 0.1
 
-    def deviate(self, goal: Array, own: Self, near: Nearby, period: float) -> Array:
+    def deviate(self, goal: Array, own: OwnState, near: Nearby, period: float) -> Array:
         """The goals (N, 3) [m] that are pursued in place of `goal` (N, 3); asked every `period` [s]."""
         return goal
 
-    def restrain(self, setpoint: Array, own: Self, near: Nearby) -> Array:
+    def restrain(self, setpoint: Array, own: OwnState, near: Nearby) -> Array:
         """The setpoints (N, 4) that may be sent in place of `setpoint` (N, 4), in the meaning of each row's kind.
 
         What is changed is held to the limits of speed and arena; rows that do not know where they are keep theirs.
@@ -159,7 +159,7 @@ class Potential(Avoidance, frozen=True):
     velocity: Annotated[Positive | None, Meta(description="v [m/s]; left out: the robot's limit of speed")] = None
     period_s: Annotated[Positive | None, Meta(description="h [s]; left out: 1/response of the robot's kind")] = None
 
-    def force(self, own: Self, near: Nearby) -> Array:
+    def force(self, own: OwnState, near: Nearby) -> Array:
         """F (N, 2) of eq. (3), summed over what is near; zero where nothing is."""
         away, distance = near.bearing(own)
         gap = np.maximum(distance - own.radius[near.row] - near.radius, TOUCHING)
@@ -168,7 +168,7 @@ class Potential(Avoidance, frozen=True):
         np.add.at(total, near.row, push[:, None] * away)
         return total
 
-    def deviate(self, goal: Array, own: Self, near: Nearby, period: float) -> Array:
+    def deviate(self, goal: Array, own: OwnState, near: Nearby, period: float) -> Array:
         """See `Avoidance.deviate`; eq. (4)."""
         if not len(near):
             return goal

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta
 
 from agents.arrays import Array, Index, Mask, clamp, every, norm, some
-from agents.plugins.avoidance import Avoidance, Nearby, NotNegative, Positive, Self
+from agents.plugins.avoidance import Avoidance, Nearby, NotNegative, OwnState, Positive
 
 SECTORS: Final = 8  # of what surrounds a robot; the tightest half-plane of each takes part in the exact solution
 SLACK: Final = 1e-9  # [m/s] violations smaller than this are arithmetic
@@ -67,7 +67,7 @@ class Barrier(Avoidance, frozen=True):
     ] = 0.2
     right: Annotated[NotNegative, Meta(description="share of what is barred that is driven to the right instead")] = 1.0
 
-    def bounds(self, own: Self, near: Nearby, share: Array | float = 1.0) -> tuple[Array, Array]:
+    def bounds(self, own: OwnState, near: Nearby, share: Array | float = 1.0) -> tuple[Array, Array]:
         """The half-planes a·u ≤ b that the commanded velocities must obey: unit vectors a (K, 2), b (K,) [m/s].
 
         `share` (K,) of α is used.
@@ -80,18 +80,18 @@ class Barrier(Avoidance, frozen=True):
         used = self.alpha * share * left
         return -away, np.minimum(np.where(left > 0.0, 0.5 * used, used), used - coming)
 
-    def deviate(self, goal: Array, own: Self, near: Nearby, period: float) -> Array:
+    def deviate(self, goal: Array, own: OwnState, near: Nearby, period: float) -> Array:
         """See `Avoidance.deviate`: steers robots that cannot move sideways."""
         if not len(near):
             return goal
         mine = own.by_twist[near.row]
         if not some(mine):
             return goal
-        near = near if every(mine) else near.of(mine)
+        near = near if every(mine) else near.select(mine)
         here, response = own.position[:, :2], own.response[:, None]
         wanted = response * (goal[:, :2] - here)
         wanted *= np.minimum(1.0, own.speed / np.maximum(norm(wanted), SLACK))[:, None]
-        share = np.where(near.heard, self.steering, 1.0)
+        share = np.where(near.is_robot, self.steering, 1.0)
         rows, allowed = self._nearest(wanted, own, near, *self.bounds(own, near, share))
         if not len(rows):
             return goal
@@ -99,7 +99,7 @@ class Barrier(Avoidance, frozen=True):
         steered[rows, :2] = here[rows] + allowed / response[rows]
         return steered
 
-    def restrain(self, setpoint: Array, own: Self, near: Nearby) -> Array:
+    def restrain(self, setpoint: Array, own: OwnState, near: Nearby) -> Array:
         """See `Avoidance.restrain`."""
         if not len(near):
             return setpoint
@@ -107,8 +107,8 @@ class Barrier(Avoidance, frozen=True):
         driving = some(twist)
         if driving and every(twist):
             return self._along_heading(setpoint, own, near)
-        others = near.of(~twist) if driving else near
-        restrained = self._along_heading(setpoint, own, near.of(twist)) if driving else setpoint
+        others = near.select(~twist) if driving else near
+        restrained = self._along_heading(setpoint, own, near.select(twist)) if driving else setpoint
         response, here = own.response[:, None], own.position[:, :2]
         aims = own.by_position[:, None]
         wanted = np.where(aims, response * (setpoint[:, :2] - here), setpoint[:, :2])
@@ -118,7 +118,7 @@ class Barrier(Avoidance, frozen=True):
             restrained[rows, :2] = np.where(aims[rows], here[rows] + allowed / response[rows], allowed)
         return restrained
 
-    def _nearest(self, wanted: Array, own: Self, near: Nearby, normal: Array, bound: Array) -> tuple[Index, Array]:
+    def _nearest(self, wanted: Array, own: OwnState, near: Nearby, normal: Array, bound: Array) -> tuple[Index, Array]:
         """Rows (M,) whose `wanted` velocity (N, 2) the half-planes do not allow, and what they do (M, 2) [m/s]."""
         excess = np.vecdot(normal, wanted[near.row]) - bound
         barred = excess > SLACK
@@ -139,7 +139,7 @@ class Barrier(Avoidance, frozen=True):
         velocity = _closest(velocity, chosen, tightest)
         return rows, _scaled(velocity, own.speed[rows], normal, bound, place)
 
-    def _aside(self, own: Self, near: Nearby, normal: Array) -> Array:
+    def _aside(self, own: OwnState, near: Nearby, normal: Array) -> Array:
         """Where each row gives way to, per m/s that a thing bars (K, 2): to its right, seen toward the thing.
 
         One that comes faster than the row can flee will not mind it: there it is the side of its way where the row is.
@@ -153,7 +153,7 @@ class Barrier(Avoidance, frozen=True):
             share[fast & (off > 0.0)] = 1.0
         return share[:, None] * np.stack([y, -x], axis=1)
 
-    def _along_heading(self, setpoint: Array, own: Self, near: Nearby) -> Array:
+    def _along_heading(self, setpoint: Array, own: OwnState, near: Nearby) -> Array:
         """The speeds of twists (N, 4) within the interval that all half-planes leave along the heading."""
         row = near.row
         normal, bound = self.bounds(own, near)

@@ -49,12 +49,12 @@ class Distance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def offset(self, position: Array, heard: Array, links: Links) -> Array:
         """u_i = ½ Σ_j μ_ij (d_ij² − ‖p_i − p_j‖²)(p_i − p_j), see `Law.offset`."""
-        pull = _by_distance(position[links.listener] - heard, links, self.dead_zone)
-        return links.onto_listeners(pull, len(position))
+        pull = _by_distance(position[links.receiver] - heard, links, self.dead_zone)
+        return links.sum_by_receiver(pull, len(position))
 
     def error(self, position: Array, heard: Array, links: Links) -> Array:
         """|d_ij − ‖p_i − p_j‖|, see `Law.error`."""
-        return np.abs(links.distance - norm(position[links.listener] - heard))
+        return np.abs(links.distance - norm(position[links.receiver] - heard))
 
 
 class Displacement(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -69,12 +69,12 @@ class Displacement(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def offset(self, position: Array, heard: Array, links: Links) -> Array:
         """u_i = −Σ_j k_ij (p_i − p_j − d_ij), see `Law.offset`."""
-        pull = _by_relative(position[links.listener] - heard, links)
-        return links.onto_listeners(pull, len(position))
+        pull = _by_relative(position[links.receiver] - heard, links)
+        return links.sum_by_receiver(pull, len(position))
 
     def error(self, position: Array, heard: Array, links: Links) -> Array:
         """‖p_i − p_j − d_ij‖, see `Law.error`."""
-        return norm(np.asarray(position[links.listener] - heard - _given(links.relative, links)))
+        return norm(np.asarray(position[links.receiver] - heard - _given(links.relative, links)))
 
 
 class Bearing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -90,12 +90,12 @@ class Bearing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def offset(self, position: Array, heard: Array, links: Links) -> Array:
         """u_i = −Σ_j k_ij (x − max(gᵀx, 0) g) with x = p_i − p_j, see `Law.offset`."""
-        pull = _by_bearing(position[links.listener] - heard, links)
-        return links.onto_listeners(pull, len(position))
+        pull = _by_bearing(position[links.receiver] - heard, links)
+        return links.sum_by_receiver(pull, len(position))
 
     def error(self, position: Array, heard: Array, links: Links) -> Array:
         """‖x − max(gᵀx, 0) g‖, see `Law.error`."""
-        return norm(_beside(position[links.listener] - heard, links))
+        return norm(_beside(position[links.receiver] - heard, links))
 
 
 class Mixed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -112,18 +112,18 @@ class Mixed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def offset(self, position: Array, heard: Array, links: Links) -> Array:
         """The sum of what each link's own law has to say, see `Law.offset`."""
-        offset = position[links.listener] - heard
+        offset = position[links.receiver] - heard
         pull = _by_distance(offset, links, self.dead_zone)
         if links.wants is not None:
             other = np.where(
                 (links.wants == BY_BEARING)[:, None], _by_bearing(offset, links), _by_relative(offset, links)
             )
             pull = np.where((links.wants == BY_DISTANCE)[:, None], pull, other)
-        return links.onto_listeners(pull, len(position))
+        return links.sum_by_receiver(pull, len(position))
 
     def error(self, position: Array, heard: Array, links: Links) -> Array:
         """As each link's own law measures it, see `Law.error`."""
-        offset = position[links.listener] - heard
+        offset = position[links.receiver] - heard
         error = np.abs(links.distance - norm(offset))
         if links.wants is None:
             return error
@@ -169,14 +169,14 @@ def _given(vectors: Array | None, links: Links) -> Array:
     return np.full((len(links), 3), np.nan) if vectors is None else vectors
 
 
-def tracking(position: Array, target: Array, gain: float | Array) -> Array:
+def tracking_offset(position: Array, target: Array, gain: float | Array) -> Array:
     """u_i^t = −½ k_i ‖p_i − q_i‖² (p_i − q_i) (N, 3) (paper, eq. (7)); zero where the target is NaN."""
     offset = position - target
     pull = (-0.5 * gain * np.vecdot(offset, offset))[:, None] * offset
     return np.where(np.isnan(pull), 0.0, pull)
 
 
-def goal(position: Array, offset: Array, limit: float) -> Array:
+def goal_position(position: Array, offset: Array, limit: float) -> Array:
     """Goal position p + u (N, 3), u clamped to ± `limit` per axis [m].
 
     The clamp is not cosmetic: unclamped, (6) grows with the third power of a large error.

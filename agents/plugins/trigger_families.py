@@ -65,7 +65,7 @@ class Decaying(Trigger, frozen=True):
 
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
-        return view.deviation > self.floor + self.extra * np.exp(-self.rate * view.since)
+        return view.deviation > self.floor + self.extra * np.exp(-self.rate * view.since_start)
 
 
 class Dynamic(Trigger, frozen=True):
@@ -116,7 +116,7 @@ class Integral(Trigger, frozen=True):
 
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
-        told, gap = view.told.time, view.deviation
+        told, gap = view.last_event.time, view.deviation
         anew = memory[:, 2] != told
         area, until = np.where(anew, 0.0, memory[:, 0]), np.where(anew, told, memory[:, 1])
         known = np.isfinite(gap) & np.isfinite(until)
@@ -152,7 +152,7 @@ class SelfTriggered(Trigger, frozen=True):
         """See `Trigger.fires`."""
         drift, bound = view.drift, self.acceleration
         wait = 2.0 * self.threshold / (drift + np.sqrt(drift**2 + 2.0 * bound * self.threshold))
-        return view.quiet >= np.minimum(wait, min(self.longest_s, view.reach_s)) - ROUNDING_S
+        return view.since_event >= np.minimum(wait, min(self.longest_s, view.reach_s)) - ROUNDING_S
 
 
 class Lyapunov(Trigger, frozen=True):
@@ -172,7 +172,7 @@ class Lyapunov(Trigger, frozen=True):
 
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
-        now, then, slack = view.energy, view.told.energy, 0.5 * self.floor**2
+        now, then, slack = view.energy, view.last_event.energy, 0.5 * self.floor**2
         left = (now < self.level * then - slack) | (now > then / self.level + slack)
         return left | (view.deviation > self.largest)
 
@@ -192,4 +192,4 @@ class RelativeControl(Trigger, frozen=True):
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
         u = view.offset
-        return norm(u - view.told.offset) >= self.floor + np.minimum(self.share * norm(u), self.share)
+        return norm(u - view.last_event.offset) >= self.floor + np.minimum(self.share * norm(u), self.share)

@@ -48,12 +48,12 @@ class LastEvent:
     energy: Array
 
     @classmethod
-    def nothing(cls, rows: int) -> LastEvent:
+    def none(cls, rows: int) -> LastEvent:
         """Before any event."""
         zeros = np.zeros((rows, 3))
         return cls(np.full((rows, 3), np.inf), zeros, np.full(rows, -np.inf), zeros.copy(), np.zeros(rows))
 
-    def tell(self, rows: Index, view: View) -> None:
+    def record(self, rows: Index, view: View) -> None:
         """An event of `rows`: remembers what they see."""
         if len(rows) == len(self.time):  # all of them, as always in a process of one: a copy, without an index
             self.position[:], self.velocity[:], self.time[:] = view.position, view.velocity, view.t
@@ -70,7 +70,7 @@ class View:
         t: Now [s].
         position: (N, 3) own [m]; for communication what would be said, smoothed if that is asked for.
         velocity: (N, 3) own [m/s].
-        told: The last event of each row.
+        last_event: The last event of each row.
         error: (N,) Σ|e| of its links, as the row itself sees them [m].
         energy: (N,) edge potential Σ ½e² of its links [m²].
         start: (N,) when each row began, or will [s].
@@ -82,7 +82,7 @@ class View:
         t: float,
         position: Array,
         velocity: Array,
-        told: LastEvent,
+        last_event: LastEvent,
         *,
         error: Array,
         energy: Array,
@@ -90,17 +90,17 @@ class View:
         offset: Array,
         predictor: Predictor = HOLD,
     ) -> None:
-        self.t, self.position, self.velocity, self.told = t, position, velocity, told
+        self.t, self.position, self.velocity, self.last_event = t, position, velocity, last_event
         self.error, self.energy, self.start, self.predictor = error, energy, start, predictor
         self._offset = offset
 
     @property
-    def quiet(self) -> Array:
+    def since_event(self) -> Array:
         """(N,) t − t_k: time since the last event [s], infinite before the first."""
-        return self.t - self.told.time
+        return self.t - self.last_event.time
 
     @property
-    def since(self) -> Array:
+    def since_start(self) -> Array:
         """(N,) time since the row's start in the experiment [s], 0 before."""
         return np.maximum(self.t - self.start, 0.0)
 
@@ -113,9 +113,9 @@ class View:
     def believed(self) -> Array:
         """(N, 3) where the neighbours believe each row to be [m]; infinite before it first spoke."""
         if self.predictor is HOLD:
-            return self.told.position
-        age = np.where(np.isinf(self.told.time), 0.0, self.quiet)
-        return self.predictor.position(self.told.position, self.told.velocity, age)
+            return self.last_event.position
+        age = np.where(np.isinf(self.last_event.time), 0.0, self.since_event)
+        return self.predictor.position(self.last_event.position, self.last_event.velocity, age)
 
     @cached_property
     def deviation(self) -> Array:
@@ -125,7 +125,7 @@ class View:
     @property
     def drift(self) -> Array:
         """(N,) how fast ε began to grow after the last event, as was known then [m/s]."""
-        told = self.told.velocity
+        told = self.last_event.velocity
         return norm(told - self.predictor.velocity(told, np.zeros(len(told))))
 
     @property
@@ -180,9 +180,9 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             ValueError: If `fires` does not give one bool per row.
         """
         fired = self._evaluated(view, state)
-        if np.shape(fired) != view.told.time.shape:
-            raise ValueError(f"`fires` must give one bool per row, {view.told.time.shape}, not {np.shape(fired)}")
-        quiet = view.quiet
+        if np.shape(fired) != view.last_event.time.shape:
+            raise ValueError(f"`fires` must give one bool per row, {view.last_event.time.shape}, not {np.shape(fired)}")
+        quiet = view.since_event
         if self.maximum_silence_s is not None:
             fired = fired | (quiet >= self.maximum_silence_s - ROUNDING_S)
         if self.minimum_interval_s > 0.0:
@@ -209,7 +209,7 @@ class Periodic(Trigger, frozen=True):
 
     def fires(self, view: View, memory: Array) -> Mask:
         """See `Trigger.fires`."""
-        return view.quiet >= self.period_s - ROUNDING_S
+        return view.since_event >= self.period_s - ROUNDING_S
 
 
 class SendOnDelta(Trigger, frozen=True):

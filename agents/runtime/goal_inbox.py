@@ -75,7 +75,7 @@ class HeardGoals:
             said = (got.link.tolist(), got.seq.tolist(), got.stamp.tolist(), got.position, got.extra.tolist())
             for link, seq, stamp, position, (toward, sent, pose) in zip(*said, strict=True):
                 which = self._rows[[link]]
-                news = self._agent.hear_goal(which, position[None], np.array([toward]), np.array([stamp]))
+                news = self._agent.receive_goal(which, position[None], np.array([toward]), np.array([stamp]))
                 if news.any():
                     self.news[which[0]].append(messages.GoalReceipt(seq, utc + sent, utc + pose, utc + t))
 
@@ -99,7 +99,7 @@ class HeardGoals:
         row = int(self._rows[link])
         self._seq[row] = goal.seq
         stamp, sent = validation.taken(goal.stamp - utc, t), goal.stamp - utc
-        start = self._agent.life.start_at[[row]]
+        start = self._agent.lifecycle.start_at[[row]]
         self._channel.send(
             np.array([link]),
             np.array([goal.seq]),

@@ -89,7 +89,7 @@ class Runtime:
             network.Unreachable: If no router answers.
         """
         lost = threading.Event()
-        rope = Lifeline(lost, told=self._setup.clock.heed)
+        rope = Lifeline(lost, told=self._setup.clock.follow)
         if self._setup.lifeline:
             rope.start()
         asked = threading.Event()
@@ -132,7 +132,7 @@ class Runtime:
         self._coming_down = True
         self._watchdog.start()
         failures: list[Exception] = []
-        if self._in_the_air(failures) and (self.agent.life.phase < Phase.DONE).any():  # else it was stopped
+        if self._in_the_air(failures) and (self.agent.lifecycle.phase < Phase.DONE).any():  # else it was stopped
             error = sys.exception()
             why = "it did not land in time" if error is None else f"its control loop broke: {_what(error)}"
             self._watchdog.call_for_help(why)
@@ -294,14 +294,14 @@ class Runtime:
 
     def _recover(self, why: str) -> None:
         """The loop runs again after the watchdog had its robots land: they do, whatever was decided before."""
-        for row in np.flatnonzero(self.agent.life.active).tolist():
-            self.agent.life.land(row, why)
+        for row in np.flatnonzero(self.agent.lifecycle.active).tolist():
+            self.agent.lifecycle.land(row, why)
         self.agent.land_here()
         self._be_there()
 
     def _wake(self, slept: float) -> None:
         """The process stood still for so long [s]: until it has heard the others again, it holds."""
-        self.agent.health.wake(self._next, slept)
+        self.agent.health.mark_resumed(self._next, slept)
         print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
     def _listen(self, t: float) -> None:
@@ -310,7 +310,7 @@ class Runtime:
         outside = agent.health
         outside.offline_since = self._cut_off_since(t)
         for _, there in self._conductor.changes():
-            outside.unattended_since = np.inf if there else min(outside.unattended_since, t)
+            outside.conductor_lost_since = np.inf if there else min(outside.conductor_lost_since, t)
         self._neighbours.listen(t, self._utc)
         if self._goals is not None:
             self._goals.take(t, self._utc)
@@ -344,7 +344,7 @@ class Runtime:
         for stop in network.received(self._estop):
             self._cut_off = False  # the phases say it from now on
             for row in range(len(self._names)):
-                self.agent.life.stop(row, stop.words)
+                self.agent.lifecycle.stop(row, stop.words)
 
     def _malformed(self) -> int:
         """Payloads that were refused, of all kinds but poses."""
@@ -359,10 +359,10 @@ class Runtime:
         """Carries out one order to one row, and replies."""
         key = self._setup.keys.order(self._names[row])
         with query:
-            waits = self.agent.life.phase[row] == Phase.AIRBORNE
-            slept = self.agent.health.slept
+            waits = self.agent.lifecycle.phase[row] == Phase.AIRBORNE
+            slept = self.agent.health.suspended_s
             # the conductor left long ago
-            if order.order == "takeoff" and slept > ASK_S and self.agent.health.just_woke(t):
+            if order.order == "takeoff" and slept > ASK_S and self.agent.health.just_resumed(t):
                 refusal, value = f"the process stood still for {slept:.1f} s; ask again", None
             else:
                 refusal, value = carry_out(self.agent, row, order, t, self._utc)
@@ -374,7 +374,7 @@ class Runtime:
             ):  # one that runs keeps its grid
                 self._align(order.at - self._utc)
                 self._telemetry.due = t  # whoever decides for it must know in time when it begins
-            phase = Phase(self.agent.life.phase[row]).word
+            phase = Phase(self.agent.lifecycle.phase[row]).word
             reply = messages.Reply(self._names[row], not refusal, phase, refusal, value)
             query.reply(key, messages.encode(reply, self._setup.encoding), encoding=self._mime)
 
@@ -411,7 +411,7 @@ class Runtime:
                 continue
             self._counts.missed += behind
             self._next += behind * self._dt
-            self.agent.skip(behind)
+            self.agent.skip_ticks(behind)
             if behind * self._dt > self._setup.loop_silence_s:
                 self._wake(behind * self._dt)
             t = self._now = self._next
@@ -423,9 +423,9 @@ class Runtime:
                 farewell = t + FAREWELL_S
                 self._stopping = reason
                 for row in range(len(self._names)):
-                    self.agent.life.land(row, reason)
+                    self.agent.lifecycle.land(row, reason)
             if (self._stopping is not None or self._setup.once) and (
-                t > farewell or (self.agent.life.phase == Phase.DONE).all()
+                t > farewell or (self.agent.lifecycle.phase == Phase.DONE).all()
             ):
                 self._telemetry.report(t, everything=True)
                 return
@@ -447,12 +447,12 @@ class Runtime:
             state.ahead = located.ahead if state.ahead is None else np.where(known, located.ahead, state.ahead)
         if self._ranges is not None:
             state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))
-        said = self.agent.speak(t, state)
+        said = self.agent.transmit(t, state)
         for row in said.rows if not self._retired else [row for row in said.rows if row not in self._retired]:
             self._say(int(row), said, float(state.yaw[row]), t)
         actions = self.agent.act(t, state, said)
         self._act(actions)
-        if self._retired or not self.agent.life.all_running:
+        if self._retired or not self.agent.lifecycle.all_running:
             self._retire(t)
         counts, telemetry = self._counts, self._telemetry
         if not begun and self.agent.decisions:
@@ -474,10 +474,10 @@ class Runtime:
         When the experiment is over the latter says again that it is there; whoever was ordered down is told about
         elsewhere.
         """
-        life = self.agent.life
+        life = self.agent.lifecycle
         during = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
         # those who serve robots whose launcher is gone go when the tokens do (`agents.network.shutdown`)
-        down = self.agent.sinking if self._stopping is None else life.phase == Phase.DONE
+        down = self.agent.descending if self._stopping is None else life.phase == Phase.DONE
         for row in np.flatnonzero(down).tolist():
             unasked = during[row] and not life.reason[row].startswith((messages.EMERGENCY, LAND, STOP))
             if (unasked or row in self._leaving) and row not in self._retired:
@@ -492,7 +492,7 @@ class Runtime:
 
     def _act(self, actions: Actions) -> None:
         """What the body must do, the motors-off first."""
-        duties = actions.duties
+        duties = actions.commands
         stale = self._make_sure()
         overruled = self._cut_off or self._watchdog.tripped  # another thread has told the body to stop or to land
         if duties is not None:

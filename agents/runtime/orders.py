@@ -34,7 +34,7 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
     """
     match order.order:
         case "takeoff":
-            return agent.life.takeoff(row), None
+            return agent.lifecycle.takeoff(row), None
         case "start":
             return _start(agent, row, order, t, utc), None
         case "hold":
@@ -42,11 +42,11 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
         case "resume":
             return _resume(agent, row), None
         case "leave":
-            agent.life.land(row, "told to leave")
+            agent.lifecycle.land(row, "told to leave")
         case "land":
-            agent.life.land(row, LAND)
+            agent.lifecycle.land(row, LAND)
         case "stop":
-            agent.life.stop(row, STOP)
+            agent.lifecycle.stop(row, STOP)
         case "get" | "set":
             return _parameter(agent, order)
     return "", None
@@ -55,14 +55,14 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
 def _hold(agent: Agent, row: int) -> str:
     refusal = agent.hold(row)
     if not refusal:
-        agent.life.reason[row] = PAUSED
+        agent.lifecycle.reason[row] = PAUSED
     return refusal
 
 
 def _resume(agent: Agent, row: int) -> str:
     agent.resume(row)
-    if agent.life.reason[row] == PAUSED:
-        agent.life.reason[row] = ""
+    if agent.lifecycle.reason[row] == PAUSED:
+        agent.lifecycle.reason[row] = ""
     return ""
 
 
@@ -90,7 +90,7 @@ def _parameter(agent: Agent, order: Order) -> Answer:
         refusal = _set(agent, name, of_trigger.get(name), order.value)
         if refusal:
             return refusal, None
-    value = getattr(agent.trigger, of_trigger[name]) if name in of_trigger else getattr(agent.deciding, name)
+    value = getattr(agent.trigger, of_trigger[name]) if name in of_trigger else getattr(agent.goal_computer, name)
     return ("", float(value)) if isinstance(value, int | float) else (f"'{name}' is not set", None)
 
 
@@ -98,7 +98,7 @@ def _set(agent: Agent, name: str, of_trigger: str | None, value: float | None) -
     if value is None or not isfinite(value) or value < 0.0:
         return f"'{name}' needs a `value`, a number that is not negative"
     if of_trigger is None:
-        setattr(agent.deciding, name, value)
+        setattr(agent.goal_computer, name, value)
         return ""
     try:
         changed = {**msgspec.structs.asdict(agent.trigger), of_trigger: value}

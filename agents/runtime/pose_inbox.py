@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import zenoh
 
-from agents.agent import Agent, links_by_speaker
+from agents.agent import Agent, links_by_sender
 from agents.arrays import Index, PoseTable
 from agents.network import messages, pubsub, validation
 from agents.network.channel_model import Channel, Conditions
@@ -207,10 +207,10 @@ class Neighbours:
         assignment = agent.assignment
         self._agent = agent
         self._links = assignment.links
-        names = [assignment.speakers[speaker] for speaker in assignment.links.speaker.tolist()]
-        self._ends = list(zip(assignment.links.listener.tolist(), names, strict=True))
+        names = [assignment.robots[speaker] for speaker in assignment.links.sender.tolist()]
+        self._ends = list(zip(assignment.links.receiver.tolist(), names, strict=True))
         self._channel = Channel(conditions or Conditions.ideal(len(assignment.links)))
-        by_speaker = links_by_speaker(assignment.links, assignment.speakers)
+        by_speaker = links_by_sender(assignment.links, assignment.robots)
         rate = assignment.body_hz / assignment.pose_every
         self.speakers = [
             NeighbourSubscription(session, keys, name, links, reach=reach, rate=rate)
@@ -250,7 +250,7 @@ class Neighbours:
                     arrived = [(link, before) for link, before in arrived if link not in speaker.links]
                 arrived += [(link, said) for link in speaker.links.tolist()]
             if speaker.behind != behind:
-                self._agent.neighbours.distrust(speaker.links, speaker.behind)
+                self._agent.neighbours.mark_clock_lag(speaker.links, speaker.behind)
         if arrived:
             self._send(arrived, t, utc)
         if (got := self._channel.due(t)) is not None:
@@ -259,7 +259,7 @@ class Neighbours:
     def _begin(self, speaker: NeighbourSubscription) -> None:
         """A neighbour begins a new life."""
         self._channel.forget(speaker.links)
-        self._agent.forget(speaker.links)
+        self._agent.discard_poses(speaker.links)
 
     def _send(self, arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> None:
         """Gives poses, each with the link on which it arrived, to the modelled network, all of a tick at once."""
@@ -277,7 +277,7 @@ class Neighbours:
         if self._channel.ideal:
             self._believe(got, utc)
             return
-        start = self._agent.life.start_at[self._links.listener[got.link]]
+        start = self._agent.lifecycle.start_at[self._links.receiver[got.link]]
         sizes = np.array([heard.size for _, heard in arrived])
         for at in range(len(arrived)):  # the queue of a link counts one sample after the other
             one = slice(at, at + 1)

@@ -127,7 +127,7 @@ class Telemetry:
         agent = self._agent
         position, velocity, truth = state.position.tolist(), state.velocity.tolist(), state.true_position.tolist()
         goal, setpoint, error = agent.goal.tolist(), actions.setpoint.tolist(), agent.error.tolist()
-        yaw, true_yaw, phase = state.yaw.tolist(), state.true_yaw.tolist(), agent.life.phase.tolist()
+        yaw, true_yaw, phase = state.yaw.tolist(), state.true_yaw.tolist(), agent.lifecycle.phase.tolist()
         for row, name in enumerate(self._names):
             message = messages.State(
                 name,
@@ -171,15 +171,15 @@ class Telemetry:
         `changed` says that neighbours came or went: what the phases alone would not tell.
         """
         agent, counts = self._agent, self._counts
-        if not (everything or changed or agent.life.moved or agent.hazards.incidents):
+        if not (everything or changed or agent.lifecycle.moved or agent.hazards.incidents):
             return
         self._note_incidents()
         if everything:
             self.due = t + STATUS_S
-        life = agent.life
-        listener = agent.assignment.links.listener
+        life = agent.lifecycle
+        listener = agent.assignment.links.receiver
         for row, name in enumerate(self._names):
-            missing = agent.missing(row)
+            missing = agent.missing_neighbours(row)
             news = (life.phase[row], life.reason[row], tuple(missing), self._numbers[row])
             if not everything and news == self._reported[row]:
                 continue
@@ -250,9 +250,9 @@ class Telemetry:
         """How many samples of whom a row did not get because the modelled network dropped them."""
         assignment = self._agent.assignment
         dropped = self._neighbours.dropped
-        at = np.flatnonzero((dropped > 0) & (assignment.links.listener == row))
-        speakers = assignment.links.speaker[at].tolist()
-        return {assignment.speakers[j]: int(n) for j, n in zip(speakers, dropped[at].tolist(), strict=True)}
+        at = np.flatnonzero((dropped > 0) & (assignment.links.receiver == row))
+        speakers = assignment.links.sender[at].tolist()
+        return {assignment.robots[j]: int(n) for j, n in zip(speakers, dropped[at].tolist(), strict=True)}
 
 
 def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it

@@ -147,12 +147,12 @@ def rules(limits: Limits) -> dict[Cause, Rule]:
     return {cause: replace(rule, **chosen.get(cause, {})) for cause, rule in RULES.items()}  # type: ignore[arg-type]
 
 
-class Sighting(NamedTuple):
+class Observation(NamedTuple):
     """A cause that is seen on this tick: on which rows (N,), and how bad it is there, in words with numbers."""
 
     cause: Cause
     rows: Mask
-    say: Callable[[int], str]
+    detail: Callable[[int], str]
 
 
 class Incident(NamedTuple):
@@ -201,7 +201,7 @@ class Hazards:
         self._nobody = self.held
         self.incidents: list[Incident] = []
 
-    def assess(self, t: float, seen: Sequence[Sighting], active: Mask, landing: Mask) -> list[Incident]:
+    def update(self, t: float, seen: Sequence[Observation], active: Mask, landing: Mask) -> list[Incident]:
         """One tick: the rows that must land or be cut now, for the first time, each with why.
 
         Args:
@@ -238,7 +238,7 @@ class Hazards:
             return []
         return self._tell(t, before, lasted, {sighting.cause: sighting for sighting in seen})
 
-    def _tell(self, t: float, before: Index, lasted: Array, seen: Mapping[int, Sighting]) -> list[Incident]:
+    def _tell(self, t: float, before: Index, lasted: Array, seen: Mapping[int, Observation]) -> list[Incident]:
         """What has changed, in words; returns landings and cuts, the hardest of each row last."""
         news = []
         for cause, row in np.argwhere(self._level != before).tolist():
@@ -248,7 +248,7 @@ class Hazards:
                 text = f"over: {words}, after {lasted[cause, row]:.2f} s"
                 self._texts[row].pop(cause, None)
             else:
-                text = f"{outcome.name.lower()}: {words}: {seen[cause].say(row)}"
+                text = f"{outcome.name.lower()}: {words}: {seen[cause].detail(row)}"
                 self._texts[row][cause] = text
             news.append(Incident(t, row, Cause(cause), outcome, text))
         news.sort(key=lambda incident: incident.outcome)

@@ -34,28 +34,28 @@ class Landing:
 
     Attributes:
         aside: (N,) rows that must land and are not there yet.
-        anybody_aside: Whether there are any.
-        spot: (N, 3) where they go [m].
+        any_aside: Whether there are any.
+        place: (N, 3) where they go [m].
     """
 
     def __init__(self, assignment: Assignment) -> None:
         """Of the rows of an assignment; whom they hear, for the law or to keep clear, they know of."""
         rows, links = len(assignment.names), assignment.links
-        self._assignment, self._listener = assignment, links.listener
-        kinds = assignment.speaker_kinds
-        speaks = [kinds[speaker] for speaker in links.speaker.tolist()] if kinds else ()
+        self._assignment, self._listener = assignment, links.receiver
+        kinds = assignment.robot_kinds
+        speaks = [kinds[speaker] for speaker in links.sender.tolist()] if kinds else ()
         self._radius = np.array([kind.radius for kind in assignment.kinds])
         self._height = np.array([kind.height for kind in assignment.kinds])
         self._their_radius = np.array([kind.radius for kind in speaks])
         self._their_height = np.array([kind.height for kind in speaks])
         self._flies = np.array([kind.flies for kind in assignment.kinds])
         self._nobody: Mask = np.zeros(rows, dtype=bool)
-        self.aside, self.anybody_aside = self._nobody, False
-        self.spot = np.full((rows, 3), np.nan)
+        self.aside, self.any_aside = self._nobody, False
+        self.place = np.full((rows, 3), np.nan)
         self._until = np.full(rows, -np.inf)
         self._apart = np.full(len(links), np.inf)
 
-    def direct(
+    def filter_commands(
         self,
         t: float,
         duties: BodyCommands | None,
@@ -78,19 +78,19 @@ class Landing:
             phase: (N,) of the rows; one that does not land any more goes nowhere.
         """
         told = duties is not None and len(duties.land) > 0
-        if not (told or self.anybody_aside):
+        if not (told or self.any_aside):
             return duties
-        self.spot[~self.aside] = np.nan
+        self.place[~self.aside] = np.nan
         due = self.aside & (phase == LANDING)
         if duties is not None and told:
             due[duties.land] = True
             self._until[duties.land] = t + PATIENCE_S
-        gone = hearing.heard.gone < np.inf
-        place = hearing.everywhere(self._assignment.predictor, t)
+        gone = hearing.poses.lost_since < np.inf
+        place = hearing.extrapolate_all(self._assignment.predictor, t)
         able = due & self._flies & state.flying & ~where.invalid & ~where.outside_wall & (t <= self._until)
         able &= (state.position[:, 2] > LOW) & (not late)
         self.aside = able & self._must_wait(state, place, gone)
-        self.anybody_aside = some(self.aside)
+        self.any_aside = some(self.aside)
         for row in np.flatnonzero(self.aside).tolist():
             self._choose(row, state.position[row], place, gone)
         lands = np.flatnonzero(due & ~self.aside)
@@ -99,16 +99,16 @@ class Landing:
             return BodyCommands(nobody, lands, nobody) if len(lands) else None
         return replace(duties, land=lands)
 
-    def hurry(self) -> None:
+    def land_in_place(self) -> None:
         """Whoever is on its way aside has been told to land where it is."""
-        self.aside, self.anybody_aside = self._nobody, False
+        self.aside, self.any_aside = self._nobody, False
 
-    def below(self, row: int) -> str:
+    def robot_below(self, row: int) -> str:
         """Who is below a row that goes aside, in words."""
         links = self._assignment.links
         mine: Index = np.flatnonzero(self._listener == row)
         nearest = int(mine[self._apart[mine].argmin()])
-        return f"{self._assignment.speakers[links.speaker[nearest]]}; it goes aside first"
+        return f"{self._assignment.robots[links.sender[nearest]]}; it goes aside first"
 
     def _under(self, row: Index | int, state_z: Array | float, place: Array, gone: Mask) -> Mask:
         """Of places (E, 3), which are those of robots under rows, or beside them: who is gone may have come down."""
@@ -142,7 +142,7 @@ class Landing:
             apart = (norm(tried[:, None] - others[None, :, :2]) - touching).min(axis=1, initial=np.inf)
             return np.where(open_way, apart, -np.inf)
 
-        if np.isfinite(self.spot[row]).all() and room(self.spot[row : row + 1, :2])[0] > NEAR:
+        if np.isfinite(self.place[row]).all() and room(self.place[row : row + 1, :2])[0] > NEAR:
             return
         ways = RINGS[:, None, None] * np.stack([np.cos(WAYS), np.sin(WAYS)], axis=1)
         tried = here[:2] + ways.reshape(-1, 2)
@@ -152,11 +152,11 @@ class Landing:
         there = np.where(inside, room(tried), -np.inf)
         free = np.flatnonzero(there > ROOM)
         if not len(free):  # nowhere: down
-            self.spot[row], self._until[row] = here, -np.inf
+            self.place[row], self._until[row] = here, -np.inf
             return
         ring = free // len(WAYS)
         nearest = free[ring == ring[0]]
-        self.spot[row] = *tried[nearest[there[nearest].argmax()]], here[2]
+        self.place[row] = *tried[nearest[there[nearest].argmax()]], here[2]
 
 
 def _passing(here: Array, there: Array, place: Array) -> Array:

@@ -13,7 +13,7 @@ from agents.arrays import Array, Index, Mask, some
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import NeighbourStates
-from agents.safety.detection import ProcessHealth, Separation, lean, leaning, misstamped, stamped
+from agents.safety.detection import ProcessHealth, Separation, clock_off, clock_text, tilt_angle, tilted
 from agents.safety.setpoint_filter import PoseValidity
 
 LOST_S: Final = 0.5  # a robot that was ready is so no more when a check has failed for this long
@@ -86,8 +86,8 @@ class Preflight:
         def nowhere(row: int) -> str:
             if np.isnan(state.yaw[row]) and known[row]:
                 return "it does not know which way it looks"
-            off = misstamped(ahead, self._limits.own_silence_s)[row]
-            return "no position of its own" + (f": {stamped(self._assignment.names, ahead, row)}" if off else "")
+            off = clock_off(ahead, self._limits.own_silence_s)[row]
+            return "no position of its own" + (f": {clock_text(self._assignment.names, ahead, row)}" if off else "")
 
         yield where.invalid, nowhere
         waits, whom = lacking
@@ -105,8 +105,8 @@ class Preflight:
         yield fast, lambda row: f"it is not at rest: {np.linalg.norm(state.velocity[row]):.2f} m/s"
         if state.attitude is not None:
             attitude = state.attitude
-            leans = flies & leaning(attitude, LEVEL)
-            yield leans, lambda row: f"it is not level: it leans {degrees(lean(attitude, row)):.0f}°"
+            leans = flies & tilted(attitude, LEVEL)
+            yield leans, lambda row: f"it is not level: it leans {degrees(tilt_angle(attitude, row)):.0f}°"
         low = state.battery < least
         yield low, lambda row: f"its battery is at {state.battery[row]:.0%}, less than {least:.0%}"
 
@@ -116,7 +116,7 @@ class Preflight:
         if some(near):
 
             def say(row: int) -> str:
-                distance, other = self._separation.nearest(row, apart)
+                distance, other = self._separation.nearest_robot(row, apart)
                 return f"it is {distance:.2f} m from {other}, nearer than {limit:g} m"
 
-            yield self._separation.rows(near), say
+            yield self._separation.receivers_of(near), say

@@ -11,10 +11,10 @@ import numpy as np
 from agents.arrays import Array, Mask, Rows, clamp, every, norm, some, span
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
-from agents.plugins.avoidance import Avoidance, Nearby, Self
+from agents.plugins.avoidance import Avoidance, Nearby, OwnState
 from agents.plugins.registry import FAILURES, PluginError
 
-ESCAPED = 0.25  # [m] this far outside the arena a robot is no longer under control
+OUTSIDE_M = 0.25  # [m] this far outside the arena a robot is no longer under control
 ABSURD = 1e6  # [m, m/s, rad, rad/s] no place, speed or angle is that large; NaN is not smaller either
 ROUNDING = 1e-9  # smaller differences are arithmetic, not interventions
 
@@ -46,7 +46,7 @@ class FilteredSetpoint(msgspec.Struct, frozen=True):
     Attributes:
         setpoint: (N, 4) safe.
         changed: (N,) the setpoint was not what had been decided.
-        blind: (N,) own position missing, stale or not finite: no closed loop is possible.
+        invalid_pose: (N,) own position missing, stale or not finite: no closed loop is possible.
         not_finite: (N,) it was not made of finite numbers although the row is not blind;
             the setpoint sent instead keeps the row in place.
         avoided: (N,) avoidance changed the setpoint.
@@ -54,12 +54,12 @@ class FilteredSetpoint(msgspec.Struct, frozen=True):
 
     setpoint: Array
     changed: Mask
-    blind: Mask
+    invalid_pose: Mask
     not_finite: Mask
     avoided: Mask
 
 
-class Safety:
+class SetpointFilter:
     """Checks setpoints of rows of any kinds."""
 
     def __init__(self, kinds: Sequence[Kind], limits: Limits) -> None:
@@ -84,7 +84,7 @@ class Safety:
         self._nobody: Mask = np.zeros(len(kinds), dtype=bool)
         self._sure = PoseValidity(True, *(self._nobody,) * 4, np.zeros(len(kinds)))
 
-    def where(self, position: Array, yaw: Array, age: Array) -> PoseValidity:
+    def validate_poses(self, position: Array, yaw: Array, age: Array) -> PoseValidity:
         """What poses are worth: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s]."""
         off = np.abs(position - self._centre)
         known = (np.abs(yaw) < ABSURD) & (age <= self.limits.own_silence_s)
@@ -94,7 +94,7 @@ class Safety:
         off = np.where(blind[:, None], 0.0, off)  # what is not known is not outside
         excess = np.maximum((off - self._half).max(axis=1), 0.0)
         walls = (off[:, :2] > self._half[:2]).any(axis=1) | (~blind & (position[:, 2] > self.limits.high[2]))
-        outside = np.asarray((off > self._half + ESCAPED).any(axis=1))
+        outside = np.asarray((off > self._half + OUTSIDE_M).any(axis=1))
         return PoseValidity(False, blind, np.asarray(walls), outside, excess > self.limits.cut_outside, excess)
 
     def check(  # noqa: PLR0917 - the four that always are, and those of avoidance
@@ -104,7 +104,7 @@ class Safety:
         yaw: Array,
         age: Array,
         avoidance: Avoidance | None = None,
-        own: Self | None = None,
+        own: OwnState | None = None,
         nearby: Nearby | None = None,
         where: PoseValidity | None = None,
     ) -> FilteredSetpoint:
@@ -120,7 +120,7 @@ class Safety:
             nearby: For it.
             where: What the pose is worth, if it has been asked already.
         """
-        where = self.where(position, yaw, age) if where is None else where
+        where = self.validate_poses(position, yaw, age) if where is None else where
         sane = np.abs(setpoint) < ABSURD
         nobody = self._nobody
         blind, wild = where.invalid, nobody
@@ -215,7 +215,7 @@ class Safety:
         return twist
 
 
-def _wished(avoidance: Avoidance, setpoint: Array, own: Self, nearby: Nearby) -> Array:
+def _wished(avoidance: Avoidance, setpoint: Array, own: OwnState, nearby: Nearby) -> Array:
     """What avoidance makes of setpoints (N, 4). It may be somebody's first: one that fails is named."""
     name = type(avoidance).__name__
     try:

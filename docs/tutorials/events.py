@@ -55,12 +55,12 @@ def by_hand(trace: Trace) -> tuple[float, float]:
     """Messages in a second and IAE [m s], mean over the followers."""
     net, duration = links_of(trace), float(trace.time[-1] - trace.time[0])
     position = trace.true_position
-    off = np.abs(net.distance - norm(position[:, net.listener] - position[:, net.speaker]))  # (T, E)
+    off = np.abs(net.distance - norm(position[:, net.receiver] - position[:, net.sender]))  # (T, E)
     rates, errors = [], []
     for row in range(len(trace.robots)):
-        if row in net.listener:  # the leader is not: it listens to nobody
+        if row in net.receiver:  # the leader is not: it listens to nobody
             rates.append(len(trace.sent_by(row)) / duration)
-            error = off[:, net.listener == row].sum(axis=1)
+            error = off[:, net.receiver == row].sum(axis=1)
             errors.append(np.trapezoid(error, trace.time))
     assert len(rates) == 6
     return float(np.mean(rates)), float(np.mean(errors))
@@ -150,7 +150,7 @@ show(pictures["intervals"], OUT / "events-intervals")
 # %%
 net = links_of(event)
 believed = beliefs(event, net)  # (T, E) [m]
-ground = np.array([not name.startswith("CF") for name in event.robots])[net.speaker]
+ground = np.array([not name.startswith("CF") for name in event.robots])[net.sender]
 worst_ground = float(np.nanmax(believed[:, ground]))
 print(f"worst belief of a ground robot {1e3 * worst_ground:.1f} mm, of a drone {1e3 * np.nanmax(believed):.1f} mm")
 within = (believed < DELTA).sum(axis=0) / np.isfinite(believed).sum(axis=0)  # unknown before the first message

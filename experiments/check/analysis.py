@@ -13,7 +13,7 @@ import numpy as np
 from agents.arrays import Array, Index, Mask, norm
 from agents.decision.assignment import Assignment
 from agents.decision.position_control import REACHED
-from agents.formation.changes import wanted
+from agents.formation.changes import changed_targets
 from agents.formation.graph import Links, components, edges
 from agents.formation.rigidity import Redundancy, Rigidity
 from agents.plugins.laws import Law
@@ -140,7 +140,7 @@ class Analysis:
     def follower(self) -> int | None:
         """The slowest row that follows the formation and no plan."""
         planned = [self.names.index(robot) for _, robot, _ in self.legs]
-        rows = np.setdiff1d(self.assignment.links.listener, planned)
+        rows = np.setdiff1d(self.assignment.links.receiver, planned)
         return int(rows[self.pull[rows].argmin()]) if len(rows) else None
 
     @property
@@ -169,10 +169,10 @@ class Analysis:
         time, position, pattern = self.prediction.time, self.prediction.position, self.pattern
         links, anchors, hz = pattern.links, self.assignment.anchors, self.experiment.rates.coordination_hz
         if pattern.changes:
-            links = wanted(links, pattern.changes, np.full(len(links), time[at]))
+            links = changed_targets(links, pattern.changes, np.full(len(links), time[at]))
         there, here = pattern.present(time[at : at + 1], position[at : at + 1]), position[at]
-        links = links if there is None else links.take(there[0])
-        offset = self.assignment.law.offset(here, here[links.speaker], links)
+        links = links if there is None else links.select(there[0])
+        offset = self.assignment.law.offset(here, here[links.sender], links)
         offset = offset if anchors is None else offset + anchors.offset(here)
         stands = norm(position[at] - position[max(0, at - round(WINDOW_S * hz))]) < STANDS
         wheels = np.array([not kind.flies for kind in self.assignment.kinds])
@@ -182,16 +182,16 @@ class Analysis:
     def link(self, number: int) -> str:
         """A link in words."""
         links = self.assignment.links
-        return f"{self.names[links.speaker[number]]} - {self.names[links.listener[number]]}"
+        return f"{self.names[links.sender[number]]} - {self.names[links.receiver[number]]}"
 
     def pair(self, number: int) -> str:
         """One of the pairs `edges(...)` of the links that stand at the beginning, in words."""
-        first, second = edges(self.asked.take(self.standing))[number]
+        first, second = edges(self.asked.select(self.standing))[number]
         return f"{self.names[first]} - {self.names[second]}"
 
     def link_path(self, number: int) -> Path:
         """Where a link stands in the file."""
-        wanted = self.assignment.links.listener[number], self.assignment.links.speaker[number]
+        wanted = self.assignment.links.receiver[number], self.assignment.links.sender[number]
         wanted_names = tuple(self.names[row] for row in wanted)
         return next(
             (("formation", "links", text) for text in self.experiment.formation.links if wanted_names in pairs(text)),
@@ -210,18 +210,18 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     aloft = start.copy()
     aloft[:, 2] = np.nan_to_num(assignment.hover)
     anchored = np.zeros(0, dtype=np.intp) if assignment.anchors is None else assignment.anchors.row
-    silent = np.setdiff1d(np.arange(rows), np.concatenate([links.listener, anchored]))
-    standing = np.ones(len(links), dtype=bool) if pattern.presence is None else pattern.presence.at_first()
+    silent = np.setdiff1d(np.arange(rows), np.concatenate([links.receiver, anchored]))
+    standing = np.ones(len(links), dtype=bool) if pattern.presence is None else pattern.presence.present_at_start()
     stages: list[list[Shape]] = []
     shape, planar, spatial, spare, loop = None, None, None, None, None
     asked = as_taken(assignment.law, links)
     if standing.any() or len(anchored):
         for at, wanted in zip((0.0, *(each.at + each.over for each in pattern.changes)), pattern.stages(), strict=True):
-            there = standing if pattern.presence is None else pattern.presence.planned(at)
+            there = standing if pattern.presence is None else pattern.presence.planned_at(at)
             stage = _shapes(experiment, assignment, as_taken(assignment.law, wanted), there, prediction, aloft, silent)
             stages.append(stage)
         shape = _best(stages[0])
-        here = asked.take(standing)
+        here = asked.select(standing)
         planar, spatial = stiffness(shape.position, here, silent, assignment.anchors)
         if planar.rigid and spatial is not None and rows <= MANY:
             spare = expendable(shape.position, here, silent)
@@ -269,7 +269,7 @@ def _shapes(  # noqa: PLR0917 - one caller
     silent: Index,
 ) -> list[Shape]:
     """Where the robots end, where they start, what the distances suggest, and random places, until one is exact."""
-    end, rows, links = prediction.position[-1], len(aloft), wanted.take(there)
+    end, rows, links = prediction.position[-1], len(aloft), wanted.select(there)
     moves = np.ones(rows, dtype=bool)
     moves[silent] = False
     rng = np.random.default_rng(experiment.seed)

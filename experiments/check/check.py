@@ -71,7 +71,7 @@ def telemetry(analysis: Analysis) -> Iterator[Claim]:
     experiment, links = analysis.experiment, analysis.plan.heard_links
     if not len(links):
         return
-    heard = np.bincount(links.listener)
+    heard = np.bincount(links.receiver)
     size = float(heard.max()) * experiment.rates.pose_hz / experiment.rates.state_hz * HEARD_BYTES
     if size > MAX_PAYLOAD:
         name = analysis.names[int(heard.argmax())]

@@ -192,15 +192,15 @@ def message_rate(
     position[..., :2] += _wobble(nature, (count, rows, 2), 1.0 / hz, rng)
     velocity, still = np.zeros((rows, 3)), np.zeros((rows, 3))
     voice = Transmitter(trigger, rows, predictor, kinds=kinds)
-    heard = position[:, links.speaker]
+    heard = position[:, links.sender]
     spoken = 0
     for tick in range(count):
         link_error = law.error(position[tick], heard[tick], links)
-        error, energy = links.onto_listeners(np.stack([link_error, 0.5 * link_error**2], axis=1), rows).T
+        error, energy = links.sum_by_receiver(np.stack([link_error, 0.5 * link_error**2], axis=1), rows).T
         t = float(time[tick])
         if tick:
             velocity = velocity_after(velocity, position[tick] - position[tick - 1], 1.0 / hz)
-        said = voice.speak(
+        said = voice.transmit(
             t, position[tick], velocity,
             error=error, energy=energy, start=np.zeros(rows), offset=still, setpoint=setpoint[tick],
         )  # fmt: skip

@@ -171,7 +171,7 @@ def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:
     """That robots on wheels which stand at sample `at` keep the formation from being acquired."""
     experiment, links = analysis.experiment, analysis.pattern.links
     off = np.flatnonzero(analysis.error[at] > experiment.tolerance)
-    ends = np.union1d(links.listener[off], links.speaker[off])
+    ends = np.union1d(links.receiver[off], links.sender[off])
     stopped = np.intersect1d(analysis.stopped(at), ends)
     if not len(stopped) or np.setdiff1d(ends, np.union1d(stopped, analysis.silent)).size:
         return None
@@ -233,7 +233,7 @@ def encounters(analysis: Analysis) -> Iterator[Claim]:
         below = (final[:, 2] < final[row, 2] - FORGIVEN) & (norm(final[:, :2] - final[row, :2]) < radius + radius[row])
         for under in np.flatnonzero(below):
             targets = ("formation", "links")
-            if ((links.listener == row) & (links.speaker == under)).any():
+            if ((links.receiver == row) & (links.sender == under)).any():
                 message = f"{names[row]} ends above {names[under]}, and goes aside before it lands"
                 yield Claim("note", "lands-beside", message, "", targets)
                 continue

@@ -74,7 +74,7 @@ def as_taken(law: Law, links: Links) -> Links:
 
 def residuals(links: Links, anchors: Anchors | None, position: Array) -> Residuals:
     """The equations at `position` (N, 3) [m]; of links as `as_taken` gives them."""
-    apart = position[links.listener] - position[links.speaker]
+    apart = position[links.receiver] - position[links.sender]
     wants = np.full(len(links), BY_DISTANCE) if links.wants is None else links.wants
     parts = [_of_lengths(apart, links, np.flatnonzero(wants == BY_DISTANCE))]
     if links.wants is not None and links.relative is not None and links.bearing is not None:
@@ -92,15 +92,13 @@ def residuals(links: Links, anchors: Anchors | None, position: Array) -> Residua
 
 def _of_lengths(apart: Array, links: Links, at: Index) -> Residuals:
     length = np.sqrt(np.einsum("ek,ek->e", apart[at], apart[at]) + TINY)
-    return Residuals(
-        length - links.distance[at], links.listener[at], links.speaker[at], apart[at, :2] / length[:, None]
-    )
+    return Residuals(length - links.distance[at], links.receiver[at], links.sender[at], apart[at, :2] / length[:, None])
 
 
 def _of_vectors(value: Array, slope: Array, links: Links, at: Index) -> Residuals:
     """Three equations of each link: its vector (K, 3) and the derivative of that (K, 3, 3)."""
     return Residuals(
-        value.reshape(-1), np.repeat(links.listener[at], 3), np.repeat(links.speaker[at], 3),
+        value.reshape(-1), np.repeat(links.receiver[at], 3), np.repeat(links.sender[at], 3),
         slope[:, :, :2].reshape(-1, 2),
     )  # fmt: skip
 
@@ -117,7 +115,7 @@ def _beside(apart: Array, bearing: Array) -> tuple[Array, Array]:
 
 
 def _of_anchors(anchors: Anchors, position: Array) -> Residuals:
-    away = anchors.away(position)
+    away = anchors.displacement(position)
     matrix = anchors.whole[:, None, None] * np.eye(3) + anchors.along[:, None, None] * (
         anchors.axis[:, :, None] * anchors.axis[:, None, :]
     )
@@ -163,7 +161,7 @@ class Shape:
 
 def link_errors(links: Links, position: Array) -> Array:
     """|‖p_i − p_j‖ − d_ij| (..., E) [m] of positions (..., N, 3)."""
-    offset = position[..., links.listener, :] - position[..., links.speaker, :]
+    offset = position[..., links.receiver, :] - position[..., links.sender, :]
     return np.asarray(np.abs(norm(offset) - links.distance))
 
 
@@ -182,7 +180,7 @@ def realise(links: Links, guesses: Iterable[Array], moves: Mask, anchors: Anchor
     found = []
     for guess in guesses:
         position = _fitted(links, anchors, guess, np.flatnonzero(moves))
-        error = Mixed().error(position, position[links.speaker], links)
+        error = Mixed().error(position, position[links.sender], links)
         found.append(Shape(position, error, np.zeros(0) if anchors is None else anchors.error(position)))
         if found[-1].worst < ENOUGH:
             break
@@ -197,9 +195,9 @@ def unfolded(links: Links, height: Array) -> Array:
     """
     rows = len(height)
     way = np.full((rows, rows), np.inf)
-    rise = height[links.listener] - height[links.speaker]
+    rise = height[links.receiver] - height[links.sender]
     far = np.sqrt(np.maximum(links.distance**2 - rise**2, 0.0))
-    way[links.listener, links.speaker] = np.where(np.isnan(far), 1.0, far)  # any length suits a direction
+    way[links.receiver, links.sender] = np.where(np.isnan(far), 1.0, far)  # any length suits a direction
     way = np.minimum(way, way.T)
     np.fill_diagonal(way, 0.0)
     for over in range(rows):
@@ -253,7 +251,7 @@ def conflicts(links: Links, height: Array) -> list[Conflict]:
     """Pairs and triangles of linked robots that cannot be met with the held heights (N,) [m]."""
     rows = len(height)
     wanted = np.full((rows, rows), np.nan)
-    wanted[links.listener, links.speaker] = links.distance
+    wanted[links.receiver, links.sender] = links.distance
     wanted = np.where(np.isnan(wanted), wanted.T, wanted)
     rise = np.abs(height[:, None] - height[None, :])
     found = []
@@ -311,7 +309,7 @@ def contradictions(links: Links) -> list[Contradiction]:
     above: dict[int, int] = {}
     neighbours: dict[int, list[tuple[int, Array]]] = {}
     for k in here.tolist():
-        i, j = int(links.listener[k]), int(links.speaker[k])
+        i, j = int(links.receiver[k]), int(links.sender[k])
         neighbours.setdefault(j, []).append((i, links.relative[k]))
         neighbours.setdefault(i, []).append((j, -links.relative[k]))
     for root in neighbours:
@@ -325,7 +323,7 @@ def contradictions(links: Links) -> list[Contradiction]:
                     queue.append(to)
     found = []
     for k in here.tolist():
-        i, j = int(links.listener[k]), int(links.speaker[k])
+        i, j = int(links.receiver[k]), int(links.sender[k])
         gap = float(norm((place[i] - place[j] - links.relative[k])[None, :2])[0])
         if gap > ROUNDED:
             found.append(Contradiction(_ring(i, j, above), k, gap))

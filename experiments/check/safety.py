@@ -9,7 +9,7 @@ import numpy as np
 
 from agents.arrays import norm
 from agents.plugins import registry
-from agents.safety.setpoint_filter import ESCAPED
+from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Claim, listed
 from experiments.definition import bodies
@@ -26,12 +26,12 @@ def safety(analysis: Analysis) -> Iterator[Claim]:
             "as soon as it is up"
         )
         yield Claim("warning", "battery", message, "raise battery_min above battery_low", ("safety", "battery_min"))
-    if chosen.cut_outside <= ESCAPED:
+    if chosen.cut_outside <= OUTSIDE_M:
         message = (
             f"motors are cut {chosen.cut_outside:g} m outside the arena, before a drone lands, which it does at "
-            f"{ESCAPED:g} m"
+            f"{OUTSIDE_M:g} m"
         )
-        yield Claim("warning", "cut-outside", message, f"raise it above {ESCAPED:g}", ("safety", "cut_outside"))
+        yield Claim("warning", "cut-outside", message, f"raise it above {OUTSIDE_M:g}", ("safety", "cut_outside"))
     for name, robot in analysis.experiment.robots.items():
         if robot.hover is not None and robot.hover > SLOW_M_S * chosen.landing_s:
             message = f"{name} may still be landing from {robot.hover:g} m when landing_s cuts its motors"
@@ -45,12 +45,10 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
     """Pairs that hear each other: at the start, as the formation wants them, and on their way."""
     names, path = tuple(analysis.experiment.robots), ("safety", "separation")
     links, heard = analysis.plan.links, analysis.plan.heard_links
-    pairs = sorted({tuple(sorted(pair)) for pair in zip(heard.listener.tolist(), heard.speaker.tolist(), strict=True)})
+    pairs = sorted({tuple(sorted(pair)) for pair in zip(heard.receiver.tolist(), heard.sender.tolist(), strict=True)})
     wanted = {
         tuple(sorted(pair)): distance
-        for *pair, distance in zip(
-            links.listener.tolist(), links.speaker.tolist(), links.distance.tolist(), strict=True
-        )
+        for *pair, distance in zip(links.receiver.tolist(), links.sender.tolist(), links.distance.tolist(), strict=True)
     }
     start, _ = bodies.start(analysis.experiment, names)
     quiet = True

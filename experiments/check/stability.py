@@ -62,7 +62,7 @@ def modes(
         within_s: Modes with a longer time constant than this are free [s].
     """
     anchored = np.zeros(0, dtype=np.intp) if anchors is None else anchors.row
-    listeners = np.unique(np.concatenate([links.listener, anchored]))
+    listeners = np.unique(np.concatenate([links.receiver, anchored]))
     share = np.repeat(closed[listeners], 2)
     slope = -_derivative(law, links, position, anchors, listeners)
     if not np.isfinite(slope).all():
@@ -70,7 +70,7 @@ def modes(
     # H M and H^½ M H^½ have the same eigenvalues, and the second is symmetric where M is
     root = np.sqrt(share)
     taken = root[:, None] * slope * root[None, :]
-    offset = law.offset(position, position[links.speaker], links)
+    offset = law.offset(position, position[links.sender], links)
     offset = offset if anchors is None else offset + anchors.offset(position)
     turned = np.stack([-offset[listeners, 1], offset[listeners, 0]], axis=1).ravel()
     expected = np.stack([0.0 * turned, 0.0 * turned, -root * turned], axis=1)
@@ -99,9 +99,9 @@ def _derivative(law: Law, links: Links, position: Array, anchors: Anchors | None
     rows, count = len(position), len(listeners)
     column = np.full(rows, -1)
     column[listeners] = np.arange(count)
-    heard = position[links.speaker]
+    heard = position[links.sender]
     blocks = np.zeros((count, 2, count, 2))
-    rank = np.arange(len(links)) - np.searchsorted(links.listener, links.listener)
+    rank = np.arange(len(links)) - np.searchsorted(links.receiver, links.receiver)
     for axis in (0, 1):
         step = np.zeros(3)
         step[axis] = STEP
@@ -113,7 +113,7 @@ def _derivative(law: Law, links: Links, position: Array, anchors: Anchors | None
             mine = rank == turn
             shift = mine[:, None] * step
             answer = law.offset(position, heard + shift, links) - law.offset(position, heard - shift, links)
-            listener, speaker = links.listener[mine], column[links.speaker[mine]]
+            listener, speaker = links.receiver[mine], column[links.sender[mine]]
             listens = speaker >= 0
             at = column[listener[listens]], speaker[listens]
             blocks[at[0], :, at[1], axis] += answer[listener[listens], :2] / (2.0 * STEP)

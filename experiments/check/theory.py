@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from agents.arrays import Index, Mask
-from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, components, reached
+from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, components, reachable
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Claim, Severity, listed
 from experiments.check.realisation import Conflict, Shape, conflicts, contradictions
@@ -31,22 +31,22 @@ def network(analysis: Analysis) -> Iterator[Claim]:
         return
     rows = len(names)
     sources = np.array([names.index(name) for name in leaders], dtype=np.intp)
-    listens = np.isin(np.arange(rows), links.listener)
+    listens = np.isin(np.arange(rows), links.receiver)
     anchors = analysis.assignment.anchors
     if anchors is not None and len(sources):  # who knows a place is led by it
         sources = np.union1d(sources, anchors.row)
     problems = []
     if len(sources):
-        lost = np.flatnonzero(~reached(links, rows, sources) & listens)
+        lost = np.flatnonzero(~reachable(links, rows, sources) & listens)
         if len(lost):
             who = listed([names[row] for row in lost])
             message = f"{who} cannot hear of the leader ({listed(leaders)}), neither directly nor through others"
             remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
             problems.append(Claim("error", "leader-unknown", message, remedy, path))
-    linked = np.union1d(links.listener, links.speaker)
+    linked = np.union1d(links.receiver, links.sender)
     parts = analysis.parts - (rows - len(linked))  # robots without links go their own way
     apart = analysis.experiment.avoidance is not None and len(leaders) >= analysis.parts
-    if parts > 1 and anchors is not None and reached(links, rows, anchors.row)[linked].all():
+    if parts > 1 and anchors is not None and reachable(links, rows, anchors.row)[linked].all():
         yield Claim("note", "parts", f"{parts} formations, each of which is anchored", "", path)
     elif parts > 1 and apart:
         message = f"{parts} formations that know of each other only to keep clear"
@@ -59,7 +59,7 @@ def network(analysis: Analysis) -> Iterator[Claim]:
         message = f"{listed(deaf)} hears nobody and is no leader: it takes no part in the formation"
         problems.append(Claim("warning", "hears-nobody", message, f'add "... > {deaf[0]}" to its links', path))
     for name in leaders:
-        if names.index(name) not in links.speaker:
+        if names.index(name) not in links.sender:
             message, remedy = f"nobody listens to the leader {name}", f'add "{name} > ..." for one of the others'
             problems.append(Claim("error" if len(leaders) == 1 else "warning", "leader-unheard", message, remedy, path))
     yield from problems
@@ -112,7 +112,7 @@ def _unmet(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
         yield Claim(severity, "anchor-not-realisable", message, remedy, ("formation", "anchors", name))
         return
     off = f"at best, {analysis.link(int(shape.error.argmax()))} is {1e3 * shape.worst:.1f} mm off"
-    rings = contradictions(analysis.asked.take(analysis.standing))
+    rings = contradictions(analysis.asked.select(analysis.standing))
     for ring in rings[:1]:
         names = [analysis.names[row] for row in ring.rows]
         way = f"around {listed([*names, names[0]], 8)}" if len(names) > 2 else f"between {names[0]} and {names[1]}"
@@ -149,19 +149,19 @@ def _measured(analysis: Analysis) -> Mask:
 
 
 def _by_distance(analysis: Analysis) -> Links:
-    return analysis.asked.take(_measured(analysis))
+    return analysis.asked.select(_measured(analysis))
 
 
 def _inside(analysis: Analysis, conflict: Conflict) -> Index:
     """The links by distance among the robots of a conflict."""
     links, rows = analysis.asked, conflict.rows
-    return np.flatnonzero(_measured(analysis) & np.isin(links.listener, rows) & np.isin(links.speaker, rows))
+    return np.flatnonzero(_measured(analysis) & np.isin(links.receiver, rows) & np.isin(links.sender, rows))
 
 
 def _pair(analysis: Analysis, link: int | np.intp) -> str:
     """The same words for both directions of a link."""
     links = analysis.assignment.links
-    i, j = sorted((int(links.speaker[link]), int(links.listener[link])))
+    i, j = sorted((int(links.sender[link]), int(links.receiver[link])))
     return f"{analysis.names[i]} - {analysis.names[j]}"
 
 
@@ -207,7 +207,7 @@ def presence(analysis: Analysis) -> Iterator[Claim]:
     there = pattern.present(prediction.time, prediction.position)
     if there is None or analysis.parts > 1:
         return
-    apart = np.array([components(pattern.links.take(mask), len(analysis.names)) for mask in _runs(there)])
+    apart = np.array([components(pattern.links.select(mask), len(analysis.names)) for mask in _runs(there)])
     begins = np.concatenate([[0], 1 + np.flatnonzero((there[1:] != there[:-1]).any(axis=1))])
     broken = np.flatnonzero(apart > 1)
     count = there.sum(axis=1)

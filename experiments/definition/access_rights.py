@@ -153,7 +153,7 @@ def heard(experiment: Experiment) -> dict[str, set[str]]:
     plan = Plan(experiment)
     links = plan.heard_links
     found: dict[str, set[str]] = {name: set() for name in plan.names}
-    for listener, speaker in zip(links.listener.tolist(), links.speaker.tolist(), strict=True):
+    for listener, speaker in zip(links.receiver.tolist(), links.sender.tolist(), strict=True):
         found[plan.names[listener]].add(plan.names[speaker])
     return found
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
 from agents.formation.anchors import Anchors
-from agents.formation.changes import Change, Presence, Reshaping, wanted
+from agents.formation.changes import Change, Presence, Reshaping, changed_targets
 from agents.formation.graph import BY_DISTANCE, Links
 from agents.plugins.laws import Distance, Law
 from experiments.definition.experiment import Anchor, Experiment
@@ -54,26 +54,26 @@ class FormationArrays:
 
     def take(self, which: Index) -> FormationArrays:
         """Some of the links, or the same in another order."""
-        changes = tuple(change.take(which) for change in self.changes)
+        changes = tuple(change.select(which) for change in self.changes)
         return FormationArrays(
-            self.links.take(which), changes, None if self.presence is None else self.presence.take(which)
+            self.links.select(which), changes, None if self.presence is None else self.presence.select(which)
         )
 
     def heard_by(self, rows: Index) -> FormationArrays:
         """The links on which these rows listen, as `Links.of` gives them."""
-        at, listener = self.links.heard_by(rows)
+        at, listener = self.links.indices_to_receivers(rows)
         mine = self.take(at)
-        return replace(mine, links=replace(mine.links, listener=listener))
+        return replace(mine, links=replace(mine.links, receiver=listener))
 
     def without_listeners(self, rows: Index) -> FormationArrays:
         """The links on which others than these rows listen."""
-        return self.take(np.flatnonzero(~np.isin(self.links.listener, rows))) if len(rows) else self
+        return self.take(np.flatnonzero(~np.isin(self.links.receiver, rows))) if len(rows) else self
 
     def and_then(self, others: Links) -> FormationArrays:
         """With other links behind them, which do not change and are always there."""
         changes = tuple(change.padded(len(others)) for change in self.changes)
         presence = None if self.presence is None else self.presence.padded(len(others))
-        return FormationArrays(self.links.and_then(others), changes, presence)
+        return FormationArrays(self.links.append(others), changes, presence)
 
     def repeated(self, times: int, rows: int) -> FormationArrays:
         """The same in `times` copies of an experiment of `rows` robots, one copy behind the other."""
@@ -83,7 +83,7 @@ class FormationArrays:
     def stages(self) -> list[Links]:
         """The links with their targets at the beginning, and after each change."""
         count, ends = len(self.links), [change.at + change.over + 1.0 for change in self.changes]
-        later = (wanted(self.links, self.changes[: k + 1], np.full(count, end)) for k, end in enumerate(ends))
+        later = (changed_targets(self.links, self.changes[: k + 1], np.full(count, end)) for k, end in enumerate(ends))
         return [self.links, *later]
 
     def present(self, time: Array, position: Array) -> Mask | None:
@@ -93,8 +93,8 @@ class FormationArrays:
         reshaping = Reshaping(self.links, (), self.presence)
         there = np.empty((len(time), len(self.links)), dtype=bool)
         for k, t in enumerate(time.tolist()):
-            reshaping.move(np.full(position.shape[1], t), position[k], position[k, self.links.speaker])
-            there[k] = reshaping.there
+            reshaping.advance(np.full(position.shape[1], t), position[k], position[k, self.links.sender])
+            there[k] = reshaping.present
         return there
 
 
@@ -109,7 +109,7 @@ def errors(law: Law, pattern: FormationArrays, time: Array, position: Array) -> 
     """
     links = pattern.links
     if isinstance(law, Distance) and not pattern.changes:
-        error = np.abs(norm(position[:, links.listener] - position[:, links.speaker]) - links.distance)
+        error = np.abs(norm(position[:, links.receiver] - position[:, links.sender]) - links.distance)
     else:
         step = max(1, AT_ONCE // max(1, len(links)))
         begins = range(0, len(time), step)
@@ -124,10 +124,10 @@ def _errors(law: Law, pattern: FormationArrays, time: Array, position: Array) ->
     many = links.repeated(count, rows)
     if pattern.changes:
         all_of_them = np.tile(np.arange(len(links)), count)
-        changes = [change.take(all_of_them) for change in pattern.changes]
-        many = wanted(many, changes, np.repeat(time, len(links)))
+        changes = [change.select(all_of_them) for change in pattern.changes]
+        many = changed_targets(many, changes, np.repeat(time, len(links)))
     flat = position.reshape(-1, 3)
-    return law.error(flat, flat[many.speaker], many).reshape(count, len(links))
+    return law.error(flat, flat[many.sender], many).reshape(count, len(links))
 
 
 def anchors_of(experiment: Experiment, names: Sequence[str], only: Sequence[str] | None = None) -> Anchors | None:

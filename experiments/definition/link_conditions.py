@@ -40,7 +40,7 @@ def virtual(experiment: Experiment, over: Links, seeds: Sequence[int], *, stream
 
     What else goes between the same robots has another `stream`, and its own luck.
     """
-    ends = _Ends.of(experiment, over.take(np.arange(len(over) // len(seeds))), tuple(experiment.robots))
+    ends = _Ends.of(experiment, over.select(np.arange(len(over) // len(seeds))), tuple(experiment.robots))
     return Conditions.side_by_side(_seeded(_of(experiment.channel, ends, experiment.duration_s), ends, seeds, stream))
 
 
@@ -78,7 +78,7 @@ class _Ends:
 
     @classmethod
     def of(cls, experiment: Experiment, links: Links, listeners: Sequence[str]) -> _Ends:
-        return cls(np.array(listeners)[links.listener], np.array(tuple(experiment.robots))[links.speaker])
+        return cls(np.array(listeners)[links.receiver], np.array(tuple(experiment.robots))[links.sender])
 
     def named(self, text: str) -> Mask:
         """Which links (E,) a text such as "A > B" or "A - B" means."""

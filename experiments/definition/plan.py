@@ -127,7 +127,7 @@ class Plan:
     @cached_property
     def heard_links(self) -> Links:
         """Every link on which robots receive poses: those for the formation, then those that only avoidance needs."""
-        return self.formation.without_listeners(self.rows(self.guided)).links.and_then(self.watched_links)
+        return self.formation.without_listeners(self.rows(self.guided)).links.append(self.watched_links)
 
     @cached_property
     def guided(self) -> tuple[str, ...]:
@@ -216,7 +216,7 @@ class Plan:
         others = [name for name in everyone if (name in steered) != centrally]
         mine = [name for name in names if name not in others]
         formation = self.formation.without_listeners(self.rows(others)).heard_by(rows)
-        watched = links([], [], []) if centrally else self.watched_links.of(rows)
+        watched = links([], [], []) if centrally else self.watched_links.to_receivers(rows)
         anchors = anchors_of(experiment, names, only=mine)
         only_watched = np.repeat([False, True], [len(formation.links), len(watched)])
         planned = [(row, self.legs[name]) for row, name in enumerate(names) if name in mine and name in self.legs]
@@ -231,7 +231,7 @@ class Plan:
             names=tuple(names) * copies,
             kinds=kinds(experiment, names) * copies,
             hover=np.tile(hover(experiment, names), copies),
-            speakers=everyone * copies,
+            robots=everyone * copies,
             links=formation.links,
             changes=formation.changes,
             presence=formation.presence,
@@ -245,8 +245,8 @@ class Plan:
             legs=tuple((row + first_rows, legs) for row, legs in planned),
             limits=self.limits(names, copies),
             avoidance=None if centrally else self.avoidance,
-            speaker_kinds=self.kinds * copies,
-            watched=np.tile(only_watched, copies) if len(watched) else None,
+            robot_kinds=self.kinds * copies,
+            avoidance_only=np.tile(only_watched, copies) if len(watched) else None,
             avoids=np.array([experiment.robots[name].avoids for name in names] * copies),
             body_hz=rates.body_hz,
             pose_every=round(rates.body_hz / rates.pose_hz),
@@ -254,10 +254,10 @@ class Plan:
             duration=experiment.duration_s,
             patience_s=experiment.start.deadline_s if experiment.start.missing == "go-on" else None,
             guided=np.array([name in steered for name in names] * copies) if steered else None,
-            waited_for=self._waited_for(formation.links, copies),
+            awaited=self._waited_for(formation.links, copies),
         )
 
     def _waited_for(self, links: Links, copies: int) -> Mask | None:
         """Links (E,) from robots that are not on standby; None if no robot is."""
         standby = np.array([robot.standby for robot in self.experiment.robots.values()] * copies)
-        return ~standby[links.speaker] if standby.any() else None
+        return ~standby[links.sender] if standby.any() else None

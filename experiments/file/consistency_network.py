@@ -195,7 +195,7 @@ def _heard(experiment: Experiment) -> set[tuple[str, str]] | None:
     except (ValueError, KeyError):
         return None
     names = tuple(experiment.robots)
-    return {(names[i], names[j]) for i, j in zip(links.listener.tolist(), links.speaker.tolist(), strict=True)}
+    return {(names[i], names[j]) for i, j in zip(links.receiver.tolist(), links.sender.tolist(), strict=True)}
 
 
 def _bursts(held: LinkEffects, path: Path, own: LinkEffects | LinkChannel) -> Iterator[Fault]:

@@ -39,7 +39,7 @@ def centre_hears(trace: Trace) -> Mask:
     rows = guided_rows(trace)
     net = trace.plan.links
     hears = rows.copy()
-    hears[net.speaker[rows[net.listener]]] = True
+    hears[net.sender[rows[net.receiver]]] = True
     return np.asarray(hears & rows.any())
 
 
@@ -64,7 +64,7 @@ def goals_to(trace: Trace) -> tuple[Index, Index]:
 def deliveries(trace: Trace, sent: Index) -> int:
     """Messages counted once for everybody who listens, when robots `sent` (N,) poses: to each other, to the centre, and
     the goals."""
-    listeners = np.bincount(trace.plan.heard_links.speaker, minlength=len(sent)) + centre_hears(trace)
+    listeners = np.bincount(trace.plan.heard_links.sender, minlength=len(sent)) + centre_hears(trace)
     return int(sent @ listeners) + (0 if trace.goals is None else len(trace.goals.sent))
 
 

@@ -112,7 +112,7 @@ def measure(trace: Trace) -> CaseMetrics:
         j2=sum(_cost(robot) for robot in robots),
         belief=tuple(
             Belief(names[i], names[j], _number(rms[k]), _number(largest[k]))
-            for k, (i, j) in enumerate(zip(errors.net.listener, errors.net.speaker, strict=True))
+            for k, (i, j) in enumerate(zip(errors.net.receiver, errors.net.sender, strict=True))
         ),
         belief_rms=_number(math.sqrt(mean_known(held.reshape(-1) ** 2))),
         belief_max=_number(largest.max(initial=-np.inf)),
@@ -182,12 +182,12 @@ def _robots(
     sent, recorded = transmissions(trace)
     size = np.bincount(trace.sent.link, weights=trace.sent.bytes, minlength=rows)
     linked = np.zeros((rows, rows), dtype=bool)  # what only avoidance listens to does not belong to the formation
-    told = centralised.guided_rows(trace)[errors.net.listener]  # what they would listen to, the centre hears
-    linked[errors.net.listener[~told], errors.net.speaker[~told]] = True
+    told = centralised.guided_rows(trace)[errors.net.receiver]  # what they would listen to, the centre hears
+    linked[errors.net.receiver[~told], errors.net.sender[~told]] = True
     net, received = trace.plan.heard_links, trace.received.link
-    counted = linked[net.listener, net.speaker][received]
-    heard = np.bincount(net.speaker[received[counted]], minlength=rows)
-    listeners = np.bincount(errors.net.speaker[~told], minlength=rows) + centralised.centre_hears(trace)
+    counted = linked[net.receiver, net.sender][received]
+    heard = np.bincount(net.sender[received[counted]], minlength=rows)
+    listeners = np.bincount(errors.net.sender[~told], minlength=rows) + centralised.centre_hears(trace)
     if trace.goals is not None:
         heard += trace.goals.received
     goals, goal_bytes, late = *centralised.goals_to(trace), centralised.delays(trace)
@@ -249,7 +249,7 @@ def _robots(
 def _short(trace: Trace, net: Links, row: int) -> float | None:
     """How far a robot that had a plan was from where that wanted it, at the end [m]; None: no plan, or not known."""
     began = [leg for leg in trace.experiment.timeline if leg.robot == trace.robots[row] and leg.at_s < trace.time[-1]]
-    if not began or row in net.listener:
+    if not began or row in net.receiver:
         return None
     return _number(float(norm(trace.goal[-1, row] - trace.position[-1, row])))
 

@@ -46,8 +46,8 @@ def own_links(net: Links, rows: int) -> Array:
     """Which links count for which robot (E, N): those on which it listens, or if there are none, is listened to."""
     link = np.arange(len(net))
     hears, heard = np.zeros((2, len(net), rows))
-    hears[link, net.listener] = 1.0
-    heard[link, net.speaker] = 1.0
+    hears[link, net.receiver] = 1.0
+    heard[link, net.sender] = 1.0
     return np.where(hears.any(axis=0), hears, heard)
 
 
@@ -117,7 +117,7 @@ class LinkErrors:
                 found.append((None, ""))
                 continue
             k = candidates[mean[candidates].argmax()]
-            other = self.net.speaker[k] if self.net.listener[k] == i else self.net.listener[k]
+            other = self.net.sender[k] if self.net.receiver[k] == i else self.net.receiver[k]
             found.append((float(mean[k]), names[other]))
         return found
 
@@ -206,8 +206,8 @@ def beliefs(trace: Trace, net: Links) -> Array:
     """
     rows, heard, links = len(trace.robots), trace.received, trace.plan.heard_links
     number = np.full((rows, rows), -1)
-    number[net.listener, net.speaker] = np.arange(len(net))
-    link = number[links.listener, links.speaker][heard.link]
+    number[net.receiver, net.sender] = np.arange(len(net))
+    link = number[links.receiver, links.sender][heard.link]
     error = np.full((len(trace.time), len(net)), np.nan)
     order = np.argsort(link, kind="stable")
     ends = np.searchsorted(link[order], np.arange(len(net) + 1))
@@ -220,7 +220,7 @@ def beliefs(trace: Trace, net: Links) -> Array:
         newest = mine[at]
         age = np.maximum(trace.time - heard.stamp[newest], 0.0)
         believed = trace.plan.predictor.position(heard.position[newest], heard.velocity[newest], age)
-        error[:, k] = norm(believed - trace.true_position[:, net.speaker[k]])
+        error[:, k] = norm(believed - trace.true_position[:, net.sender[k]])
         error[at < 0, k] = np.nan
     return error
 
@@ -266,7 +266,7 @@ def passages(trace: Trace) -> tuple[Passage, ...]:
     total = np.bincount(link, weights=took, minlength=count)
     longest = np.full(count, -np.inf)
     np.maximum.at(longest, link, took)
-    columns = zip(links.listener.tolist(), links.speaker.tolist(), heard.tolist(), dropped.tolist(), strict=True)
+    columns = zip(links.receiver.tolist(), links.sender.tolist(), heard.tolist(), dropped.tolist(), strict=True)
     return tuple(
         Passage(
             listener=trace.robots[i],

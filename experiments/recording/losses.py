@@ -67,7 +67,7 @@ def dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, float]) 
     """(E,) what the modelled network dropped on each of `Plan.heard_links`; `statuses` of each robot."""
     links, robots = plan.heard_links, plan.names
     found = [_by_speaker(said, run, "dropped") for said in statuses]
-    ends = zip(links.listener.tolist(), links.speaker.tolist(), strict=True)
+    ends = zip(links.receiver.tolist(), links.sender.tolist(), strict=True)
     return np.array([found[i][robots[j]] for i, j in ends], dtype=np.intp)
 
 

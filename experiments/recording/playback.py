@@ -318,7 +318,7 @@ def _sent(poses: list[list[SentPose]], start: float, duration: float) -> PoseTab
 def _received(states: list[list[State]], plan: Plan, start: float, duration: float) -> PoseTable:
     """On the links of the plan; other poses that a robot received count nowhere."""
     ends, names = plan.heard_links, plan.names
-    pairs = zip(ends.listener.tolist(), ends.speaker.tolist(), strict=True)
+    pairs = zip(ends.receiver.tolist(), ends.sender.tolist(), strict=True)
     links = {(receiver, names[sender]): link for link, (receiver, sender) in enumerate(pairs)}
     rows = [
         (links[row, each.speaker], each.seq, each.stamp, each.arrived, *each.position, *each.velocity, math.nan, 0)

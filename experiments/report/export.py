@@ -132,8 +132,8 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     arrays = ("time", "position", "yaw", "true_position", "goal", "setpoint")
     columns = [name for name, kind in get_type_hints(RobotMetrics).items() if _is_number(kind)]
     links = {
-        "listener": net.listener + 1,  # MATLAB counts from 1
-        "speaker": net.speaker + 1,
+        "listener": net.receiver + 1,  # MATLAB counts from 1
+        "speaker": net.sender + 1,
         "distance": net.distance,
         "gain": net.gain,
         "relative": net.relative,

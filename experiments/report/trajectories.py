@@ -67,7 +67,7 @@ def plan_view(traces: Sequence[Trace]) -> Figure:
         scenery.from_above(axes, trace.experiment)
         few, net = thinned(trace, len(traces)), links_of(trace)
         place, last = trace.true_position, last_known(trace)
-        for i, j in edges(net.listener, net.speaker):
+        for i, j in edges(net.receiver, net.sender):
             axes.plot(*last[[i, j], :2].T, color="#8a8a8a", linewidth=0.5, zorder=1)
         small = 3.0 if len(trace.robots) <= MANY else 2.0
         for i, line in enumerate(robot_lines(trace)):
@@ -150,7 +150,7 @@ def _draw_spatial(axes: Axes3D, trace: Trace, place: Array, columns: int) -> Non
     ends = place[len(place) - 1 - known[::-1].argmax(axis=0), np.arange(place.shape[1])]
     starts = place[known.argmax(axis=0), np.arange(place.shape[1])]
     net = links_of(trace)
-    pairs = edges(net.listener, net.speaker)
+    pairs = edges(net.receiver, net.sender)
     thin = (1.0 if len(trace.robots) <= MANY else 0.5) / math.sqrt(columns)
     for where, colour, width, order in ((starts, INK, 0.6, 1), (ends, MAGENTA, 0.9, 4)) if pairs else ():
         lines = [where[[i, j]] for i, j in pairs]

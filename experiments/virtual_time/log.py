@@ -266,7 +266,7 @@ class Logbook:
     def _heard_by_sample(self) -> dict[tuple[int, int], list[messages.Heard]]:
         names, got = self._log.names, self._received
         sample = np.searchsorted(self._log.time, got.arrival - ROUNDING_S)
-        listener, speaker = self._links.listener[got.link], self._links.speaker[got.link]
+        listener, speaker = self._links.receiver[got.link], self._links.sender[got.link]
         found: dict[tuple[int, int], list[messages.Heard]] = {}
         columns = (sample, listener, speaker, got.seq, got.stamp, got.arrival, got.position, got.velocity)
         for k, row, whose, number, taken, arrived, where, moves in zip(*(c.tolist() for c in columns), strict=True):
@@ -278,12 +278,12 @@ class Logbook:
         """The counters at the end of the run and at the end of everything."""
         log = self._log
         sent = self._counts(self._sent.link, self._sent.stamp)
-        heard = self._counts(self._links.listener[self._received.link], self._received.arrival)
+        heard = self._counts(self._links.receiver[self._received.link], self._received.arrival)
         unsafe = {each.row - self._mine.start: each.text for each in self._incidents() if each.outcome >= Outcome.LAND}
         for end, phase, done in ((self._experiment.duration_s, "landing", 0), (log.ended, "done", 1)):
             for row, name in enumerate(log.names):
-                mine = self._links.listener == row
-                each = zip(self._links.speaker[mine].tolist(), self._dropped[mine].tolist(), strict=True)
+                mine = self._links.receiver == row
+                each = zip(self._links.sender[mine].tolist(), self._dropped[mine].tolist(), strict=True)
                 yield messages.Status(
                     robot=name,
                     stamp=EPOCH + end,
@@ -293,7 +293,7 @@ class Logbook:
                     battery=None,
                     sent=int(sent[done][row]),
                     heard=int(heard[done][row]),
-                    lost={log.names[s]: 0 for s in self._links.speaker[mine].tolist()},
+                    lost={log.names[s]: 0 for s in self._links.sender[mine].tolist()},
                     dropped={log.names[s]: n for s, n in each if n},
                     malformed=0,
                     refused=0,

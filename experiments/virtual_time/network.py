@@ -33,7 +33,7 @@ class Channel:
         """`links` of all repetitions, those of the first seed first; each `stream` has its own luck."""
         self._channel = channel_model.Channel(link_conditions.virtual(experiment, links, seeds, stream=stream))
         self.instant = self._channel.instant
-        self._speaker = links.speaker
+        self._speaker = links.sender
         self._names = tuple(experiment.robots)
         self._encoding: messages.Encoding = experiment.network.encoding
 
@@ -118,13 +118,13 @@ class Steering:
 
     def __init__(self, experiment: Experiment, seeds: Sequence[int]) -> None:
         self.centre = Centre(Plan(experiment).centre_assignment(len(seeds)))
-        self.centre.mark_alive(self.centre.listens)  # all robots are there from the beginning
+        self.centre.mark_alive(self.centre.needed)  # all robots are there from the beginning
         self._sent: list[PoseTable] = []
         self._followed: list[PoseTable] = []
         self._received: list[PoseTable] = []
         rows = len(self.centre.guided)
         told = np.flatnonzero(self.centre.guided)
-        ends = [[(row, row) for row in group.tolist()] for group in (self.centre.listens, told)]
+        ends = [[(row, row) for row in group.tolist()] for group in (self.centre.needed, told)]
         self._poses, self._goals = (
             Channel(experiment, links(pairs), seeds, stream=stream)
             for pairs, stream in zip(ends, (TO_CENTRE, FROM_CENTRE), strict=True)
@@ -163,20 +163,20 @@ class Steering:
             rows = self._goals_of[arrived.link]
             assert arrived.extra is not None
             toward, rests = arrived.extra.T
-            news = agent.hear_goal(rows, arrived.position, toward, arrived.stamp)
+            news = agent.receive_goal(rows, arrived.position, toward, arrived.stamp)
             if news.any():
                 accepted = _bare(rows, arrived.seq, arrived.stamp, np.full(len(rows), t), rests[:, None])
                 self._followed.append(accepted.take(news))
 
     def decide(self, t: float, agent: Agent) -> None:
         """On a tick on which goals are decided: those of the robots that are guided."""
-        told = self.centre.decide(t, agent.life.phase, agent.life.start_at)
+        told = self.centre.decide(t, agent.lifecycle.phase, agent.lifecycle.start_at)
         rows = told.rows
         if not len(rows):
             return
         self._seq[rows] += 1
         self._goal[rows], self._extra[rows, 0], self._extra[rows, 1] = told.goal, told.yaw, told.pose_stamp
-        start, yaw = float(agent.life.start_at.min()), self._extra[:, 0]
+        start, yaw = float(agent.lifecycle.start_at.min()), self._extra[:, 0]
         self._goals.send(t, rows, self._seq, self._goal, self._still, yaw=yaw, start=start, extra=self._extra)
         now, still = np.full(len(rows), t), np.zeros((len(rows), 0))
         sent = PoseTable(rows, self._seq[rows], now, now, told.goal, still, told.yaw, extra=told.pose_stamp[:, None])
@@ -231,12 +231,12 @@ class VirtualNetwork:
         """
         agent, steering, instant = self._agent, self._steering, self._channel.instant
         self._deliver(t)
-        said = agent.speak(t, state)
+        said = agent.transmit(t, state)
         if len(said.rows):
             self._say(t, said, state.yaw)
             if instant:
                 self._deliver(t)
-        if steering is not None and agent.decides:
+        if steering is not None and agent.decision_due:
             steering.decide(t, agent)
             if instant:
                 steering.deliver(t, agent)
@@ -244,7 +244,7 @@ class VirtualNetwork:
 
     def _say(self, t: float, said: Transmission, yaw: Array) -> None:
         """Robots speak to those who listen. Before the common start nothing is lost."""
-        speak, start = said.rows, float(self._agent.life.start_at.min())
+        speak, start = said.rows, float(self._agent.lifecycle.start_at.min())
         self._seq[speak] += 1
         now = np.full(len(speak), t)
         if self._lean:

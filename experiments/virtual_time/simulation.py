@@ -161,10 +161,10 @@ def simulate(
         state = body.read(t)
         said = network.carry(t, state)
         actions = agent.act(t, state, said)
-        if actions.duties is not None:
-            body.takeoff(actions.duties.takeoff, assignment.hover[actions.duties.takeoff])
-            body.land(actions.duties.land)
-            body.stop(actions.duties.stop)
+        if actions.commands is not None:
+            body.takeoff(actions.commands.takeoff, assignment.hover[actions.commands.takeoff])
+            body.land(actions.commands.land)
+            body.stop(actions.commands.stop)
         body.command(actions.setpoint)
         if agent.decisions:
             if some(actions.changed):
@@ -174,7 +174,7 @@ def simulate(
         touches += twin.touches()
         if (agent.tick - 1) % log_every == 0:  # the agent's count begins anew at the common start
             tell(t - conductor.start_at)
-            whole = (agent.life.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
+            whole = (agent.lifecycle.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
             states.add(t, *((*blank, state.true_position, *blank) if lean else whole))
             more = () if lean else tuple(value for value in _extra(state) if value is not None)
             seen.add(nothing if lean else np.array(twin.engine.obstacles), *more)
@@ -239,14 +239,14 @@ class _Conductor:
         self._stage = Phase.READY
         self._since = 0.0
         self.airborne_at = self.start_at = np.nan
-        self.waited: Mask = np.zeros(len(agent.life.phase) // len(names), dtype=bool)
+        self.waited: Mask = np.zeros(len(agent.lifecycle.phase) // len(names), dtype=bool)
         self.over = False
 
     def look(self, t: float, dt: float) -> None:
         """After each tick."""
-        if self._agent.life.all_running:
+        if self._agent.lifecycle.all_running:
             return
-        phase = self._agent.life.phase
+        phase = self._agent.lifecycle.phase
         if self._stage == Phase.RUNNING:
             if phase.min() >= Phase.LANDING:
                 self._since, self._stage = t, Phase.DONE
@@ -258,13 +258,13 @@ class _Conductor:
             if t - self._since > PATIENCE_S:
                 late = np.flatnonzero(phase < self._stage)[: len(self._names)]
                 names = ", ".join(sorted({self._names[row % len(self._names)] for row in late}))
-                reason = self._agent.life.reason[late[0]]
+                reason = self._agent.lifecycle.reason[late[0]]
                 raise Stuck(f"not {self._stage.word} after {PATIENCE_S:g} s: {names} ({reason})")
             return
         if self._stage < Phase.RUNNING and not orders:
             return
         self._since = t
-        life = self._agent.life
+        life = self._agent.lifecycle
         if self._stage == Phase.READY:
             for row in range(len(phase)):
                 life.takeoff(row)

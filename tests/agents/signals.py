@@ -62,11 +62,11 @@ class Play:
         fired, before, after = [], [], []
         for k in range(len(signal.position)):
             t = k * dt
-            told = voice.told
+            told = voice.last_event
             known = np.isfinite(told.time)
             age = np.where(known, t - told.time, 0.0)
             held = predictor.position(told.position, told.velocity, age)
-            said = voice.speak(
+            said = voice.transmit(
                 t, signal.position[k], signal.velocity[k], error=signal.error[k], energy=signal.energy[k],
                 start=np.zeros(rows), offset=signal.offset[k],
             )  # fmt: skip
@@ -75,4 +75,4 @@ class Play:
             fired.append(now)
             after.append(np.where(now, 0.0, before[-1]))
         self.fired, self.gap_before, self.gap_after = np.array(fired), np.array(before), np.array(after)
-        self.told, self.state = voice.told, voice._state
+        self.last_event, self.state = voice.last_event, voice._state

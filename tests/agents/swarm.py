@@ -10,7 +10,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from agents.agent import Actions, Agent, links_by_speaker
+from agents.agent import Actions, Agent, links_by_sender
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
 from experiments.definition import bodies
@@ -30,7 +30,7 @@ class Group:
         self.agent = Agent(self.assignment)
         self.body = TwinBody(bodies.request(experiment, self.names, [experiment.seed]))
         self.agent.mark_alive(np.arange(len(self.assignment.links)))
-        self.by_speaker = links_by_speaker(self.assignment.links, self.assignment.speakers)
+        self.by_speaker = links_by_sender(self.assignment.links, self.assignment.robots)
         self.state: BodyState
         self.actions: Actions
 
@@ -51,7 +51,7 @@ class Group:
         # copies: without noise the measured position is the true one, in the same array
         self.state = self.spoil(t, replace(state, time=state.time.copy(), position=state.position.copy()))
         self.actions = agent.step(t, self.state)
-        duties = self.actions.duties
+        duties = self.actions.commands
         if duties is not None:
             body.stop(duties.stop)
             body.land(duties.land)
@@ -93,7 +93,7 @@ class Swarm:
 
     def phase(self, name: str) -> int:
         group, row = self.where[name]
-        return int(group.agent.life.phase[row])
+        return int(group.agent.lifecycle.phase[row])
 
     def row(self, name: str, what: str) -> np.ndarray:
         """What the last tick says of one robot."""
@@ -108,7 +108,7 @@ class Swarm:
         phases = [self.phase(name) for name in self.names]
         if min(phases) == READY:
             for group, row in self.where.values():
-                assert group.agent.life.takeoff(row) == ""
+                assert group.agent.lifecycle.takeoff(row) == ""
         elif min(phases) == AIRBORNE and self.start_at == np.inf:
             self.start_at = self.t + LEAD_S
             for group, row in self.where.values():
@@ -124,7 +124,7 @@ class Swarm:
             group.step(self.t)
         for name in self.names:  # in one order, however they are grouped
             group, row = self.where[name]
-            if row in group.actions.speak:
+            if row in group.actions.transmit:
                 self.sent.append((self.tick, name))
                 said = group.actions
                 self._flying.append((name, said.position[row].copy(), said.velocity[row].copy(), self.t))
@@ -135,7 +135,7 @@ class Swarm:
         def of(group: Group) -> np.ndarray:
             match what:
                 case "phase":
-                    return group.agent.life.phase
+                    return group.agent.lifecycle.phase
                 case "setpoint":
                     return group.actions.setpoint
                 case "position":

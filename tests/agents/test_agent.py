@@ -6,7 +6,7 @@ import pytest
 from agents.agent import Agent
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, IDLE, READY, RUNNING
-from agents.decision.neighbours import Heard
+from agents.decision.neighbours import NeighbourPoses
 from experiments.definition.experiment import Formation, Leg, Robot, Start
 from experiments.definition.plan import Plan
 from tests.agents.few import pair, triangle
@@ -32,10 +32,10 @@ def test_older_samples_than_known_are_left_out():
     say(agent, [1.0, 0.0, 0.0], 2.0)
     say(agent, [9.0, 9.0, 9.0], 1.0)
     say(agent, [9.0, 9.0, 9.0], 2.0)
-    np.testing.assert_array_equal(agent.heard.position, [[1.0, 0.0, 0.0]])
-    assert agent.heard.stamp[0] == 2.0
+    np.testing.assert_array_equal(agent.neighbour_poses.position, [[1.0, 0.0, 0.0]])
+    assert agent.neighbour_poses.stamp[0] == 2.0
     say(agent, [0.5, 0.0, 0.0], 2.5)
-    np.testing.assert_array_equal(agent.heard.position, [[0.5, 0.0, 0.0]])
+    np.testing.assert_array_equal(agent.neighbour_poses.position, [[0.5, 0.0, 0.0]])
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 2, 0], [0, 2, 1]])
@@ -46,17 +46,17 @@ def test_of_samples_that_arrive_together_the_newest_stays(order):
     for place, stamp in zip(places.tolist(), stamps.tolist(), strict=True):
         say(one_by_one, place, stamp)
     for agent in (together, one_by_one):
-        np.testing.assert_array_equal(agent.heard.position, [[3.0, 0.0, 0.0]])
-        assert agent.heard.stamp[0] == 3.0
+        np.testing.assert_array_equal(agent.neighbour_poses.position, [[3.0, 0.0, 0.0]])
+        assert agent.neighbour_poses.stamp[0] == 3.0
 
 
 def test_nothing_heard_is_nothing():
-    heard = Heard.nothing(2)
+    heard = NeighbourPoses.none_received(2)
     assert np.isnan(heard.position).all()
     assert (heard.stamp == -np.inf).all()
-    assert (heard.gone == -np.inf).all()
+    assert (heard.lost_since == -np.inf).all()
     heard.stamp[0] = 1.0
-    assert heard.arrived[0] == -np.inf
+    assert heard.arrival[0] == -np.inf
 
 
 def seen(t, position=(-0.4, 0.0, 0.0), **parts):
@@ -72,39 +72,39 @@ def seen(t, position=(-0.4, 0.0, 0.0), **parts):
 def test_who_misses_a_neighbour_is_not_ready_and_says_whom():
     agent = bare()
     agent.step(0.0, seen(0.0))
-    assert (agent.life.phase[0], agent.life.reason[0]) == (IDLE, "never heard B")
-    assert agent.missing(0) == ["B"]
+    assert (agent.lifecycle.phase[0], agent.lifecycle.reason[0]) == (IDLE, "never heard B")
+    assert agent.missing_neighbours(0) == ["B"]
     agent.step(0.01, seen(0.01, position=(np.nan, 0, 0)))
-    assert agent.life.reason[0] == "no position of its own"
+    assert agent.lifecycle.reason[0] == "no position of its own"
     agent.step(0.7, seen(0.1))
-    assert agent.life.reason[0] == "no position of its own"  # too old
+    assert agent.lifecycle.reason[0] == "no position of its own"  # too old
     say(agent, [0.4, 0.1, 0.0], 0.7)
     agent.step(0.71, seen(0.71))
-    assert (agent.life.phase[0], agent.life.reason[0]) == (READY, "")
-    assert agent.missing(0) == []
+    assert (agent.lifecycle.phase[0], agent.lifecycle.reason[0]) == (READY, "")
+    assert agent.missing_neighbours(0) == []
     agent.mark_lost(np.array([0]), 0.8)
-    assert agent.missing(0) == ["B"]
+    assert agent.missing_neighbours(0) == ["B"]
 
 
 def test_patience_ends():
     agent = bare(start=Start(deadline_s=2.0, missing="go-on"))
     agent.step(2.0, seen(2.0))
-    assert agent.life.phase[0] == IDLE
+    assert agent.lifecycle.phase[0] == IDLE
     agent.step(2.01, seen(2.01))
-    assert agent.life.phase[0] == READY
+    assert agent.lifecycle.phase[0] == READY
 
 
 def test_a_position_that_is_not_known_is_not_told():
     agent = bare()
-    assert not len(agent.step(0.0, seen(0.0, position=(np.nan, 0, 0))).speak)
-    assert np.isinf(agent.told.position).all()
-    assert len(agent.step(0.02, seen(0.02)).speak) == 0  # asked on every second tick
-    assert agent.step(0.03, seen(0.03)).speak.tolist() == [0]
+    assert not len(agent.step(0.0, seen(0.0, position=(np.nan, 0, 0))).transmit)
+    assert np.isinf(agent.last_transmission.position).all()
+    assert len(agent.step(0.02, seen(0.02)).transmit) == 0  # asked on every second tick
+    assert agent.step(0.03, seen(0.03)).transmit.tolist() == [0]
 
 
 def live(agent):
     """The links that take part in the decision."""
-    return agent.neighbours.live.tolist()
+    return agent.neighbours.active.tolist()
 
 
 def test_a_neighbour_that_is_gone_is_left_out_after_the_silence_and_back_when_found():
@@ -118,7 +118,7 @@ def test_a_neighbour_that_is_gone_is_left_out_after_the_silence_and_back_when_fo
     assert live(agent) == [0, 1]
     swarm.run(0.02)
     assert live(agent) == [1]
-    assert agent.missing(0) == ["B"]
+    assert agent.missing_neighbours(0) == ["B"]
     before = swarm.row("A", "goal")
     swarm.run(0.1)
     assert not np.array_equal(swarm.row("A", "goal"), before)  # it still follows C
@@ -135,7 +135,7 @@ def test_a_neighbour_that_is_gone_is_not_back_because_it_is_heard_again():
     swarm.step()
     assert live(agent) == [1]
     swarm.run(0.03)
-    assert agent.heard.arrived[0] > swarm.t - 0.03
+    assert agent.neighbour_poses.arrival[0] > swarm.t - 0.03
     assert live(agent) == [1]
 
 
@@ -146,7 +146,7 @@ def test_a_neighbour_never_heard_does_not_hide_one_that_is_gone():
     say(agent, [0.0, -0.5, 0.0], 0.1, at=1)  # C is heard, B never
     for tick in range(30):
         agent.step(0.01 * tick, seen(0.01 * tick))
-    assert agent.life.takeoff(0) == ""
+    assert agent.lifecycle.takeoff(0) == ""
     agent.step(0.3, seen(0.3))
     agent.step(0.31, seen(0.31))
     assert agent.start(0, 0.32) == ""
@@ -207,7 +207,7 @@ def test_hold_and_start_again():
     assert agent.start(0, 0.0) == ""
     swarm.run(0.2)
     assert not np.array_equal(swarm.row("A", "goal"), held)
-    assert agent.life.start_at[0] == swarm.start_at
+    assert agent.lifecycle.start_at[0] == swarm.start_at
 
 
 def test_another_row_that_arrives_in_the_air_does_not_move_a_place_that_is_held():
@@ -220,7 +220,7 @@ def test_another_row_that_arrives_in_the_air_does_not_move_a_place_that_is_held(
     agent = swarm.agent("A")
     swarm.run(0.05)
     for row in range(3):
-        assert agent.life.takeoff(row) == ""
+        assert agent.lifecycle.takeoff(row) == ""
     swarm.run(0.05)
     for row in range(2):
         assert agent.start(row, swarm.t) == ""
@@ -309,7 +309,7 @@ def test_who_joins_late_is_where_the_plan_is_now():
     swarm = Swarm(pair(robots=robots, formation=Formation(), timeline=[Leg(at_s=1.0, robot="L", plan=plan)]))
     swarm.run(0.05)
     agent = swarm.agent("L")
-    agent.life.takeoff(0)
+    agent.lifecycle.takeoff(0)
     swarm.run(0.05)
     begin = swarm.t - 3.0
     assert agent.start(0, begin) == ""

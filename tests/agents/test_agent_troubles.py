@@ -32,7 +32,7 @@ def test_a_drone_that_does_not_know_where_it_is_lands(what, grace, moment):
         swarm.until(AIRBORNE)
     else:
         swarm.run(0.02)
-        swarm.agent("F").life.takeoff(0)
+        swarm.agent("F").lifecycle.takeoff(0)
         swarm.run(0.8)
         assert swarm.phase("F") == READY
     (group,) = swarm.groups
@@ -41,7 +41,7 @@ def test_a_drone_that_does_not_know_where_it_is_lands(what, grace, moment):
         assert swarm.phase("F") < LANDING
         swarm.step()
     assert swarm.phase("F") == LANDING
-    assert group.agent.life.reason == ["its own position is lost"]
+    assert group.agent.lifecycle.reason == ["its own position is lost"]
     assert np.isnan(swarm.row("F", "setpoint")).all()
     for _ in range(500):
         swarm.step()
@@ -56,14 +56,14 @@ def test_a_drone_that_left_the_arena_lands(moment):
         swarm.running()
     else:
         swarm.run(0.02)
-        swarm.agent("F").life.takeoff(0)
+        swarm.agent("F").lifecycle.takeoff(0)
         swarm.run(0.5)
     blinded(swarm, "elsewhere", [2.2, 0.0, 0.5])  # the arena ends at 2 m
     swarm.run(0.1)
     assert swarm.phase("F") < LANDING
     blinded(swarm, "elsewhere", [2.3, 0.0, 0.5])
     swarm.step()
-    assert (swarm.phase("F"), swarm.agent("F").life.reason) == (LANDING, ["it left the arena"])
+    assert (swarm.phase("F"), swarm.agent("F").lifecycle.reason) == (LANDING, ["it left the arena"])
 
 
 def test_a_drone_whose_motors_stop_by_themselves_is_not_commanded_any_more():
@@ -77,7 +77,7 @@ def test_a_drone_whose_motors_stop_by_themselves_is_not_commanded_any_more():
 
     group.spoil = down
     swarm.step()
-    assert (swarm.phase("F"), group.agent.life.reason) == (LANDING, ["it came down by itself"])
+    assert (swarm.phase("F"), group.agent.lifecycle.reason) == (LANDING, ["it came down by itself"])
     swarm.step()  # the body is told to land, all the same
     assert np.isnan(swarm.row("F", "setpoint")).all()
     swarm.step()
@@ -112,7 +112,7 @@ def test_a_ground_robot_outside_the_arena_rolls_out():
     group.spoil = far
     swarm.run(0.5)
     assert [swarm.phase(name) for name in "AB"] == [DONE, RUNNING]
-    assert group.agent.life.reason[0] == "it left the arena"
+    assert group.agent.lifecycle.reason[0] == "it left the arena"
 
 
 def test_bodies_act_by_themselves_until_they_are_in_the_air_and_from_landing_on():

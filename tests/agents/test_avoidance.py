@@ -14,7 +14,7 @@ from agents.body.limits import Limits
 from agents.decision.lifecycle import RUNNING
 from agents.plugins.avoidance import Avoidance, Potential
 from agents.plugins.registry import AVOIDANCES, PluginError, build
-from agents.safety.setpoint_filter import Safety
+from agents.safety.setpoint_filter import SetpointFilter
 from experiments.definition.experiment import Experiment, Robot
 from experiments.definition.plan import Plan
 from tests.agents.things import NOTHING, near, own
@@ -98,7 +98,7 @@ class Wild(Avoidance, frozen=True):
 def judged(kinds, setpoint, answer, position, age=0.0):
     here = own(kinds, position)
     asked = np.array(setpoint, dtype=float)
-    return Safety(kinds, LIMITS).check(
+    return SetpointFilter(kinds, LIMITS).check(
         asked, here.position, here.yaw, np.full(len(kinds), age), Wild(answer=answer), here, NOTHING
     )
 
@@ -131,11 +131,11 @@ def test_setpoints_that_are_left_alone_are_the_same_bits():
     kinds = (CRAZYFLIE, TELLO, KHEPERA4) * 20
     here = own(kinds, rng.uniform(-2.1, 2.1, (60, 3)), yaw=rng.uniform(-3, 3, 60))
     setpoint = rng.uniform(-3, 3, (60, 4))
-    plain = Safety(kinds, LIMITS).check(setpoint, here.position, here.yaw, np.zeros(60))
+    plain = SetpointFilter(kinds, LIMITS).check(setpoint, here.position, here.yaw, np.zeros(60))
     answer = plain.setpoint.copy()
     answer[7, 0] += 0.01
     wild = Wild(answer=tuple(map(tuple, answer.tolist())))
-    verdict = Safety(kinds, LIMITS).check(setpoint, here.position, here.yaw, np.zeros(60), wild, here, NOTHING)
+    verdict = SetpointFilter(kinds, LIMITS).check(setpoint, here.position, here.yaw, np.zeros(60), wild, here, NOTHING)
     same = np.arange(60) != 7
     np.testing.assert_array_equal(verdict.setpoint[same], plain.setpoint[same])
     assert not verdict.avoided[same].any()
@@ -182,14 +182,14 @@ def running_pair(avoidance, gap=1.0, **parts):
         title="A pair", duration_s=60.0, robots=robots, avoidance={"kind": "barrier", "hears": "all"}, **parts
     )
     agent = Agent(replace(Plan(experiment).assignment(tuple(robots)), avoidance=avoidance))
-    agent.life.phase[:] = RUNNING
-    agent.life.start_at[:] = 0.0
+    agent.lifecycle.phase[:] = RUNNING
+    agent.lifecycle.start_at[:] = 0.0
     place = np.array([[0.0, 0.0, 0.0], [0.14 + gap, 0.0, 0.0]])
     still, nobody = np.zeros((2, 3)), np.zeros(2, dtype=bool)
     state = BodyState(np.zeros(2), place, still, np.zeros(2), place, np.zeros(2), np.ones(2), nobody)
     links = agent.assignment.links
     if len(links):
-        told = place[links.speaker]
+        told = place[links.sender]
         agent.mark_alive(np.arange(len(links)))
         agent.receive(np.arange(len(links)), told, still[: len(told)], np.zeros(len(told)), np.zeros(len(told)))
     return agent, state

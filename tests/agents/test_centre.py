@@ -29,7 +29,7 @@ class Desk:
 
     def __init__(self, experiment, copies=1, seed=3):
         self.centre = Centre(Plan(experiment).centre_assignment(copies))
-        self.centre.mark_alive(self.centre.listens)
+        self.centre.mark_alive(self.centre.needed)
         self.rows = len(self.centre.guided)
         rng = np.random.default_rng(seed)
         one = rng.uniform(-0.8, 0.8, (self.rows // copies, 3))
@@ -54,16 +54,16 @@ def test_it_decides_what_the_robots_would_to_the_last_bit(park, update):
     agent = Agent(Plan(park).assignment(tuple(park.robots)))
     links, rng = agent.assignment.links, np.random.default_rng(1)
     agent.mark_alive(np.arange(len(links)))
-    agent.life.phase[:] = AIRBORNE
-    agent.life.start_at[:] = 0.0
+    agent.lifecycle.phase[:] = AIRBORNE
+    agent.lifecycle.start_at[:] = 0.0
     still, place = np.zeros((7, 3)), desk.position.copy()
-    place[:, 2] = desk.centre.deciding.ground
+    place[:, 2] = desk.centre.goal_computer.ground
     sent = 0
     for tick in range(100):
         t = 0.01 * tick
         if tick % 10 == 0:
             place[:, :2] += rng.normal(0.0, 0.02, (7, 2))
-            agent.receive(np.arange(len(links)), place[links.speaker], still[links.speaker],
+            agent.receive(np.arange(len(links)), place[links.sender], still[links.sender],
                        np.full(len(links), t), np.full(len(links), t))  # fmt: skip
             desk.hear(range(7), t, place)
             told = desk.decide(t)
@@ -71,7 +71,7 @@ def test_it_decides_what_the_robots_would_to_the_last_bit(park, update):
             np.testing.assert_array_equal(told.pose_stamp, np.full(len(told.rows), t))
         state = BodyState(
             time=np.full(7, t), position=place.copy(), velocity=still, yaw=np.zeros(7), battery=np.full(7, NAN),
-            flying=desk.centre.deciding.ground > 0, true_position=place.copy(), true_yaw=np.zeros(7),
+            flying=desk.centre.goal_computer.ground > 0, true_position=place.copy(), true_yaw=np.zeros(7),
         )  # fmt: skip
         agent.step(t, state)
         np.testing.assert_array_equal(desk.centre.goal, agent.goal)
@@ -97,23 +97,23 @@ def test_older_poses_that_come_late_are_left_out(park):
     desk.hear([1], 1.1, [[0.7, 0, 0]], [0.85])
     assert desk.centre.poses.position[1, 0] == 0.3
     links = desk.centre.assignment.links
-    heard = desk.centre.deciding.hearing.heard
-    assert set(heard.position[links.speaker == 1, 0].tolist()) == {0.3}
-    assert set(heard.stamp[links.speaker == 1].tolist()) == {0.9}
+    heard = desk.centre.goal_computer.neighbours.poses
+    assert set(heard.position[links.sender == 1, 0].tolist()) == {0.3}
+    assert set(heard.stamp[links.sender == 1].tolist()) == {0.9}
 
 
 def test_who_waits_is_told_to_stay_once_all_his_neighbours_were_heard(park):
     desk = Desk(replaced(park, architecture="centralised"))
     desk.phase[:], desk.start[:] = IDLE, np.inf
     assert len(desk.decide(0.0).rows) == 0
-    assert desk.centre.missing().tolist() == list(range(7))
+    assert desk.centre.missing_robots().tolist() == list(range(7))
     desk.hear([0, 1, 2, 3, 5], 0.1)  # CF01 listens to CF03, whom nobody heard; so does CF02
     assert desk.decide(0.1).rows.tolist() == [0, 2, 3]  # KH01 (1) needs CF01
     desk.hear([4, 6], 0.2)
     told = desk.decide(0.2)
     assert told.rows.tolist() == list(range(7))
     wanted = desk.position.copy()
-    wanted[:, 2] = desk.centre.deciding.ground
+    wanted[:, 2] = desk.centre.goal_computer.ground
     np.testing.assert_array_equal(told.goal, wanted)
     assert desk.centre.decisions == 0
     desk.phase[:], desk.start[:] = AIRBORNE, 0.3
@@ -128,11 +128,11 @@ def test_who_is_gone_gets_no_goals_and_his_neighbours_go_on_without_him(park):
     assert desk.decide(0.0).rows.tolist() == list(range(7))
     desk.centre.mark_lost(np.array([6]), 0.1)
     assert desk.decide(0.1).rows.tolist() == list(range(6))
-    live = desk.centre.deciding.hearing
-    assert 6 in desk.centre.assignment.links.speaker[live.live]
+    live = desk.centre.goal_computer.neighbours
+    assert 6 in desk.centre.assignment.links.sender[live.active]
     desk.decide(1.2)
-    assert 6 not in desk.centre.assignment.links.speaker[live.live]
-    assert desk.centre.missing().tolist() == [6]
+    assert 6 not in desk.centre.assignment.links.sender[live.active]
+    assert desk.centre.missing_robots().tolist() == [6]
     desk.centre.mark_alive(np.array([6]))
     assert desk.decide(1.3).rows.tolist() == list(range(7))
 
@@ -155,8 +155,8 @@ def test_a_hybrid_listens_to_those_who_matter_and_guides_its_own(park):
     desk = Desk(replaced(park, architecture=Hybrid(kind="hybrid", robots=["CF03", "KH02"])))
     names = np.array(list(park.robots))
     assert names[desk.centre.guided].tolist() == ["KH02", "CF03"]
-    assert names[desk.centre.listens].tolist() == ["KH01", "KH02", "KH03", "CF01", "CF02", "CF03"]  # not the leader
-    desk.hear(desk.centre.listens, 0.0)
+    assert names[desk.centre.needed].tolist() == ["KH01", "KH02", "KH03", "CF01", "CF02", "CF03"]  # not the leader
+    desk.hear(desk.centre.needed, 0.0)
     assert names[desk.decide(0.0).rows].tolist() == ["KH02", "CF03"]
     desk.phase[6] = DONE
     assert names[desk.decide(0.1).rows].tolist() == ["KH02"]
@@ -187,7 +187,7 @@ def test_plans_begin_where_the_robots_did_though_the_centre_came_later(park):
     first.hear(range(7), 0.0)
     first.decide(0.0)
     first.hear([0], 23.0, [first.position[0] + [0.2, 0.0, 0.0]])
-    second.centre.begin(0, (*first.position[0, :2].tolist(), 0.0, 0.0))
+    second.centre.begin_plan(0, (*first.position[0, :2].tolist(), 0.0, 0.0))
     second.hear([*range(1, 7)], 23.0)
     assert 0 not in second.decide(22.9).rows  # where it is, nobody knows
     second.hear([0], 23.0, [first.position[0] + [0.2, 0.0, 0.0]])

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.clock import SLEW, STEP_S, Clock, said
+from agents.clock import SLEW, STEP_S, Clock, correction_line
 from agents.decision.neighbours import NeighbourStates
 from agents.formation.graph import links
 from agents.plugins.predictors import HOLD, ConstantVelocity, Predictor
@@ -31,7 +31,7 @@ def believed(stamp: float, predictor: Predictor) -> float:
     where = np.array([[SPEED * T, 0.0, 0.0]])
     at = np.array([0])
     hearing.receive(at, where, np.array([[SPEED, 0.0, 0.0]]), np.array([stamp]), np.array([T]))
-    return float(hearing.heard.believed(predictor, T + LATER, at)[0, 0])
+    return float(hearing.poses.extrapolate_position(predictor, T + LATER, at)[0, 0])
 
 
 def test_a_wrong_clock_moves_the_neighbours_of_those_who_predict():
@@ -93,7 +93,7 @@ def test_a_process_that_is_started_after_a_step_of_the_wall_clock_reads_the_cloc
 
 def test_a_clock_follows_what_it_is_told_smoothly_and_never_back():
     clock, now, stamps = Clock(-0.2), 0.0, []
-    clock.heed(said(-0.23).strip())
+    clock.follow(correction_line(-0.23).strip())
     for _ in range(1000):
         now += 0.01
         clock.slew(0.01)
@@ -111,7 +111,7 @@ def test_a_clock_follows_what_it_is_told_smoothly_and_never_back():
 )
 def test_nonsense_and_jumps_are_not_followed(line, capsys):
     clock = Clock(0.1)
-    clock.heed(line)
+    clock.follow(line)
     assert clock.slew(1.0) == 0.0
     assert capsys.readouterr().err.startswith("clock: ")
 
@@ -119,7 +119,7 @@ def test_nonsense_and_jumps_are_not_followed(line, capsys):
 @given(st.binary(max_size=60) | st.floats().map(lambda number: b"clock %r" % number))
 def test_whatever_is_told_moves_it_no_farther_than_drift_does(line):
     clock = Clock(0.1)
-    clock.heed(line)
+    clock.follow(line)
     assert abs(clock.slew(1.0)) <= SLEW
     for _ in range(200):
         clock.slew(1.0)

@@ -65,7 +65,7 @@ class Life:
             )
             self.agent.step(self.t, state)
             self.t += 0.01
-        assert self.agent.life.phase[0] == phase
+        assert self.agent.lifecycle.phase[0] == phase
 
 
 def test_a_leader_that_is_restarted_where_it_stands_does_not_drive_its_plan_a_second_time():
@@ -99,7 +99,7 @@ def test_the_plan_of_a_robot_that_listens_begins_where_its_first_leg_did():
 
 def test_a_start_with_an_origin_that_is_not_known_is_refused():
     life = Life(START, 0.0)
-    life.agent.life.phase[0] = AIRBORNE
+    life.agent.lifecycle.phase[0] = AIRBORNE
     start = messages.Order("start", at=UTC + life.t, origin=(0.0, math.nan, 0.0, 0.0))
     assert "origin" in life.order(start)
 
@@ -116,9 +116,9 @@ def test_a_start_that_is_repeated_does_not_move_the_ticks_of_a_robot_that_runs()
             for query, order in robot._orders[0].read():
                 robot._obey(0, query, order, robot._now)
 
-        robot.agent.life.phase[0] = AIRBORNE
+        robot.agent.lifecycle.phase[0] = AIRBORNE
         start(7.504)
         assert robot._next == pytest.approx(7.004)
-        robot.agent.life.phase[0] = RUNNING
+        robot.agent.lifecycle.phase[0] = RUNNING
         start(7.508)
         assert robot._next == pytest.approx(7.004)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, links
 from agents.plugins import registry
-from agents.plugins.laws import Bearing, Displacement, Distance, Mixed, goal, tracking
+from agents.plugins.laws import Bearing, Displacement, Distance, Mixed, goal_position, tracking_offset
 
 SEEDS = st.integers(0, 2**32 - 1)
 FEW = settings(max_examples=25)
@@ -32,7 +32,7 @@ def told_more(seed, wants=None):
     bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
     bearing[::3, 2] = np.nan
     asked = rng.choice([BY_DISTANCE, BY_RELATIVE, BY_BEARING], len(net)) if wants is None else np.full(len(net), wants)
-    return position, Links(net.listener, net.speaker, net.distance, net.gain, relative, bearing, asked)
+    return position, Links(net.receiver, net.sender, net.distance, net.gain, relative, bearing, asked)
 
 
 def slope_of(potential, position):
@@ -55,10 +55,10 @@ def rotation(seed):
 @given(SEEDS)
 def test_the_offset_is_minus_the_gradient_of_its_potential(seed):
     position, net = formation(seed)
-    heard = position[net.speaker] + 0.01  # not quite where the neighbours are
+    heard = position[net.sender] + 0.01  # not quite where the neighbours are
 
     def potential(place):
-        error = net.distance**2 - ((place[net.listener] - heard) ** 2).sum(axis=1)
+        error = net.distance**2 - ((place[net.receiver] - heard) ** 2).sum(axis=1)
         return (net.gain / 8.0 * error**2).sum()
 
     slope = np.zeros_like(position)
@@ -76,7 +76,7 @@ def test_the_offset_is_minus_the_gradient_of_its_potential(seed):
 @given(SEEDS)
 def test_turning_and_moving_the_world_turns_the_offset(seed):
     position, net = formation(seed)
-    heard = position[net.speaker] + 0.02
+    heard = position[net.sender] + 0.02
     turn, shift = rotation(seed), np.array([3.0, -2.0, 0.5])
     law = Distance()
     before, after = law.offset(position, heard, net), law.offset(position @ turn.T + shift, heard @ turn.T + shift, net)
@@ -90,10 +90,10 @@ def test_turning_and_moving_the_world_turns_the_offset(seed):
 @given(SEEDS)
 def test_at_the_distances_wanted_nothing_moves(seed):
     position, net = formation(seed)
-    heard = position[net.speaker]
+    heard = position[net.sender]
     reached = links(
-        list(zip(net.listener, net.speaker, strict=True)),
-        np.linalg.norm(position[net.listener] - heard, axis=1),
+        list(zip(net.receiver, net.sender, strict=True)),
+        np.linalg.norm(position[net.receiver] - heard, axis=1),
         net.gain,
     )
     np.testing.assert_allclose(Distance().offset(position, heard, reached), 0.0, atol=1e-13)
@@ -103,21 +103,21 @@ def test_at_the_distances_wanted_nothing_moves(seed):
 def test_a_pair_that_is_too_far_apart_closes_up():
     net = links([(0, 1), (1, 0)], [1.0, 1.0], [3.0, 1.0])
     position = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-    offset = Distance().offset(position, position[net.speaker], net)
+    offset = Distance().offset(position, position[net.sender], net)
     # 1/2 * 3 * (1 - 4) * (0 - 2) = 9, and 1/2 * 1 * (1 - 4) * 2 = -3
     np.testing.assert_array_equal(offset, [[9.0, 0.0, 0.0], [-3.0, 0.0, 0.0]])
-    np.testing.assert_array_equal(Distance().error(position, position[net.speaker], net), [1.0, 1.0])
+    np.testing.assert_array_equal(Distance().error(position, position[net.sender], net), [1.0, 1.0])
 
 
 def test_who_does_not_know_where_it_is_moves_nobody_else():
     position, net = formation(7)
-    heard = position[net.speaker]
+    heard = position[net.sender]
     whole = Distance().offset(position, heard, net)
     position[2] = np.nan
     part = Distance().offset(position, heard, net)
     others = np.arange(5) != 2
     np.testing.assert_array_equal(part[others], whole[others])
-    assert np.isnan(part[2]).all() == bool((net.listener == 2).any())
+    assert np.isnan(part[2]).all() == bool((net.receiver == 2).any())
 
 
 @pytest.mark.parametrize("name", registry.names(registry.LAWS))
@@ -126,13 +126,13 @@ def test_who_does_not_know_where_it_is_moves_nobody_else():
 def test_a_law_gives_each_row_what_it_gives_it_alone(name, seed):
     law = registry.build(registry.LAWS, name)
     position, net = told_more(seed)
-    heard = position[net.speaker] + 0.03
+    heard = position[net.sender] + 0.03
     whole, error = law.offset(position, heard, net), law.error(position, heard, net)
     assert (error >= 0.0).all()
     for row in range(len(position)):
-        mine, rows = net.listener == row, np.array([row])
-        np.testing.assert_array_equal(law.offset(position[rows], heard[mine], net.of(rows))[0], whole[row])
-        np.testing.assert_array_equal(law.error(position[rows], heard[mine], net.of(rows)), error[mine])
+        mine, rows = net.receiver == row, np.array([row])
+        np.testing.assert_array_equal(law.offset(position[rows], heard[mine], net.to_receivers(rows))[0], whole[row])
+        np.testing.assert_array_equal(law.error(position[rows], heard[mine], net.to_receivers(rows)), error[mine])
 
 
 # ---------------------------------------------------------------- relative positions, directions, and all together
@@ -143,7 +143,7 @@ def test_a_law_gives_each_row_what_it_gives_it_alone(name, seed):
 def test_a_linear_law_is_the_gradient_of_half_its_squared_errors(seed):
     for law, wants in ((Displacement(), BY_RELATIVE), (Bearing(), BY_BEARING)):
         position, net = told_more(seed, wants)
-        heard = position[net.speaker] + 0.01
+        heard = position[net.sender] + 0.01
 
         def potential(place, law=law, net=net, heard=heard):
             return (net.gain / 2.0 * law.error(place, heard, net) ** 2).sum()
@@ -155,12 +155,12 @@ def test_a_linear_law_is_the_gradient_of_half_its_squared_errors(seed):
 @given(SEEDS)
 def test_a_law_for_all_does_on_each_link_what_its_own_law_does(seed):
     position, net = told_more(seed)
-    heard = position[net.speaker] + 0.02
+    heard = position[net.sender] + 0.02
     total, error = np.zeros_like(position), np.zeros(len(net))
     for law, wants in ((Distance(), BY_DISTANCE), (Displacement(), BY_RELATIVE), (Bearing(), BY_BEARING)):
         mine = net.wants == wants
-        total += law.offset(position, heard[mine], net.take(mine))
-        error[mine] = law.error(position, heard[mine], net.take(mine))
+        total += law.offset(position, heard[mine], net.select(mine))
+        error[mine] = law.error(position, heard[mine], net.select(mine))
     np.testing.assert_allclose(Mixed().offset(position, heard, net), total, atol=1e-12)
     np.testing.assert_array_equal(Mixed().error(position, heard, net), error)
 
@@ -170,7 +170,7 @@ def test_a_law_for_all_does_on_each_link_what_its_own_law_does(seed):
 def test_what_a_law_does_not_see(seed):
     """Displacement is blind for a shift; bearing for a shift and a growth, and seen from above also for heights."""
     position, net = told_more(seed)
-    heard, shift = position[net.speaker], np.array([3.0, -2.0, 0.5])
+    heard, shift = position[net.sender], np.array([3.0, -2.0, 0.5])
     for law in (Displacement(), Bearing(), Mixed(dead_zone=0.1)):
         np.testing.assert_allclose(
             law.offset(position + shift, heard + shift, net), law.offset(position, heard, net), atol=1e-12
@@ -189,15 +189,15 @@ def test_what_a_law_does_not_see(seed):
 @given(SEEDS)
 def test_where_everything_is_met_nothing_moves(seed):
     position, net = told_more(seed)
-    heard = position[net.speaker]
-    apart = position[net.listener] - heard
+    heard = position[net.sender]
+    apart = position[net.receiver] - heard
     length = np.linalg.norm(apart, axis=1)
     flat = apart.copy()
     flat[:, 2] = np.nan
     flat[:, :2] /= np.linalg.norm(flat[:, :2], axis=1, keepdims=True)
     above = np.isnan(net.bearing[:, 2])[:, None]
     met = Links(
-        net.listener, net.speaker, length, net.gain, apart, np.where(above, flat, apart / length[:, None]), net.wants
+        net.receiver, net.sender, length, net.gain, apart, np.where(above, flat, apart / length[:, None]), net.wants
     )
     for law in (Distance(), Displacement(), Bearing(), Mixed()):
         np.testing.assert_allclose(law.offset(position, heard, met), 0.0, atol=1e-13)
@@ -207,17 +207,17 @@ def test_where_everything_is_met_nothing_moves(seed):
 def test_consensus_is_displacement_by_nothing_and_meets_in_the_middle():
     pairs = [(i, j) for i in range(4) for j in range(4) if i != j]
     net = links(pairs, [0.0] * 12, [0.1] * 12)
-    net = Links(net.listener, net.speaker, net.distance, net.gain, np.zeros((12, 3)), None, np.full(12, BY_RELATIVE))
+    net = Links(net.receiver, net.sender, net.distance, net.gain, np.zeros((12, 3)), None, np.full(12, BY_RELATIVE))
     position = np.random.default_rng(3).uniform(-1, 1, (4, 3))
     middle = position.mean(axis=0)
     for _ in range(60):
-        position = position + Displacement().offset(position, position[net.speaker], net)
+        position = position + Displacement().offset(position, position[net.sender], net)
     np.testing.assert_allclose(position, np.tile(middle, (4, 1)), atol=1e-12)
 
 
 def test_robots_on_the_wrong_side_of_a_direction_turn_round():
     net = links([(1, 0)], [1.0], [1.0])
-    net = Links(net.listener, net.speaker, net.distance, net.gain, None, np.array([[1.0, 0.0, np.nan]]), None)
+    net = Links(net.receiver, net.sender, net.distance, net.gain, None, np.array([[1.0, 0.0, np.nan]]), None)
     ahead, behind = np.array([[0, 0, 0], [0.5, 0.2, 0.7]]), np.array([[0, 0, 0], [-0.5, 0.2, 0.7]])
     heard = np.zeros((1, 3))
     np.testing.assert_allclose(Bearing().offset(ahead, heard, net)[1], [0.0, -0.2, 0.0], atol=1e-15)
@@ -243,7 +243,7 @@ def turning(law, disagree, steps=3000):
     position = np.stack([np.cos(angle), np.sin(angle), np.zeros(3)], axis=1) * 0.4
     facing = []
     for _ in range(steps):
-        position = position + law.offset(position, position[net.speaker], net)
+        position = position + law.offset(position, position[net.sender], net)
         facing.append(np.arctan2(*(position[0] - position.mean(axis=0))[1::-1]))
     late = np.unwrap(facing)[-100:]
     sides = np.linalg.norm(position - np.roll(position, 1, axis=0), axis=1)
@@ -266,17 +266,17 @@ def test_robots_that_disagree_turn_for_ever_unless_a_dead_zone_spans_what_they_d
 def test_tracking_is_the_paper_s_cubic_pull(seed):
     rng = np.random.default_rng(seed)
     position, target, gain = rng.normal(size=(4, 3)), rng.normal(size=(4, 3)), rng.uniform(0.1, 5.0, 4)
-    pull = tracking(position, target, gain)
+    pull = tracking_offset(position, target, gain)
     for i in range(4):
         away = position[i] - target[i]
         np.testing.assert_allclose(pull[i], -0.5 * gain[i] * (away @ away) * away, rtol=1e-12)
-    np.testing.assert_allclose(tracking(position, target, 2.0)[1], pull[1] * 2.0 / gain[1], rtol=1e-12)
+    np.testing.assert_allclose(tracking_offset(position, target, 2.0)[1], pull[1] * 2.0 / gain[1], rtol=1e-12)
 
 
 def test_tracking_ignores_rows_without_a_target():
     position = np.ones((2, 3))
     target = np.array([[np.nan, np.nan, np.nan], [0.0, 0.0, 1.0]])
-    np.testing.assert_array_equal(tracking(position, target, 2.0), [[0, 0, 0], [-2, -2, 0]])
+    np.testing.assert_array_equal(tracking_offset(position, target, 2.0), [[0, 0, 0], [-2, -2, 0]])
 
 
 @FEW
@@ -284,7 +284,7 @@ def test_tracking_ignores_rows_without_a_target():
 def test_the_goal_is_within_the_clamp_on_every_axis(seed, limit):
     rng = np.random.default_rng(seed)
     position, offset = rng.normal(size=(6, 3)), rng.normal(size=(6, 3))
-    step = goal(position, offset, limit) - position
+    step = goal_position(position, offset, limit) - position
     assert (np.abs(step) <= limit + 1e-12).all()
     free = np.abs(offset) < limit
     np.testing.assert_allclose(step[free], offset[free], atol=1e-12)

@@ -30,7 +30,7 @@ def eventful(experiment, groups):
     assert group.agent.start(row, 0.0) == ""
     swarm.run(0.5)
     group, row = swarm.where["CF02"]
-    group.agent.life.land(row, "told to")
+    group.agent.lifecycle.land(row, "told to")
     swarm.run(0.5)
     swarm.until(DONE)
     return swarm

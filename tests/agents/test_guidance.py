@@ -42,7 +42,7 @@ class Bench:
         for _ in range(count):
             rows = len(self.position)
             still, flying = np.zeros((rows, 3)), np.array([False, True])[:rows]
-            life, position = self.agent.life, self.position.copy()
+            life, position = self.agent.lifecycle, self.position.copy()
             position[(life.phase <= READY) & ~life.active, 2] = 0.0  # on the floor, until it is told to climb
             state = BodyState(
                 time=np.full(rows, self.t), position=position, velocity=still, yaw=np.zeros(rows),
@@ -55,14 +55,14 @@ class Bench:
     def told(self, rows, goal, *, stamp=None, toward=NAN):
         count = len(rows)
         stamps = np.full(count, self.t if stamp is None else stamp)
-        return self.agent.hear_goal(np.array(rows), np.array(goal, dtype=float), np.full(count, toward), stamps)
+        return self.agent.receive_goal(np.array(rows), np.array(goal, dtype=float), np.full(count, toward), stamps)
 
     def running(self):
         rows = range(len(self.position))
         self.told(list(rows), self.position)
         self.step()
         for row in rows:
-            assert self.agent.life.takeoff(row) == ""
+            assert self.agent.lifecycle.takeoff(row) == ""
         self.step(2)
         for row in rows:
             assert self.agent.start(row, self.t) == ""
@@ -71,18 +71,18 @@ class Bench:
 
     @property
     def phases(self):
-        return self.agent.life.phase.tolist()
+        return self.agent.lifecycle.phase.tolist()
 
 
 def test_it_is_ready_when_the_centre_has_spoken():
     bench = Bench(pair()).step()
     assert bench.phases == [IDLE, IDLE]
-    assert bench.agent.life.reason == ["never heard centre"] * 2
-    assert bench.agent.missing(0) == ["centre"]
+    assert bench.agent.lifecycle.reason == ["never heard centre"] * 2
+    assert bench.agent.missing_neighbours(0) == ["centre"]
     bench.told([0], [[0.0, 0.0, 0.0]])
     bench.step()
     assert bench.phases == [READY, IDLE]
-    assert bench.agent.missing(0) == []
+    assert bench.agent.missing_neighbours(0) == []
 
 
 def test_without_a_centre_it_goes_on_after_the_deadline_where_the_file_says_so():
@@ -95,7 +95,7 @@ def test_nothing_is_pursued_before_the_start():
     bench = Bench(pair())
     bench.told([0, 1], [[1.0, 0.0, 0.0], [1.0, 0.0, 0.8]])
     bench.step()
-    assert bench.agent.life.takeoff(0) == bench.agent.life.takeoff(1) == ""
+    assert bench.agent.lifecycle.takeoff(0) == bench.agent.lifecycle.takeoff(1) == ""
     bench.step(3)
     assert bench.phases == [AIRBORNE, AIRBORNE]
     np.testing.assert_array_equal(bench.agent.goal, [[-0.4, 0.0, 0.0], [0.4, 0.1, 0.8]])
@@ -108,7 +108,7 @@ def test_a_goal_is_pursued_on_the_tick_on_which_it_comes():
     assert bench.told([0, 1], [[-0.3, 0.1, 0.7], [0.5, 0.2, 0.7]], toward=0.5).all()
     bench.step()
     np.testing.assert_array_equal(bench.agent.goal, [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.7]])  # the Khepera has no height
-    assert bench.agent.toward.tolist() == [0.5, 0.5]
+    assert bench.agent.goal_yaw.tolist() == [0.5, 0.5]
     np.testing.assert_array_equal(bench.actions.setpoint[1], [0.5, 0.2, 0.7, 0.5])
     assert (bench.agent.updates - before).tolist() == [1, 1]
     bench.step(5)
@@ -136,7 +136,7 @@ def test_an_old_goal_is_none_and_the_robot_stays_where_it_is_then():
         bench.step()
     bench.step()
     np.testing.assert_array_equal(bench.agent.goal, [[-0.35, 0.0, 0.0], [0.5, 0.25, 0.8]])  # the other has a fresh one
-    assert np.isnan(bench.agent.toward[0])
+    assert np.isnan(bench.agent.goal_yaw[0])
     bench.position[0] = [-0.34, 0.01, 0.0]
     bench.step(5)
     np.testing.assert_array_equal(bench.agent.goal[0], [-0.35, 0.0, 0.0])  # drift does not move the place
@@ -152,7 +152,7 @@ def test_a_dead_centre_stops_all_that_it_guides_at_once():
     bench.agent.guidance.mark_lost(bench.t)
     bench.step()
     np.testing.assert_array_equal(bench.agent.goal, bench.position)
-    assert bench.agent.missing(1) == ["centre"]
+    assert bench.agent.missing_neighbours(1) == ["centre"]
     assert bench.phases == [RUNNING, RUNNING]
     bench.agent.guidance.mark_alive()
     bench.step()  # back in time: the last goal is still young
@@ -173,7 +173,7 @@ def test_orders_are_obeyed_whatever_the_centre_says():
     assert bench.agent.start(0, 0.0) == ""
     bench.step()
     np.testing.assert_array_equal(bench.agent.goal[0], [-0.3, 0.1, 0.0])
-    bench.agent.life.land(1, "told to")
+    bench.agent.lifecycle.land(1, "told to")
     bench.told([1], [[0.6, 0.2, 0.8]])
     bench.step()
     assert bench.phases == [RUNNING, LANDING]
@@ -202,19 +202,19 @@ def test_safety_has_the_last_word_on_goals_too():
 def test_who_is_guided_listens_to_nobody_but_to_keep_clear():
     assert len(Plan(pair()).assignment(["A", "B"]).links) == 0
     told = Plan(pair(avoidance={"kind": "barrier", "hears": "neighbours"})).assignment(["A"])
-    assert told.watched.tolist() == [True]
-    assert told.speakers[told.links.speaker[0]] == "B"
+    assert told.avoidance_only.tolist() == [True]
+    assert told.robots[told.links.sender[0]] == "B"
 
 
 def test_in_a_hybrid_only_the_others_have_a_law_of_their_own():
     hybrid = pair(architecture=Hybrid(kind="hybrid", robots=["B"]))
     told = Plan(hybrid).assignment(["A", "B"])
     assert told.guided.tolist() == [False, True]
-    assert told.links.listener.tolist() == [0]
-    assert told.links.speaker.tolist() == [1]
+    assert told.links.receiver.tolist() == [0]
+    assert told.links.sender.tolist() == [1]
     assert (
         not Agent(Plan(hybrid).assignment(["A"]))
-        .hear_goal(np.array([0]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+        .receive_goal(np.array([0]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
         .any()
     )  # who decides for himself takes no goals
 
@@ -229,6 +229,6 @@ def test_rows_are_guided_each_for_itself():
         one.receive(np.array([0]), goal[2:], np.zeros(1), np.array([t]))
         np.testing.assert_array_equal(many.goal[2], one.goal[0])
         for now in (t, t + 0.7, t + 2.0):
-            assert many.lacking(now)[2] == one.lacking(now)[0]
+            assert many.unguided(now)[2] == one.unguided(now)[0]
     assert np.isnan(many.goal[1]).all()
-    assert not many.lacking(99.0)[1]
+    assert not many.unguided(99.0)[1]

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from agents.body.limits import Limits, Safety
 from agents.decision.lifecycle import AIRBORNE, DONE, LANDING, READY, RUNNING
-from agents.safety.detection import LATE_SHARE, SILENT_S, ProcessHealth, lean, leaning
-from agents.safety.hazards import RULES, Cause, Hazards, Outcome, Sighting, rules
+from agents.safety.detection import LATE_SHARE, SILENT_S, ProcessHealth, tilt_angle, tilted
+from agents.safety.hazards import RULES, Cause, Hazards, Observation, Outcome, rules
 from agents.safety.landing import PATIENCE_S
 from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import drone, pair, triangle
@@ -38,8 +38,8 @@ class Bench:
 
     def see(self, seconds, *causes, rows=ALL, active=ALL, landing=NONE):
         for _ in range(round(seconds / self.dt)):
-            seen = [Sighting(cause, rows, lambda row: f"number {row}") for cause in causes]
-            self.acts += self.hazards.assess(self.t, seen, active, landing)
+            seen = [Observation(cause, rows, lambda row: f"number {row}") for cause in causes]
+            self.acts += self.hazards.update(self.t, seen, active, landing)
             self.tick += 1
         return self
 
@@ -287,7 +287,7 @@ def test_two_that_nearly_touch_land():
     swarm.step()
     swarm.step()
     assert swarm.phase("A") >= LANDING
-    assert swarm.agent("A").life.reason == ["far too near to another robot"]
+    assert swarm.agent("A").lifecycle.reason == ["far too near to another robot"]
     assert swarm.phase("B") == RUNNING  # it knows better where it is itself
 
 
@@ -320,13 +320,13 @@ def test_without_a_router_it_holds_and_then_lands():
     assert happened(swarm)["F"] == ["hold: no connection to a router: for 1.0 s"]
     assert swarm.phase("F") == RUNNING
     swarm.run(0.15)
-    assert (swarm.phase("F"), swarm.agent("F").life.reason) == (LANDING, ["no connection to a router"])
+    assert (swarm.phase("F"), swarm.agent("F").lifecycle.reason) == (LANDING, ["no connection to a router"])
 
 
 @pytest.mark.parametrize(("choice", "phase"), [("finish", RUNNING), ("land", LANDING)])
 def test_without_a_conductor(choice, phase):
     swarm = drone(safety=Safety(lost_conductor=choice)).running().run(0.2)
-    swarm.agent("F").health.unattended_since = swarm.t
+    swarm.agent("F").health.conductor_lost_since = swarm.t
     swarm.run(1.9)
     assert happened(swarm)["F"] == []
     swarm.run(0.2)
@@ -337,51 +337,51 @@ def test_without_a_conductor(choice, phase):
 def test_a_control_loop_that_hardly_runs_holds_and_then_lands():
     outside = ProcessHealth()
     for _ in range(500):
-        outside.ticked(4, DT)
-    assert outside.late == pytest.approx(0.8)  # 20 Hz is slow, not hopeless
-    outside.ticked(500, DT)  # 5 s of nothing
-    assert outside.late > LATE_SHARE
+        outside.count_tick(4, DT)
+    assert outside.missed_share == pytest.approx(0.8)  # 20 Hz is slow, not hopeless
+    outside.count_tick(500, DT)  # 5 s of nothing
+    assert outside.missed_share > LATE_SHARE
     for _ in range(20):
-        outside.ticked(0, DT)
-    assert outside.late < LATE_SHARE
+        outside.count_tick(0, DT)
+    assert outside.missed_share < LATE_SHARE
     for _ in range(2000):
-        outside.ticked(0, DT)
-    assert outside.late == 0.0
+        outside.count_tick(0, DT)
+    assert outside.missed_share == 0.0
     swarm = drone().running().run(0.2)
     agent = swarm.agent("F")
     for _ in range(30):
-        agent.health.ticked(30, DT)
+        agent.health.count_tick(30, DT)
         swarm.tick += 30
         swarm.step()
     assert swarm.phase("F") >= LANDING
-    assert agent.life.reason == ["its control loop misses its ticks"]
+    assert agent.lifecycle.reason == ["its control loop misses its ticks"]
 
 
 def test_a_law_that_wants_nonsense_lands():
     swarm = drone().running().run(0.2)
     group = swarm.groups[0]
-    group.agent.deciding.decide = lambda *_, **__: pytest.fail("not asked")  # the goal stays what it is
+    group.agent.goal_computer.decide = lambda *_, **__: pytest.fail("not asked")  # the goal stays what it is
     group.agent._decide = lambda *_: group.agent.goal.__setitem__(slice(None), np.nan)
     swarm.run(1.0)
     assert happened(swarm)["F"][0] == "hold: what it wants is not a setpoint: not made of finite numbers"
-    assert swarm.agent("F").life.reason == ["what it wants is not a setpoint"]
+    assert swarm.agent("F").lifecycle.reason == ["what it wants is not a setpoint"]
     assert swarm.phase("F") >= LANDING
 
 
 def test_a_drone_that_does_not_come_down_is_cut():
     swarm = drone(safety=Safety(landing_s=2.0)).running().run(0.2)
-    swarm.agent("F").life.land(0, "ordered to land")
+    swarm.agent("F").lifecycle.land(0, "ordered to land")
     spoiled(swarm, flying=True)
     swarm.run(1.9)
     assert swarm.phase("F") == LANDING
     swarm.run(0.2)
-    assert (swarm.phase("F"), swarm.agent("F").life.reason) == (DONE, ["its landing takes too long"])
+    assert (swarm.phase("F"), swarm.agent("F").lifecycle.reason) == (DONE, ["its landing takes too long"])
 
 
 def test_leaning_is_an_angle_to_the_vertical():
     attitude = np.array([leant(0.5), [math.cos(0.6), 0.0, 0.0, math.sin(0.6)], [0.0, 1.0, 0.0, 0.0], [np.nan] * 4])
-    assert [round(lean(attitude, row), 6) for row in range(3)] == [0.5, 0.0, round(math.pi, 6)]
-    assert leaning(attitude, 0.49).tolist() == [True, False, True, False]
+    assert [round(tilt_angle(attitude, row), 6) for row in range(3)] == [0.5, 0.0, round(math.pi, 6)]
+    assert tilted(attitude, 0.49).tolist() == [True, False, True, False]
 
 
 # ---------------------------------------------------------------- whatever happens
@@ -412,9 +412,9 @@ def occur(agent, event, t):
         case "offline" | "online":
             outside.offline_since = t if event == "offline" else np.inf
         case "unattended":
-            outside.unattended_since = t
+            outside.conductor_lost_since = t
         case "skip":
-            agent.skip(200)
+            agent.skip_ticks(200)
         case "hold":
             agent.hold(0)
         case "start":
@@ -436,14 +436,14 @@ def test_whatever_happens_nobody_comes_up_again(story, lost, early):
     (group,) = swarm.groups
     agent = group.agent
     if early:
-        agent.life.takeoff(0), agent.life.takeoff(1)
-    before, lands = agent.life.phase.copy(), swarm.t
+        agent.lifecycle.takeoff(0), agent.lifecycle.takeoff(1)
+    before, lands = agent.lifecycle.phase.copy(), swarm.t
     for values, event, ticks in story:
         spoiled(swarm, **values)
         occur(agent, event, swarm.t)
         for _ in range(ticks):
             swarm.step()
-            phase, setpoint = agent.life.phase, group.actions.setpoint
+            phase, setpoint = agent.lifecycle.phase, group.actions.setpoint
             down = before >= LANDING
             lands = swarm.t if phase[0] < LANDING else lands
             assert (phase[down] >= before[down]).all()
@@ -452,7 +452,7 @@ def test_whatever_happens_nobody_comes_up_again(story, lost, early):
             for row in range(2):
                 if agent.hazards.outcome(row) >= Outcome.LAND:
                     assert phase[row] >= LANDING
-                    assert agent.life.reason[row]
+                    assert agent.lifecycle.reason[row]
             ended = (phase < AIRBORNE) | (phase >= LANDING)
             assert not setpoint[1].any() or not ended[1]
             aside = swarm.t <= lands + PATIENCE_S + DT  # who comes down beside a robot goes there at its height
@@ -460,7 +460,7 @@ def test_whatever_happens_nobody_comes_up_again(story, lost, early):
             before = phase.copy()
     spoiled(swarm, position=np.nan)  # and now nothing is known any more
     swarm.run(3.0)
-    assert agent.life.phase[0] in (LANDING, DONE) or agent.life.phase[0] <= READY
+    assert agent.lifecycle.phase[0] in (LANDING, DONE) or agent.lifecycle.phase[0] <= READY
     assert not group.actions.setpoint[1].any()
 
 
@@ -480,7 +480,7 @@ def woken(slept=0.6, **parts):
     """A and B run in processes of their own; that of A has just stood still."""
     swarm = Swarm(pair(**parts), [["A"], ["B"]]).running()
     swarm.run(3.0)
-    swarm.agent("A").health.wake(swarm.t, slept)
+    swarm.agent("A").health.mark_resumed(swarm.t, slept)
     return swarm
 
 
@@ -519,5 +519,5 @@ def test_after_a_standstill_neighbours_are_waited_for_from_when_the_router_is_ba
 
 def test_who_hears_nobody_does_not_hold_after_a_standstill():
     swarm = Swarm(pair(formation=Formation()), [["A"], ["B"]]).running()
-    swarm.agent("A").health.wake(swarm.t, 0.6)
+    swarm.agent("A").health.mark_resumed(swarm.t, 0.6)
     assert held(swarm, 0.5) == 0

@@ -44,7 +44,7 @@ class Robot:
     def __init__(self, net: Net, conditions: Conditions | None = None) -> None:
         self.net, self.agent = net, Agent(Plan(pair()).assignment(("A",)))
         self.neighbours = Neighbours(net.session, KEYS, self.agent, reach=(5.0, 5.0, 5.0), conditions=conditions)
-        (self.speaker,) = self.neighbours.speakers
+        (self.sender,) = self.neighbours.speakers
         self.t = 0.0
 
     def tell(self, key: str, **what: object) -> None:
@@ -64,17 +64,17 @@ class Robot:
 
     def after(self, seconds: float = 0.02) -> None:
         self.neighbours.listen(self.t, UTC)
-        self.agent.deciding.update_links(self.t)
+        self.agent.goal_computer.update_links(self.t)
         self.t += seconds
 
     @property
     def live(self) -> bool:
         """Whether B takes part in the law."""
-        return len(self.agent.neighbours.live) == 1
+        return len(self.agent.neighbours.active) == 1
 
     @property
     def x(self) -> float:
-        return float(self.agent.heard.position[0, 0])
+        return float(self.agent.neighbour_poses.position[0, 0])
 
 
 @pytest.fixture
@@ -88,12 +88,12 @@ def test_a_pose_without_a_token_is_not_believed(robot):
     robot.after(5.0)
     robot.after()
     assert not robot.live
-    assert robot.agent.missing(0) == ["B"]
-    assert robot.agent.assignment.lacking(robot.agent.neighbours.greeted).all()
+    assert robot.agent.missing_neighbours(0) == ["B"]
+    assert robot.agent.assignment.unreceived(robot.agent.neighbours.stamp_once_alive).all()
     robot.token("one")
     robot.after()
     assert robot.live
-    assert robot.agent.missing(0) == []
+    assert robot.agent.missing_neighbours(0) == []
     assert robot.x == 0.4
 
 
@@ -106,7 +106,7 @@ def test_a_late_sample_revives_nobody(robot):
     robot.pose(2, 0.5, session="one", age=2.5)
     robot.after()
     assert not robot.live
-    assert robot.agent.missing(0) == ["B"]
+    assert robot.agent.missing_neighbours(0) == ["B"]
     robot.after(500.0)
     robot.after()
     assert not robot.live
@@ -123,16 +123,16 @@ def test_a_neighbour_that_is_restarted_is_heard_at_once_whatever_its_clock_says(
     robot.token("two")
     robot.after()
     assert not robot.live  # where the former process was is not where this one is
-    assert robot.agent.missing(0) == ["B"]
+    assert robot.agent.missing_neighbours(0) == ["B"]
     robot.pose(1, -0.4, session="two", age=max(0.0, behind_s))
     robot.after()
     assert robot.live
     assert robot.x == -0.4
-    assert robot.speaker.lost == 0
+    assert robot.sender.lost == 0
     robot.pose(100, 0.4, session="one")  # held back by the network since the first life
     robot.after()
     assert robot.x == -0.4
-    assert robot.speaker.stale == 1
+    assert robot.sender.stale == 1
 
 
 def test_a_neighbour_that_was_cut_off_is_believed_where_it_was(robot):
@@ -165,7 +165,7 @@ def test_a_robot_of_another_make_begins_anew_with_its_token_or_with_a_clock_that
     assert robot.x == 0.2
     robot.pose(1, 0.9, session=None, age=95.0)
     robot.after()
-    assert (robot.x, robot.speaker.stale) == (0.2, 1)
+    assert (robot.x, robot.sender.stale) == (0.2, 1)
 
 
 def test_no_other_session_speaks_for_a_robot_whose_token_is_there(robot):
@@ -174,15 +174,15 @@ def test_no_other_session_speaks_for_a_robot_whose_token_is_there(robot):
     robot.after()
     robot.pose(9, 3.0, session="other")
     robot.after()
-    assert (robot.x, robot.speaker.stale) == (0.4, 1)
+    assert (robot.x, robot.sender.stale) == (0.4, 1)
 
 
 def hazards(robot: Robot) -> list[str]:
     agent = robot.agent
     seen: list = []
-    if agent.neighbours.behind is not None:
-        agent._detector._behind(agent.neighbours, agent.neighbours.behind, seen)
-    return [f"{each.cause.name}: {each.say(0)}" for each in seen if each.rows[0]]
+    if agent.neighbours.clock_lag is not None:
+        agent._detector._behind(agent.neighbours, agent.neighbours.clock_lag, seen)
+    return [f"{each.cause.name}: {each.detail(0)}" for each in seen if each.rows[0]]
 
 
 def test_poses_that_are_always_older_than_a_network_delays_them_are_a_hazard(robot):
@@ -210,9 +210,9 @@ def test_what_waited_while_the_listener_stood_still_is_no_proof_of_a_slow_clock(
 
 def believed(robot: Robot) -> float:
     """Where B is believed to be now by a predictor without a horizon, x [m]."""
-    heard, predictor = robot.agent.heard, ConstantVelocity()
-    place = heard.believed(predictor, robot.t, np.array([0]))
-    np.testing.assert_array_equal(robot.agent.neighbours.everywhere(predictor, robot.t), place)
+    heard, predictor = robot.agent.neighbour_poses, ConstantVelocity()
+    place = heard.extrapolate_position(predictor, robot.t, np.array([0]))
+    np.testing.assert_array_equal(robot.agent.neighbours.extrapolate_all(predictor, robot.t), place)
     return float(place[0, 0])
 
 
@@ -287,8 +287,8 @@ def test_a_pose_that_is_stamped_ahead_was_measured_when_it_arrived(robot, ahead)
     robot.t = 7.0
     robot.pose(1, 0.4, session="one", age=-ahead, speed=0.1)
     robot.after(0.0)
-    heard = robot.agent.heard
-    assert (heard.stamp[0], heard.arrived[0]) == pytest.approx((7.0, 7.0), abs=1e-5)
+    heard = robot.agent.neighbour_poses
+    assert (heard.stamp[0], heard.arrival[0]) == pytest.approx((7.0, 7.0), abs=1e-5)
     robot.t += 2.0
     assert believed(robot) == pytest.approx(0.6, abs=1e-5), "two seconds old, not younger"
     (news,) = robot.neighbours.news[0]

@@ -10,7 +10,7 @@ from agents.decision.lifecycle import DONE, LANDING, BodyCommands
 from agents.decision.neighbours import NeighbourStates
 from agents.safety.hazards import Cause
 from agents.safety.landing import NEAR, PATIENCE_S, ROOM, Landing
-from agents.safety.setpoint_filter import Safety
+from agents.safety.setpoint_filter import SetpointFilter
 from experiments.definition.experiment import Arena, Experiment, Formation, Robot
 from experiments.definition.plan import Plan
 from tests.agents.swarm import Swarm
@@ -43,7 +43,7 @@ class Bench:
         self.landing = Landing(assignment)
         self.hearing = NeighbourStates(assignment.links, None, 1.0)
         self.hearing.mark_alive(np.arange(len(assignment.links)))
-        self.safety = Safety(assignment.kinds, assignment.limits)
+        self.safety = SetpointFilter(assignment.kinds, assignment.limits)
         self.position = np.array(position, dtype=float)
         self.velocity = np.zeros_like(self.position)
         rows = len(kinds)
@@ -58,21 +58,23 @@ class Bench:
     def step(self):
         every = np.arange(len(self.phase))
         links = self.assignment.links
-        speaker = links.speaker
+        speaker = links.sender
         stamps = np.full(len(links), self.t)
         self.hearing.receive(np.arange(len(links)), self.position[speaker], self.velocity[speaker], stamps, stamps)
         state = BodyState(
             np.full(len(every), self.t - self.lag), self.position.copy(), self.velocity.copy(), np.zeros(len(every)),
             self.position, np.zeros(len(every)), np.ones(len(every)), self.flies & (self.phase != DONE),
         )  # fmt: skip
-        where = self.safety.where(state.position, state.yaw, self.t - state.time)
+        where = self.safety.validate_poses(state.position, state.yaw, self.t - state.time)
         duties = BodyCommands(NOBODY, np.flatnonzero(self.asked), NOBODY) if self.asked.any() else None
         self.asked[:] = False
-        out = self.landing.direct(self.t, duties, state, where, hearing=self.hearing, late=self.late, phase=self.phase)
+        out = self.landing.filter_commands(
+            self.t, duties, state, where, hearing=self.hearing, late=self.late, phase=self.phase
+        )
         if out is not None:
             self.sinking[out.land] = True
             self.told_at[out.land] = self.t
-        way = np.where(self.landing.aside[:, None], self.landing.spot - self.position, 0.0)
+        way = np.where(self.landing.aside[:, None], self.landing.place - self.position, 0.0)
         wanted = np.clip(2.0 * way, -0.3, 0.3)
         wanted[self.sinking & (self.phase != DONE), 2] = -SINKS
         self.velocity += (wanted - self.velocity) * DT / 0.1
@@ -106,8 +108,8 @@ def test_it_goes_aside_at_its_height_and_comes_down_there():
     bench = above()
     bench.step()
     assert bench.landing.aside.tolist() == [False, True]
-    assert bench.landing.spot[1, 2] == 0.8
-    assert bench.landing.below(1) == "R0; it goes aside first"
+    assert bench.landing.place[1, 2] == 0.8
+    assert bench.landing.robot_below(1) == "R0; it goes aside first"
     bench.until_down()
     assert 0.3 < bench.told_at[1] < 2.0
     assert bench.gap() > NEAR
@@ -154,7 +156,7 @@ def test_on_its_way_it_can_be_told_to_stop_and_to_hurry():
     assert bench.told_at[1] == pytest.approx(DT)
     bench = above()
     bench.step()
-    bench.landing.hurry()
+    bench.landing.land_in_place()
     bench.step()
     assert not bench.landing.aside.any()
     assert np.isnan(bench.told_at[1])  # something else has told the body

@@ -233,12 +233,12 @@ def test_an_idle_robot_says_what_it_waits_for():
     robots = Robots([True])
     robots.ready[:] = False
     robots.step()
-    robots.life.wait(0, "never heard KH01")
+    robots.life.set_missing(0, "never heard KH01")
     assert robots.life.takeoff(0) == "cannot take off while idle: never heard KH01"
     robots.ready[:] = True
     robots.step()
     assert (robots.life.phase[0], robots.life.reason[0]) == (READY, "")
-    robots.life.wait(0, "too late to say")
+    robots.life.set_missing(0, "too late to say")
     assert robots.life.reason[0] == ""
 
 
@@ -253,7 +253,7 @@ def test_who_was_ready_and_is_not_is_idle_again_unless_it_climbs():
     assert robots.life.takeoff(1) == ""
     robots.ready[:] = False
     for row in range(3):
-        robots.life.wait(row, "its battery is low")
+        robots.life.set_missing(row, "its battery is low")
     robots.step()
     assert robots.life.phase.tolist() == [IDLE, READY, IDLE]
     assert robots.life.reason == ["its battery is low", "", "its battery is low"]

@@ -11,7 +11,7 @@ from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.loop import Runtime
 from agents.runtime.setup import Setup
-from agents.safety.detection import stamped
+from agents.safety.detection import clock_text
 from experiments.definition import bodies
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
@@ -48,8 +48,8 @@ def test_a_position_stamped_ahead_counts_as_now_and_one_that_is_refused_is_told_
 
 
 def test_the_text_names_robot_and_size() -> None:
-    assert stamped(("CF01", "CF02"), np.array([0.0, 2.3]), 1) == "positions of CF02 are stamped 2.3 s ahead"
-    assert stamped(("CF01",), np.array([-0.4]), 0) == "positions of CF01 are stamped 0.4 s behind"
+    assert clock_text(("CF01", "CF02"), np.array([0.0, 2.3]), 1) == "positions of CF02 are stamped 2.3 s ahead"
+    assert clock_text(("CF01",), np.array([-0.4]), 0) == "positions of CF01 are stamped 0.4 s behind"
 
 
 def flown(ahead: Callable[[float], float | None], seconds: float) -> tuple[Runtime, list[tuple[float, str]]]:
@@ -70,11 +70,13 @@ def flown(ahead: Callable[[float], float | None], seconds: float) -> tuple[Runti
         for tick in range(1, round(seconds / DT)):
             t = tick * DT
             if (off := ahead(t)) is not None:
-                place = messages.Position("T", UTC + t + off, (0.1, 0.2, 0.5 if agent.life.phase[0] > 1 else 0.0), 0.0)
+                place = messages.Position(
+                    "T", UTC + t + off, (0.1, 0.2, 0.5 if agent.lifecycle.phase[0] > 1 else 0.0), 0.0
+                )
                 net.deliver(sent(KEYS.position("T"), place)[0])
             runtime._tick(t)
-            if agent.life.phase[0] == 1:
-                agent.life.takeoff(0)
+            if agent.lifecycle.phase[0] == 1:
+                agent.lifecycle.takeoff(0)
             worst = agent.hazards.worst(0)
             if worst and (not said or said[-1][1] != worst):
                 said.append((t, worst))
@@ -103,4 +105,4 @@ def test_positions_stamped_behind_are_told_of_before_they_are_too_old() -> None:
 
 def test_who_waits_for_take_off_says_that_its_positions_are_of_another_clock() -> None:
     runtime, _ = flown(lambda _: -3600.0, 0.5)
-    assert runtime.agent.life.reason[0] == "no position of its own: positions of T are stamped 3.6e+03 s behind"
+    assert runtime.agent.lifecycle.reason[0] == "no position of its own: positions of T are stamped 3.6e+03 s behind"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.decision.neighbours import Heard
+from agents.decision.neighbours import NeighbourPoses
 from agents.plugins import registry
 from agents.plugins.predictors import HOLD, ConstantVelocity, Hold, Predictor
 
@@ -54,10 +54,11 @@ def test_constant_velocity_goes_on_until_its_horizon():
 
 
 def test_what_was_heard_is_carried_on_from_the_time_of_its_sample():
-    heard = Heard.nothing(3)
+    heard = NeighbourPoses.none_received(3)
     heard.position[:2], heard.velocity[:2] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[0.1, 0.0, 0.0], [0.0, 0.2, 0.0]]
-    heard.stamp[:2], heard.arrived[:2] = [4.0, 4.5], [4.4, 4.9]  # the delay of the network is made up for
+    heard.stamp[:2], heard.arrival[:2] = [4.0, 4.5], [4.4, 4.9]  # the delay of the network is made up for
     both = np.array([0, 1])
-    np.testing.assert_allclose(heard.believed(ConstantVelocity(), 5.0, both), [[1.1, 0.0, 0.0], [0.0, 1.1, 0.0]])
-    np.testing.assert_array_equal(heard.believed(HOLD, 5.0, both), heard.position[:2])
-    np.testing.assert_array_equal(heard.believed_velocity(HOLD, 5.0, both), np.zeros((2, 3)))
+    found = heard.extrapolate_position(ConstantVelocity(), 5.0, both)
+    np.testing.assert_allclose(found, [[1.1, 0.0, 0.0], [0.0, 1.1, 0.0]])
+    np.testing.assert_array_equal(heard.extrapolate_position(HOLD, 5.0, both), heard.position[:2])
+    np.testing.assert_array_equal(heard.extrapolate_velocity(HOLD, 5.0, both), np.zeros((2, 3)))

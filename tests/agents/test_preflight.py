@@ -30,11 +30,11 @@ def test_a_drone_is_not_ready_while_something_is_wrong(what):
     agent = swarm.agent("F")
     spoiled(swarm, **values)
     swarm.run(0.1)
-    assert (agent.life.phase[0], agent.life.reason[0]) == (IDLE, reason)
-    assert agent.life.takeoff(0) == f"cannot take off while idle: {reason}"
+    assert (agent.lifecycle.phase[0], agent.lifecycle.reason[0]) == (IDLE, reason)
+    assert agent.lifecycle.takeoff(0) == f"cannot take off while idle: {reason}"
     del swarm.groups[0].spoil
     swarm.step()
-    assert (agent.life.phase[0], agent.life.reason[0]) == (READY, "")
+    assert (agent.lifecycle.phase[0], agent.lifecycle.reason[0]) == (READY, "")
 
 
 @pytest.mark.parametrize("what", FAILURES)
@@ -42,15 +42,15 @@ def test_and_is_ready_no_more_when_it_lasts(what):
     values, reason = FAILURES[what]
     swarm = drone().run(0.1)
     agent = swarm.agent("F")
-    assert agent.life.phase[0] == READY
+    assert agent.lifecycle.phase[0] == READY
     spoiled(swarm, **values)
     swarm.run(0.4)
-    assert agent.life.phase[0] == READY  # what flickers does not matter
+    assert agent.lifecycle.phase[0] == READY  # what flickers does not matter
     del swarm.groups[0].spoil
     swarm.run(0.4)
     spoiled(swarm, **values)
     swarm.run(0.52)
-    assert (agent.life.phase[0], agent.life.reason[0]) == (IDLE, reason)
+    assert (agent.lifecycle.phase[0], agent.lifecycle.reason[0]) == (IDLE, reason)
     assert not agent.hazards.incidents  # it stands: nothing is unsafe yet
 
 
@@ -73,7 +73,7 @@ def test_without_a_router_nobody_takes_off():
     agent = swarm.agent("F")
     agent.health.offline_since = swarm.t
     swarm.run(0.6)
-    assert agent.life.reason == ["no connection to a router"]
+    assert agent.lifecycle.reason == ["no connection to a router"]
     agent.health.offline_since = np.inf
     swarm.step()
     assert swarm.phase("F") == READY
@@ -83,14 +83,14 @@ def test_who_stands_too_near_to_another_does_not_take_off():
     robots = {"A": Robot(kind="khepera4", start=[-0.1, 0.0]), "B": Robot(kind="khepera4", start=[0.1, 0.1])}
     swarm = Swarm(pair(robots=robots, safety=Safety(separation=0.3)), [["A"], ["B"]]).run(0.2)
     assert [swarm.phase(name) for name in "AB"] == [IDLE, IDLE]
-    assert swarm.agent("A").life.reason == ["it is 0.22 m from B, nearer than 0.3 m"]
+    assert swarm.agent("A").lifecycle.reason == ["it is 0.22 m from B, nearer than 0.3 m"]
     near = Swarm(pair(robots=robots, safety=Safety(separation=0.2))).running()
     assert near.phase("A") == RUNNING
 
 
 def test_a_law_that_wants_nonsense_is_known_before():
     swarm = Swarm(pair(), [["A"], ["B"]])
-    swarm.agent("A").deciding.law_offset = lambda t, position: np.full_like(position, np.nan)
+    swarm.agent("A").goal_computer.law_offset = lambda t, position: np.full_like(position, np.nan)
     swarm.run(0.2)
-    assert swarm.agent("A").life.reason == ["its law wants something that is not finite"]
+    assert swarm.agent("A").lifecycle.reason == ["its law wants something that is not finite"]
     assert swarm.phase("B") == READY

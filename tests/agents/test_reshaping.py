@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.formation.changes import Change, Presence, Reshaping, progress, wanted
+from agents.formation.changes import Change, Presence, Reshaping, changed_targets, progress
 from agents.formation.graph import Links
 from tests.agents.test_coordination import told_more
 
@@ -20,7 +20,7 @@ def change(count, at=10.0, over=4.0, **parts):
 
 
 def after(net, changes, t):
-    return wanted(net, changes, np.full(len(net), t))
+    return changed_targets(net, changes, np.full(len(net), t))
 
 
 def test_progress_is_smooth():
@@ -56,11 +56,11 @@ def test_before_nothing_changes_and_after_it_has(seed):
 def test_a_drawing_that_grows_and_turns_stays_a_drawing(seed, scale, turn, t):
     """What links ask for at any time is what one set of places has, grown and turned as far as it has come."""
     position, net = told_more(seed)
-    apart = position[net.listener] - position[net.speaker]
+    apart = position[net.receiver] - position[net.sender]
     flat = apart * [1.0, 1.0, 0.0]
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     flat[:, 2] = np.nan
-    net = Links(net.listener, net.speaker, np.linalg.norm(apart, axis=1), net.gain, apart, flat, net.wants)
+    net = Links(net.receiver, net.sender, np.linalg.norm(apart, axis=1), net.gain, apart, flat, net.wants)
     now = after(net, [change(len(net), scale=scale, turn=turn, rise=apart[:, 2])], t)
     share = progress(np.array([t]), 10.0, 4.0)[0]
     angle, grown = share * turn, 1.0 + share * (scale - 1.0)
@@ -92,24 +92,24 @@ def presence(**parts):
 
 def test_links_by_the_clock():
     one, far = presence(since=5.0, until=8.0), np.array([np.nan])
-    seen = [bool(one.now(np.array([t]), far, np.array([False]))[0]) for t in (0.0, 4.9, 5.0, 7.9, 8.0, 20.0)]
+    seen = [bool(one.present_now(np.array([t]), far, np.array([False]))[0]) for t in (0.0, 4.9, 5.0, 7.9, 8.0, 20.0)]
     assert seen == [False, False, True, True, False, False]
-    assert not one.at_first()[0]
-    assert presence().at_first()[0]
-    assert not presence(reach=1.0).at_first()[0]
+    assert not one.present_at_start()[0]
+    assert presence().present_at_start()[0]
+    assert not presence(reach=1.0).present_at_start()[0]
 
 
 def test_links_by_range_do_not_flicker():
     one, were, seen = presence(reach=1.0, release=1.2), np.array([False]), []
     for apart in (1.5, 1.1, 0.9, 1.1, 1.19, 1.21, 1.1, 1.0):
-        were = one.now(np.zeros(1), np.array([apart]), were)
+        were = one.present_now(np.zeros(1), np.array([apart]), were)
         seen.append(bool(were[0]))
     assert seen == [False, False, True, True, True, False, False, True]
-    assert not one.now(np.zeros(1), np.array([np.nan]), np.array([True]))[0]  # who is not known is not near
+    assert not one.present_now(np.zeros(1), np.array([np.nan]), np.array([True]))[0]  # who is not known is not near
 
 
 def test_each_row_goes_by_its_own_clock():
     net = Links(np.array([0, 1]), np.array([1, 0]), np.ones(2), np.ones(2))
     what = Reshaping(net, [change(2, distance=np.full(2, 3.0))], None)
-    what.move(np.array([20.0, -np.inf]), np.zeros((2, 3)), np.zeros((2, 3)))
+    what.advance(np.array([20.0, -np.inf]), np.zeros((2, 3)), np.zeros((2, 3)))
     np.testing.assert_array_equal(what.links.distance, [3.0, 1.0])

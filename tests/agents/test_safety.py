@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO
 from agents.body.limits import Limits
-from agents.safety.setpoint_filter import ESCAPED, Safety
+from agents.safety.setpoint_filter import OUTSIDE_M, SetpointFilter
 
 FEW = settings(max_examples=60)
 ALL = tuple(KINDS.values())
@@ -44,10 +44,10 @@ def bounds(limits=LIMITS):
 )
 def test_whatever_comes_in_a_lawful_setpoint_goes_out(setpoint, position, yaw, age):
     before = setpoint.copy(), position.copy(), yaw.copy()
-    verdict = Safety(ALL, LIMITS).check(setpoint, position, yaw, age)
+    verdict = SetpointFilter(ALL, LIMITS).check(setpoint, position, yaw, age)
     for kept, now in zip(before, (setpoint, position, yaw), strict=True):
         np.testing.assert_array_equal(kept, now)
-    safe, blind = verdict.setpoint, verdict.blind
+    safe, blind = verdict.setpoint, verdict.invalid_pose
     believable = (np.abs(position) < 1e6).all(axis=1) & (np.abs(yaw) < 1e6)
     np.testing.assert_array_equal(blind, ~(believable & (age <= LIMITS.own_silence_s)))
     by_position = TAKES == "position"
@@ -77,7 +77,7 @@ def test_whatever_comes_in_a_lawful_setpoint_goes_out(setpoint, position, yaw, a
 @given(arrays(float, (ROWS, 4), elements=nearby), arrays(float, (ROWS, 3), elements=nearby), nearby)
 def test_nobody_is_driven_farther_out(setpoint, position, turned):
     yaw = np.full(ROWS, 3.0 * turned)
-    safe = Safety(ALL, LIMITS).check(setpoint, position, yaw, FRESH).setpoint
+    safe = SetpointFilter(ALL, LIMITS).check(setpoint, position, yaw, FRESH).setpoint
     low, high = bounds()
     for row in range(ROWS):
         if TAKES[row] == "position":
@@ -92,7 +92,7 @@ def test_nobody_is_driven_farther_out(setpoint, position, turned):
 @FEW
 @given(arrays(float, (ROWS, 4), elements=st.one_of(nearby, anything)), arrays(float, (ROWS, 3), elements=nearby))
 def test_changed_says_whether_it_was_changed(setpoint, position):
-    verdict = Safety(ALL, LIMITS).check(setpoint, position, np.zeros(ROWS), FRESH)
+    verdict = SetpointFilter(ALL, LIMITS).check(setpoint, position, np.zeros(ROWS), FRESH)
     same = np.isclose(verdict.setpoint, setpoint, rtol=0, atol=1e-9).all(axis=1)
     np.testing.assert_array_equal(verdict.changed, ~same)
 
@@ -101,20 +101,22 @@ def test_changed_says_whether_it_was_changed(setpoint, position):
 @given(arrays(float, (ROWS, 4), elements=anything), arrays(float, (ROWS, 3), elements=st.one_of(nearby, anything)))
 def test_rows_are_checked_as_if_each_were_alone(setpoint, position):
     yaw, age = np.linspace(-3, 3, ROWS), np.linspace(0, 0.7, ROWS)
-    whole = Safety(ALL, LIMITS).check(setpoint, position, yaw, age)
+    whole = SetpointFilter(ALL, LIMITS).check(setpoint, position, yaw, age)
     for row in range(ROWS):
         one = slice(row, row + 1)
-        alone = Safety(ALL[one], LIMITS).check(setpoint[one], position[one], yaw[one], age[one])
-        for field in ("setpoint", "changed", "blind", "not_finite"):
+        alone = SetpointFilter(ALL[one], LIMITS).check(setpoint[one], position[one], yaw[one], age[one])
+        for field in ("setpoint", "changed", "invalid_pose", "not_finite"):
             np.testing.assert_array_equal(getattr(alone, field)[0], getattr(whole, field)[row])
 
 
 def check(kind, setpoint, position, *, yaw=0.0, age=0.0, limits=LIMITS):
-    return Safety((kind,), limits).check(np.array([setpoint]), np.array([position]), np.array([yaw]), np.array([age]))
+    return SetpointFilter((kind,), limits).check(
+        np.array([setpoint]), np.array([position]), np.array([yaw]), np.array([age])
+    )
 
 
 def whereabouts(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
-    return Safety((kind,), limits).where(np.array([position]), np.array([yaw]), np.array([age]))
+    return SetpointFilter((kind,), limits).validate_poses(np.array([position]), np.array([yaw]), np.array([age]))
 
 
 def test_lawful_setpoints_pass_untouched():
@@ -125,7 +127,7 @@ def test_lawful_setpoints_pass_untouched():
     ):
         verdict = check(kind, setpoint, [0.0, 0.0, 0.8])
         np.testing.assert_array_equal(verdict.setpoint, [setpoint])
-        assert (verdict.changed[0], verdict.blind[0], verdict.not_finite[0]) == (False, False, False)
+        assert (verdict.changed[0], verdict.invalid_pose[0], verdict.not_finite[0]) == (False, False, False)
 
 
 def test_goals_are_pulled_into_the_arena_and_near_the_robot():
@@ -159,7 +161,7 @@ def test_a_ground_robot_beyond_the_wall_may_turn_and_come_back():
 def test_escaped_is_far_outside(axis, side):
     edge = np.array([0.0, 0.0, 1.25])
     edge[axis] = LIMITS.high[axis] if side > 0 else LIMITS.low[axis]
-    for beyond, escaped in ((ESCAPED - 0.01, False), (ESCAPED + 0.01, True)):
+    for beyond, escaped in ((OUTSIDE_M - 0.01, False), (OUTSIDE_M + 0.01, True)):
         place = edge.copy()
         place[axis] += side * beyond
         where = whereabouts(CRAZYFLIE, place.tolist())
@@ -171,7 +173,7 @@ def test_escaped_is_far_outside(axis, side):
 @pytest.mark.parametrize(("age", "blind"), [(0.0, False), (0.5, False), (0.51, True), (np.inf, True), (np.nan, True)])
 def test_an_old_position_is_none(age, blind):
     verdict = check(TELLO, [0.1, 0, 0, 0], [0, 0, 1.0], age=age)
-    assert verdict.blind[0] == blind
+    assert verdict.invalid_pose[0] == blind
     np.testing.assert_array_equal(verdict.setpoint, [[0.0 if blind else 0.1, 0, 0, 0]])
 
 

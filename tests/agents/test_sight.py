@@ -8,7 +8,7 @@ import pytest
 from agents.body.interface import BodyState, Rays
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.body.limits import Limits
-from agents.decision.neighbours import Heard
+from agents.decision.neighbours import NeighbourPoses
 from agents.decision.perception import AHEAD_S, DESCENT_S, REACH, SCAN_S, Perception
 from agents.formation.graph import links
 
@@ -26,10 +26,10 @@ def state(position, yaw=0.0, velocity=0.0, time=0.0, rays=None):
 
 def heard(position, velocity=0.0, stamp=0.0):
     place = np.array(position, dtype=float).reshape(-1, 3)
-    told = Heard.nothing(len(place))
+    told = NeighbourPoses.none_received(len(place))
     told.position[:], told.velocity[:] = place, velocity
-    told.stamp[:] = told.arrived[:] = stamp
-    told.gone[:] = np.inf  # they live
+    told.stamp[:] = told.arrival[:] = stamp
+    told.lost_since[:] = np.inf  # they live
     return told
 
 
@@ -50,7 +50,7 @@ def alone(kind=KHEPERA4):
 
 def placed(sight, t, now, told=None):
     """Places of the things that one row sees."""
-    return sight.sense(t, now, Heard.nothing(0) if told is None else told)[1].position
+    return sight.sense(t, now, NeighbourPoses.none_received(0) if told is None else told)[1].position
 
 
 # ---------------------------------------------------------------- oneself
@@ -58,14 +58,14 @@ def placed(sight, t, now, told=None):
 
 @pytest.mark.parametrize("absurd", [np.nan, np.inf, -np.inf, 51.0, -1e8, 1e38])
 def test_a_velocity_that_no_robot_has_is_not_known(absurd):
-    own, _ = alone().sense(0.0, state([[0, 0, 0]], velocity=[[0.1, absurd, 0.2]]), Heard.nothing(0))
+    own, _ = alone().sense(0.0, state([[0, 0, 0]], velocity=[[0.1, absurd, 0.2]]), NeighbourPoses.none_received(0))
     np.testing.assert_array_equal(own.velocity, [[0.1, 0.0, 0.2]])
 
 
 def test_a_row_knows_its_kind_its_pose_and_the_lower_of_two_limits():
     sight = Perception((KHEPERA4, TELLO, CRAZYFLIE), (KHEPERA4,), links([], [], []), LIMITS, 0.1)
     now = state([[0, 0, 0], [1, 0, 1], [2, 0, 1]], yaw=[1, 2, 3], velocity=[[0.1, 0, 0], [np.nan] * 3, [0, 0.2, 0]])
-    own, near = sight.sense(0.0, now, Heard.nothing(0))
+    own, near = sight.sense(0.0, now, NeighbourPoses.none_received(0))
     assert own.speed.tolist() == [KHEPERA4.speed, 0.5, 0.5]
     assert own.takes == ("twist", "velocity", "position")
     assert own.by_twist.tolist() == [True, False, False]
@@ -89,7 +89,7 @@ def test_a_heard_robot_is_where_its_velocity_has_carried_it_but_not_for_long():
         np.testing.assert_array_equal(near.velocity, [[0.2, -0.1]])
     now.time[:] = 1.6
     assert not sight.sense(1.6, now, told)[1].velocity.any()  # silent for long: nobody knows whether it still moves
-    assert (near.row.tolist(), near.heard.tolist()) == ([0], [True])
+    assert (near.row.tolist(), near.is_robot.tolist()) == ([0], [True])
     assert (near.radius[0], near.low[0], near.high[0]) == (TURTLEBOT3.radius, 0.0, TURTLEBOT3.height)
     assert near.lag.tolist() == [TURTLEBOT3.lag]
 
@@ -112,14 +112,14 @@ def test_who_is_far_or_was_never_heard_is_not_near():
     sight, now = pair(), state([0, 0, 0], time=9.0)
     assert len(placed(sight, 9.0, now, heard([REACH - 0.01, 0, 0], stamp=9.0))) == 1
     assert len(placed(sight, 9.0, now, heard([REACH + 0.01, 0, 0], stamp=9.0))) == 0
-    assert len(placed(sight, 9.0, now, Heard.nothing(1))) == 0
+    assert len(placed(sight, 9.0, now, NeighbourPoses.none_received(1))) == 0
 
 
 def test_who_is_gone_is_in_the_way_where_it_was_heard_last():
     sight, now = pair(), state([0, 0, 0], time=9.0)
     told = heard([0.5, 0, 0], stamp=7.0)
     for gone in (8.5, 7.9, 7.0):
-        told.gone[:] = gone
+        told.lost_since[:] = gone
         assert len(placed(sight, 9.0, now, told)) == 1
 
 
@@ -137,9 +137,9 @@ def test_a_drone_that_is_gone_may_have_come_down(height, before, after):
     """It hovered at 1 m and fell silent: from then on it may be anywhere from there to the floor."""
     sight, told = pair(TURTLEBOT3 if height == 0.0 else CRAZYFLIE, CRAZYFLIE), heard([0.1, 0, 1.0], stamp=7.0)
     now = state([0, 0, height], time=9.0)
-    told.gone[:] = 8.5  # a second of silence is borne
+    told.lost_since[:] = 8.5  # a second of silence is borne
     assert len(placed(sight, 9.0, now, told)) == before
-    told.gone[:] = 7.9
+    told.lost_since[:] = 7.9
     _, near = sight.sense(9.0, now, told)
     assert len(near) == after
     assert near.low.tolist() == [0.0] * after
@@ -160,11 +160,11 @@ def test_who_does_not_know_where_it_is_or_does_not_avoid_knows_of_nothing():
 
 def test_a_ray_ends_where_it_points_from_the_pose_of_the_robot():
     now = state([1.0, 2.0, 0.0], yaw=0.5, rays=rays([0, 0, 0], [0.0, math.pi / 2, 1.0], [0.4, 0.9, np.nan]))
-    _, near = alone().sense(0.0, now, Heard.nothing(0))
+    _, near = alone().sense(0.0, now, NeighbourPoses.none_received(0))
     c, s = math.cos(0.5), math.sin(0.5)
     np.testing.assert_allclose(near.position, [[1 + 0.4 * c, 2 + 0.4 * s], [1 - 0.9 * s, 2 + 0.9 * c]])
     assert not near.radius.any()
-    assert not near.heard.any()
+    assert not near.is_robot.any()
     assert not near.velocity.any()
     assert len(placed(alone(), 0.0, state([0, 0, 0], rays=rays([0], [0.0], [REACH + 0.1])))) == 0
 
@@ -203,7 +203,7 @@ def test_old_readings_are_none():
 
 def test_rays_that_look_up_and_what_is_over_or_under_the_robot_are_left_out():
     now = state([0, 0, 1.0], rays=rays([0, 0, 0], 0.0, [0.3, 0.3, 0.3], elevation=[math.pi / 2, 0.2, -0.6]))
-    _, near = alone(TELLO).sense(0.0, now, Heard.nothing(0))
+    _, near = alone(TELLO).sense(0.0, now, NeighbourPoses.none_received(0))
     np.testing.assert_allclose(near.position, [[0.3 * math.cos(0.2), 0.0]])
     np.testing.assert_allclose(near.low, [1.0 + 0.5 * TELLO.height + 0.3 * math.sin(0.2)])
     np.testing.assert_array_equal(near.low, near.high)
@@ -218,9 +218,9 @@ def test_a_robot_that_was_heard_is_not_seen_a_second_time():
     distance = np.where(hits, along - np.sqrt(np.maximum(inside, 0.0)) + 0.01, 1.6)  # 1 cm of noise; a wall behind it
     now = state([0, 0, 0], rays=rays([0] * len(bearing), bearing, distance))
     _, near = pair().sense(0.0, now, heard([*at, 0.0]))
-    assert near.heard.sum() == 1
-    assert (~near.heard).sum() == (~hits).sum() == 10
-    _, near = pair().sense(0.0, now, Heard.nothing(1))
+    assert near.is_robot.sum() == 1
+    assert (~near.is_robot).sum() == (~hits).sum() == 10
+    _, near = pair().sense(0.0, now, NeighbourPoses.none_received(1))
     assert len(near) == len(bearing)
     high = pair(KHEPERA4, CRAZYFLIE).sense(0.0, now, heard([*at, 1.0]))[1]  # a drone overhead is not what the ray met
     assert len(high) == len(bearing)
@@ -236,7 +236,7 @@ def test_rows_see_for_themselves_whatever_the_order_of_their_rays():
     def seen(order):
         scan = rays(np.array(row)[order], np.array(bearing)[order], np.array(distance)[order])
         _, near = Perception(kinds, kinds, net, LIMITS, 0.1).sense(0.0, state(place, rays=scan), told)
-        return sorted(zip(near.row.tolist(), near.position.round(9).tolist(), near.heard.tolist(), strict=True))
+        return sorted(zip(near.row.tolist(), near.position.round(9).tolist(), near.is_robot.tolist(), strict=True))
 
     first = seen([0, 1, 2, 3, 4])
     rows = sorted((r, h) for r, _, h in first)

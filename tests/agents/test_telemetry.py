@@ -64,7 +64,7 @@ class Robot:
         state = self.body.read(t)
         for name, value in changed.items():
             getattr(state, name)[:] = value
-        actions = self.agent.act(t, state, self.agent.speak(t, state))
+        actions = self.agent.act(t, state, self.agent.transmit(t, state))
         (publisher,) = self.telemetry._states
         publisher.states.clear()
         self.telemetry.tell(state, actions, t)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.arrays import norm
-from agents.decision.control_updates import Input
+from agents.decision.control_updates import ControlView
 from agents.plugins.predictors import HOLD, ConstantVelocity
 from agents.plugins.trigger_families import (
     Decaying,
@@ -195,7 +195,7 @@ def test_self_triggered_keeps_its_bound_when_the_acceleration_keeps_to_its_own(s
 
 
 class Unseen(View):
-    """A view in which nothing can be seen but what was told."""
+    """A view in which nothing can be seen but what was last_event."""
 
     def __getattribute__(self, name):
         if name in {"position", "velocity", "error", "energy", "offset", "deviation", "believed", "since"}:
@@ -208,13 +208,13 @@ class Unseen(View):
 def test_self_triggered_looks_at_nothing_between_its_own_instants(seed):
     trigger, signal = SelfTriggered(longest_s=0.5), wander(seed, 3, 80)
     play = Play(trigger, signal)
-    told = Play(trigger, signal.every(1)).told
+    last_event = Play(trigger, signal.every(1)).last_event
     instants = [np.flatnonzero(column) for column in play.fired.T]
     rows = np.arange(3)
-    told.time[:] = [times[0] * DT for times in instants]
-    told.velocity[:] = [signal.velocity[times[0], row] for row, times in enumerate(instants)]
+    last_event.time[:] = [times[0] * DT for times in instants]
+    last_event.velocity[:] = [signal.velocity[times[0], row] for row, times in enumerate(instants)]
     blind = Unseen.__new__(Unseen)
-    blind.told, blind.predictor = told, HOLD
+    blind.last_event, blind.predictor = last_event, HOLD
     for k in range(1, max(times[1] if len(times) > 1 else 0 for times in instants) + 1):
         blind.t = k * DT
         due = np.isin(rows, trigger.due(blind, trigger.state(3)))
@@ -248,4 +248,4 @@ def test_where_they_belong():
     assert RelativeControl.places == ("control",)
     assert SendOnDelta.places == ("communication", "control")
     assert SendOnDelta.prediction == "hold"
-    assert issubclass(Input, View)
+    assert issubclass(ControlView, View)

@@ -36,19 +36,19 @@ def gaps(fired):
     return [np.diff(np.flatnonzero(column)) for column in fired.T]
 
 
-def view(position, told, *, t=0.0, error=0.0):
+def view(position, last_event, *, t=0.0, error=0.0):
     """A moment of rows that stand at `position`."""
     rows = len(position)
     zeros = np.zeros(rows)
     return View(
-        t, np.asarray(position, dtype=float), np.zeros((rows, 3)), told,
+        t, np.asarray(position, dtype=float), np.zeros((rows, 3)), last_event,
         error=zeros + error, energy=zeros, start=zeros, offset=np.zeros((rows, 3)), predictor=HOLD,
     )  # fmt: skip
 
 
-def told(position, t=0.0):
+def last_event(position, t=0.0):
     """Everybody said this at `t`."""
-    said = LastEvent.nothing(len(position))
+    said = LastEvent.none(len(position))
     said.position[:], said.time[:] = position, t
     return said
 
@@ -71,7 +71,7 @@ def test_rows_have_events_as_if_each_were_alone(name, seed):
         np.testing.assert_array_equal(alone.fired[:, 0], together.fired[:, row])
         np.testing.assert_array_equal(alone.state[0], together.state[row])
         for what in ("position", "velocity", "time", "offset", "energy"):
-            np.testing.assert_array_equal(getattr(alone.told, what)[0], getattr(together.told, what)[row])
+            np.testing.assert_array_equal(getattr(alone.last_event, what)[0], getattr(together.last_event, what)[row])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -122,7 +122,7 @@ def test_parameters_have_units_in_their_descriptions(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_position_that_is_not_known_is_not_news(name):
-    rows = view([[np.nan] * 3], told([[0.0] * 3]), t=1e-3, error=1.0)
+    rows = view([[np.nan] * 3], last_event([[0.0] * 3]), t=1e-3, error=1.0)
     trigger = made(name)
     if name != "relative-control":  # it looks at the offset alone
         assert not len(trigger.due(rows, trigger.state(1)))
@@ -141,7 +141,7 @@ def test_send_on_delta_bounds_what_the_neighbours_do_not_know(seed, threshold):
 def test_send_on_delta_speaks_beyond_the_threshold_and_not_at_it():
     position = [[0.25, 0.0, 0.0], [0.0, 0.0, 0.2500001], [0.2, 0.2, 0.0]]
     trigger = SendOnDelta(threshold=0.25)
-    assert trigger.due(view(position, told(np.zeros((3, 3))), t=9.0), trigger.state(3)).tolist() == [1, 2]
+    assert trigger.due(view(position, last_event(np.zeros((3, 3))), t=9.0), trigger.state(3)).tolist() == [1, 2]
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_send_on_delta_speaks_beyond_the_threshold_and_not_at_it():
 )
 def test_periodic_counts_are_exact_however_long_it_runs(period, hz, begin_s, length_s, expected):
     trigger = Periodic(period_s=period)
-    said, state, sent = LastEvent.nothing(1), trigger.state(1), 0
+    said, state, sent = LastEvent.none(1), trigger.state(1), 0
     moment = view([[0.0] * 3], said)
     for tick in range(begin_s * hz, (begin_s + length_s) * hz):
         moment.t = tick / hz
@@ -167,7 +167,7 @@ def test_periodic_counts_are_exact_however_long_it_runs(period, hz, begin_s, len
 
 def test_a_trigger_must_say_when_it_fires():
     with pytest.raises(TypeError, match="Trigger must say when it fires"):
-        Trigger().due(view([[0.0] * 3], LastEvent.nothing(1)), Trigger().state(1))
+        Trigger().due(view([[0.0] * 3], LastEvent.none(1)), Trigger().state(1))
 
 
 def test_what_fires_must_be_one_bool_per_row():
@@ -176,15 +176,15 @@ def test_what_fires_must_be_one_bool_per_row():
             return np.array([True])
 
     with pytest.raises(ValueError, match=r"`fires` must give one bool per row, \(2,\), not \(1,\)"):
-        Wrong().due(view(np.zeros((2, 3)), LastEvent.nothing(2)), Wrong().state(2))
+        Wrong().due(view(np.zeros((2, 3)), LastEvent.none(2)), Wrong().state(2))
 
 
 def test_the_table_of_the_docs_has_every_family_with_its_defaults():
     text = (Path(__file__).parents[2] / "docs" / "triggers.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([a-z-]+)` \| .* \| (.*) \|$", text, re.MULTILINE)
-    told = {name: parameters for name, parameters in rows if name in NAMES}
-    assert set(told) >= FAMILIES
-    for name, parameters in told.items():
+    last_event = {name: parameters for name, parameters in rows if name in NAMES}
+    assert set(last_event) >= FAMILIES
+    for name, parameters in last_event.items():
         kind = registry.struct(registry.TRIGGERS, name)
         defaults = {field.name: field.default for field in msgspec.structs.fields(kind)}
         own = set(kind.__struct_fields__) - set(Trigger.__struct_fields__)

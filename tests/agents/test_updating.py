@@ -97,14 +97,14 @@ def test_what_moved_is_the_largest_change_on_a_link(trigger):
     swarm = Swarm(triangle({key: value for key, value in chosen.items() if value is not None})).running().run(0.5)
     (group,) = swarm.groups
     agent, state = group.agent, group.state
-    view = agent.deciding.input(swarm.t, state.position, state.velocity, agent.life.start_at)
+    view = agent.goal_computer.control_view(swarm.t, state.position, state.velocity, agent.lifecycle.start_at)
     links = Plan(swarm.experiment).links
-    apart = state.position[links.listener] - agent.heard.position
-    moved = np.linalg.norm(apart - agent.deciding._updating._apart, axis=1)
+    apart = state.position[links.receiver] - agent.neighbour_poses.position
+    moved = np.linalg.norm(apart - agent.goal_computer._updating._apart, axis=1)
     for row in range(2):
-        assert view.deviation[row] == pytest.approx(moved[links.listener == row].max(), abs=1e-15)
+        assert view.deviation[row] == pytest.approx(moved[links.receiver == row].max(), abs=1e-15)
     assert view.deviation[2] == 0.0
-    np.testing.assert_array_equal(view.offset, agent.deciding.law_offset(swarm.t, state.position))
-    error, energy = agent.deciding.errors(swarm.t, state.position)
+    np.testing.assert_array_equal(view.offset, agent.goal_computer.law_offset(swarm.t, state.position))
+    error, energy = agent.goal_computer.errors(swarm.t, state.position)
     np.testing.assert_array_equal(view.error, error)
     np.testing.assert_array_equal(view.energy, energy)

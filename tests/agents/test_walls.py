@@ -7,7 +7,7 @@ from agents.body.interface import Disturbance
 from agents.body.kinds import KINDS, TELLO
 from agents.body.limits import Limits
 from agents.decision.lifecycle import RUNNING
-from agents.safety.setpoint_filter import Safety
+from agents.safety.setpoint_filter import SetpointFilter
 from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import pair
 from tests.agents.swarm import Group
@@ -37,14 +37,14 @@ def farthest(kind: str, axis: int, side: float, latency_s: float = 0.0) -> float
     for tick in range(round(9.0 / dt)):
         t = tick * dt
         if tick % 10 == 0:
-            agent.hear_goal(np.array([0]), goal, np.array([np.nan]), np.array([t]))
+            agent.receive_goal(np.array([0]), goal, np.array([np.nan]), np.array([t]))
         group.step(t)
-        agent.life.takeoff(0)
-        if not np.isfinite(agent.life.start_at[0]):
+        agent.lifecycle.takeoff(0)
+        if not np.isfinite(agent.lifecycle.start_at[0]):
             agent.start(0, t + 0.1)
-        if agent.life.phase[0] == RUNNING:
+        if agent.lifecycle.phase[0] == RUNNING:
             reached = max(reached, side * (group.state.true_position[0, axis] - wall))
-    assert agent.life.phase[0] == RUNNING, agent.life.reason[0]
+    assert agent.lifecycle.phase[0] == RUNNING, agent.lifecycle.reason[0]
     return reached
 
 
@@ -61,7 +61,7 @@ def test_nor_where_commands_take_effect_late(kind):
 def test_velocities_toward_a_wall_are_what_would_close_in_on_a_goal_there():
     def out(x: float, age: float = 0.0) -> float:
         return float(
-            Safety((TELLO,), LIMITS)
+            SetpointFilter((TELLO,), LIMITS)
             .check(np.array([[1.0, 0.5, 0.0, 0.0]]), np.array([[x, 0.0, 1.0]]), np.zeros(1), np.array([age]))
             .setpoint[0, 0]
         )
@@ -79,7 +79,7 @@ def test_wheels_slow_down_toward_a_wall_whichever_way_they_look(kind):
 
     def driven(v: float, yaw: float, x: float = 0.85) -> float:
         return float(
-            Safety((made,), LIMITS)
+            SetpointFilter((made,), LIMITS)
             .check(np.array([[v, 1.0, 0.0, 0.0]]), np.array([[x, 0.0, 0.0]]), np.array([yaw]), np.zeros(1))
             .setpoint[0, 0]
         )

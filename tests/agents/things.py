@@ -3,7 +3,7 @@
 import numpy as np
 
 from agents.body.kinds import KHEPERA4
-from agents.plugins.avoidance import Nearby, Self
+from agents.plugins.avoidance import Nearby, OwnState
 
 
 def own(kinds, position, *, yaw=0.0, velocity=0.0):
@@ -16,7 +16,7 @@ def own(kinds, position, *, yaw=0.0, velocity=0.0):
         name: np.array([float(getattr(kind, name)) for kind in kinds])
         for name in ("radius", "height", "speed", "turn_rate", "response", "lag")
     }
-    return Self(
+    return OwnState(
         position=place,
         velocity=np.broadcast_to(np.asarray(velocity, dtype=float), place.shape).copy(),
         yaw=np.broadcast_to(np.asarray(yaw, dtype=float), len(kinds)).copy(),
@@ -40,7 +40,7 @@ def near(row, position, *, velocity=0.0, radius=0.0, heard=False, lag=0.0):
         radius=np.broadcast_to(np.asarray(radius, dtype=float), many).copy(),
         low=np.zeros(many),
         high=np.full(many, KHEPERA4.height),
-        heard=np.broadcast_to(np.asarray(heard), many).copy(),
+        is_robot=np.broadcast_to(np.asarray(heard), many).copy(),
         lag=np.broadcast_to(np.asarray(lag, dtype=float), many).copy(),
     )
 

@@ -137,7 +137,7 @@ def test_robots_that_decide_for_themselves_do_not_feel_that_others_are_guided(ca
     np.testing.assert_array_equal(first.sent.link, second.sent.link)
     names = np.array(first.names)
     links = Plan(with_delay(park, 0.0, HYBRID)).heard_links
-    assert not set(names[links.listener]) & set(HYBRID.robots)
+    assert not set(names[links.receiver]) & set(HYBRID.robots)
     assert len(second.received) == len(first.received) * len(links) / len(Plan(park).heard_links)
 
 

@@ -28,7 +28,7 @@ def park():
 
 def test_everybody_together(park):
     made = Plan(park).assignment(NAMES)
-    assert made.names == made.speakers == NAMES
+    assert made.names == made.robots == NAMES
     assert made.kinds == (TURTLEBOT3, KHEPERA4, KHEPERA4, KHEPERA4, CRAZYFLIE, CRAZYFLIE, CRAZYFLIE)
     np.testing.assert_array_equal(made.hover, [np.nan] * 4 + [0.8] * 3)
     assert made.law == Distance()
@@ -45,7 +45,7 @@ def test_everybody_together(park):
 def test_the_links_of_the_paper(park):
     """Eq. (11) and figure 11: 12 edges, three of them from the leader only."""
     net = Plan(park).links
-    heard = {NAMES[i]: {NAMES[j] for j in net.speaker[net.listener == i]} for i in range(7)}
+    heard = {NAMES[i]: {NAMES[j] for j in net.sender[net.receiver == i]} for i in range(7)}
     assert heard == {
         "TB01": set(),
         "KH01": {"TB01", "KH02", "KH03", "CF01"},
@@ -55,7 +55,7 @@ def test_the_links_of_the_paper(park):
         "CF02": {"KH02", "KH03", "CF01", "CF03"},
         "CF03": {"CF01", "CF02"},
     }
-    distance = {(NAMES[i], NAMES[j]): d for i, j, d in zip(net.listener, net.speaker, net.distance, strict=True)}
+    distance = {(NAMES[i], NAMES[j]): d for i, j, d in zip(net.receiver, net.sender, net.distance, strict=True)}
     assert distance["KH01", "KH03"] == distance["KH03", "KH01"] == pytest.approx(0.6 * math.sqrt(2))
     assert distance["CF01", "TB01"] == distance["KH02", "CF02"] == 0.86
     assert (net.gain == 3.0).all()
@@ -65,10 +65,10 @@ def test_the_links_of_the_paper(park):
 def test_some_robots_in_any_order_know_their_own_part(park, names):
     made, whole = Plan(park).assignment(names), Plan(park).links
     assert made.names == names
-    assert made.speakers == NAMES
+    assert made.robots == NAMES
 
     def table(net, listeners):
-        return {(listeners[i], NAMES[j], d) for i, j, d in zip(net.listener, net.speaker, net.distance, strict=True)}
+        return {(listeners[i], NAMES[j], d) for i, j, d in zip(net.receiver, net.sender, net.distance, strict=True)}
 
     mine, everyone = table(made.links, names), table(whole, NAMES)
     assert mine == {link for link in everyone if link[0] in names}
@@ -78,9 +78,9 @@ def test_some_robots_in_any_order_know_their_own_part(park, names):
 
 def test_repetitions_stand_side_by_side(park):
     made = Plan(park).assignment(NAMES, copies=3)
-    assert made.names == made.speakers == NAMES * 3
+    assert made.names == made.robots == NAMES * 3
     assert len(made.links) == 3 * len(Plan(park).links)
-    assert (made.links.listener // 7 == made.links.speaker // 7).all()
+    assert (made.links.receiver // 7 == made.links.sender // 7).all()
     ((rows, _),) = made.legs
     assert rows.tolist() == [0, 7, 14]
     assert made.hover.shape == (21,)
@@ -127,7 +127,7 @@ def test_limits_are_the_arena_and_the_safety_of_the_file():
 def test_links_may_have_gains_of_their_own():
     given = {"A > B": Link(distance=0.5, gain=7.0), "B - C": 0.6, "C > A": Link(distance=1.0)}
     net = Plan(experiment(formation=Formation(gain=2.0, links=given))).links
-    table = zip(*(column.tolist() for column in (net.listener, net.speaker, net.distance, net.gain)), strict=True)
+    table = zip(*(column.tolist() for column in (net.receiver, net.sender, net.distance, net.gain)), strict=True)
     assert list(table) == [(0, 2, 1.0, 2.0), (1, 0, 0.5, 7.0), (1, 2, 0.6, 2.0), (2, 1, 0.6, 2.0)]
 
 

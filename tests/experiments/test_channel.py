@@ -183,7 +183,7 @@ def test_what_is_sent_has_the_size_that_it_has_on_the_wire(encoding):
         pose = messages.pose(name, 1, EPOCH, [float(row), 0.0, 1.0], [-float(row), -0.0, -1.0], 0.0)
         sizes[row] = len(messages.encode(pose, encoding))
     assert sizes[0] > 60
-    for link, speaker in enumerate(NET.speaker):
+    for link, speaker in enumerate(NET.sender):
         assert got.arrival[got.link == link] == pytest.approx(8.0 * sizes[speaker] / bandwidth, abs=1e-12)
 
 

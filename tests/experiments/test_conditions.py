@@ -80,7 +80,7 @@ def test_keys_come_from_the_seed_and_the_names_wherever_the_link_is():
     for names in (("A",), ("B",), ("C",), ("C", "A"), NAMES):  # processes with some of the robots
         here = at(channel, *names)
         links = Plan(experiment(channel)).assignment(names).links
-        for k, (i, j) in enumerate(zip(links.listener, links.speaker, strict=True)):
+        for k, (i, j) in enumerate(zip(links.receiver, links.sender, strict=True)):
             k_all = ends.index((NAMES[j], names[i]))
             assert here.key[k] == both.key[k_all]
             assert here.loss[k] == both.loss[k_all]
@@ -160,4 +160,4 @@ def test_links_that_only_avoidance_hears_are_links():
     links = Plan(chosen).assignment(NAMES).links
     made = link_conditions.virtual(chosen, links, [1])
     ((k),) = np.flatnonzero(made.loss)
-    assert (NAMES[links.listener[k]], NAMES[links.speaker[k]]) == ("A", "C")
+    assert (NAMES[links.receiver[k]], NAMES[links.sender[k]]) == ("A", "C")

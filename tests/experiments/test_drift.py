@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.clock import STEP_S, Clock, said
+from agents.clock import STEP_S, Clock, correction_line
 from agents.network.messages import HostClock
 from experiments.real_time.hosts import clock_drift
 from experiments.real_time.hosts.hosts import HostError
@@ -29,7 +29,7 @@ def simulated(ppm, seconds, *, follows):
             now = HostClock("lab2", t, lies + rng.uniform(-1, 1) * UNCERTAINTY_S, UNCERTAINTY_S, ["CF01"])
             due = t + clock_drift.due(measured[-1], now)
             wanted = clock_drift.applied(now, measured[-1].applied) if follows else 0.2
-            clock.heed(said(-wanted).strip())
+            clock.follow(correction_line(-wanted).strip())
             measured.append(HostClock("lab2", t, now.offset, UNCERTAINTY_S, ["CF01"], wanted))
         clock.slew(DT)
         left.append(lies + clock.correction_s)

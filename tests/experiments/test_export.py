@@ -57,8 +57,8 @@ def test_who_spoke_and_who_listens_count_from_one(flown, mat):
     assert read["sent"]["robot"].tolist() == (trace.sent.link + 1.0).tolist()
     assert read["sent"]["position"] == pytest.approx(trace.sent.position, abs=1e-6)
     net = links_of(trace)
-    assert read["links"]["listener"].tolist() == (net.listener + 1.0).tolist()
-    assert read["links"]["speaker"].tolist() == (net.speaker + 1.0).tolist()
+    assert read["links"]["listener"].tolist() == (net.receiver + 1.0).tolist()
+    assert read["links"]["speaker"].tolist() == (net.sender + 1.0).tolist()
     assert read["links"]["distance"].tolist() == net.distance.tolist()
     assert (np.diag(read["adjacency"].sum(axis=1)) - read["adjacency"]).tolist() == laplacian(net, 3).tolist()
     assert min(read["sent"]["robot"]) >= 1.0

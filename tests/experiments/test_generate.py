@@ -78,7 +78,7 @@ def test_a_hundred_drones_form_their_hemisphere_from_random_starts(tmp_path, see
     experiment = written(tmp_path, "hemisphere", "100", Wanted(duration_s=25.0)).experiment
     log = simulation.simulate(experiment, [seed])
     net = Plan(experiment).links
-    apart = np.linalg.norm(log.true_position[:, net.listener] - log.true_position[:, net.speaker], axis=2)
+    apart = np.linalg.norm(log.true_position[:, net.receiver] - log.true_position[:, net.sender], axis=2)
     worst = np.abs(apart - net.distance).max(axis=1)
     running = (log.time >= 0.0) & (log.time <= 25.0)
     assert worst[running][0] > 0.25
@@ -94,8 +94,8 @@ def test_by_offsets_they_come_from_anywhere(tmp_path):
     net = Plan(read.experiment).links
     law = Plan(read.experiment).assignment(tuple(read.experiment.robots)).law
     begin, end = (log.true_position[np.searchsorted(log.time, at)] for at in (0.0, 29.9))
-    assert law.error(begin, begin[net.speaker], net).max() > 3.0
-    assert law.error(end, end[net.speaker], net).max() < 0.07  # three times the threshold at which robots speak
+    assert law.error(begin, begin[net.sender], net).max() > 3.0
+    assert law.error(end, end[net.sender], net).max() < 0.07  # three times the threshold at which robots speak
 
 
 @pytest.mark.slow

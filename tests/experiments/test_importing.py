@@ -51,7 +51,7 @@ def test_they_run(tmp_path, count):
     net = Plan(experiment).links
     last = log.true_position[np.searchsorted(log.time, 19.9)]
     allowed = experiment.tolerance if experiment.formation.update is None else 0.15  # what a chain of thresholds leaves
-    assert law.error(last, last[net.speaker], net).max() < allowed
+    assert law.error(last, last[net.sender], net).max() < allowed
 
 
 def test_a_distance_task(tmp_path):

@@ -31,7 +31,7 @@ def both_ways(made, gain):
 def by_hand(law, net, position, share, anchors=None):
     """Eigenvalues by moving one coordinate of one robot at a time, with everybody hearing of it."""
     step, rows = 1e-4, len(position)
-    listeners = np.unique(np.concatenate([net.listener, [] if anchors is None else anchors.row])).astype(int)
+    listeners = np.unique(np.concatenate([net.receiver, [] if anchors is None else anchors.row])).astype(int)
     columns = []
     for row in listeners:
         for axis in (0, 1):
@@ -39,7 +39,7 @@ def by_hand(law, net, position, share, anchors=None):
             for sign in (1.0, -1.0):
                 moved = position.copy()
                 moved[row, axis] += sign * step
-                offset = law.offset(moved, moved[net.speaker], net)
+                offset = law.offset(moved, moved[net.sender], net)
                 offset = offset if anchors is None else offset + anchors.offset(moved)
                 answers.append(offset[listeners, :2].ravel())
             columns.append((answers[0] - answers[1]) / (2.0 * step))
@@ -62,7 +62,7 @@ def test_stiffest_and_slowest_mode_of_the_reference():
 def test_a_rounded_shape_without_a_leader_has_no_modes_of_hours():
     made = layouts.hemisphere(8, 0.6, 0.25)
     net = both_ways(made, 1.5)
-    rounded = Links(net.listener, net.speaker, np.round(net.distance, 4), net.gain)
+    rounded = Links(net.receiver, net.sender, np.round(net.distance, 4), net.gain)
     shape = realise(rounded, [made.position], np.ones(8, dtype=bool))[0]
     share = np.full(8, 0.18)
     found = modes(Distance(), rounded, shape.position, share, 10.0)
@@ -89,7 +89,7 @@ def test_rounded_lengths_make_no_slow_mode_of_a_turn(digits, led):
         net = links(pairs, far, [1.0] * len(pairs))
         share, moves = np.full(rows, 0.18), np.arange(rows) >= led
         exact = modes(Distance(), net, position, share, 10.0)
-        rounded = Links(net.listener, net.speaker, np.round(net.distance, digits), net.gain)
+        rounded = Links(net.receiver, net.sender, np.round(net.distance, digits), net.gain)
         shape = realise(rounded, [position], moves)[0]
         found = modes(Distance(), rounded, shape.position, share, 10.0)
         assert found.slowest_s == pytest.approx(exact.slowest_s, rel=10.0**-digits * 300.0)

@@ -75,6 +75,6 @@ def test_a_late_goal_does_not_bring_a_dead_centre_back():
     guidance.receive(row, goal, np.zeros(1), np.array([1.0]))
     guidance.mark_lost(2.0)
     guidance.receive(row, goal, np.zeros(1), np.array([1.9]))
-    assert guidance.lacking(2.1)[0]
+    assert guidance.unguided(2.1)[0]
     guidance.receive(row, goal, np.zeros(1), np.array([2.2]))  # of another one, such as a tool of ROS
-    assert not guidance.lacking(2.3)[0]
+    assert not guidance.unguided(2.3)[0]

@@ -60,7 +60,7 @@ def test_a_run_is_read_back(path):
     np.testing.assert_allclose(trace.received.arrival, along[1:] - 0.04, atol=1e-6)
     np.testing.assert_allclose(trace.received.stamp, along[1:] - 0.05, atol=1e-6)
     net = trace.plan.heard_links
-    assert {(net.listener[link], net.speaker[link]) for link in trace.received.link} == {(1, 0)}
+    assert {(net.receiver[link], net.sender[link]) for link in trace.received.link} == {(1, 0)}
     assert trace.received.seq.tolist() == list(range(1, 11))
     np.testing.assert_allclose(trace.received.position[:, 0], along[1:] - 0.05)
     np.testing.assert_array_equal(trace.received.velocity, np.tile([1.0, 0.0, 0.0], (10, 1)))

@@ -100,8 +100,8 @@ def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     robots = {**case.robots, "C": msgspec.structs.replace(FLY, standby=standby)}
     told = Plan(msgspec.structs.replace(case, robots=robots)).assignment(["A"])
     agent = Agent(told)
-    assert agent.missing(0) == ["B", "C"]
-    link = np.array([told.speakers[j] for j in told.links.speaker]) == "B"
+    assert agent.missing_neighbours(0) == ["B", "C"]
+    link = np.array([told.robots[j] for j in told.links.sender]) == "B"
     at = np.flatnonzero(link)
     agent.mark_alive(at)
     agent.receive(at, np.array([[0.5, 0.0, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
@@ -111,8 +111,8 @@ def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     )  # fmt: skip
     for tick in range(3):
         agent.step(0.01 * tick, state)
-    assert (agent.life.phase[0] > 0) == standby
-    assert agent.missing(0) == ["C"]
+    assert (agent.lifecycle.phase[0] > 0) == standby
+    assert agent.missing_neighbours(0) == ["C"]
 
 
 def order(**more: object) -> messages.RunOrder:

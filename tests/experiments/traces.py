@@ -66,7 +66,7 @@ def trace(
     who = np.array([i for _, i, _ in sends], dtype=np.intp)
     number = np.array([k for _, _, k in sends], dtype=np.intp)
     place = position[np.clip(np.round(when / step).astype(int), 0, count - 1), who].reshape(-1, 3)
-    speaker = Plan(what).heard_links.speaker
+    speaker = Plan(what).heard_links.sender
     pairs = [(k, link) for k, j in enumerate(who) for link in np.flatnonzero(speaker == j)]
     take = np.array([k for k, _ in pairs], dtype=np.intp)
     rows = len(names)
@@ -187,7 +187,7 @@ def simulate(what: Experiment, start: Array, case: str, threshold: float, *, see
     row = {name: i for i, name in enumerate(names)}
     parsed = parse_links(what)
     net = links([(row[i], row[j]) for i, j, _, _ in parsed], [d for *_, d, _ in parsed], [3.0] * len(parsed))
-    moves = np.isin(np.arange(rows), net.listener)
+    moves = np.isin(np.arange(rows), net.receiver)
     place, held, goal = start.copy(), start.copy(), start.copy()
     wobble = np.zeros((rows, 3))
     count = round(duration / STEP) + 1
@@ -202,9 +202,9 @@ def simulate(what: Experiment, start: Array, case: str, threshold: float, *, see
         for i in np.flatnonzero(speaks & (k < count - 1)):
             sent[names[i]].append(t)
         if k % 5 == 0:
-            away = seen[net.listener] - held[net.speaker]
+            away = seen[net.receiver] - held[net.sender]
             pull = 0.5 * net.gain * (net.distance**2 - norm(away) ** 2)
-            step = np.clip(net.onto_listeners(pull[:, None] * away, rows), -0.1, 0.1) * [1.0, 1.0, 0.0]
+            step = np.clip(net.sum_by_receiver(pull[:, None] * away, rows), -0.1, 0.1) * [1.0, 1.0, 0.0]
             goal = np.where(moves[:, None], seen + step, place)
         place = place + STEP * 1.5 * (goal - seen) * moves[:, None]
         if what.timeline and what.timeline[0].at_s <= t < what.timeline[0].at_s + 5.0:

@@ -28,7 +28,7 @@ def sent_and_heard(trace: Trace, listener: int, speaker: int, end: float) -> tup
     """Running numbers of the run that a robot said, and those of them that another one heard."""
     said = trace.sent.seq[(trace.sent.link == speaker) & (trace.sent.stamp < end - MARGIN_S)]
     net = trace.plan.heard_links
-    mine = trace.received.link == np.flatnonzero((net.listener == listener) & (net.speaker == speaker))
+    mine = trace.received.link == np.flatnonzero((net.receiver == listener) & (net.sender == speaker))
     return said, np.intersect1d(said, trace.received.seq[mine])
 
 
@@ -52,7 +52,7 @@ def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Pat
     transmits_at_50_hz(real)
     shares, sent = [], 0
     net = real.plan.heard_links
-    pairs = sorted({(int(net.listener[link]), int(net.speaker[link])) for link in real.received.link})
+    pairs = sorted({(int(net.receiver[link]), int(net.sender[link])) for link in real.received.link})
     assert len(pairs) == len(real.dropped if real.dropped is not None else ())
     for listener, speaker in pairs:
         said, heard = sent_and_heard(real, listener, speaker, 3.0)

@@ -396,7 +396,7 @@ def test_the_reference_formation_needs_half_the_gain():
         parts = {"formation": formation, "world": World(engine="mujoco"), "duration_s": 20.0, "timeline": []}
         log = simulate(msgspec.structs.replace(park, **parts), (1,))
         place = log.true_position[(log.time > 15.0) & (log.time < 20.0)]
-        apart = np.linalg.norm(place[:, links.listener] - place[:, links.speaker], axis=2)
+        apart = np.linalg.norm(place[:, links.receiver] - place[:, links.sender], axis=2)
         error[gain] = np.abs(apart - links.distance).mean()
     assert error[1.5] < 0.02
     assert error[3.0] > 0.025

@@ -69,7 +69,7 @@ class Meter:
 
 def process() -> Iterator[Figure]:
     """Robot processes of the reference experiment in flight, each beside a bare process: CPU and memory of both."""
-    from agents.agent import links_by_speaker  # noqa: PLC0415
+    from agents.agent import links_by_sender  # noqa: PLC0415
     from agents.network import messages  # noqa: PLC0415
     from agents.network.endpoints import free_endpoint  # noqa: PLC0415
     from experiments.definition.plan import Plan  # noqa: PLC0415
@@ -107,7 +107,7 @@ def process() -> Iterator[Figure]:
             start_router(launcher, endpoints)
             for robot in experiment.robots:
                 mine = Plan(experiment).assignment([robot])
-                speakers = links_by_speaker(mine.links, mine.speakers)
+                speakers = links_by_sender(mine.links, mine.robots)
                 rate = f"{experiment.rates.pose_hz:g}"
                 started = launcher.start(
                     f"bare-{robot}", "tools.bench.bare_process", robot, rate, *speakers, "--connect", endpoints[0]

@@ -183,7 +183,7 @@ class Station:
         assert self.clock is not None
         self.applied = applied
         for process, launcher in self._robots:
-            launcher.tell(process, clock.said(-applied))
+            launcher.tell(process, clock.correction_line(-applied))
         self.clock = msgspec.structs.replace(self.clock, applied=applied)
         return self.clock
 

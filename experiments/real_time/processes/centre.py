@@ -64,14 +64,14 @@ class CentreProcess:
         self._period = assignment.decide_every / assignment.body_hz
         # what robots say on the tick of a decision is on its way then: half a tick more, and it counts
         self._patience = 0.5 / assignment.body_hz
-        names, rows = self._names, centre.listens.tolist()
+        names, rows = self._names, centre.needed.tolist()
         reach, rate = reach_of(assignment.limits.low, assignment.limits.high), experiment.rates.pose_hz
         self._speakers = [
             NeighbourSubscription(session, keys, names[row], np.array([link]), reach=reach, rate=rate, depth=DEPTH)
             for link, row in enumerate(rows)
         ]
         self._heard: Index = np.zeros(len(rows), dtype=np.intp)
-        self._channel = Channel(link_conditions.to_centre(experiment, centre.listens))
+        self._channel = Channel(link_conditions.to_centre(experiment, centre.needed))
         self._guided = [row for row in rows if centre.guided[row]]
         self._statuses = {
             row: pubsub.Inbox(pubsub.pose_subscriber(session, keys.status(names[row])), messages.Status, keys=keys)
@@ -116,7 +116,7 @@ class CentreProcess:
             for status in inbox.read(_check_status):
                 self._update_status(row, status)
         for speaker in self._speakers:
-            rows = self.centre.listens[speaker.links]
+            rows = self.centre.needed[speaker.links]
             for coming in speaker.comings():
                 if coming is Coming.CAME:
                     self.centre.mark_alive(rows)
@@ -139,7 +139,7 @@ class CentreProcess:
     def _begin(self, speaker: NeighbourSubscription) -> None:
         """A robot begins a new life."""
         self._channel.forget(speaker.links)
-        self.centre.forget(self.centre.listens[speaker.links])
+        self.centre.discard_poses(self.centre.needed[speaker.links])
 
     def _send(self, speaker: NeighbourSubscription, said: ReceivedPose, t: float) -> None:
         """One pose has come: it is given to the modelled network."""
@@ -162,7 +162,7 @@ class CentreProcess:
     def _believe(self, got: PoseTable) -> None:
         """Poses have got through."""
         assert got.extra is not None  # all bring along their yaw, and when they were measured
-        rows = self.centre.listens[got.link]
+        rows = self.centre.needed[got.link]
         yaw, measured = got.extra.T
         self.centre.receive(rows, got.position, got.velocity, yaw, measured, got.arrival)
         start = float(self._start[self._guided].min())
@@ -176,7 +176,7 @@ class CentreProcess:
     def _update_status(self, row: int, status: messages.Status) -> None:
         self._phase[row] = PHASES[status.phase]
         if status.origin is not None and all(map(isfinite, status.origin)):
-            self.centre.begin(row, status.origin)
+            self.centre.begin_plan(row, status.origin)
         self._start[row] = status.started - self._utc if status.started > 0.0 else np.inf
 
     def _tell(self, told: CentreGoals, t: float) -> None:
@@ -202,7 +202,7 @@ class CentreProcess:
         report = messages.CentreState(
             stamp=self._utc + t,
             robots=[self._names[row] for row in self._guided],
-            missing=[self._names[row] for row in self.centre.missing()],
+            missing=[self._names[row] for row in self.centre.missing_robots()],
             load=round((cpu_s - self._cpu_s) / max(t - self._reported, self._period), 4),
             late_s=round(self._late_s, 6),
             decisions=self.centre.decisions,
