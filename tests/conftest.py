@@ -97,7 +97,7 @@ class RouterProcess:
         return self._reap()
 
     def _reap(self) -> int:
-        code = self.process.wait(10)
+        code = self.process.wait(30)
         assert self.process.stdout is not None
         self.process.stdout.close()
         return code
@@ -135,11 +135,11 @@ def no_orphans(request: pytest.FixtureRequest) -> Iterator[None]:
     threads = set(threading.enumerate())
     processes = set(psutil.Process().children(recursive=True))
     yield
-    _, left = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - processes, timeout=2.0)
+    _, left = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - processes, timeout=10.0)
     what = [f"{process.pid}: {' '.join(process.cmdline())}" for process in left]
     for process in left:
         process.kill()
     assert not what, f"processes left behind: {what}"
     for thread in set(threading.enumerate()) - threads:
-        thread.join(2.0)
+        thread.join(10.0)
         assert not thread.is_alive(), f"thread left behind: {thread.name}"

@@ -65,7 +65,7 @@ def test_router_ends_with_its_starter():
         text=True,
     )
     assert process.stdout.readline() == f"router ready on {endpoint}\n"
-    _, said = process.communicate(timeout=10)
+    _, said = process.communicate(timeout=30)
     assert process.returncode == 0
     assert said == "router: the starter is gone\n"
 

@@ -447,7 +447,7 @@ def test_interpreter_exits_although_a_session_was_left_open(router):
         input="",
         capture_output=True,
         text=True,
-        timeout=20,
+        timeout=60,
         check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "ready\n", "")

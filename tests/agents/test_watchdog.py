@@ -44,13 +44,13 @@ class Told:
 
 
 class Kennel:
-    def __init__(self, down_s: float = 10.0) -> None:
+    def __init__(self, down_s: float = 10.0, silence_s: float = SILENCE_S) -> None:
         self.body, self.alarms, self.ends = Told(), list[str](), list[int]()
         self.dog = Watchdog(
             self.body,  # type: ignore[arg-type]
             np.arange(2),
             alarm=self.alarms.append,
-            silence_s=SILENCE_S,
+            silence_s=silence_s,
             down_s=down_s,
             end=self.ends.append,
         )
@@ -63,25 +63,25 @@ class Kennel:
 
 
 def test_a_loop_that_goes_round_is_left_alone():
-    kennel = Kennel()
+    kennel = Kennel(silence_s=1.0)  # a busy machine may hold up a loop for some tenths
     with kennel.dog:
-        kennel.beat_for(5 * SILENCE_S)
+        kennel.beat_for(2.0)
     assert not kennel.body.orders
     assert not kennel.alarms
     assert not kennel.dog.tripped
 
 
 def test_a_loop_that_hangs_has_its_robots_landed_and_may_come_back(eventually: Callable[[Callable[[], object]], None]):
-    kennel = Kennel()
+    kennel = Kennel(silence_s=0.5)
     with kennel.dog:
         kennel.beat_for(0.05)
         eventually(lambda: kennel.body.count("land"))
         eventually(lambda: kennel.alarms)
         assert kennel.dog.tripped == kennel.alarms[0]
-        assert kennel.dog.tripped.startswith("its control loop hangs: no tick for 0.")
+        assert kennel.dog.tripped.startswith("its control loop hangs: no tick for ")
         assert kennel.dog.forgive() == kennel.alarms[0]
         assert not kennel.dog.tripped
-        kennel.beat_for(3 * SILENCE_S)
+        kennel.beat_for(1.0)
     assert not kennel.body.count("stop")
     assert len(kennel.alarms) == 1
     assert not kennel.ends
@@ -106,7 +106,7 @@ from agents.runtime.watchdog import Watchdog
 class Body:
     def land(self, rows): print("landed", flush=True)
     stop = land
-with Watchdog(Body(), None, alarm=print, silence_s=0.3) as dog:
+with Watchdog(Body(), None, alarm=print, silence_s=0.5) as dog:
     print("runs", flush=True)
     pause = threading.Event()
     for _ in range(150):
@@ -125,5 +125,5 @@ def test_a_process_that_was_frozen_is_not_a_loop_that_hangs():
     os.kill(process.pid, signal.SIGSTOP)
     time.sleep(1.0)
     os.kill(process.pid, signal.SIGCONT)
-    out, _ = process.communicate(timeout=20)
+    out, _ = process.communicate(timeout=30)
     assert out == "over\n"

@@ -271,7 +271,7 @@ def bridge(router):
     assert process.stdout.readline() == "ros2 ready: node /zenpark, domain 7, jazzy\n"
     yield process
     process.send_signal(signal.SIGTERM)
-    assert process.wait(10) == 0
+    assert process.wait(30) == 0
     process.stdout.close()
 
 

@@ -428,7 +428,7 @@ class TwinProcess:
 
     def kill(self):
         os.kill(self.process.pid, signal.SIGKILL)
-        self.process.wait(10)
+        self.process.wait(30)
         self.process.stdin.close()
         self.process.stdout.close()
 

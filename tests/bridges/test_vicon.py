@@ -192,7 +192,7 @@ class BridgeProcess:
         return self.wait()
 
     def wait(self) -> int:
-        code = self.process.wait(10)
+        code = self.process.wait(30)
         self._ears.join(5)
         for stream in (self.process.stdin, self.process.stderr):
             assert stream is not None

@@ -97,14 +97,14 @@ def test_it_sweeps_up_its_own_run_only():
         found = []  # a process has its environment only after its exec
         until(lambda: found.extend(started.ask(Question("sweep")).found) or found, "it is found")
         assert [each.what for each in found] == [str(mine.pid)]
-        assert mine.wait(5) == -9
+        assert mine.wait(30) == -9
         assert other.poll() is None
         assert started.leave() == 0
         assert psutil.pid_exists(other.pid)
     finally:
         for process in (mine, other):
             process.stdin.close()
-            process.wait(5)
+            process.wait(30)
 
 
 @pytest.mark.mechanism("station: way out on a host")
@@ -115,6 +115,6 @@ def test_it_waits_for_robots_that_land_and_kills_those_that_do_not():
         started.ask(Question("clock"))
         frozen.send_signal(signal.SIGSTOP)
         assert started.leave() == 0
-        assert frozen.wait(5) == -signal.SIGKILL
+        assert frozen.wait(30) == -signal.SIGKILL
     finally:
         frozen.stdin.close()

@@ -120,7 +120,7 @@ class Watcher(Looking):
 class Started:
     """A process started by hand as a user would, with its standard input held open."""
 
-    patience_s = 20.0  # for its end
+    patience_s = 40.0  # for its end
 
     def __init__(self, module: str, *arguments: str) -> None:
         self.process = subprocess.Popen(
@@ -161,7 +161,7 @@ class RobotProcess(Started):
 class WorldProcess(Started):
     """`zenpark world`, whose first line is `ready`."""
 
-    patience_s = 25.0
+    patience_s = 40.0
 
     def __init__(self, endpoint: str, file: str | Path, *arguments: str) -> None:
         super().__init__("experiments.real_time.processes.world", str(file), "--connect", endpoint, *arguments)

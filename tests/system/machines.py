@@ -146,7 +146,7 @@ class Machine:
     def close(self) -> None:
         if self._sshd is not None:
             self._sshd.terminate()
-            self._sshd.wait(5)
+            self._sshd.wait(30)
         for pid in subprocess.run(
             ["ip", "netns", "pids", self.namespace], capture_output=True, text=True, check=False
         ).stdout.split():

@@ -93,7 +93,7 @@ class Laboratory:
         if self.robots:
             self.watcher.close()
         self.process.terminate()
-        self.process.wait(10)
+        self.process.wait(30)
         assert self.process.stdout is not None
         self.process.stdout.close()
 

@@ -152,7 +152,7 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
     watcher.until(reported, "the centre says how it is, and that it hears KH01")
     assert (reports[-1].robots, reports[-1].missing) == (["TB01", "KH01", "KH02"], [])
     centre.terminate()
-    assert centre.wait(10.0) == 0
+    assert centre.wait(30) == 0
     centre.stdout.close()
     watcher.until(lambda: watcher.status["KH02"].missing == ["centre"], "its end is noticed")
     for robot in robots:

@@ -115,7 +115,7 @@ def test_a_loop_that_hangs_is_landed_said_and_ended(router: RouterProcess, watch
     finally:
         for process in reversed(started):
             process.kill()
-            process.wait(5)
+            process.wait(30)
 
 
 def test_what_was_frozen_in_the_air_is_landed_and_knows_it(

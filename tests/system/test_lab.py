@@ -82,7 +82,7 @@ def test_a_router_of_a_lab_listens_on_every_interface(tmp_path: Path) -> None:
     assert process.stdout is not None
     assert process.stdout.readline().startswith("router ready on tls/0.0.0.0:0")
     process.terminate()
-    assert process.wait(10) == 0
+    assert process.wait(30) == 0
     process.stdout.close()
 
 

@@ -235,7 +235,7 @@ def test_what_a_user_can_mend_is_said_without_a_traceback(router: RouterProcess)
         (("triangle", "KH01", "--case", "evnt"), "no case 'evnt'"),
     ):
         robot = RobotProcess(router.endpoint, *arguments)
-        out, _ = robot.process.communicate(timeout=20.0)
+        out, _ = robot.process.communicate(timeout=30)
         assert robot.process.returncode == 2
         assert words in out
         assert "Traceback" not in out

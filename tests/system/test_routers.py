@@ -90,7 +90,7 @@ def laboratory(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
     finally:
         made.close()
         second.terminate()
-        second.wait(10)
+        second.wait(30)
         second.stdout.close()  # type: ignore[union-attr]
 
 

@@ -348,7 +348,7 @@ def test_a_world_that_is_told_to_end_waits_for_its_robots(
         world.process.terminate()
         assert robot.end() == 0
         watcher.until(lambda: watcher.phase("CF01") == "done", "it landed in the world that was told to end")
-        assert world.wait(5.0) == 0
+        assert world.wait(30) == 0
     finally:
         watcher.close()
 

@@ -58,7 +58,7 @@ def started(endpoint: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]
     finally:
         process.send_signal(signal.SIGCONT)
         process.terminate()
-        process.wait(10)
+        process.wait(30)
 
 
 def answers(endpoint: str, process: subprocess.Popen[bytes]) -> bool:

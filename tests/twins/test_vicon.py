@@ -301,7 +301,7 @@ def process(router: RouterProcess) -> Iterator[subprocess.Popen[str]]:
     made.stdout.close()
     if made.poll() is None:
         made.kill()
-    made.wait(10)
+    made.wait(30)
 
 
 @pytest.mark.system
@@ -333,7 +333,7 @@ def test_the_process_shows_the_truth_that_it_hears(process: subprocess.Popen[str
         assert seen is None
         reader.close()
     process.send_signal(signal.SIGTERM)
-    assert process.wait(5) == 0
+    assert process.wait(30) == 0
 
 
 @pytest.mark.mechanism("lifeline: motion capture stays until the robots are down")
@@ -352,7 +352,7 @@ def test_the_process_ends_with_its_starter_but_not_before_the_robots(
             assert reader.newest(1.0) is not None
         assert process.poll() is None
         token.undeclare()  # type: ignore[no-untyped-call]
-        assert process.wait(5) == 0
+        assert process.wait(30) == 0
     reader.close()
 
 
