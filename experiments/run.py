@@ -76,27 +76,17 @@ MOST_SAMPLES: Final = 2e7  # states of one robot; each takes about 300 bytes
 
 @dataclass(frozen=True)
 class Run:
-    """What a run leaves.
+    """What a run leaves."""
 
-    Attributes:
-        title: Of the experiment.
-        seed: Of its noise.
-        traces: What happened, per case.
-        metrics: What it comes to, per case.
-        folder: Where the recordings are; None if none were made.
-        source: The experiment file.
-        notes: What the reader should know: robots lost, a damaged recording, a case that never began.
-        made: When, UTC [s].
-    """
-
-    title: str
-    seed: int
-    traces: dict[str, Trace]
-    metrics: dict[str, CaseMetrics]
-    folder: Path | None = None
-    source: str = ""
+    title: str  # of the experiment
+    seed: int  # of its noise
+    traces: dict[str, Trace]  # what happened, per case
+    metrics: dict[str, CaseMetrics]  # what it comes to, per case
+    folder: Path | None = None  # where the recordings are; None if none were made
+    source: str = ""  # the experiment file
+    # what the reader should know: robots lost, a damaged recording, a case that never began
     notes: tuple[str, ...] = ()
-    made: float = field(default_factory=time.time)
+    made: float = field(default_factory=time.time)  # when, UTC [s]
 
     def figures(self) -> dict[str, Figure]:
         """The figures of the report, by name."""

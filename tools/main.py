@@ -46,7 +46,7 @@ EXPLAINED: Final = (
     ("experiments.report.export", "ExportError"),
     ("experiments.real_time.conductor.conductor", "RunFailed"),
     ("experiments.real_time.hosts.hosts", "HostError"),
-    ("experiments.virtual_time.simulation", "Stuck"),
+    ("experiments.virtual_time.conductor", "Stuck"),
     ("experiments.sweep.workers", "SweepError"),
     ("experiments.real_time.conductor.support", "StandInError"),
     ("tools.commands.orders", "WorldOrderError"),

@@ -27,7 +27,8 @@ from agents.plugins.triggers import Trigger
 from agents.safety.hazards import Incident, Outcome
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, World
-from experiments.virtual_time import simulation
+from experiments.recording.trace import ROUNDING_S
+from experiments.virtual_time import conductor, simulation
 
 FAR: Final = 1e6  # [m] walls that nobody meets
 TICK_COST: Final = 200.0  # robots whose arithmetic takes as long as what a tick costs in any case
@@ -105,11 +106,11 @@ def repeat(bare: Experiment, count: int) -> list[Prediction]:
     names = tuple(bare.robots)
     try:
         log = simulation.simulate(bare, [bare.seed + k for k in range(count)], lean=True, landing=False)
-    except simulation.Stuck as stuck:
+    except conductor.Stuck as stuck:
         position, _ = bodies.start(bare, names)
         position[:, 2] = np.nan_to_num(bodies.hover(bare, names))
         return [Prediction(np.zeros(1), position[None], stuck=str(stuck))] * count
-    run = log.time >= -simulation.ROUNDING_S
+    run = log.time >= -ROUNDING_S
     begun = [each for each in log.incidents if each.outcome > Outcome.NONE and 0.0 <= each.time < bare.duration_s]
     flights = []
     for k in range(count):

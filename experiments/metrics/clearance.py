@@ -25,17 +25,12 @@ TOUCH_M = 1e-6  # [m] less overlap than this is rounding
 
 @dataclass(frozen=True)
 class Clearance:
-    """Distances between surfaces [m], negative where they overlap; times since the common start [s].
+    """Distances between surfaces [m], negative where they overlap; times since the common start [s]."""
 
-    Attributes:
-        robots: Closest approach of each robot to another one; None where there is no other.
-        arena: Closest approach of each robot to an obstacle or a wall.
-        overlaps: Every maximal time in which two robots, or a robot and a thing, overlapped: when it began, how deep it
-            became, and who.
-    """
-
-    robots: tuple[Approach | None, ...]
-    arena: tuple[Approach | None, ...]
+    robots: tuple[Approach | None, ...]  # closest approach of each robot to another one; None where there is no other
+    arena: tuple[Approach | None, ...]  # closest approach of each robot to an obstacle or a wall
+    # every maximal time in which two robots, or a robot and a thing, overlapped: when it began, how deep it became,
+    # and who
     overlaps: tuple[Collision, ...]
 
     @classmethod

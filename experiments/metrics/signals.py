@@ -53,24 +53,16 @@ def own_links(net: Links, rows: int) -> Array:
 
 @dataclass(frozen=True)
 class LinkErrors:
-    """How far the links are from what they ask for, and whose they are.
+    """How far the links are from what they ask for, and whose they are."""
 
-    Attributes:
-        time: (T,) [s].
-        net: The links.
-        own: (E, N) 1 where a link counts for a robot, see `own_links`.
-        error: (T, E) as the law measures it, |‖p_i − p_j‖ − d_ij| for distances [m]; NaN where an end is unknown or
-            the link is not there.
-        alive: (T, N) whether the robot's own position is known.
-        away: (T,) the network was away, see `network_away`: what is unknown then tells nothing of a robot.
-    """
-
-    time: Array
-    net: Links
-    own: Array
+    time: Array  # (T,) [s]
+    net: Links  # the links
+    own: Array  # (E, N) 1 where a link counts for a robot, see `own_links`
+    # (T, E) as the law measures it, |‖p_i − p_j‖ − d_ij| for distances [m]; NaN where an end is unknown or the link
+    # is not there
     error: Array
-    alive: Mask
-    away: Mask
+    alive: Mask  # (T, N) whether the robot's own position is known
+    away: Mask  # (T,) the network was away, see `network_away`: what is unknown then tells nothing of a robot
 
     @classmethod
     def of(cls, trace: Trace) -> LinkErrors:

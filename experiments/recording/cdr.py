@@ -38,19 +38,12 @@ class Undecodable(ValueError):
 
 @dataclass(frozen=True)
 class Codec(Generic[S]):
-    """A struct as a ROS 2 message.
+    """A struct as a ROS 2 message."""
 
-    Attributes:
-        name: Type of the message, such as `zenpark_msgs/msg/State`.
-        schema: Its definition as ros2msg text, with the definitions it needs.
-        encode: From the struct to CDR with its encapsulation header; raises `Unencodable`.
-        decode: The way back; raises `Undecodable`.
-    """
-
-    name: str
-    schema: str
-    encode: Callable[[S], bytes]
-    decode: Callable[[bytes], S]
+    name: str  # type of the message, such as `zenpark_msgs/msg/State`
+    schema: str  # its definition as ros2msg text, with the definitions it needs
+    encode: Callable[[S], bytes]  # from the struct to CDR with its encapsulation header; raises `Unencodable`
+    decode: Callable[[bytes], S]  # the way back; raises `Undecodable`
 
 
 @cache

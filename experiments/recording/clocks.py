@@ -35,25 +35,16 @@ def offset(samples: Sequence[Sample]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """How one host's clock lay to ours over a run.
+    """How one host's clock lay to ours over a run."""
 
-    Attributes:
-        host: Its name.
-        robots: That ran there.
-        first: Offset at the beginning [s], which was taken off every stamp where it was made.
-        last: Offset at the end [s].
-        worst: The largest error that was left in stamps when it was measured [s]; as much as `last` less `first`
-            if they had not been corrected during the run.
-        uncertainty: The larger of both measurements' [s].
-        over: Time between them [s].
-    """
-
-    host: str
-    robots: tuple[str, ...]
-    first: float
-    last: float
-    uncertainty: float
-    over: float
+    host: str  # its name
+    robots: tuple[str, ...]  # that ran there
+    first: float  # offset at the beginning [s], which was taken off every stamp where it was made
+    last: float  # offset at the end [s]
+    uncertainty: float  # the larger of both measurements' [s]
+    over: float  # time between them [s]
+    # the largest error that was left in stamps when it was measured [s]; as much as `last` less `first` if they had
+    # not been corrected during the run
     worst: float = 0.0
 
     @property

@@ -41,19 +41,12 @@ class NotStarted(RecordingError):
 
 @dataclass(frozen=True)
 class Playback:
-    """A recording, read.
+    """A recording, read."""
 
-    Attributes:
-        trace: What happened, until the end of the run.
-        started: The common start, UTC [s]; of a virtual run the one that it pretends.
-        complete: The recorder finished the file and nothing in it is damaged.
-        messages: How many the file holds, those of other programs included.
-    """
-
-    trace: Trace
-    started: float
-    complete: bool
-    messages: int
+    trace: Trace  # what happened, until the end of the run
+    started: float  # the common start, UTC [s]; of a virtual run the one that it pretends
+    complete: bool  # the recorder finished the file and nothing in it is damaged
+    messages: int  # how many the file holds, those of other programs included
 
 
 def read(path: Path) -> Playback:

@@ -45,25 +45,15 @@ class Message(NamedTuple):
 
 @dataclass
 class Records:
-    """What a file holds. Everything but the messages grows while `messages` is iterated.
+    """What a file holds. Everything but the messages grows while `messages` is iterated."""
 
-    Attributes:
-        path: Where the file is.
-        header: Profile and library.
-        schemas: By their id in the file.
-        channels: By their id in the file.
-        attachments: In the order of the file.
-        metadata: In the order of the file.
-        complete: The file was finished by its recorder and nothing in it is damaged; known at the end.
-    """
-
-    path: Path
-    header: Header | None = None
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    attachments: list[Attachment] = field(default_factory=list)
-    metadata: list[Metadata] = field(default_factory=list)
-    complete: bool = False
+    path: Path  # where the file is
+    header: Header | None = None  # profile and library
+    schemas: dict[int, Schema] = field(default_factory=dict)  # by their id in the file
+    channels: dict[int, Channel] = field(default_factory=dict)  # by their id in the file
+    attachments: list[Attachment] = field(default_factory=list)  # in the order of the file
+    metadata: list[Metadata] = field(default_factory=list)  # in the order of the file
+    complete: bool = False  # the file was finished by its recorder and nothing in it is damaged; known at the end
 
     def messages(self) -> Iterator[Message]:
         """All messages whose channel is known, in the order they were written.
@@ -141,17 +131,11 @@ def _stranger(path: Path, magic: bytes) -> str:
 
 @dataclass(frozen=True)
 class Recovered:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        messages: How many.
-        robots: Whose, in the order in which they appear.
-        complete: The source was whole already, and no target was written.
-    """
-
-    messages: int
-    robots: tuple[str, ...]
-    complete: bool
+    messages: int  # how many
+    robots: tuple[str, ...]  # whose, in the order in which they appear
+    complete: bool  # the source was whole already, and no target was written
 
 
 def recover(source: Path, target: Path) -> Recovered:

@@ -61,15 +61,10 @@ ORIGIN: Final = "run.json"  # how and when a run was made, for when its report i
 
 
 class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the numbers come from.
+    """Where the numbers come from."""
 
-    Attributes:
-        command: How to do the run again.
-        date: When it was.
-    """
-
-    command: str
-    date: str
+    command: str  # how to do the run again
+    date: str  # when it was
 
 
 def write(

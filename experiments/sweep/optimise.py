@@ -82,29 +82,18 @@ class Wish:
 
 @dataclass(frozen=True)
 class Tuned:
-    """What the search came to.
+    """What the search came to."""
 
-    Attributes:
-        read: The experiment.
-        wish: What was wished.
-        tuning: Seeds on which it was sought.
-        seeds: Seeds on which it is reported.
-        rows: The reference, and the best of each case, on `seeds`.
-        tried: Everything that was tried, in that order, on the first third of `tuning`.
-        chosen: Of each case what was chosen, on the other two thirds; its limits may be broken if nothing kept them.
-        folder: Where the runs are kept.
-        notes: What the user should know.
-    """
-
-    read: Document
-    wish: Wish
-    tuning: tuple[int, ...]
-    seeds: tuple[int, ...]
-    rows: tuple[Row, ...]
-    tried: tuple[Row, ...]
+    read: Document  # the experiment
+    wish: Wish  # what was wished
+    tuning: tuple[int, ...]  # seeds on which it was sought
+    seeds: tuple[int, ...]  # seeds on which it is reported
+    rows: tuple[Row, ...]  # the reference, and the best of each case, on `seeds`
+    tried: tuple[Row, ...]  # everything that was tried, in that order, on the first third of `tuning`
+    # of each case what was chosen, on the other two thirds; its limits may be broken if nothing kept them
     chosen: tuple[Row, ...]
-    folder: Path
-    notes: tuple[str, ...]
+    folder: Path  # where the runs are kept
+    notes: tuple[str, ...]  # what the user should know
 
     @property
     def searched(self) -> tuple[int, ...]:

@@ -65,19 +65,12 @@ class Span:
 
 @dataclass(frozen=True)
 class Axis:
-    """A value of the file that a sweep changes.
+    """A value of the file that a sweep changes."""
 
-    Attributes:
-        argument: As it was written.
-        path: As behind `--set`.
-        values: As behind `--set`, each once; empty if only a span is given.
-        span: Of the values, if they are one.
-    """
-
-    argument: str
-    path: str
-    values: tuple[str, ...]
-    span: Span | None
+    argument: str  # as it was written
+    path: str  # as behind `--set`
+    values: tuple[str, ...]  # as behind `--set`, each once; empty if only a span is given
+    span: Span | None  # of the values, if they are one
 
     def at(self, share: float) -> str:
         """The value so far along its span."""
@@ -86,22 +79,15 @@ class Axis:
 
 @dataclass(frozen=True)
 class Cell:
-    """One case with one value of each axis that it has.
+    """One case with one value of each axis that it has."""
 
-    Attributes:
-        case: Name of the case.
-        parameters: Values of the axes, by path.
-        experiment: What is run.
-        reference: Digest of what the ratios are taken over: the first case of the file with the same values, but for
-            those of its trigger.
-        digest: Of what is run.
-    """
-
-    case: str
-    parameters: Mapping[str, Any]
-    experiment: Experiment
+    case: str  # name of the case
+    parameters: Mapping[str, Any]  # values of the axes, by path
+    experiment: Experiment  # what is run
+    # digest of what the ratios are taken over: the first case of the file with the same values, but for those of its
+    # trigger
     reference: str
-    digest: str
+    digest: str  # of what is run
 
 
 def arguments(given: Sequence[str]) -> tuple[list[Axis], dict[str, str]]:

@@ -25,53 +25,36 @@ from experiments.file.structure import group_of
 from experiments.metrics.measure import KNOWN, WINDOW_S, bounds_of
 from experiments.metrics.signals import LinkErrors, gaps, integrals, leaders, transmissions
 from experiments.recording.trace import Trace
+from experiments.virtual_time.conductor import Stuck
 from experiments.virtual_time.log import Logbook
-from experiments.virtual_time.simulation import Log, Stuck, simulate
+from experiments.virtual_time.simulation import Log, simulate
 
 PACKAGES: Final = ("agents", "twins", "experiments")  # whose code decides what a run comes to
 FAILED: Final = (Stuck, BodyError, registry.PluginError)  # what a run may end with that other runs do not
 
 
 class Figures(msgspec.Struct, frozen=True):
-    """One run in numbers, the same to the bit as `experiments.metrics.measure.measure` makes of its whole trace.
+    """One run in numbers, the same to the bit as `experiments.metrics.measure.measure` makes of its whole trace."""
 
-    Attributes:
-        seed: Of the run.
-        f_hz: Transmissions per second; this and the next five are means over robots, without leaders.
-        messages: Transmissions.
-        iae: ∫ e dt [m s]; None where no error is known.
-        itae: ∫ t·e dt [m s²].
-        rmse: √(mean e²) [m].
-        acquired_s: When its links were within the tolerance for good [s]; None if that is missing for any robot.
-        gap_min_s: Shortest time between two transmissions of any robot [s]; None if none sent twice.
-        updates: Times that a goal was computed anew; a mean as those above.
-        dropped: Samples that the modelled network dropped on all links.
-    """
-
-    seed: int
-    f_hz: float | None
-    messages: float | None
-    iae: float | None
-    itae: float | None
-    rmse: float | None
+    seed: int  # of the run
+    f_hz: float | None  # transmissions per second; this and the next five are means over robots, without leaders
+    messages: float | None  # transmissions
+    iae: float | None  # ∫ e dt [m s]; None where no error is known
+    itae: float | None  # ∫ t·e dt [m s²]
+    rmse: float | None  # √(mean e²) [m]
+    # when its links were within the tolerance for good [s]; None if that is missing for any robot
     acquired_s: float | None
-    gap_min_s: float | None
-    updates: float | None
-    dropped: int
+    gap_min_s: float | None  # shortest time between two transmissions of any robot [s]; None if none sent twice
+    updates: float | None  # times that a goal was computed anew; a mean as those above
+    dropped: int  # samples that the modelled network dropped on all links
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What came of some seeds.
+    """What came of some seeds."""
 
-    Attributes:
-        runs: Those that went through.
-        failed: Seeds of the others, and why.
-        stranger: Digest of the code, if it is another than was asked for, or what is missing: nothing was run.
-    """
-
-    runs: list[Figures]
-    failed: dict[int, str] = {}
-    stranger: str = ""
+    runs: list[Figures]  # those that went through
+    failed: dict[int, str] = {}  # seeds of the others, and why
+    stranger: str = ""  # digest of the code, if it is another than was asked for, or what is missing: nothing was run
 
 
 def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:

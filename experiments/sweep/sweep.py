@@ -45,27 +45,16 @@ Tell = Callable[[int, int], None]  # runs done, of how many
 
 @dataclass(frozen=True)
 class Found:
-    """What a sweep came to.
+    """What a sweep came to."""
 
-    Attributes:
-        read: The experiment.
-        axes: What was changed.
-        seeds: Of the runs.
-        rows: The table.
-        failures: Why runs failed, each reason once.
-        missing: Runs that are not done, because the sweep was interrupted.
-        folder: Where the runs are kept.
-        notes: What the user should know.
-    """
-
-    read: Document
-    axes: tuple[Axis, ...]
-    seeds: tuple[int, ...]
-    rows: tuple[Row, ...]
-    failures: tuple[str, ...]
-    missing: int
-    folder: Path
-    notes: tuple[str, ...]
+    read: Document  # the experiment
+    axes: tuple[Axis, ...]  # what was changed
+    seeds: tuple[int, ...]  # of the runs
+    rows: tuple[Row, ...]  # the table
+    failures: tuple[str, ...]  # why runs failed, each reason once
+    missing: int  # runs that are not done, because the sweep was interrupted
+    folder: Path  # where the runs are kept
+    notes: tuple[str, ...]  # what the user should know
 
     def __str__(self) -> str:
         """The table, as the command prints it."""

@@ -19,29 +19,17 @@ NONE: Final = "-"
 
 
 class Row(msgspec.Struct, frozen=True):
-    """A cell in numbers.
+    """A cell in numbers."""
 
-    Attributes:
-        case: Name of the case.
-        parameters: Values of the axes that it has, by path.
-        reference: Whether it is what the ratios of others are taken over.
-        seeds: Runs that went through.
-        failed: Runs that did not.
-        mean: Over the seeds: each of `MEANS`; `acquired_s` over those in which all acquired.
-        ratio: Of each of `RATIOS` over the reference with the same seed, then over the seeds.
-        acquired: Share of the seeds in which every robot but the leaders acquired.
-        gap_min_s: Shortest time between two transmissions of any robot, in all seeds [s].
-    """
-
-    case: str
-    parameters: dict[str, Any]
-    reference: bool
-    seeds: int
-    failed: int
-    mean: dict[str, Spread]
-    ratio: dict[str, Spread]
-    acquired: float | None
-    gap_min_s: float | None
+    case: str  # name of the case
+    parameters: dict[str, Any]  # values of the axes that it has, by path
+    reference: bool  # whether it is what the ratios of others are taken over
+    seeds: int  # runs that went through
+    failed: int  # runs that did not
+    mean: dict[str, Spread]  # over the seeds: each of `MEANS`; `acquired_s` over those in which all acquired
+    ratio: dict[str, Spread]  # of each of `RATIOS` over the reference with the same seed, then over the seeds
+    acquired: float | None  # share of the seeds in which every robot but the leaders acquired
+    gap_min_s: float | None  # shortest time between two transmissions of any robot, in all seeds [s]
 
     def value(self, index: str) -> Spread:
         """The ratio of an index if it has one, else its mean."""

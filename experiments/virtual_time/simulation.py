@@ -18,89 +18,52 @@ from agents.agent import Agent
 from agents.arrays import Array, Index, Mask, PoseTable, some
 from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
-from agents.decision.lifecycle import Phase
 from agents.safety.hazards import Incident
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
+from experiments.virtual_time.conductor import VirtualConductor
 from experiments.virtual_time.network import Steered, VirtualNetwork
 from twins.body import TwinBody
 from twins.engines.engine import Touch
 
-LEAD_S = 0.5  # from the order to the common start
-ORDERS_S = 0.5  # orders before the start fall on multiples of this, so that repetitions a few ticks apart get the same
-ROUNDING_S = 1e-9  # ticks are multiples of a period that binary fractions miss by less than this
-PATIENCE_S = 60.0  # an experiment whose robots are not ready, up or down after this long never will be
-
-
-class Stuck(RuntimeError):
-    """Robots that do not become ready, airborne or done."""
-
 
 @dataclass(frozen=True)
 class Log:
-    """What happened, in the time of the experiment [s]; arrays over samples (K) and rows (R).
+    """Everything recorded of a virtual run; times since the common start [s], arrays over samples (K) and rows (R)."""
 
-    Attributes:
-        names: Of the rows of one repetition (N).
-        seeds: One for each repetition; R = N × repetitions, the rows of the first seed first.
-        lean: Only `true_position`, and of poses only numbers and times, are kept.
-        time: (K,) at state_hz, from before take-off (negative) to the end.
-        phase: (K, R) `agents.decision.lifecycle.Phase`.
-        position: (K, R, 3), `velocity` (K, R, 3), `yaw` (K, R): measured.
-        true_position: (K, R, 3), `true_yaw` (K, R).
-        goal: (K, R, 3), `setpoint` (K, R, 4), `error` (K, R).
-        sent: Poses of all robots; `link` is the row.
-        received: Poses on all links, those of the first repetition first.
-        lost: (E,) samples lost on each link of all repetitions, from the common start to the landing.
-        decisions: Coordination decisions of each row.
-        updates: (R,) of these, those at which the row computed its goal anew.
-        interventions: (R,) ticks on which safety changed what was decided, from the common start on.
-        avoided: (R,) ticks on which avoidance did, from the common start on.
-        touches: Contacts that began, at times since the common start.
-        ticks: Ticks from the common start to the end.
-        airborne: When all robots were up (negative), and `ended` when all were done.
-        ended: See `airborne`.
-        attitude: (K, R, 4) unit quaternions w, x, y, z from robot to room; None if the engine has none.
-        obstacles: (K, repetitions, M, 3) x, y [m], yaw [rad] of each.
-        shadow_position: (K, R, 3) of the twins beside the robots, NaN for rows without one; None if there is none.
-        shadow_yaw: (K, R) of those twins.
-        waited: (repetitions,) that got an order later than they would have got it alone, because another one was late.
-        steered: What went between the robots and the centre; None if every robot decides for itself.
-        incidents: What was wrong with robots, at times since the common start.
-    """
-
-    names: tuple[str, ...]
-    seeds: tuple[int, ...]
-    lean: bool
-    time: Array
-    phase: Index
-    position: Array
-    velocity: Array
-    yaw: Array
-    true_position: Array
-    true_yaw: Array
-    goal: Array
-    setpoint: Array
-    error: Array
-    sent: PoseTable
-    received: PoseTable
-    lost: Index
-    decisions: int
-    updates: Index
-    interventions: Index
-    avoided: Index
-    touches: tuple[Touch, ...]
-    ticks: int
-    airborne: float
-    ended: float
-    attitude: Array | None
-    obstacles: Array
+    names: tuple[str, ...]  # (N) robots of one repetition
+    seeds: tuple[int, ...]  # one per repetition; R = N × repetitions, the rows of the first seed first
+    lean: bool  # only `true_position`, and of poses only numbers and times, are kept
+    time: Array  # (K,) at state_hz, from before take-off (negative) to the end
+    phase: Index  # (K, R) `agents.decision.lifecycle.Phase`
+    position: Array  # (K, R, 3) [m] measured
+    velocity: Array  # (K, R, 3) [m/s] measured
+    yaw: Array  # (K, R) [rad] measured
+    true_position: Array  # (K, R, 3) [m]
+    true_yaw: Array  # (K, R) [rad]
+    goal: Array  # (K, R, 3) [m]
+    setpoint: Array  # (K, R, 4)
+    error: Array  # (K, R) [m]
+    sent: PoseTable  # poses of all robots; `link` is the row
+    received: PoseTable  # poses on all links, those of the first repetition first
+    lost: Index  # (E,) samples lost on each link of all repetitions, from the common start to the landing
+    decisions: int  # coordination decisions of each row
+    updates: Index  # (R,) goals computed anew
+    interventions: Index  # (R,) ticks on which safety changed the decision, from the common start on
+    avoided: Index  # (R,) ticks on which avoidance changed the decision, from the common start on
+    touches: tuple[Touch, ...]  # contacts, by their beginning
+    ticks: int  # ticks from the common start to the end
+    airborne: float  # [s] all robots were up (negative)
+    ended: float  # [s] all robots were done
+    attitude: Array | None  # (K, R, 4) unit quaternions w, x, y, z from robot to room; None if the engine has none
+    obstacles: Array  # (K, repetitions, M, 3) x, y [m], yaw [rad] of each
+    # (K, R, 3) of the twins beside the robots, NaN for rows without one; None if there is none
     shadow_position: Array | None
-    shadow_yaw: Array | None
-    waited: Mask
-    steered: Steered | None = None
-    incidents: tuple[Incident, ...] = ()
+    shadow_yaw: Array | None  # (K, R) of those twins
+    waited: Mask  # (repetitions,) that got an order later than alone, because another one was late
+    steered: Steered | None = None  # None if each robot decides for itself
+    incidents: tuple[Incident, ...] = ()  # hazards of robots
 
 
 class _Samples:
@@ -152,7 +115,7 @@ def simulate(
     interventions, avoided = np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
     touches: list[Touch] = []
     states, seen = _Samples(), _Samples()
-    conductor = _Conductor(agent, names)
+    conductor = VirtualConductor(agent, names)
     nothing = np.zeros((rows, 0))
     blank = (nothing,) * 4
     tick = 0
@@ -180,7 +143,7 @@ def simulate(
             seen.add(nothing if lean else np.array(twin.engine.obstacles), *more)
         if not landing and t - conductor.start_at >= experiment.duration_s - 0.5 * dt:
             break
-        conductor.look(t, dt)
+        conductor.give_orders(t, dt)
         twin.begun_at = conductor.start_at
         tick += 1
     begin = conductor.start_at
@@ -229,51 +192,3 @@ def _measured(state: BodyState) -> tuple[Array, ...]:
 def _extra(state: BodyState) -> tuple[Array | None, ...]:
     """What there is of in all samples or in none."""
     return state.attitude, state.shadow_position, state.shadow_yaw
-
-
-class _Conductor:
-    """Gives the orders that the conductor of a real run gives, at the same moments of the robots' lives."""
-
-    def __init__(self, agent: Agent, names: tuple[str, ...]) -> None:
-        self._agent, self._names = agent, names
-        self._stage = Phase.READY
-        self._since = 0.0
-        self.airborne_at = self.start_at = np.nan
-        self.waited: Mask = np.zeros(len(agent.lifecycle.phase) // len(names), dtype=bool)
-        self.over = False
-
-    def look(self, t: float, dt: float) -> None:
-        """After each tick."""
-        if self._agent.lifecycle.all_running:
-            return
-        phase = self._agent.lifecycle.phase
-        if self._stage == Phase.RUNNING:
-            if phase.min() >= Phase.LANDING:
-                self._since, self._stage = t, Phase.DONE
-            return
-        orders = not round(t / dt) % max(1, round(ORDERS_S / dt))
-        if phase.min() < self._stage:
-            if orders and self._stage < Phase.RUNNING:
-                self.waited |= phase.reshape(len(self.waited), -1).min(axis=1) >= self._stage
-            if t - self._since > PATIENCE_S:
-                late = np.flatnonzero(phase < self._stage)[: len(self._names)]
-                names = ", ".join(sorted({self._names[row % len(self._names)] for row in late}))
-                reason = self._agent.lifecycle.reason[late[0]]
-                raise Stuck(f"not {self._stage.word} after {PATIENCE_S:g} s: {names} ({reason})")
-            return
-        if self._stage < Phase.RUNNING and not orders:
-            return
-        self._since = t
-        life = self._agent.lifecycle
-        if self._stage == Phase.READY:
-            for row in range(len(phase)):
-                life.takeoff(row)
-            self._stage = Phase.AIRBORNE
-        elif self._stage == Phase.AIRBORNE:
-            self.airborne_at = t
-            self.start_at = t + round(LEAD_S / dt) * dt
-            for row in np.flatnonzero(phase == Phase.AIRBORNE).tolist():
-                life.start(row, self.start_at)
-            self._stage = Phase.RUNNING
-        else:
-            self.over = True

@@ -23,7 +23,7 @@ from experiments.file import catalogue, document
 from experiments.file.document import Document
 from experiments.file.problems import DocumentError
 from experiments.sweep.runs import figures_of
-from experiments.virtual_time import simulation
+from experiments.virtual_time import conductor, simulation
 from tools.commands import check as commands
 
 pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
@@ -207,7 +207,7 @@ def test_flights_with_noise_are_those_of_their_seeds():
 
 def test_an_experiment_whose_robots_do_not_get_under_way_is_told_why(monkeypatch):
     def stuck(*_, **__):
-        raise simulation.Stuck("not ready after 60 s: KH01 (its law wants something that is not finite)")
+        raise conductor.Stuck("not ready after 60 s: KH01 (its law wants something that is not finite)")
 
     monkeypatch.setattr(simulation, "simulate", stuck)
     found = {each.code: each for each in check(of(robots_on_wheels(1.0)))}

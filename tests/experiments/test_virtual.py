@@ -11,7 +11,8 @@ from agents.body.interface import Disturbance
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING
 from experiments.definition.experiment import Channel, Experiment, Formation, Leg, Robot, Start
 from experiments.file import document
-from experiments.virtual_time.simulation import LEAD_S, Log, Stuck, simulate
+from experiments.virtual_time.conductor import LEAD_S, Stuck
+from experiments.virtual_time.simulation import Log, simulate
 
 
 def changed(experiment, **parts):
@@ -187,14 +188,14 @@ def test_the_reference_formation_is_acquired():
 
 
 def test_who_hears_nobody_is_named(monkeypatch):
-    monkeypatch.setattr("experiments.virtual_time.simulation.PATIENCE_S", 5.0)
+    monkeypatch.setattr("experiments.virtual_time.conductor.PATIENCE_S", 5.0)
     with pytest.raises(Stuck, match=r"not ready after 5 s: A, B \(never heard B\)"):
         simulate(ground(channel=Channel(delay_s=100.0)), [1])
 
 
 def test_who_cannot_get_up_is_named(monkeypatch):
     monkeypatch.setattr("agents.decision.lifecycle.AT_HEIGHT", -1.0)  # nobody is ever near enough to his height
-    monkeypatch.setattr("experiments.virtual_time.simulation.PATIENCE_S", 5.0)
+    monkeypatch.setattr("experiments.virtual_time.conductor.PATIENCE_S", 5.0)
     robots = {
         "A": Robot(kind="khepera4", start=[0.0, 0.0]),
         "F": Robot(kind="crazyflie", start=[0.5, 0.0], hover=0.5),

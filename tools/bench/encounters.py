@@ -125,7 +125,7 @@ def meet(experiment: Experiment, seeds: Sequence[int]) -> Outcome:
     """One encounter for each seed.
 
     Raises:
-        experiments.virtual_time.simulation.Stuck: If robots do not take off or land.
+        experiments.virtual_time.conductor.Stuck: If robots do not take off or land.
     """
     batches = (seeds[first : first + BATCH] for first in range(0, len(seeds), BATCH))
     return Outcome.joined(_outcome(experiment, simulate(experiment, batch)) for batch in batches)
