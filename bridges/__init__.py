@@ -1,1 +1,4 @@
-"""Bodies that are hardware, positioning systems and other middleware. One file per device."""
+"""Bodies of real robots, positioning systems, ROS 2 and external simulators: one folder or file per device.
+
+May import agents.
+"""

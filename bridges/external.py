@@ -1,6 +1,6 @@
-"""A body in another process: any simulator, or any robot, that hears commands and says where it is on two keys.
+"""Body in another process, a simulator or a robot: commands go out on one key, positions come in on another.
 
-The contract is `docs/external-simulators.md`; nothing of it is asked about here that the far end could not know.
+The contract is `docs/external-simulators.md`; it requires nothing that a simulator could not know.
 """
 
 from __future__ import annotations
@@ -27,44 +27,44 @@ from agents.runtime.range_inbox import HeardRanges
 
 Action = Literal["drive", "takeoff", "land", "stop"]
 
-OPEN_S: Final = 5.0  # for the router to answer and a first position of every row to come
-LOOK_S: Final = 0.02  # between looks for it
-STALE_S: Final = 0.5  # what the robots bear
-WORLD: Final = "world"  # the address of robots that the twin service carries
-REPEAT_S: Final = 0.1  # an order is said again this often: the publisher drops what does not fit
-HALT_S: Final = 3.0  # a robot on wheels that was told to land is told so this long
-LANDING_S: Final = 10.0  # a robot that was told to land this long ago, and cannot be seen, is taken for down
-LAIN_S: Final = 1.0  # one that is seen on the ground for so long, though it was steered, has come down by itself
-AWAY_M: Final = 0.05  # higher above the place of take-off than this it is in the air, lower it is down
-SETTLED: Final = 0.1  # [m/s] slower than this it is down
-ANSWER_S: Final = 2.5  # a stop after which a robot is not seen to stand for so long is worth a word
-FAREWELL_S: Final = 1.0  # how long `close` waits until robots that were stopped are seen to stand
-REACH: Final = (1e3, 1e3, 1e3)  # [m] any room
+OPEN_S: Final = 5.0  # deadline of the router's answer and of the first position of every row
+POLL_S: Final = 0.02  # between looks for them
+STALE_S: Final = 0.5  # older positions are lost; robots tolerate as much
+WORLD: Final = "world"  # the address of robots in the shared world process
+REPEAT_S: Final = 0.1  # period of repeated orders: the publisher drops samples when its queue is full
+HALT_S: Final = 3.0  # how long `land` is repeated to a robot on wheels
+LANDING_S: Final = 10.0  # a robot without positions counts as landed so long after `land`
+GROUNDED_S: Final = 1.0  # a robot in flight that is measured on the ground for so long has landed by itself
+AWAY_M: Final = 0.05  # [m] above the place of take-off: higher is in the air, lower is down
+SETTLED: Final = 0.1  # [m/s] slower robots stand
+ANSWER_S: Final = 2.5  # the note reports a robot that is not measured to stand so long after a stop
+STANDSTILL_S: Final = 1.0  # how long `close` waits until stopped robots are measured to stand
+REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The `device` of a robot whose body is external: nothing to set."""
+    """The `device` of a robot with an external body: no settings."""
 
 
-class _Standing(msgspec.Struct):
-    """An order that is repeated, under the number that it had, until it is obeyed or `until` [s].
+class _RepeatedOrder(msgspec.Struct):
+    """An order repeated under its own sequence number until it is completed or `until`.
 
-    Obeyed to the end, not begun: half-way through a climb or a landing another process may answer at the far end, as
-    soon as the first one died, and it knows of no earlier order.
+    Until completed, not begun: the simulator may be restarted half-way through a climb or a landing, and then knows no
+    earlier order.
     """
 
     order: messages.Command
-    until: float
+    until: float  # [s]
 
 
 class ExternalBody:
-    """Rows whose robots live in another process; implements `agents.body.interface.Body`.
+    """Robots of another process; implements `agents.body.interface.Body`.
 
-    Its own clock is the monotonic one, from when it was made; `read` tells how the clock of its caller lies to it.
+    Its own clock is monotonic and starts at creation; `read` measures the offset of the caller's clock.
     """
 
     def __init__(self, request: BodyRequest) -> None:
-        """Makes it ready to be opened.
+        """Create the body, still closed.
 
         Raises:
             BodyError: If a row has settings: there are none.
@@ -73,28 +73,28 @@ class ExternalBody:
             try:
                 msgspec.convert(dict(device), Settings)
             except msgspec.ValidationError as error:
-                raise BodyError(f"{name}: device: {error}; a body that is external has no settings") from None
+                raise BodyError(f"{name}: device: {error}; an external body has no settings") from None
         rows = len(request.names)
         self._names, self._kinds, self._keys = request.names, request.kinds, request.keys
         self._endpoints, self._addresses = request.endpoints, request.addresses
         self._flies = np.array([kind.flies for kind in request.kinds])
         self._zero = time.monotonic()
         self._clock, self._corrected = request.clock, request.clock.correction_s
-        self._utc = request.clock.utc()  # one reading, as in the runtime: a step of the wall clock moves nothing
-        self._shift = np.inf  # from the caller's clock to this one
-        self._seen = External(rows)
+        self._utc = request.clock.utc()  # one reading, as in the runtime: a step of the wall clock has no effect
+        self._clock_offset = np.inf  # from the caller's clock to this one [s]
+        self._poses = External(rows)
         self._yaw = np.array(request.yaw, dtype=float)
         self._flying = np.zeros(rows, dtype=bool)
-        self._landing = np.full(rows, np.inf)  # since when
-        self._ground = np.zeros(rows)
-        self._lain = np.full(rows, np.inf)  # since when it is seen on the ground although it should fly
+        self._landing_since = np.full(rows, np.inf)
+        self._takeoff_z = np.zeros(rows)
+        self._grounded_since = np.full(rows, np.inf)  # measured on the ground although it should fly
         self._stopped = np.zeros(rows, dtype=bool)
-        self._stopped_at = np.full(rows, np.inf)
-        # so that numbers grow over restarts: a simulator that outlives this process knows new orders from old
-        self._sent = [round(1e3 * self._utc)] * rows
-        self._standing: dict[int, _Standing] = {}
-        self._repeat = 0.0
-        self._lock = threading.Lock()  # of the numbers: `land` and `stop` come from other threads too
+        self._stopped_since = np.full(rows, np.inf)
+        # sequence numbers grow over restarts: a simulator that outlives this process can tell new orders from old
+        self._seq = [round(1e3 * self._utc)] * rows
+        self._repeated: dict[int, _RepeatedOrder] = {}
+        self._next_repeat = 0.0
+        self._lock = threading.Lock()  # of the sequence numbers: `land` and `stop` are called from other threads too
         self._session: zenoh.Session | None = None
 
     # ------------------------------------------------------------------ Body
@@ -114,31 +114,31 @@ class ExternalBody:
         self._setpoints = [pubsub.publisher(session, keys.setpoint(name), mime) for name in self._names]
         self._orders = [pubsub.urgent_publisher(session, keys.setpoint(name), mime) for name in self._names]
         pause = threading.Event()
-        while (missing := self._missing()) and time.monotonic() < deadline:
-            pause.wait(LOOK_S)
+        while (missing := self._missing_positions()) and time.monotonic() < deadline:
+            pause.wait(POLL_S)
         if missing:
             self.close()
             raise BodyError("\n".join(missing))
 
     def read(self, t: float) -> BodyState:
         """See `Body.read`."""
-        self._shift = min(self._shift, self._now() - t)  # whoever calls late, sees too large a difference
-        self._listen()
-        self._settle()
+        self._clock_offset = min(self._clock_offset, self._now() - t)  # a late call only makes the difference larger
+        self._read_positions()
+        self._update_flying()
         rows = len(self._names)
         nothing = np.full((rows, 3), np.nan)
         rays = self._ranges.read(self._utc, self._now())
         return BodyState(
-            time=self._seen.time - self._shift,
-            position=self._seen.position.copy(),
+            time=self._poses.time - self._clock_offset,
+            position=self._poses.position.copy(),
             velocity=self._velocity(),
-            yaw=np.where(np.isfinite(self._seen.yaw), self._seen.yaw, self._yaw),
+            yaw=np.where(np.isfinite(self._poses.yaw), self._poses.yaw, self._yaw),
             true_position=nothing,
             true_yaw=nothing[:, 0],
             battery=nothing[:, 0],
             flying=self._flying.copy(),
             notes=self._notes(),
-            rays=None if rays is None else replace(rays, time=rays.time - self._shift),
+            rays=None if rays is None else replace(rays, time=rays.time - self._clock_offset),
             ahead=self._positions.ahead,
         )
 
@@ -148,57 +148,58 @@ class ExternalBody:
         values = setpoint.tolist()
         for row in np.flatnonzero(given).tolist():
             x, y, z, w = values[row]
-            self._drive(row, (x, y, z, w))
+            self._send_setpoint(row, (x, y, z, w))
         now = self._now()
-        if self._standing and now >= self._repeat:
-            self._repeat = now + REPEAT_S
+        if self._repeated and now >= self._next_repeat:
+            self._next_repeat = now + REPEAT_S
             with self._lock:
-                for row, standing in list(self._standing.items()):
-                    if now > standing.until:
-                        del self._standing[row]
+                for row, repeated in list(self._repeated.items()):
+                    if now > repeated.until:
+                        del self._repeated[row]
                     else:
-                        self._put(row, msgspec.structs.replace(standing.order, stamp=self._stamp()))
+                        self._put(row, msgspec.structs.replace(repeated.order, stamp=self._stamp()))
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Body.takeoff`; ground robots have nothing to do."""
+        """See `Body.takeoff`; no effect on ground robots."""
         for row, up in zip(rows.tolist(), height.tolist(), strict=True):
             if self._flies[row]:
-                z = self._seen.position[row, 2]
-                self._ground[row] = z if isfinite(z) else 0.0
-                self._flying[row], self._landing[row], self._stopped[row] = True, np.inf, False
-                self._order(row, "takeoff", np.inf, up)
+                z = self._poses.position[row, 2]
+                self._takeoff_z[row] = z if isfinite(z) else 0.0
+                self._flying[row], self._landing_since[row], self._stopped[row] = True, np.inf, False
+                self._send_order(row, "takeoff", np.inf, up)
 
     def land(self, rows: Index) -> None:
-        """See `Body.land`; a stop is the last word."""
+        """See `Body.land`; no effect after a stop."""
         for row in rows[~self._stopped[rows]].tolist():
-            self._landing[row] = self._now()
-            self._order(row, "land", LANDING_S if self._flying[row] else HALT_S)
+            self._landing_since[row] = self._now()
+            self._send_order(row, "land", LANDING_S if self._flying[row] else HALT_S)
 
     def stop(self, rows: Index) -> None:
-        """See `Body.stop`; said again for as long as this process lives."""
+        """See `Body.stop`; repeated as long as this process lives."""
         for row in rows.tolist():
             if not self._stopped[row]:
                 now = self._now()
-                self._stopped[row], self._stopped_at[row] = True, now
-                self._landing[row] = min(self._landing[row], now)  # from now on it flies until it is seen to be down
-                self._order(row, "stop", np.inf)
+                self._stopped[row], self._stopped_since[row] = True, now
+                # from now on the robot counts as flying until it is measured on the ground
+                self._landing_since[row] = min(self._landing_since[row], now)
+                self._send_order(row, "stop", np.inf)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        """Nothing: what the runtime heard on the key `position` has been heard here."""
+        """No effect: this body subscribes to the key `position` itself."""
 
     def close(self) -> None:
         """See `Body.close`."""
         if self._session is not None:
-            until, nothing = self._now() + FAREWELL_S, np.full((len(self._names), 4), np.nan)
-            while some(self._unanswered()) and self._now() < until:
-                time.sleep(LOOK_S)
+            until, nothing = self._now() + STANDSTILL_S, np.full((len(self._names), 4), np.nan)
+            while some(self._unconfirmed_stops()) and self._now() < until:
+                time.sleep(POLL_S)
                 self.command(nothing)
-                self._listen()
-                self._settle()
+                self._read_positions()
+                self._update_flying()
             leave(self._session, self)
             self._session = None
 
-    # ------------------------------------------------------------------ what the far end says
+    # ------------------------------------------------------------------ positions received
 
     def _now(self) -> float:
         return time.monotonic() - self._zero + self._clock.correction_s - self._corrected
@@ -206,68 +207,70 @@ class ExternalBody:
     def _stamp(self) -> float:
         return round(self._utc + self._now(), 6)
 
-    def _listen(self) -> None:
+    def _read_positions(self) -> None:
         for row, taken, position, yaw in self._positions.receive(self._utc, self._now()):
-            self._seen.update(row, taken, position, yaw)
+            self._poses.update(row, taken, position, yaw)
 
-    def _missing(self) -> list[str]:
-        """What every row lacks before it can be driven, and what to do."""
-        self._listen()
+    def _missing_positions(self) -> list[str]:
+        """Diagnosis and remedy for each row without a usable position."""
+        self._read_positions()
         now, found = self._now(), []
         for row, name in enumerate(self._names):
-            key, age = self._keys.position(name), now - float(self._seen.time[row])
+            key, age = self._keys.position(name), now - float(self._poses.time[row])
             if not isfinite(age):
                 found.append(
-                    f"{name}: what is published on {key} is no position: {self._positions.trouble[row]}"
+                    f"{name}: samples on {key} are not positions: {self._positions.trouble[row]}"
                     if self._positions.malformed[row]
-                    else f"{name}: nothing is published on {key}: is {self._far_end(row)} running and connected to "
+                    else f"{name}: nothing is published on {key}: is {self._source_name(row)} running and connected to "
                     f"{', '.join(self._endpoints)}?"
                 )
             elif age > STALE_S:
                 found.append(
                     f"{name}: the position on {key} was measured {age:.1f} s ago by its stamp: stamps are UTC seconds, "
-                    "not the time of the simulation; if they are, set the clocks of both computers"
+                    "not simulation time; if they are UTC, set the clocks of both computers"
                 )
-            elif self._kinds[row].takes == "twist" and not isfinite(self._seen.yaw[row]):
+            elif self._kinds[row].takes == "twist" and not isfinite(self._poses.yaw[row]):
                 found.append(f"{name}: the position on {key} has no yaw, without which a robot on wheels cannot steer")
         return found
 
-    def _far_end(self, row: int) -> str:
+    def _source_name(self, row: int) -> str:
         return "`zenpark world` with this experiment" if self._addresses[row] == WORLD else "the simulator"
 
     def _velocity(self) -> Array:
-        """Of all rows (n, 3) [m/s]; one on wheels that was told to halt long ago, and cannot be seen, stands."""
+        """Velocities (n, 3) [m/s]; a robot on wheels without positions stands some time after a halt."""
         now = self._now()
-        stands = ~self._flies & (now - self._landing > HALT_S) & (now - self._seen.time > STALE_S)
-        return np.where(stands[:, None], 0.0, self._seen.velocity)
+        stands = ~self._flies & (now - self._landing_since > HALT_S) & (now - self._poses.time > STALE_S)
+        return np.where(stands[:, None], 0.0, self._poses.velocity)
 
-    def _unanswered(self) -> Mask:
-        """Rows that were stopped and are not seen to stand."""
+    def _unconfirmed_stops(self) -> Mask:
+        """Stopped rows that are not measured to stand."""
         return self._stopped & (self._flying | (norm(self._velocity()) > SETTLED))
 
-    def _settle(self) -> None:
-        """Ends the landings that have come to their end, and finds those that nobody here ordered."""
+    def _update_flying(self) -> None:
+        """Update which rows fly: completed landings, and landings without an order."""
         if not some(self._flying):
             return
         now = self._now()
-        landing = np.isfinite(self._landing)
-        high = self._seen.position[:, 2] - self._ground > AWAY_M
-        slow = np.abs(self._seen.velocity[:, 2]) < SETTLED
-        aged = now - self._seen.time > STALE_S
-        seen = ~aged & ~high & slow
-        climbing = np.isin(np.arange(len(self._names)), list(self._standing))
-        self._lain = np.where(seen & self._flying & ~climbing, np.minimum(self._lain, now), np.inf)
-        alone = ~landing & (now - self._lain > LAIN_S)
-        down = self._flying & ((landing & np.where(aged, now - self._landing > LANDING_S, seen)) | alone)
+        landing = np.isfinite(self._landing_since)
+        high = self._poses.position[:, 2] - self._takeoff_z > AWAY_M
+        slow = np.abs(self._poses.velocity[:, 2]) < SETTLED
+        aged = now - self._poses.time > STALE_S
+        grounded = ~aged & ~high & slow
+        climbing = np.isin(np.arange(len(self._names)), list(self._repeated))
+        self._grounded_since = np.where(
+            grounded & self._flying & ~climbing, np.minimum(self._grounded_since, now), np.inf
+        )
+        alone = ~landing & (now - self._grounded_since > GROUNDED_S)
+        down = self._flying & ((landing & np.where(aged, now - self._landing_since > LANDING_S, grounded)) | alone)
         self._flying &= ~down
         with self._lock:
             for row in np.flatnonzero(down).tolist():
                 if not self._stopped[row]:
-                    self._standing.pop(row, None)
+                    self._repeated.pop(row, None)
 
     def _notes(self) -> tuple[str, ...]:
-        age, positions = self._now() - self._seen.time, self._positions
-        unanswered = self._unanswered() & (self._now() - self._stopped_at > ANSWER_S)
+        age, positions = self._now() - self._poses.time, self._positions
+        unanswered = self._unconfirmed_stops() & (self._now() - self._stopped_since > ANSWER_S)
         if not ((age > STALE_S) | unanswered).any() and not any(positions.malformed) and not self._ranges.malformed:
             return ()
         notes = []
@@ -281,41 +284,41 @@ class ExternalBody:
             notes.append("; ".join(parts))
         return tuple(notes)
 
-    # ------------------------------------------------------------------ what the far end is told
+    # ------------------------------------------------------------------ commands sent
 
-    def _drive(self, row: int, setpoint: messages.Setpoint) -> None:
+    def _send_setpoint(self, row: int, setpoint: messages.Setpoint) -> None:
         with self._lock:
             if self._stopped[row]:
-                return  # while the setpoint was decided
-            self._put(row, self._command(row, "drive", setpoint))
-            if (standing := self._standing.get(row)) is not None and standing.order.action == "takeoff":
-                del self._standing[row]  # who is steered need not climb
+                return  # stopped while the setpoint was computed
+            self._put(row, self._next_command(row, "drive", setpoint))
+            if (repeated := self._repeated.get(row)) is not None and repeated.order.action == "takeoff":
+                del self._repeated[row]  # setpoints replace a take-off
 
-    def _order(self, row: int, action: Action, seconds: float, height: float | None = None) -> None:
-        """Says an order now, and again for so long."""
+    def _send_order(self, row: int, action: Action, seconds: float, height: float | None = None) -> None:
+        """Send an order now, and repeat it for `seconds`."""
         with self._lock:
-            order = self._command(row, action, height=height)
-            self._standing[row] = _Standing(order, self._now() + seconds)
+            order = self._next_command(row, action, height=height)
+            self._repeated[row] = _RepeatedOrder(order, self._now() + seconds)
             self._put(row, order)
 
-    def _command(
+    def _next_command(
         self, row: int, action: Action, setpoint: messages.Setpoint | None = None, height: float | None = None
     ) -> messages.Command:
-        self._sent[row] += 1
-        return messages.Command(self._names[row], self._sent[row], self._stamp(), action, setpoint, height)
+        self._seq[row] += 1
+        return messages.Command(self._names[row], self._seq[row], self._stamp(), action, setpoint, height)
 
     def _put(self, row: int, command: messages.Command) -> None:
         if self._session is None:
-            return  # `stop` may come after `close`
+            return  # `stop` may be called after `close`
         try:
             publishers = self._setpoints if command.action == "drive" else self._orders
             publishers[row].put(messages.encode(command))
         except zenoh.ZError as error:
-            self._positions.trouble[row] = f"cannot be told anything: {error}"
+            self._positions.trouble[row] = f"commands cannot be sent: {error}"
 
 
 def open_external(request: BodyRequest) -> ExternalBody:
-    """The entry point `external` of the group `zenpark.bodies`.
+    """Entry point `external` of the group `zenpark.bodies`.
 
     Raises:
         BodyError: If a row has settings.

@@ -1,6 +1,7 @@
-"""The robots of a realm in the graph of ROS 2, over rmw_zenoh: `python -m bridges.ros2`, no ROS needed here.
+"""ROS 2 bridge over rmw_zenoh: the robots of a realm as ROS 2 topics, without ROS here: `python -m bridges.ros2`.
 
-Out: /<robot>/pose, /<robot>/velocity and /diagnostics. In: /<robot>/goal. Robots come and go with their liveliness.
+Published: /<robot>/pose, /<robot>/velocity and /diagnostics. Subscribed: /<robot>/goal. A robot's topics exist while
+its liveliness token does.
 """
 
 from __future__ import annotations
@@ -31,37 +32,33 @@ from agents.runtime.lifeline import Lifeline
 NODE: Final = "zenpark"
 FRAME: Final = "map"  # the arena, as rviz and nav2 name the fixed frame; goals must be in it
 POLL_S: Final = 0.01
-REACH: Final = (1e3, 1e3, 1e3)  # [m] any room
+REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 OK, WARN, ERROR = 0, 1, 2  # levels of a DiagnosticStatus
 
 
 @dataclass
 class _Robot:
-    """What one robot has in the graph."""
+    """Topics of one robot, and its goal's publisher in the realm."""
 
     pose: Publisher
     velocity: Publisher
     goal: Subscriber
-    out: zenoh.Publisher
-    stamp: float = 0.0  # when its last pose was taken that ROS was told, UTC [s]
+    goal_publisher: zenoh.Publisher
+    stamp: float = 0.0  # of the last pose published to ROS, UTC [s]
 
     def close(self) -> None:
         self.pose.close()
         self.velocity.close()
         self.goal.close()
-        self.out.undeclare()  # type: ignore[no-untyped-call]
+        self.goal_publisher.undeclare()  # type: ignore[no-untyped-call]
 
 
 class Graph:
-    """The robots of a realm as topics; call `poll` from a loop.
-
-    Attributes:
-        robots: Those in the graph now.
-        refused: Goals that were not finite, not in the frame "map", for a robot whose pose ROS never got, or that came
-            while a centre decides.
-    """
+    """The robots of a realm as ROS 2 topics; call `poll` from a loop."""
 
     def __init__(self, session: zenoh.Session, participant: Participant, keys: Keys) -> None:
+        # goals that are not finite, not in the frame "map", for a robot without a published pose, or received while a
+        # central controller is alive
         self.refused = 0
         self._session, self._keys = session, keys
         self._types = participant.types
@@ -72,9 +69,9 @@ class Graph:
         self._statuses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.status("*"), 256), messages.Status)
         self._alive = pubsub.AliveWatch(session, keys.alive("*"))
         self._centres = pubsub.AliveWatch(session, keys.centre_alive)
-        self._guided = False
+        self._centralised = False
         self._clock = participant.clock
-        self._seq = round(self._clock.utc() * 1e3)  # beyond whatever somebody else who decided had reached
+        self._seq = round(self._clock.utc() * 1e3)  # above the sequence numbers of any earlier sender of goals
 
     @property
     def malformed(self) -> int:
@@ -87,20 +84,20 @@ class Graph:
         return tuple(sorted(self._robots))
 
     def poll(self) -> None:
-        """Passes on what has arrived."""
-        statuses = [*self._lives(), *self._reports()]
+        """Forward all received samples and messages."""
+        statuses = [*self._update_robots(), *self._diagnostics_of_statuses()]
         if statuses:
             header = self._types.header(self._clock.utc(), "")
             self._diagnostics.put(self._types.make(ros2.DIAGNOSTIC_ARRAY, header=header, status=statuses))
-        self._moves()
-        for _, guided in self._centres.changes():
-            self._guided = guided
+        self._publish_states()
+        for _, alive in self._centres.changes():
+            self._centralised = alive
         for name, robot in self._robots.items():
             for message in robot.goal.received():
-                self._order(name, robot, message)
+                self._forward_goal(name, robot, message)
 
-    def _lives(self) -> list[Message]:
-        """Who comes and goes; says so to the graph."""
+    def _update_robots(self) -> list[Message]:
+        """Add and remove robots by their liveliness tokens; returns the diagnostics of the removed ones."""
         gone = []
         for token, there in self._alive.changes():
             name = self._keys.whose(token)
@@ -111,10 +108,10 @@ class Graph:
                     robot.close()
                     gone.append(diagnostic(self._types, name, ERROR, "gone", {}))
             elif name not in self._robots:
-                self._robots[name] = self._enter(name)
+                self._robots[name] = self._declare_topics(name)
         return gone
 
-    def _enter(self, name: str) -> _Robot:
+    def _declare_topics(self, name: str) -> _Robot:
         chunk = ros_name(name)
         return _Robot(
             self._node.publisher(f"/{chunk}/pose", ros2.POSE_STAMPED),
@@ -123,8 +120,8 @@ class Graph:
             pubsub.publisher(self._session, self._keys.goal(name), messages.JSON),
         )
 
-    def _moves(self) -> None:
-        """Telemetry as pose and velocity."""
+    def _publish_states(self) -> None:
+        """Publish received states as pose and velocity."""
         now = self._clock.utc()
         for state in self._states.read(lambda state: validation.check_state(state, now=now, reach=REACH)):
             if (robot := self._robots.get(state.robot)) is None:
@@ -135,51 +132,51 @@ class Graph:
             if state.velocity is not None:
                 robot.velocity.put(velocity(self._types, state, state.velocity))
 
-    def _reports(self) -> list[Message]:
-        """Statuses as diagnostics."""
+    def _diagnostics_of_statuses(self) -> list[Message]:
+        """Received statuses as diagnostics."""
         return [diagnosis(self._types, status) for status in self._statuses.read() if status.robot in self._robots]
 
-    def _order(self, name: str, robot: _Robot, message: Message) -> None:
-        """A goal from ROS, passed on into the realm: a robot that is guided obeys, but two cannot guide it."""
+    def _forward_goal(self, name: str, robot: _Robot, message: Message) -> None:
+        """Forward a goal from ROS into the realm, unless a central controller sends goals."""
         place, q = message.pose.position, message.pose.orientation
         numbers = (place.x, place.y, place.z, q.x, q.y, q.z, q.w)
         known = robot.stamp > 0.0 and message.header.frame_id in ("", FRAME)
-        if self._guided or not known or not all(isfinite(number) for number in numbers):
+        if self._centralised or not known or not all(isfinite(number) for number in numbers):
             self.refused += 1
             return
-        turned = q.x or q.y or q.z or q.w  # a quaternion of zeros: whoever asks does not care
+        turned = q.x or q.y or q.z or q.w  # a quaternion of zeros means any yaw
         yaw = atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z)) if turned else None
         self._seq += 1
         goal = messages.Goal(name, self._seq, self._clock.utc(), (place.x, place.y, place.z), yaw, robot.stamp)
-        robot.out.put(messages.encode(goal))
+        robot.goal_publisher.put(messages.encode(goal))
 
 
 def ros_name(robot: str) -> str:
-    """A robot's name as ROS allows it: letters, digits, underscores, no digit first."""
+    """A robot's name as a ROS name: letters, digits, underscores, no digit first."""
     name = re.sub(r"[^A-Za-z0-9_]", "_", robot)
     return f"_{name}" if name[:1].isdigit() else name
 
 
 def pose(types: Types, state: messages.State, position: messages.Vector) -> Message:
-    """A PoseStamped in the arena; only the yaw of the robot is known, and 0 stands for one that is not."""
+    """A PoseStamped in the arena; only the robot's yaw is known, and an unknown yaw is sent as 0."""
     x, y, z = position
     place = types.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
     half = 0.5 * (state.yaw or 0.0)
-    toward = types.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin(half), w=cos(half))
-    stamped = types.make("geometry_msgs/msg/Pose", position=place, orientation=toward)
+    orientation = types.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin(half), w=cos(half))
+    stamped = types.make("geometry_msgs/msg/Pose", position=place, orientation=orientation)
     return types.make(ros2.POSE_STAMPED, header=types.header(state.stamp, FRAME), pose=stamped)
 
 
-def velocity(types: Types, state: messages.State, moves: messages.Vector) -> Message:
-    """A TwistStamped along the axes of the arena; its angular part is not known and zero."""
-    twist = types.twist(moves, (0.0, 0.0, 0.0))
+def velocity(types: Types, state: messages.State, linear: messages.Vector) -> Message:
+    """A TwistStamped along the axes of the arena; the angular part is unknown and zero."""
+    twist = types.twist(linear, (0.0, 0.0, 0.0))
     return types.make(ros2.TWIST_STAMPED, header=types.header(state.stamp, FRAME), twist=twist)
 
 
 def diagnosis(types: Types, status: messages.Status) -> Message:
-    """A DiagnosticStatus: a warning while the robot, its body or the network has something to complain of."""
+    """A DiagnosticStatus: a warning while the robot, its body or the network reports a fault."""
     level = WARN if status.body or status.missing or status.hazard else OK
-    said = "; ".join(part for part in (status.phase, status.reason, status.hazard, status.body) if part)
+    text = "; ".join(part for part in (status.phase, status.reason, status.hazard, status.body) if part)
     values = {
         "phase": status.phase,
         "reason": status.reason,
@@ -195,17 +192,17 @@ def diagnosis(types: Types, status: messages.Status) -> Message:
         "interventions": str(status.interventions),
         "missed ticks": f"{status.missed} of {status.ticks}",
     }
-    return diagnostic(types, status.robot, level, said, values)
+    return diagnostic(types, status.robot, level, text, values)
 
 
-def diagnostic(types: Types, robot: str, level: int, said: str, values: dict[str, str]) -> Message:
+def diagnostic(types: Types, robot: str, level: int, text: str, values: dict[str, str]) -> Message:
     """A DiagnosticStatus of a robot."""
     pairs = [types.make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()]
     return types.make(
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=level,
         name=f"{NODE}: {robot}",
-        message=said,
+        message=text,
         hardware_id=robot,
         values=pairs,
     )
@@ -221,20 +218,20 @@ def serve(
     stop: threading.Event,
     identity: str = "ros2",
 ) -> None:
-    """Runs the bridge until `stop` is set; prints a line when it is ready and whenever a robot comes or goes.
+    """Run the bridge until `stop` is set; prints a line when ready and whenever a robot comes or goes.
 
     Args:
         endpoints: Routers of the robots.
-        ros_endpoints: Routers of ROS 2 (rmw_zenohd), where they are others.
+        ros_endpoints: Routers of ROS 2 (rmw_zenohd), if different.
         realm: Of the robots.
         domain: ROS_DOMAIN_ID.
         distro: ROS 2 distribution, for type hashes.
-        stop: Ends it.
-        identity: Whose certificate is shown, in a lab.
+        stop: Ends the bridge.
+        identity: Name on the certificate, in a lab.
 
     Raises:
         BodyError: If the extra `ros` is not installed.
-        EndpointError, Unreachable: If a router cannot be had.
+        EndpointError, Unreachable: If a router is not reachable.
     """
     types = ros2.types(distro)
     with ExitStack() as stack:

@@ -1,1 +1,1 @@
-"""Crazyflies, real or at the far end of a protocol twin, through cflib (GPL-3.0: imported when one is opened)."""
+"""Crazyflie body through cflib, for real drones and protocol twins (cflib is GPL-3.0: imported when one is opened)."""

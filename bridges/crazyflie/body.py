@@ -1,4 +1,4 @@
-"""Rows of Crazyflies as one body: one thread each, one radio or several, one process."""
+"""Body of several Crazyflies in one process: one thread per drone, one or several radios."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bridges.crazyflie.link import prepare
 from bridges.crazyflie.pilot import Pilot
 from bridges.crazyflie.telemetry import BEARING, ELEVATION, Board, Telemetry
 
-STALE_S: Final = 0.5  # a pose older than this is worth a word
+STALE_S: Final = 0.5  # the note reports poses older than this
 POLL_S: Final = 0.01
 
 
@@ -30,19 +30,19 @@ class CrazyflieBody:
             if kind.name != "crazyflie":
                 raise BodyError(f"{name} is a {kind.name}: this body flies Crazyflies")
         addresses = [address(*pair) for pair in zip(request.names, request.addresses, strict=True)]
-        devices = [device_of(one) for one in addresses]
-        twice = {one for one, device in zip(addresses, devices, strict=True) if devices.count(device) > 1}
-        if twice:
-            raise BodyError(f"several robots have the address {', '.join(sorted(twice))}: give each its own")
+        devices = [device_of(each) for each in addresses]
+        shared = {each for each, device in zip(addresses, devices, strict=True) if devices.count(device) > 1}
+        if shared:
+            raise BodyError(f"several robots have the address {', '.join(sorted(shared))}: give each its own")
         self._claims = Claims(request.names, devices)
         settings = [
             chosen(name, device, external=outside)
             for name, device, outside in zip(request.names, request.device, request.external, strict=True)
         ]
-        self._crowded = [crowded(addresses, settings).get(one, "") for one in addresses]
+        self._congestion = [crowded(addresses, settings).get(each, "") for each in addresses]
         rows = len(addresses)
         self._board = Board(rows)
-        self._patience = max(each.connect_s + each.converge_s for each in settings) + 5.0
+        self._open_timeout = max(each.connect_s + each.converge_s for each in settings) + 5.0
         self._pilots = [
             Pilot(
                 name,
@@ -53,22 +53,22 @@ class CrazyflieBody:
             )
             for row, (name, where, each) in enumerate(zip(request.names, addresses, settings, strict=True))
         ]
-        self._outside = np.flatnonzero(request.external)
+        self._external_rows = np.flatnonzero(request.external)
         self._external = External(rows)
-        self._zero = time.monotonic()  # of the process's clock, on the monotonic one
+        self._zero = time.monotonic()  # zero of the process's clock on the monotonic clock [s]
         self._ranging = [row for row, each in enumerate(settings) if each.multiranger]
 
     def open(self) -> None:
-        """See `Body.open`. Of several, those that cannot be had are left out: their notes say why, and it is tried on.
+        """See `Body.open`. Unreachable drones are left out, retried in the background, and named in the notes.
 
         Raises:
-            BodyError: If none can be had, or another process has one.
+            BodyError: If no drone is reachable, or another process uses one.
         """
         prepare()
         self._claims.take()
         for pilot in self._pilots:
             pilot.start()
-        deadline = time.monotonic() + self._patience
+        deadline = time.monotonic() + self._open_timeout
         waiting = list(self._pilots)
         while waiting and time.monotonic() < deadline:
             time.sleep(POLL_S)
@@ -83,10 +83,10 @@ class CrazyflieBody:
         now = time.monotonic()
         self._zero = now - t
         board = self._board
-        pose = np.where(board.placed[:, None], board.pose, np.nan)
+        pose = np.where(board.settled[:, None], board.pose, np.nan)
         unknown = np.full_like(pose[:, :3], np.nan)
         state = BodyState(
-            time=board.heard - self._zero,
+            time=board.pose_time - self._zero,
             position=pose[:, :3].copy(),
             velocity=pose[:, 3:6].copy(),
             yaw=board.pose[:, 6].copy(),
@@ -97,34 +97,34 @@ class CrazyflieBody:
             notes=tuple(self._note(row, now) for row in range(len(self._pilots))),
             rays=Rays.gather([self._scan(row) for row in range(len(self._pilots))]) if self._ranging else None,
         )
-        if len(self._outside):
-            rows, heard = self._outside, state.time.copy()
+        if len(self._external_rows):
+            rows, heard = self._external_rows, state.time.copy()
             self._external.fill(state, rows)
-            state.position[rows[~board.placed[rows]]] = np.nan  # seen, but it does not know that yet: it must not fly
-            state.time[rows] = np.minimum(state.time[rows], heard[rows])  # seen, but out of control, is lost as well
+            state.position[rows[~board.settled[rows]]] = np.nan  # no flight before the estimator on board has settled
+            state.time[rows] = np.minimum(state.time[rows], heard[rows])  # a drone without telemetry is lost as well
         return state
 
     def command(self, setpoint: Array) -> None:
         """See `Body.command`."""
         now = time.monotonic()
         for pilot, (x, y, z, yaw) in zip(self._pilots, setpoint.tolist(), strict=True):
-            pilot.aim(now, (x, y, z, yaw) if isfinite(x + y + z + yaw) else None)
+            pilot.set_target(now, (x, y, z, yaw) if isfinite(x + y + z + yaw) else None)
 
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Body.takeoff`."""
         for row, up in zip(rows.tolist(), height.tolist(), strict=True):
-            self._board.airborne[row] = True  # as far as anybody who waits for a landing is concerned
-            self._pilots[row].give("takeoff", up)
+            self._board.airborne[row] = True  # at once: callers wait for a landing as long as this is set
+            self._pilots[row].give_order("takeoff", up)
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
         for row in rows.tolist():
-            self._pilots[row].give("land")
+            self._pilots[row].give_order("land")
 
     def stop(self, rows: Index) -> None:
-        """See `Body.stop`. Rows that stand are left alone: an emergency stop locks them until they are restarted."""
+        """See `Body.stop`. Drones on the ground get no command: an emergency stop locks them until a restart."""
         for row in rows.tolist():
-            self._pilots[row].give("stop")
+            self._pilots[row].give_order("stop")
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
         """See `Body.locate`."""
@@ -132,7 +132,7 @@ class CrazyflieBody:
             self._pilots[row].locate(self._zero + t, position, yaw)
 
     def close(self) -> None:
-        """See `Body.close`. Rows that are still in the air are landed first."""
+        """See `Body.close`. Drones in the air are landed first."""
         for pilot in self._pilots:
             pilot.close()
         for pilot in self._pilots:
@@ -140,21 +140,21 @@ class CrazyflieBody:
         self._claims.release()
 
     def _note(self, row: int, now: float) -> str:
-        age = now - self._board.heard[row]
+        age = now - self._board.pose_time[row]
         stale = f"no pose for {age:.1f} s" if STALE_S < age < np.inf else ""
-        return "; ".join(part for part in (self._pilots[row].note, stale, self._crowded[row]) if part)
+        return "; ".join(part for part in (self._pilots[row].note, stale, self._congestion[row]) if part)
 
     def _scan(self, row: int) -> RangeScan | None:
-        scanned = float(self._board.scanned[row])
+        scanned = float(self._board.ranges_time[row])
         if not np.isfinite(scanned):
             return None
         return RangeScan(scanned - self._zero, BEARING, ELEVATION, self._board.ranges[row].copy())
 
 
 def open_crazyflie(request: BodyRequest) -> CrazyflieBody:
-    """The entry points `radio`, `usb` and `udp` of the group `zenpark.bodies`.
+    """Entry points `radio`, `usb` and `udp` of the group `zenpark.bodies`.
 
     Raises:
-        BodyError: If an address or a setting makes no sense.
+        BodyError: If an address or a setting is invalid.
     """
     return CrazyflieBody(request)

@@ -1,7 +1,7 @@
-"""Flying one Crazyflie: taking off, following setpoints, landing, stopping, in the order that its firmware wants.
+"""Flight phases of one Crazyflie: take-off, setpoints, landing and stop, in the order that the firmware requires.
 
-Take-offs and landings are the planner's on board. Between them setpoints are streamed by default: a firmware that hears
-none for half a second levels out, and cuts the motors after two, so that no failure here leaves a robot in the air.
+Take-offs and landings are computed by the planner on board. Between them setpoints are streamed by default: without
+setpoints the firmware levels out after 0.5 s and cuts the motors after 2 s: no failure here leaves a robot in the air.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from bridges.crazyflie.link import Link
 from bridges.crazyflie.telemetry import Telemetry
 
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs and landings
-SHORTEST_S: Final = 1.5  # of a take-off or landing
-REPLY_S: Final = 0.15  # to the answer to a high-level command; asked again after that
+SHORTEST_S: Final = 1.5  # duration of a take-off or landing
+REPLY_S: Final = 0.15  # deadline of the reply to a high-level command; then the command is repeated
 TRIES: Final = 12
 ARMING_S: Final = 2.0
-STOPPING_S: Final = 2.0  # a Crazyflie that was stopped and does not say that it is locked says so long that it flies
-ANSWER_S: Final = 2.5  # an emergency stop that is not answered for so long is worth a word
+STOPPING_S: Final = 2.0  # after a stop, a Crazyflie that does not report "locked" still reports "flying" for so long
+ANSWER_S: Final = 2.5  # the note reports an emergency stop that is unconfirmed for longer
 POLL_S: Final = 0.02
-FRESH_S: Final = 1.0  # a status older than this says nothing
-LOOP_SILENCE_S: Final = 1.0  # the robot's loop must command at least this often while it flies
-GRACE_S: Final = 3.0  # from a take-off to the flag that says so
-MOVED: Final = 0.01  # [m] a goal that moved by less is the same to the planner
+FRESH_S: Final = 1.0  # an older status is ignored
+LOOP_SILENCE_S: Final = 1.0  # in flight, the robot's loop must command at least this often
+FLYING_FLAG_S: Final = 3.0  # from a take-off to the flag "flying" in the status
+MOVED: Final = 0.01  # [m] goals closer to the last one are not sent to the planner
 TURNED: Final = math.radians(2.0)
-PEAK: Final = 35.0 / 16.0  # largest over mean speed of the planner's polynomial from rest to rest
-QUICKEST_S: Final = 0.5  # of a go_to
+PEAK: Final = 35.0 / 16.0  # maximum / mean speed of the planner's polynomial from rest to rest
+SHORTEST_GO_TO_S: Final = 0.5
 
 ANSWERS: Final[dict[int | None, str]] = {Status.BUSY: "not armed, or locked", Status.REFUSED: "its planner is busy"}
 
@@ -42,13 +42,13 @@ Pause = Callable[[float], None]
 
 
 class Phase(Enum):
-    """What a Crazyflie is at."""
+    """Flight phase of a Crazyflie; the value is its text for users."""
 
     GROUND = "on the ground"
     CLIMBING = "taking off"
     FLYING = "flying"
     LANDING = "landing"
-    STOPPING = "told to stop, not answered yet"
+    STOPPING = "stop sent, not confirmed yet"
     STOPPED = "stopped"
 
 
@@ -56,80 +56,74 @@ AIRBORNE: Final = (Phase.CLIMBING, Phase.FLYING, Phase.LANDING, Phase.STOPPING)
 
 
 class Flight:
-    """Flies one Crazyflie over whatever link there is; called by its pilot's thread only, except `aim`.
-
-    Attributes:
-        link: The connection; a new one after a loss.
-        phase: What it is at.
-        trouble: What went wrong last, for people; empty if nothing did.
-    """
+    """Flight control of one Crazyflie over its current link; called by its pilot's thread only, except `set_target`."""
 
     def __init__(self, settings: Settings, telemetry: Telemetry, pause: Pause) -> None:
-        """`pause` lets some seconds pass; it raises when the link is lost or something more urgent is to be done."""
-        self.link: Link
+        """`pause` waits for some seconds; it raises when the link is lost or a stop is ordered."""
+        self.link: Link  # current connection; a new one after a loss
         self.phase = Phase.GROUND
-        self.trouble = ""
+        self.trouble = ""  # last fault, for users; empty if none
         self._settings, self._telemetry, self._pause = settings, telemetry, pause
         self._target: Target | None = None
-        self._aimed = math.inf
+        self._commanded_at = math.inf
         self._since = -math.inf
         self._sent = -math.inf
         self._goal: Target | None = None
 
     @property
     def airborne(self) -> bool:
-        """Whether its motors are on, as far as is known."""
+        """Whether the motors are on, as far as known."""
         return self.phase in AIRBORNE
 
-    def aim(self, now: float, target: Target | None) -> None:
-        """What the robot's loop wants at `now` on the monotonic clock [s]; None: nothing new. From any thread."""
-        self._aimed = now
+    def set_target(self, now: float, target: Target | None) -> None:
+        """Store the setpoint of the robot's loop at `now` [s, monotonic]; None keeps the last one. From any thread."""
+        self._commanded_at = now
         if target is not None:
             self._target = target
 
-    def show(self) -> None:
-        """Puts on the board whether it is airborne."""
+    def publish_airborne(self) -> None:
+        """Write `airborne` to the board."""
         self._telemetry.board.airborne[self._telemetry.row] = self.airborne
 
     # ------------------------------------------------------------------ orders
 
     def takeoff(self, height: float) -> None:
-        """Climbs to `height` [m] over where it stands; if it cannot, `trouble` says why."""
+        """Climb to `height` [m] above the ground here; on refusal, `trouble` gives the reason."""
         if self.airborne:
             return
-        self.trouble = self._obstacle() or self._arm()
+        self.trouble = self._takeoff_refusal() or self._arm()
         if self.trouble:
             return
-        self._release()
+        self._end_streaming()
         self._target, self._goal = None, None
         span = max(height / CLIMB, SHORTEST_S)
-        self._enter(Phase.CLIMBING)  # from here on a stop means motors off
-        answer = self._plan(HighLevel.TAKEOFF, lambda: self._planner.takeoff(height, span, yaw=None))
+        self._enter(Phase.CLIMBING)  # from here on a stop cuts the motors
+        answer = self._command_planner(HighLevel.TAKEOFF, lambda: self._planner.takeoff(height, span, yaw=None))
         if answer == Status.OK:
             return
         if answer == Status.REFUSED and Info.PLANNER_ACTIVE in self._telemetry.info:
-            return  # the answer to the first of two was lost
+            return  # the reply to the first of two commands was lost
         self._enter(Phase.GROUND)
-        self.trouble = f"it refused to take off: {ANSWERS.get(answer, 'no answer')}"
+        self.trouble = f"take-off refused: {ANSWERS.get(answer, 'no answer')}"
 
     def land(self) -> None:
-        """Descends where it is, and switches off."""
+        """Descend at the current place, then switch the motors off."""
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
         span = max(float(self._telemetry.position[2]) / CLIMB, SHORTEST_S)
         if not math.isfinite(span):
             span = SHORTEST_S
-        self._plan(HighLevel.LAND, lambda: self._planner.land(0.0, span, yaw=None))
-        self._release()  # after the command: before it, the planner would have nothing to follow, and the motors stop
+        self._command_planner(HighLevel.LAND, lambda: self._planner.land(0.0, span, yaw=None))
+        self._end_streaming()  # after the command: an idle planner without setpoints stops the motors
         self._enter(Phase.LANDING)
 
     def stop(self) -> None:
-        """Motors off; `guide` says it again until it is answered.
+        """Cut the motors; `send_due` repeats the command until the status confirms it.
 
-        One that stands is left alone: an emergency stop locks it until it is switched off and on.
+        Not sent to a drone on the ground: an emergency stop locks it until it is switched off and on.
         """
         telemetry = self._telemetry
-        fresh = time.monotonic() - telemetry.told < FRESH_S
+        fresh = time.monotonic() - telemetry.status_time < FRESH_S
         if not self.airborne and fresh and Info.FLYING not in telemetry.info:
             return
         if self.phase is not Phase.STOPPING:
@@ -138,22 +132,22 @@ class Flight:
 
     # ------------------------------------------------------------------ in the air
 
-    def guide(self, now: float) -> None:
-        """Sends what is due at `now` on the monotonic clock [s]."""
+    def send_due(self, now: float) -> None:
+        """Send the packets that are due at `now` on the monotonic clock [s]."""
         if self.phase is Phase.STOPPING:
             if now - self._since > ANSWER_S:
                 self.trouble = UNANSWERED
             self.link.cf.supervisor.send_emergency_stop()
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
-        if now - max(self._aimed, self._since) > LOOP_SILENCE_S:
-            self.trouble = "landed it: nobody commanded it any more"
+        if now - max(self._commanded_at, self._since) > LOOP_SILENCE_S:
+            self.trouble = "landed: no commands from the robot's loop"
             self.land()
             return
         self._stream(now)
 
     def _stream(self, now: float) -> None:
-        """Sends the setpoint, if one is due."""
+        """Send the setpoint, if due."""
         target = self._target
         if target is None or now - self._sent < 1.0 / self._settings.stream_hz - 0.5 * POLL_S:
             return
@@ -167,49 +161,47 @@ class Flight:
             self._send_velocity(target)
         elif self._goal is None or math.dist(self._goal[:3], target[:3]) > MOVED or abs(self._goal[3] - yaw) > TURNED:
             far = math.dist(self._telemetry.position.tolist(), target[:3])
-            span = max(PEAK * far / CRAZYFLIE.speed, QUICKEST_S)
+            span = max(PEAK * far / CRAZYFLIE.speed, SHORTEST_GO_TO_S)
             self._goal = target
             self._planner.go_to(x, y, z, yaw, span)
 
-    def watch(self, now: float) -> None:
-        """Takes in what the Crazyflie says of itself at `now` on the monotonic clock [s]."""
+    def update_phase(self, now: float) -> None:
+        """Update the phase from the drone's status at `now` on the monotonic clock [s]."""
         telemetry = self._telemetry
-        if now - telemetry.told > FRESH_S:
+        if now - telemetry.status_time > FRESH_S:
             return
         info, flying = telemetry.info, Info.FLYING in telemetry.info
         since = now - self._since
         if self.airborne and Info.LOCKED in info:
-            self.trouble = "" if self.phase is Phase.STOPPING else "it cut its motors"
+            self.trouble = "" if self.phase is Phase.STOPPING else "the drone cut its motors"
             self._enter(Phase.STOPPED)
         elif self.phase is Phase.STOPPING:
             if not flying and since > STOPPING_S:
                 self.trouble = ""
                 self._enter(Phase.STOPPED)
         elif self.phase is Phase.STOPPED and not flying and Info.LOCKED not in info and since > STOPPING_S:
-            self._enter(Phase.GROUND)  # it was switched off and on
+            self._enter(Phase.GROUND)  # switched off and on
             self.trouble = ""
         elif self.phase is Phase.LANDING and not flying and since > SHORTEST_S:
             self._enter(Phase.GROUND)
-        elif self.airborne and not flying and since > GRACE_S:
+        elif self.airborne and not flying and since > FLYING_FLAG_S:
             self._enter(Phase.GROUND)
             self.trouble = "its motors stopped"
-        elif telemetry.low and self.phase in (Phase.CLIMBING, Phase.FLYING):
-            self.trouble = "landed it: battery low"
+        elif telemetry.battery_low and self.phase in (Phase.CLIMBING, Phase.FLYING):
+            self.trouble = "landed: battery low"
             self.land()
 
-    def doubt(self) -> None:
-        """The link has been gone for so long that the firmware has cut the motors, if setpoints were streamed."""
+    def mark_out_of_reach(self) -> None:
+        """Link lost for so long that the firmware has cut the motors, provided that setpoints were streamed."""
         if self.airborne:
             stopping = self.phase is Phase.STOPPING
             alone = (stopping or self.phase is Phase.FLYING) and self._settings.control == "high-level"
-            self.trouble = (
-                "out of reach: it may still hover, by itself" if alone else "out of reach: its motors are off"
-            )
-            if not (alone and stopping):  # it is stopped as soon as it is in reach again
+            self.trouble = "out of reach: may still hover by itself" if alone else "out of reach: its motors are off"
+            if not (alone and stopping):  # else: the stop is sent as soon as the drone is in reach again
                 self._enter(Phase.GROUND)
 
     def resume(self) -> bool:
-        """A new link after a loss; True if it is found in the air."""
+        """Continue on a new link after a loss; True if the drone is in the air."""
         if self.phase is Phase.STOPPING:
             return True
         if Info.FLYING in self._telemetry.info and self.phase is not Phase.STOPPED:
@@ -218,7 +210,7 @@ class Flight:
             return True
         return False
 
-    # ------------------------------------------------------------------ how
+    # ------------------------------------------------------------------ parts of the above
 
     @property
     def _planner(self):  # type: ignore[no-untyped-def]  # noqa: ANN202 - cflib's own object
@@ -226,56 +218,56 @@ class Flight:
 
     def _enter(self, phase: Phase) -> None:
         self.phase, self._since = phase, time.monotonic()
-        self.show()
+        self.publish_airborne()
 
-    def _obstacle(self) -> str:
-        """Why it cannot take off; empty if it can."""
+    def _takeoff_refusal(self) -> str:
+        """Reason against a take-off; empty if none."""
         telemetry = self._telemetry
-        if time.monotonic() - telemetry.told > FRESH_S:
-            return "it has not said how it is"
-        if telemetry.low:
-            return "it does not take off: battery low"
+        if time.monotonic() - telemetry.status_time > FRESH_S:
+            return "no take-off: no status received"
+        if telemetry.battery_low:
+            return "no take-off: battery low"
         if Info.LOCKED in telemetry.info:
-            return "it is locked: switch it off and on"
-        if not telemetry.board.placed[telemetry.row]:
-            return "it does not take off: it does not know where it is"
+            return "locked: switch it off and on"
+        if not telemetry.board.settled[telemetry.row]:
+            return "no take-off: its position estimate has not settled"
         return ""
 
     def _arm(self) -> str:
-        """Arms it if it is not; why it could not, or empty."""
+        """Arm the motors if necessary; returns the reason of a failure, or an empty text."""
         deadline = time.monotonic() + ARMING_S
         while Info.ARMED not in self._telemetry.info:
             if not self._settings.arm:
-                return "it is not armed, and arm = false"
+                return "not armed, and arm = false"
             if time.monotonic() > deadline:
-                return "it refuses to be armed: is it level, its battery full enough?"
+                return "arming refused: is the drone level, its battery full enough?"
             self.link.cf.supervisor.send_arming_request(True)
             self._pause(5.0 * POLL_S)
         return ""
 
-    def _plan(self, command: HighLevel, send: Callable[[], None]) -> int | None:
-        """Sends a high-level command until it is answered; the answer, or None."""
-        before, _ = self.link.reply(command)
+    def _command_planner(self, command: HighLevel, send: Callable[[], None]) -> int | None:
+        """Send a high-level command until the drone replies; returns the code of the reply, or None."""
+        before, _ = self.link.planner_reply(command)
         for _ in range(TRIES):
             send()
             deadline = time.monotonic() + REPLY_S
             while time.monotonic() < deadline:
                 self._pause(0.25 * POLL_S)
-                if self.phase is Phase.FLYING:  # or the firmware cuts the motors while a landing is not answered
+                if self.phase is Phase.FLYING:  # else the firmware cuts the motors before it replies to a landing
                     self._stream(time.monotonic())
-                count, code = self.link.reply(command)
+                count, code = self.link.planner_reply(command)
                 if count > before:
                     return code
         return None
 
-    def _release(self) -> None:
-        """Says that no more setpoints come. It is never answered, so it is said thrice."""
+    def _end_streaming(self) -> None:
+        """Announce the end of setpoints to the firmware; sent three times, because there is no reply."""
         for _ in range(3):
             self.link.cf.commander.send_notify_setpoint_stop()
             self._pause(POLL_S)
 
     def _send_velocity(self, target: Target) -> None:
-        """The velocity that leads to a place, by the law of the firmware's own position controller."""
+        """Send the velocity toward a position, by the law of the firmware's own position controller."""
         telemetry, limit = self._telemetry, CRAZYFLIE.speed
         here = telemetry.position.tolist()
         if not all(map(math.isfinite, here)):

@@ -1,4 +1,4 @@
-"""The thread that serves one Crazyflie: connects, sets up, obeys, streams, watches, and connects again."""
+"""Thread of one Crazyflie: connects, sets up, executes orders, streams setpoints, supervises, and reconnects."""
 
 from __future__ import annotations
 
@@ -15,50 +15,45 @@ from bridges.crazyflie.link import Link, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure
 from bridges.crazyflie.telemetry import Telemetry
 
-NOBODY_S: Final = 2.4  # without any answer there is no Crazyflie
-LOST_S: Final = 1.0  # without a packet the link is lost; the firmware gives up after two seconds without setpoints
-LINK_GAP_S: Final = 2.0  # so long after the link was lost, a Crazyflie that streamed setpoints held up is down
-STATUS_S: Final = 2.0  # to the first status
+NO_ANSWER_S: Final = 2.4  # without any answer for so long, no Crazyflie is there
+LOST_S: Final = 1.0  # without a packet the link is lost; the firmware cuts the motors after 2 s without setpoints
+LINK_GAP_S: Final = 2.0  # so long after a loss of the link, a drone that flew by streamed setpoints is down
+STATUS_S: Final = 2.0  # deadline of the first status
 RETRY_S: Final = 0.5
-HOME_S: Final = 12.0  # `close` waits so long for a landing
+LANDING_S: Final = 12.0  # `close` waits so long for a landing
 JOIN_S: Final = 5.0
 
-TOO_LATE_S: Final = 2.0  # a take-off that could not begin for so long does not begin any more
+TAKEOFF_EXPIRY_S: Final = 2.0  # a take-off that could not begin for so long is dropped
 
-Order = tuple[str, float, float]  # "takeoff", "land" or "stop", the height of a take-off, and when it was given
+Order = tuple[str, float, float]  # "takeoff", "land" or "stop"; height of a take-off [m]; time of the order [s]
 
 
-class Overruled(RuntimeError):
-    """A newer order has come."""
+class OrderReplaced(RuntimeError):
+    """A stop has replaced the current order."""
 
 
 class Pilot:
-    """Serves one row.
-
-    Attributes:
-        opened: It was connected, set up, and knew where it was (unless somebody outside must tell it) at least once.
-        failure: Why the first connection failed.
-    """
+    """Thread and state of one drone."""
 
     def __init__(
         self, name: str, address: str, settings: Settings, telemetry: Telemetry, place: tuple[Array, float]
     ) -> None:
-        """`place` is where the robot stands: (3,) [m], and its yaw [rad]."""
-        self.opened = threading.Event()
-        self.failure: BodyError | None = None
+        """`place`: start position (3,) [m] and yaw [rad]."""
+        self.opened = threading.Event()  # connected and set up once; position settled, unless it comes from outside
+        self.failure: BodyError | None = None  # reason why the first connection failed
         self._name, self._address, self._settings, self._telemetry = name, address, settings, telemetry
-        self._place = place
+        self._start_pose = place
         self._flight = Flight(settings, telemetry, self._pause)
         self._link: Link | None = None
-        self._news = "connecting"
+        self._connection_note = "connecting"
         self._order: Order | None = None
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._ending = threading.Event()
-        self._outside: tuple[float, Array, float] | None = None
-        self._passed = -inf
+        self._external_pose: tuple[float, Array, float] | None = None
+        self._forwarded_at = -inf
         self._convergence: Convergence | None = None
-        self._patient_until = inf
+        self._settle_deadline = inf
         self._closers: list[threading.Thread] = []
         period = settings.stream_hz
         if isinstance(settings.positioning, Outside):
@@ -66,41 +61,43 @@ class Pilot:
         self._period = 1.0 / period
         self._thread = threading.Thread(target=self._run, name=f"pilot of {name}", daemon=True)
 
-    # ------------------------------------------------------------------ from the robot's loop: none of these blocks
+    # ------------------------------------------------------------------ calls of the robot's loop, none blocks
 
     def start(self) -> None:
-        """Begins to connect."""
+        """Start the thread, which connects."""
         self._thread.start()
 
-    def give(self, what: str, height: float = 0.0) -> None:
-        """An order; it replaces one that has not been taken up yet, except that nothing replaces a stop."""
+    def give_order(self, what: str, height: float = 0.0) -> None:
+        """Queue an order; it replaces a waiting one, except a stop, which nothing replaces."""
         with self._lock:
             if self._order is None or self._order[0] != "stop":
                 self._order = what, height, time.monotonic()
         self._wake.set()
 
-    def aim(self, now: float, target: Target | None) -> None:
-        """See `Flight.aim`."""
-        self._flight.aim(now, target)
+    def set_target(self, now: float, target: Target | None) -> None:
+        """See `Flight.set_target`."""
+        self._flight.set_target(now, target)
 
     def locate(self, now: float, position: Array, yaw: float) -> None:
-        """A position (3,) [m] and yaw [rad], or NaN, from outside, for the estimator on board."""
-        self._outside = now, position, yaw
+        """Store an external position (3,) [m] and yaw [rad], or NaN, for the estimator on board."""
+        self._external_pose = now, position, yaw
 
     @property
     def note(self) -> str:
-        """What there is to say, for people."""
-        return "; ".join(part for part in (self._news, self._flight.trouble, self._telemetry.words()) if part)
+        """Connection state and faults, for users."""
+        return "; ".join(
+            part for part in (self._connection_note, self._flight.trouble, self._telemetry.status_text()) if part
+        )
 
     def close(self) -> None:
-        """Lands it if it flies, and ends the thread."""
+        """Land the drone if it flies, then end the thread."""
         self._ending.set()
         self._wake.set()
 
     def join(self) -> None:
-        """Waits for the end of the thread."""
+        """Wait for the end of the thread."""
         if self._thread.ident is not None:
-            self._thread.join(HOME_S + JOIN_S)
+            self._thread.join(LANDING_S + JOIN_S)
 
     # ------------------------------------------------------------------ the thread
 
@@ -110,10 +107,10 @@ class Pilot:
             try:
                 link = self._connect()
             except LinkError as error:
-                self._news = str(error)
+                self._connection_note = str(error)
                 self._fail(error)
                 if time.monotonic() - lost > LINK_GAP_S or self._ending.is_set():
-                    self._flight.doubt()
+                    self._flight.mark_out_of_reach()
                 self._ending.wait(RETRY_S)
                 continue
             try:
@@ -122,31 +119,31 @@ class Pilot:
                 self._serve(link)
                 break
             except BodyError as error:
-                self._news = str(error)
+                self._connection_note = str(error)
                 self._fail(error)
                 self._ending.wait(RETRY_S)
-            except TROUBLE as error:  # whatever it is, the robot must be landed
+            except TROUBLE as error:  # of any kind: the robot must be landed
                 lost = time.monotonic()
                 what = str(error) if isinstance(error, LinkError) else f"{type(error).__name__}: {error}"
-                self._news = f"link lost: {what}; connecting again"
+                self._connection_note = f"link lost: {what}; connecting again"
                 self._fail(error)
                 if self._flight.airborne:
-                    self.give("land")
+                    self.give_order("land")
             finally:
                 self._discard(link)
         for closer in self._closers:
             closer.join()
 
     def _fail(self, error: Exception) -> None:
-        """The first connection was none; it is tried on, in case others of the body were had."""
+        """Record a failure of the first connection; retries go on, because other drones of the body may fly."""
         if not self.opened.is_set():
             self.failure = BodyError(f"{self._name}: {error}")
 
     def _connect(self) -> Link:
-        """A new link, by as many attempts as there is time for.
+        """Open a new link, in as many attempts as the time allows.
 
         Raises:
-            LinkError: If there is none.
+            LinkError: If all attempts fail.
         """
         begin = time.monotonic()
         answered = False
@@ -158,7 +155,7 @@ class Pilot:
                 answered = answered or link.answered
                 self._discard(link)
                 waited = time.monotonic() - begin
-                if self._ending.is_set() or waited > (self._settings.connect_s if answered else NOBODY_S):
+                if self._ending.is_set() or waited > (self._settings.connect_s if answered else NO_ANSWER_S):
                     raise LinkError(f"{error} at {self._address}: {self._remedy()}") from None
             except LinkError as error:
                 self._discard(link)
@@ -168,74 +165,76 @@ class Pilot:
 
     def _remedy(self) -> str:
         if self._address.startswith("radio"):
-            return "is it on, the Crazyradio plugged in and permitted (udev), channel and address as on the robot?"
+            return (
+                "is the drone on, the Crazyradio plugged in and permitted (udev), channel and address as on the robot?"
+            )
         if self._address.startswith("usb"):
-            return "is it plugged in, switched on, and permitted (udev)?"
+            return "is the drone plugged in, switched on, and permitted (udev)?"
         return "is the simulation running there?"
 
     def _discard(self, link: Link) -> None:
-        """Closes a link, which takes a second, on the side."""
+        """Close a link in a thread of its own: closing takes a second."""
         closer = threading.Thread(target=link.close, name=f"closing {self._name}", daemon=True)
         closer.start()
         self._closers = [other for other in self._closers if other.is_alive()] + [closer]
 
     def _prepare(self, link: Link) -> None:
-        """Logs, parameters, positioning; nothing of it if the Crazyflie is in the air.
+        """Start the logs; set parameters and positioning, unless the drone is in the air.
 
         Raises:
-            BodyError: If it cannot be set up.
-            LinkError: If it falls silent.
+            BodyError: If the setup fails.
+            LinkError: If the link is lost.
         """
         settings, telemetry = self._settings, self._telemetry
-        telemetry.forget()
+        telemetry.reset_status()
         ranges_hz = settings.ranges_hz if settings.multiranger else None
-        telemetry.listen(link, log_hz=settings.log_hz, status_hz=settings.status_hz, ranges_hz=ranges_hz)
+        telemetry.start_logging(link, log_hz=settings.log_hz, status_hz=settings.status_hz, ranges_hz=ranges_hz)
         deadline = time.monotonic() + STATUS_S
-        while telemetry.told == -inf:
+        while telemetry.status_time == -inf:
             self._check(link)
             if time.monotonic() > deadline:
-                raise LinkError("it does not say how it is")
+                raise LinkError("no status received")
             time.sleep(0.01)
         if self._flight.resume():
-            self._news = "connected again, in the air"
+            self._connection_note = "connected again, in the air"
             return
-        self._telemetry.board.placed[telemetry.row] = False
+        self._telemetry.board.settled[telemetry.row] = False
         for parameter, value in settings.parameters.items():
-            link.set(parameter, value)
+            link.set_parameter(parameter, value)
         configure(link, settings)
         for _ in range(3):
-            link.cf.commander.send_notify_setpoint_stop()  # whoever streamed before muted the planner
+            link.cf.commander.send_notify_setpoint_stop()  # setpoints of an earlier session have muted the planner
         if settings.positioning is None:
             self._arrive()
         elif isinstance(settings.positioning, Outside):
-            self._convergence, self._patient_until = None, inf
-            self._news = "no position from outside yet"
+            self._convergence, self._settle_deadline = None, inf
+            self._connection_note = "no position from outside yet"
             self.opened.set()
         else:
             self._converge(link)
             self._arrive()
 
     def _converge(self, link: Link) -> None:
-        self._news = "finding out where it is"
+        self._connection_note = "position estimate is settling"
         deadline = time.monotonic() + self._settings.converge_s
-        convergence = Convergence(link, *self._place)
+        convergence = Convergence(link, *self._start_pose)
         while not convergence.advance(time.monotonic()):
             self._check(link)
             if time.monotonic() > deadline or self._ending.is_set():
-                said = self._telemetry.words() or "does its positioning system work where it stands?"
-                raise BodyError(f"its position has not settled after {self._settings.converge_s:g} s: {said}")
+                cause = self._telemetry.status_text() or "does its positioning system work where it stands?"
+                raise BodyError(f"its position has not settled after {self._settings.converge_s:g} s: {cause}")
             time.sleep(0.02)
 
     def _arrive(self) -> None:
-        self._telemetry.board.placed[self._telemetry.row] = True
-        self._news = ""
+        self._telemetry.board.settled[self._telemetry.row] = True
+        self._connection_note = ""
         self.opened.set()
 
     def _serve(self, link: Link) -> None:
-        """Until the end, or until the link is lost.
+        """Loop of the thread, until `close` or the loss of the link.
 
         Raises:
-            LinkError: If it is.
+            LinkError: If the link is lost.
         """
         due = time.monotonic()
         landed_by = inf
@@ -246,20 +245,20 @@ class Pilot:
             due = max(due + self._period, now) if now >= due else due
             self._check(link)
             try:
-                self._obey()
-                self._pass_on(link, now)
-                self._flight.watch(now)
-                self._flight.guide(now)
-            except Overruled:
+                self._execute_order()
+                self._forward_external_pose(link, now)
+                self._flight.update_phase(now)
+                self._flight.send_due(now)
+            except OrderReplaced:
                 self._wake.set()
             if self._ending.is_set() and self._order is None:
                 if not self._flight.airborne or now > landed_by:
                     return
                 if landed_by == inf:
-                    landed_by = now + HOME_S
-                    self.give("land")
+                    landed_by = now + LANDING_S
+                    self.give_order("land")
 
-    def _obey(self) -> None:
+    def _execute_order(self) -> None:
         with self._lock:
             order, self._order = self._order, None
         if order is None:
@@ -270,59 +269,59 @@ class Pilot:
                 self._flight.stop()
             elif what == "land":
                 self._flight.land()
-            elif time.monotonic() - given < TOO_LATE_S:
+            elif time.monotonic() - given < TAKEOFF_EXPIRY_S:
                 self._flight.takeoff(height)
         finally:
-            self._flight.show()
+            self._flight.publish_airborne()
 
     def _check(self, link: Link) -> None:
         if link.error is not None:
             raise LinkError(link.error)
-        silence = time.monotonic() - link.heard
+        silence = time.monotonic() - link.last_packet
         if silence > LOST_S:
-            raise LinkError(f"nothing heard for {silence:.1f} s")
+            raise LinkError(f"no packet for {silence:.1f} s")
 
     def _pause(self, seconds: float) -> None:
-        """Lets time pass in the middle of an order.
+        """Wait in the middle of an order.
 
         Raises:
             LinkError: If the link is lost meanwhile.
-            Overruled: If it must stop.
+            OrderReplaced: If a stop is ordered meanwhile.
         """
         link = self._flight.link
         until = time.monotonic() + seconds
         while True:
             self._check(link)
             if self._order is not None and self._order[0] == "stop":
-                raise Overruled
+                raise OrderReplaced
             now = time.monotonic()
-            self._pass_on(link, now)
+            self._forward_external_pose(link, now)
             if now >= until:
                 return
             time.sleep(min(until - now, self._period))
 
-    def _pass_on(self, link: Link, now: float) -> None:
-        """Tells the estimator on board where it is, as often as wanted, and waits until it believes it."""
+    def _forward_external_pose(self, link: Link, now: float) -> None:
+        """Send external poses to the estimator on board at the rate set; start and end its convergence."""
         system = self._settings.positioning
         if not isinstance(system, Outside):
             return
-        told = self._outside
-        if told is not None and now - self._passed >= 0.9 / system.rate_hz:
-            self._outside, self._passed = None, now
-            _, position, yaw = told
+        pose = self._external_pose
+        if pose is not None and now - self._forwarded_at >= 0.9 / system.rate_hz:
+            self._external_pose, self._forwarded_at = None, now
+            _, position, yaw = pose
             x, y, z = position.tolist()
             if system.attitude and isfinite(yaw):
                 link.cf.extpos.send_extpose(x, y, z, 0.0, 0.0, sin(0.5 * yaw), cos(0.5 * yaw))
             else:
                 link.cf.extpos.send_extpos(x, y, z)
             if self._convergence is None and self._flight.phase is Phase.GROUND:
-                self._news = "finding out where it is"
-                start_yaw = yaw if isfinite(yaw) else self._place[1]
+                self._connection_note = "position estimate is settling"
+                start_yaw = yaw if isfinite(yaw) else self._start_pose[1]
                 self._convergence = Convergence(link, position, start_yaw)
-                self._patient_until = now + self._settings.converge_s
-        placed = self._telemetry.board.placed
+                self._settle_deadline = now + self._settings.converge_s
+        placed = self._telemetry.board.settled
         if self._convergence is not None and not placed[self._telemetry.row]:
             if self._convergence.advance(now):
                 self._arrive()
-            elif now > self._patient_until:
-                self._news = "its position has not settled: do the positions from outside belong to this robot?"
+            elif now > self._settle_deadline:
+                self._connection_note = "its position has not settled: are the external positions those of this robot?"

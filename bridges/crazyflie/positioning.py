@@ -1,4 +1,4 @@
-"""Telling a Crazyflie how it finds out where it is, and waiting until it knows: before that it must not fly."""
+"""Setup of a Crazyflie's positioning system and estimator, and the wait until the estimate has settled."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from bridges.crazyflie.link import Link, LinkError
 ESTIMATORS: Final = {"auto": 0, "complementary": 1, "kalman": 2, "ukf": 3}
 LOCO_MODES: Final = {"auto": 0, "twr": 1, "tdoa2": 2, "tdoa3": 3}
 UPLOAD_S: Final = 8.0
-ANCHORS_S: Final = 5.0  # an anchor hears of its position by radio, and says so once per second
+ANCHORS_S: Final = 5.0  # an anchor gets its position by radio, and confirms it once per second
 AGREE: Final = 1e-3  # [m]
-RESET_S: Final = 0.1  # how long the reset of the estimator is held
+RESET_S: Final = 0.1  # duration of the estimator's reset
 VARIANCE_HZ: Final = 20.0
-SETTLED: Final = 1e-3  # [m²] the variances of half a second differ by less,
-SURE: Final = 0.1  # [m²] and are below this
+SETTLED_SPREAD: Final = 1e-3  # [m²] settled: the variances of half a second differ by less,
+SETTLED_BELOW: Final = 0.1  # [m²] and are below this
 SAMPLES: Final = 10
 VARIANCES: Final = {f"kalman.varP{axis}": "float" for axis in "XYZ"}
 
@@ -35,14 +35,14 @@ Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
 
 
 class Geometry(msgspec.Struct, frozen=True):
-    """Where a base station is, and how it looks."""
+    """Position and orientation of a base station."""
 
     origin: Three
     rotation: Annotated[list[Three], Meta(min_length=3, max_length=3)]
 
 
 class Sweep(msgspec.Struct, frozen=True):
-    """Calibration of one of its two planes of light."""
+    """Calibration of one of the two light planes of a base station."""
 
     phase: float
     tilt: float
@@ -71,10 +71,10 @@ class StationFile(msgspec.Struct, frozen=True, kw_only=True, rename={"system_typ
 
 
 def stations(path: str, count: int) -> StationFile:
-    """The Lighthouse configuration in a file, for `count` base stations at most.
+    """Read the Lighthouse configuration of a file, for `count` base stations at most.
 
     Raises:
-        BodyError: If there is none in it.
+        BodyError: If the file holds none.
     """
     try:
         read = msgspec.yaml.decode(Path(path).read_bytes(), type=StationFile)
@@ -86,70 +86,66 @@ def stations(path: str, count: int) -> StationFile:
         raise BodyError(f"{path} is no Lighthouse configuration of version 1; save it again in the Crazyflie client")
     beyond = sorted(number for number in read.geos.keys() | read.calibs.keys() if number >= count)
     if beyond:
-        raise BodyError(f"{path} has base station {beyond[0] + 1}, the firmware is said to know {count}: base_stations")
+        raise BodyError(f"{path} has base station {beyond[0] + 1}, the firmware knows {count} by base_stations")
     return read
 
 
 def configure(link: Link, settings: Settings) -> None:
-    """Chooses the estimator and sets up the positioning system.
+    """Choose the estimator and set up the positioning system.
 
     Raises:
-        BodyError: If the Crazyflie does not have what it takes, or did not take what it was told.
-        LinkError: If it does not answer.
+        BodyError: If the Crazyflie lacks the hardware or firmware, or refuses a setting.
+        LinkError: If no answer comes.
     """
     system = settings.positioning
     estimator = settings.estimator or (None if system is None else "kalman")
     if estimator is not None:
-        link.set("stabilizer.estimator", ESTIMATORS[estimator])
+        link.set_parameter("stabilizer.estimator", ESTIMATORS[estimator])
     if isinstance(system, Lighthouse):
         _lighthouse(link, system)
     elif isinstance(system, Loco):
         _loco(link, system)
     elif isinstance(system, Outside):
-        link.set("locSrv.extPosStdDev", system.position_sigma)
-        link.set("locSrv.extQuatStdDev", system.attitude_sigma)
+        link.set_parameter("locSrv.extPosStdDev", system.position_sigma)
+        link.set_parameter("locSrv.extQuatStdDev", system.attitude_sigma)
 
 
 class Convergence:
-    """A reset of the position estimator, and the wait until it has settled; never blocks.
-
-    Attributes:
-        done: It has.
-    """
+    """Reset of the position estimator and the wait until it has settled; never blocks."""
 
     def __init__(self, link: Link, start: Array, yaw: float) -> None:
-        """`start` (3,) [m] and `yaw` [rad] are where the robot stands; no system but an attitude measures the yaw."""
-        self.done = False
+        """`start` (3,) [m] and `yaw` [rad]: pose on the ground; only positioning with attitude measures the yaw."""
+        self.done = False  # settled
         self._link = link
-        self._seen: deque[tuple[float, ...]] = deque(maxlen=SAMPLES)
+        self._variances: deque[tuple[float, ...]] = deque(maxlen=SAMPLES)
         place = {f"kalman.initial{axis}": float(value) for axis, value in zip("XYZ", start, strict=True)}
         for name, value in (place | {"kalman.initialYaw": yaw, "kalman.resetEstimation": 1.0}).items():
-            link.ask(name, value)
+            link.send_parameter(name, value)
         self._release: float | None = time.monotonic() + RESET_S
 
     def advance(self, now: float) -> bool:
-        """Goes on at `now` on the monotonic clock [s]; True when it has settled."""
+        """Continue at `now` on the monotonic clock [s]; True once the estimate has settled."""
         if self._release is not None and now >= self._release:
             self._release = None
-            self._link.ask("kalman.resetEstimation", 0.0)
-            self._link.log("variance", VARIANCE_HZ, VARIANCES, self._see)
-        if not self.done and len(self._seen) == SAMPLES:
-            seen = np.array(self._seen)
-            if np.ptp(seen, axis=0).max() < SETTLED and seen.max() < SURE:
+            self._link.send_parameter("kalman.resetEstimation", 0.0)
+            self._link.start_log("variance", VARIANCE_HZ, VARIANCES, self._store_variances)
+        if not self.done and len(self._variances) == SAMPLES:
+            variances = np.array(self._variances)
+            if np.ptp(variances, axis=0).max() < SETTLED_SPREAD and variances.max() < SETTLED_BELOW:
                 self.done = True
-                self._link.silence("variance")
+                self._link.stop_log("variance")
         return self.done
 
-    def _see(self, _t: float, values: Mapping[str, float]) -> None:
-        self._seen.append(tuple(values.values()))
+    def _store_variances(self, _t: float, values: Mapping[str, float]) -> None:
+        self._variances.append(tuple(values.values()))
 
 
 def _lighthouse(link: Link, system: Lighthouse) -> None:
     from cflib.crazyflie import mem  # noqa: PLC0415 - an optional extra
     from cflib.localization.lighthouse_config_manager import LighthouseConfigWriter  # noqa: PLC0415
 
-    if not link.value("deck.bcLighthouse4"):
-        raise BodyError("no Lighthouse deck is found on it: is it on top, the right way round?")
+    if not link.parameter_value("deck.bcLighthouse4"):
+        raise BodyError("no Lighthouse deck found: is the deck on top of the drone, the right way round?")
     if system.file is None:
         return
     wanted = stations(system.file, system.base_stations)
@@ -158,17 +154,17 @@ def _lighthouse(link: Link, system: Lighthouse) -> None:
         geometries[number] = mem.LighthouseBsGeometry.from_file_object(msgspec.to_builtins(geometry))
     for number, calibration in wanted.calibs.items():
         calibrations[number] = mem.LighthouseBsCalibration.from_file_object(msgspec.to_builtins(calibration))
-    # naming the version erases what is stored, and takes a second
-    version = None if link.value("lighthouse.systemType") == wanted.system_type else wanted.system_type
+    # naming the version erases the stored geometry, and takes a second
+    version = None if link.parameter_value("lighthouse.systemType") == wanted.system_type else wanted.system_type
     writer = LighthouseConfigWriter(link.cf, system.base_stations)
-    stored = _told(
+    stored = _await_answer(
         link,
-        lambda tell: writer.write_and_store_config(tell, geos=geometries, calibs=calibrations, system_type=version),
+        lambda done: writer.write_and_store_config(done, geos=geometries, calibs=calibrations, system_type=version),
         "geometry of the base stations",
     )
     if not stored:
         raise BodyError(f"the firmware does not know {system.base_stations} base stations: lower base_stations")
-    found = _told(link, mem.LighthouseMemHelper(link.cf).read_all_geos, "geometry of the base stations")
+    found = _await_answer(link, mem.LighthouseMemHelper(link.cf).read_all_geos, "geometry of the base stations")
     for number, geometry in wanted.geos.items():
         if number not in found or not np.allclose(found[number].origin, geometry.origin, atol=AGREE):
             raise BodyError(
@@ -180,9 +176,9 @@ def _loco(link: Link, system: Loco) -> None:
     from cflib.crazyflie.mem import MemoryElement  # noqa: PLC0415 - an optional extra
 
     memories = link.cf.mem.get_mems(MemoryElement.TYPE_LOCO2)
-    if not link.value("deck.bcLoco") or not memories:
-        raise BodyError("no Loco positioning deck is found on it: is it there, the right way round?")
-    link.set("loco.mode", LOCO_MODES[system.mode])
+    if not link.parameter_value("deck.bcLoco") or not memories:
+        raise BodyError("no Loco positioning deck found: is the deck there, the right way round?")
+    link.set_parameter("loco.mode", LOCO_MODES[system.mode])
     wanted = dict(enumerate(system.anchors))
     deadline = time.monotonic() + ANCHORS_S
     missing = wanted
@@ -197,36 +193,36 @@ def _loco(link: Link, system: Loco) -> None:
             if anchor not in known or not np.allclose(known[anchor], place, atol=AGREE)
         }
         if missing and time.monotonic() > deadline:
-            raise BodyError(f"anchor {min(missing)} did not take its position: is it on, in the mode {system.mode}?")
+            raise BodyError(f"anchor {min(missing)} did not store its position: is it on, in mode {system.mode}?")
     if not wanted and len(_anchors(link, memories[0])) == 0:
-        raise BodyError("no anchor knows where it is: write positioning.anchors = [[x, y, z], ...]")
+        raise BodyError("no anchor knows its position: write positioning.anchors = [[x, y, z], ...]")
 
 
 def _anchors(link: Link, memory: Any) -> dict[int, tuple[float, float, float]]:  # noqa: ANN401 - cflib's
-    """Positions [m] that the anchors say they have."""
-    listed = _told(link, memory.update_id_list, "list of anchors")
+    """Positions [m] that the anchors report."""
+    listed = _await_answer(link, memory.update_id_list, "list of anchors")
     if listed.nr_of_anchors == 0:
         return {}
-    read = _told(link, memory.update_data, "positions of anchors")
+    read = _await_answer(link, memory.update_data, "positions of anchors")
     return {number: anchor.position for number, anchor in read.anchor_data.items() if anchor.is_valid}
 
 
-def _told(link: Link, ask: Callable[[Callable[[Any], None]], object], what: str) -> Any:  # noqa: ANN401 - cflib's own objects
-    """What cflib calls back with.
+def _await_answer(link: Link, ask: Callable[[Callable[[Any], None]], object], what: str) -> Any:  # noqa: ANN401 - cflib's own objects
+    """Call `ask` with a callback, and return the callback's argument.
 
     Raises:
-        LinkError: If it never does.
+        LinkError: If cflib never calls back.
     """
-    come = threading.Event()
+    received = threading.Event()
     answers: list[object] = []
 
-    def tell(answer: object) -> None:
+    def receive(answer: object) -> None:
         answers.append(answer)
-        come.set()
+        received.set()
 
-    ask(tell)
+    ask(receive)
     deadline = time.monotonic() + UPLOAD_S
-    while not come.wait(0.02):
+    while not received.wait(0.02):
         if link.error is not None or time.monotonic() > deadline:
             raise LinkError(f"no answer: {what}")
     return answers[0]

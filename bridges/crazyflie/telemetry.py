@@ -1,4 +1,4 @@
-"""What Crazyflies say of themselves, newest values only: written by cflib's threads, read by the robot's loop."""
+"""Telemetry of Crazyflies, newest values only: written by cflib's threads, read by the robot's loop."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STATUS: Final = {
     "pm.batteryLevel": "uint8_t",
     "pm.state": "int8_t",
     "lighthouse.status": "uint8_t",
-    "sys.canfly": "uint8_t",  # these three for firmwares from before the supervisor
+    "sys.canfly": "uint8_t",  # these three for firmwares without a supervisor
     "sys.isFlying": "uint8_t",
     "sys.isTumbled": "uint8_t",
 }
@@ -30,61 +30,47 @@ BEARING: Final = np.radians([0.0, 180.0, 90.0, -90.0, 0.0])
 ELEVATION: Final = np.radians([0.0, 0.0, 0.0, 0.0, 90.0])
 OUT_OF_REACH_MM: Final = 8000.0
 FULL_V, EMPTY_V = 4.2, 3.0
-WORDS: Final = {
+INFO_TEXT: Final = {
     Info.LOCKED: "locked: switch it off and on",
     Info.CRASHED: "crashed",
     Info.TUMBLED: "upside down",
 }
-STATIONS: Final = ("receives no base station", "misses geometry or calibration of its base stations", "")
+STATION_TEXT: Final = ("receives no base station", "misses geometry or calibration of its base stations", "")
 
 
 class Board:
-    """Rows of Crazyflies as they were last heard of; times are of the monotonic clock, minus infinity before the first.
-
-    Attributes:
-        heard: (N,) when the pose came [s].
-        pose: (N, 7) x, y, z [m], their rates [m/s], yaw [rad].
-        placed: (N,) the position estimate has settled: what it says may be believed.
-        told: (N,) when the status came [s].
-        info: (N,) flags of the supervisor.
-        power: (N,) what power management says.
-        battery: (N,) charge, 0 to 1.
-        stations: (N,) lighthouse.status, or -1.
-        scanned: (N,) when the ranges came [s].
-        ranges: (N, 5) front, back, left, right, up [m], NaN where nothing is in reach.
-        airborne: (N,) motors on, as far as the bridge knows.
-    """
+    """Newest telemetry of N Crazyflies; times of reception on the monotonic clock [s], -inf before the first."""
 
     def __init__(self, rows: int) -> None:
         never = np.full(rows, -np.inf)
-        self.heard, self.told, self.scanned = never.copy(), never.copy(), never.copy()
-        self.pose = np.full((rows, 7), np.nan)
-        self.placed = np.zeros(rows, dtype=bool)
-        self.info = np.zeros(rows, dtype=np.intp)
-        self.power = np.full(rows, int(Power.BATTERY))
-        self.battery = np.full(rows, np.nan)
-        self.stations = np.full(rows, -1)
-        self.ranges = np.full((rows, 5), np.nan)
-        self.airborne = np.zeros(rows, dtype=bool)
+        self.pose_time, self.status_time, self.ranges_time = never.copy(), never.copy(), never.copy()  # (N,) [s]
+        self.pose = np.full((rows, 7), np.nan)  # x, y, z [m], their rates [m/s], yaw [rad]
+        self.settled = np.zeros(rows, dtype=bool)  # position estimate has settled and may be used
+        self.info = np.zeros(rows, dtype=np.intp)  # flags of the supervisor
+        self.power = np.full(rows, int(Power.BATTERY))  # state of power management
+        self.battery = np.full(rows, np.nan)  # charge, 0 to 1
+        self.stations = np.full(rows, -1)  # lighthouse.status, or -1
+        self.ranges = np.full((rows, 5), np.nan)  # front, back, left, right, up [m]; NaN: nothing in reach
+        self.airborne = np.zeros(rows, dtype=bool)  # motors on, as far as the bridge knows
 
 
 class Telemetry:
     """One row of a board."""
 
     def __init__(self, board: Board, row: int, *, lighthouse: bool) -> None:
-        """`lighthouse`: the state of its base stations matters."""
+        """`lighthouse`: report the state of the base stations."""
         self.board, self.row = board, row
         self._lighthouse = lighthouse
 
     @property
     def info(self) -> Info:
-        """What the supervisor said last."""
+        """Last flags of the supervisor."""
         return Info(int(self.board.info[self.row]))
 
     @property
-    def told(self) -> float:
-        """When it said so, on the monotonic clock [s]."""
-        return float(self.board.told[self.row])
+    def status_time(self) -> float:
+        """Time of the last status on the monotonic clock [s]."""
+        return float(self.board.status_time[self.row])
 
     @property
     def position(self) -> Array:
@@ -97,36 +83,36 @@ class Telemetry:
         return float(self.board.pose[self.row, 6])
 
     @property
-    def low(self) -> bool:
+    def battery_low(self) -> bool:
         """Whether the battery is nearly empty."""
         return bool(self.board.power[self.row] >= Power.LOW)
 
-    def forget(self) -> None:
-        """A new connection: nothing is known of the supervisor."""
-        self.board.told[self.row] = -np.inf
+    def reset_status(self) -> None:
+        """Clear the status at a new connection."""
+        self.board.status_time[self.row] = -np.inf
         self.board.info[self.row] = 0
 
-    def listen(self, link: Link, *, log_hz: float, status_hz: float, ranges_hz: float | None) -> None:
-        """Has the row's Crazyflie say what the board shows."""
-        link.log("pose", log_hz, POSE, self._pose)
-        link.log("status", status_hz, STATUS, self._status)
+    def start_logging(self, link: Link, *, log_hz: float, status_hz: float, ranges_hz: float | None) -> None:
+        """Start the log blocks that fill the board."""
+        link.start_log("pose", log_hz, POSE, self._pose)
+        link.start_log("status", status_hz, STATUS, self._status)
         if ranges_hz is not None:
-            link.log("ranges", ranges_hz, RANGES, self._ranges)
+            link.start_log("ranges", ranges_hz, RANGES, self._ranges)
 
-    def words(self) -> str:
-        """What is worth saying of the last status."""
+    def status_text(self) -> str:
+        """Faults in the last status, for users."""
         board, row = self.board, self.row
-        said = [text for flag, text in WORDS.items() if flag in self.info]
+        faults = [text for flag, text in INFO_TEXT.items() if flag in self.info]
         if board.power[row] >= Power.LOW:
-            said.append("battery low")
+            faults.append("battery low")
         if self._lighthouse and board.stations[row] >= 0:
-            said.append(STATIONS[min(int(board.stations[row]), len(STATIONS) - 1)])
-        return "; ".join(text for text in said if text)
+            faults.append(STATION_TEXT[min(int(board.stations[row]), len(STATION_TEXT) - 1)])
+        return "; ".join(text for text in faults if text)
 
     def _pose(self, t: float, values: Mapping[str, float]) -> None:
         x, y, z, vx, vy, vz, yaw = (values.get(name, nan) for name in POSE)
         self.board.pose[self.row] = x, y, z, vx, vy, vz, radians(yaw)
-        self.board.heard[self.row] = t
+        self.board.pose_time[self.row] = t
 
     def _status(self, t: float, values: Mapping[str, float]) -> None:
         board, row = self.board, self.row
@@ -136,16 +122,16 @@ class Telemetry:
         volts = values.get("pm.vbat", nan)
         board.battery[row] = (volts - EMPTY_V) / (FULL_V - EMPTY_V) if level is None else 0.01 * level
         board.stations[row] = int(values.get("lighthouse.status", -1))
-        board.told[row] = t
+        board.status_time[row] = t
 
     def _ranges(self, t: float, values: Mapping[str, float]) -> None:
-        seen = (values.get(name, OUT_OF_REACH_MM) for name in RANGES)
-        self.board.ranges[self.row] = [nan if mm >= OUT_OF_REACH_MM else MM * mm for mm in seen]
-        self.board.scanned[self.row] = t
+        measured = (values.get(name, OUT_OF_REACH_MM) for name in RANGES)
+        self.board.ranges[self.row] = [nan if mm >= OUT_OF_REACH_MM else MM * mm for mm in measured]
+        self.board.ranges_time[self.row] = t
 
 
 def _info(values: Mapping[str, float]) -> Info:
-    """What a supervisor would say, from what firmwares without one do."""
+    """Flags of a supervisor, from the variables of firmwares that have none."""
     info = Info(0)
     if values.get("sys.canfly"):
         info |= Info.ARMED | Info.CAN_FLY

@@ -1,1 +1,1 @@
-"""Programs to start from: other simulators as bodies of robots."""
+"""Templates: external simulators as bodies of robots."""

@@ -1,4 +1,4 @@
-"""Untested: lends robots with differential drive in Gazebo (gz-transport 13) to zenpark as bodies `external`."""
+"""Untested: robots with differential drive in Gazebo (gz-transport 13) as bodies `external` of zenpark."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def heading(q: Any) -> float:  # noqa: ANN401 - a gz.msgs.Quaternion
 
 
 def main(endpoint: str, world: str, names: Sequence[str]) -> None:
-    """Runs until it is interrupted; `names` are the models in Gazebo and the robots in the experiment."""
+    """Run until interrupted; `names`: models in Gazebo and robots in the experiment."""
     zenoh = importlib.import_module("zenoh")
     node = importlib.import_module("gz.transport13").Node()
     twist_type = importlib.import_module("gz.msgs10.twist_pb2").Twist
@@ -35,25 +35,25 @@ def main(endpoint: str, world: str, names: Sequence[str]) -> None:
 
         zero = time.time() - time.monotonic()  # read once: a step of the wall clock must not move a robot
 
-        def tell(message: Any) -> None:  # noqa: ANN401 - a gz.msgs.Pose_V
-            stamp = zero + time.monotonic()  # not the header's, which is the time of the simulation
+        def publish(message: Any) -> None:  # noqa: ANN401 - a gz.msgs.Pose_V
+            stamp = zero + time.monotonic()  # not the header's stamp, which is simulation time
             for pose in message.pose:
                 if pose.name in positions:
                     p = pose.position
                     place = {"robot": pose.name, "stamp": stamp, "position": [p.x, p.y, p.z]}
                     positions[pose.name].put(json.dumps({**place, "yaw": heading(pose.orientation)}))
 
-        node.subscribe(poses_type, f"/world/{world}/dynamic_pose/info", tell)
-        done, heard = dict.fromkeys(names, 0), dict.fromkeys(names, 0.0)
+        node.subscribe(poses_type, f"/world/{world}/dynamic_pose/info", publish)
+        last_seq, received = dict.fromkeys(names, 0), dict.fromkeys(names, 0.0)
         while True:
             for name in names:
                 twist = None
                 while (sample := commands[name].handler.try_recv()) is not None:
                     command = json.loads(sample.payload.to_string())
-                    if command["seq"] > done[name]:
-                        done[name], heard[name] = command["seq"], time.monotonic()
+                    if command["seq"] > last_seq[name]:
+                        last_seq[name], received[name] = command["seq"], time.monotonic()
                         twist = command["setpoint"][:2] if command["action"] == "drive" else (0.0, 0.0)
-                if twist is None and time.monotonic() - heard[name] > PATIENCE_S:
+                if twist is None and time.monotonic() - received[name] > PATIENCE_S:
                     twist = (0.0, 0.0)
                 if twist is not None:
                     message = twist_type()

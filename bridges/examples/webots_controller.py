@@ -1,4 +1,4 @@
-"""Untested: a Webots controller that lends a Khepera IV in Webots to zenpark as a body `external`."""
+"""Untested: Webots controller of a Khepera IV as a body `external` of zenpark."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PATIENCE_S = 0.5  # without a new setpoint the wheels stop
 
 
 def main(name: str, endpoint: str) -> None:
-    """Runs until Webots ends the controller; `name` is the robot in the experiment, `endpoint` its router."""
+    """Run until Webots ends the controller; `name`: robot in the experiment, `endpoint`: its router."""
     zenoh = importlib.import_module("zenoh")
     robot = importlib.import_module("controller").Supervisor()
     step_ms = int(robot.getBasicTimeStep())
@@ -27,15 +27,15 @@ def main(name: str, endpoint: str) -> None:
     with zenoh.open(config) as session:
         commands = session.declare_subscriber(f"park/{name}/setpoint", zenoh.handlers.RingChannel(100))
         position = session.declare_publisher(f"park/{name}/position", encoding="application/json")
-        v, turn, heard, done = 0.0, 0.0, 0.0, 0
+        v, turn, received, last_seq = 0.0, 0.0, 0.0, 0
         zero = time.time() - time.monotonic()  # read once: a step of the wall clock must not move a robot
         while robot.step(step_ms) != -1:
             while (sample := commands.handler.try_recv()) is not None:
                 command = json.loads(sample.payload.to_string())
-                if command["seq"] > done:
-                    done, heard = command["seq"], time.monotonic()
+                if command["seq"] > last_seq:
+                    last_seq, received = command["seq"], time.monotonic()
                     v, turn = command["setpoint"][:2] if command["action"] == "drive" else (0.0, 0.0)
-            if time.monotonic() - heard > PATIENCE_S:
+            if time.monotonic() - received > PATIENCE_S:
                 v = turn = 0.0
             for wheel, side in zip(wheels, (-1.0, 1.0), strict=True):
                 wheel.setVelocity((v + side * HALF_BASE * turn) / WHEEL_RADIUS)

@@ -1,1 +1,1 @@
-"""Khepera IV over TCP: the body, one link per robot, odometry."""
+"""Khepera IV over TCP or a serial line: the body, one link per robot, odometry."""

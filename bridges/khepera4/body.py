@@ -1,4 +1,4 @@
-"""Khepera IV over Robotic Park's protocol or K-Team's: rows of robots, each with a link of its own."""
+"""Body of several Khepera IV, over Robotic Park's protocol or K-Team's; each robot has its own link."""
 
 from __future__ import annotations
 
@@ -16,52 +16,52 @@ from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState,
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4.link import Address, Link
 
-OPEN_S: Final = 3.0  # for the first odometry of a robot
+OPEN_S: Final = 3.0  # deadline of the first odometry
 
 
 class KheperaBody:
-    """Rows of Khepera IV robots; implements `agents.body.interface.Body`."""
+    """Khepera IV robots; implements `agents.body.interface.Body`."""
 
     def __init__(self, request: BodyRequest) -> None:
         self._names = request.names
-        self._addresses = [Address.of(*row) for row in zip(request.names, request.addresses, strict=True)]
+        self._addresses = [Address.parse(*row) for row in zip(request.names, request.addresses, strict=True)]
         self._settings = [settings(protocol.Settings, *row) for row in zip(request.names, request.device, strict=True)]
         self._claims = Claims(request.names, [address.device for address in self._addresses])
         self._start = np.column_stack([request.start[:, :2], request.yaw])
-        self._outside = np.flatnonzero(request.external)
+        self._external_rows = np.flatnonzero(request.external)
         self._external = External(len(self._names))
         self._links: list[Link] = []
 
     def open(self) -> None:
-        """See `Body.open`. Robots that do not answer are waited for while the others drive."""
+        """See `Body.open`. Robots without answer are retried while the others drive."""
         self._claims.take()
-        for name, address, chosen, (x, y, yaw) in zip(
+        for name, address, device, (x, y, yaw) in zip(
             self._names, self._addresses, self._settings, self._start.tolist(), strict=True
         ):
-            self._links.append(Link(name, address, chosen, (x, y, yaw)))
+            self._links.append(Link(name, address, device, (x, y, yaw)))
             self._links[-1].start()
         deadline, pause = time.monotonic() + OPEN_S, threading.Event()
-        while time.monotonic() < deadline and any(link.heard.stamp == -math.inf for link in self._links):
+        while time.monotonic() < deadline and any(link.odometry.stamp == -math.inf for link in self._links):
             pause.wait(0.01)
-        if all(link.heard.stamp == -math.inf for link in self._links):
-            whys = [f"{name}: {link.trouble}" for name, link in zip(self._names, self._links, strict=True)]
+        if all(link.odometry.stamp == -math.inf for link in self._links):
+            reasons = [f"{name}: {link.trouble}" for name, link in zip(self._names, self._links, strict=True)]
             self.close()
-            raise BodyError("no Khepera answers: " + "; ".join(whys))
+            raise BodyError("no Khepera answers: " + "; ".join(reasons))
 
     def read(self, t: float) -> BodyState:
         """See `Body.read`."""
         now = time.monotonic()
-        heard = [link.heard for link in self._links]
-        rows = len(heard)
-        # a robot that has not spoken yet is nowhere: its pose is not what the file says but what it counts
-        position = np.array([(h.x, h.y, 0.0 * h.x) for h in heard])
-        velocity = np.array([(*h.velocity, 0.0 * h.velocity[0]) for h in heard])
-        time_heard = np.array([h.stamp for h in heard]) - now + t
+        odometry = [link.odometry for link in self._links]
+        rows = len(odometry)
+        # unknown before the first odometry: the pose is counted by the robot, not read from the file
+        position = np.array([(h.x, h.y, 0.0 * h.x) for h in odometry])
+        velocity = np.array([(*h.velocity, 0.0 * h.velocity[0]) for h in odometry])
+        odometry_time = np.array([h.stamp for h in odometry]) - now + t
         state = BodyState(
-            time_heard,
+            odometry_time,
             position,
             velocity,
-            np.array([h.yaw for h in heard]),
+            np.array([h.yaw for h in odometry]),
             np.full((rows, 3), np.nan),
             np.full(rows, np.nan),
             np.array([link.battery for link in self._links]),
@@ -69,12 +69,12 @@ class KheperaBody:
             tuple(self._note(link, now) for link in self._links),
             Rays.gather([self._scan(link, now, t) for link in self._links]),
         )
-        if len(self._outside):
-            state.time = time_heard.copy()
-            self._external.fill(state, self._outside)
-            lost = np.array([now - h.stamp > s.silence_s for h, s in zip(heard, self._settings, strict=True)])
-            # whoever is not heard cannot be driven, however well others see it
-            state.time[lost] = np.minimum(state.time, time_heard)[lost]
+        if len(self._external_rows):
+            state.time = odometry_time.copy()
+            self._external.fill(state, self._external_rows)
+            lost = np.array([now - h.stamp > s.silence_s for h, s in zip(odometry, self._settings, strict=True)])
+            # a robot without odometry cannot be driven, even if its external position is fresh
+            state.time[lost] = np.minimum(state.time, odometry_time)[lost]
         return state
 
     def command(self, setpoint: Array) -> None:
@@ -85,7 +85,7 @@ class KheperaBody:
                 link.drive(v, turn, now)
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Body.takeoff`: it stays on the ground."""
+        """See `Body.takeoff`: no effect on a ground robot."""
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
@@ -119,9 +119,9 @@ class KheperaBody:
 
     @staticmethod
     def _trouble(link: Link, now: float) -> str:
-        if link.trouble and link.heard.stamp > -math.inf:
-            return f"silent for {now - link.heard.stamp:.1f} s: {link.trouble}"
-        return link.trouble or (f"battery at {link.battery:.0%}: it does not drive on" if link.exhausted else "")
+        if link.trouble and link.odometry.stamp > -math.inf:
+            return f"silent for {now - link.odometry.stamp:.1f} s: {link.trouble}"
+        return link.trouble or (f"battery at {link.battery:.0%}: too low to drive" if link.battery_empty else "")
 
     @staticmethod
     def _scan(link: Link, now: float, t: float) -> RangeScan | None:
@@ -132,5 +132,5 @@ class KheperaBody:
 
 
 def open_khepera4(request: BodyRequest) -> KheperaBody:
-    """The entry points `khepera4` and `kteam` of the group `zenpark.bodies`."""
+    """Entry points `khepera4` and `kteam` of the group `zenpark.bodies`."""
     return KheperaBody(request)

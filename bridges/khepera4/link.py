@@ -1,4 +1,4 @@
-"""The link to one Khepera IV: a thread that speaks one of its two protocols, and connects anew when that ends."""
+"""Link to one Khepera IV: a thread that runs one of its two protocols and reconnects after a loss."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from agents.protocols import khepera4 as protocol
 from bridges.khepera4.odometry import Odometer
 
 CONNECT_S: Final = 1.5
-RETRY_S: Final = 0.5  # between the end of a connection and the next
-STOPS: Final = 3  # said when the link is let go
+RETRY_S: Final = 0.5  # between the end of a connection and the next attempt
+STOPS: Final = 3  # stop commands at the end of the link
 RANGES_S: Final = 0.2
 BATTERY_S: Final = 5.0
-FAREWELL_S: Final = 3.0  # so long it is tried to stop a robot whose connection broke while it moved
-AGAIN_S: Final = 0.1  # between two such attempts
-STANDING: Final = 0.02  # [m/s] slower than this it stands
-ANSWER_S: Final = 2.5  # a robot that was told to halt and is not known to stand after this is worth a word
+STOP_TRIES_S: Final = 3.0  # time for attempts to stop a robot whose connection broke while it moved
+STOP_RETRY_S: Final = 0.1  # between two such attempts
+STANDING: Final = 0.02  # [m/s] slower robots stand
+ANSWER_S: Final = 2.5  # the note reports a robot that is not known to stand so long after a halt
 
 
-class Unintelligible(OSError):
-    """The other end says what this protocol does not."""
+class UnknownAnswer(OSError):
+    """The answer does not belong to this protocol."""
 
 
 class Wire:
-    """Bytes to and from a robot: a TCP connection or a serial line."""
+    """Byte stream to and from a robot: a TCP connection or a serial line."""
 
     def __init__(self, descriptor: int, close: Callable[[], None]) -> None:
         self._descriptor, self.close = descriptor, close
@@ -47,16 +47,16 @@ class Wire:
         self._poll.register(descriptor, select.POLLIN)
 
     def send(self, data: bytes) -> None:
-        """Writes at once; what came in before is not an answer to it."""
+        """Discard earlier input, which cannot be the answer, then write at once."""
         while self._poll.poll(0):
             self._read()
         os.write(self._descriptor, data)
 
     def receive(self, until: float) -> bytes:
-        """What comes next.
+        """Next bytes received.
 
         Raises:
-            TimeoutError: If nothing comes until then [s, monotonic].
+            TimeoutError: If nothing comes before `until` [s, monotonic].
             ConnectionError: If the other end has closed.
         """
         if not self._poll.poll(max(0.0, 1e3 * (until - time.monotonic()))):
@@ -66,13 +66,13 @@ class Wire:
     def _read(self) -> bytes:
         data = os.read(self._descriptor, 1024)
         if not data:
-            raise ConnectionResetError("it closed the connection")
+            raise ConnectionResetError("the robot closed the connection")
         return data
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where a robot is, and what it speaks: `khepera4://HOST[:PORT]`, `kteam://HOST:PORT` or `kteam:///dev/ttyS0`."""
+    """Address and protocol of a robot: `khepera4://HOST[:PORT]`, `kteam://HOST:PORT` or `kteam:///dev/ttyS0`."""
 
     kteam: bool
     host: str
@@ -80,11 +80,11 @@ class Address:
     serial: str
 
     @classmethod
-    def of(cls, robot: str, address: str) -> Address:
-        """Reads one.
+    def parse(cls, robot: str, address: str) -> Address:
+        """Parse an address.
 
         Raises:
-            BodyError: If it is none of the three.
+            BodyError: If it has none of the three forms.
         """
         try:
             parts = urlsplit(address)
@@ -106,14 +106,14 @@ class Address:
 
     @property
     def device(self) -> str:
-        """Canonical address of a robot, whatever its host or line is called."""
+        """Canonical address, independent of aliases of the host or the line."""
         return os.path.realpath(self.serial) if self.serial else f"{numeric(self.host)}:{self.port}"
 
     def connect(self) -> Wire:
-        """Opens the line.
+        """Open the connection or line.
 
         Raises:
-            OSError: If it cannot.
+            OSError: If that fails.
         """
         if not self.serial:
             wire = socket.create_connection((self.host, self.port), CONNECT_S)
@@ -121,7 +121,7 @@ class Address:
             return Wire(wire.fileno(), wire.close)
         line = os.open(self.serial, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
-            fcntl.flock(line, fcntl.LOCK_EX | fcntl.LOCK_NB)  # before anything is changed: another process may drive
+            fcntl.flock(line, fcntl.LOCK_EX | fcntl.LOCK_NB)  # before any change: another process may drive the robot
         except OSError as error:
             os.close(line)
             raise BlockingIOError(error.errno, "another process has this line") from None
@@ -137,18 +137,18 @@ class Address:
 
 
 class Driver(Protocol):
-    """One protocol. Everything raises OSError when the robot does not answer, or not in this protocol."""
+    """One protocol. Every method raises OSError if the robot does not answer, or not in this protocol."""
 
     def begin(self) -> None:
-        """Once for each connection."""
+        """Initialise a new connection."""
         ...
 
     def drive(self, v: float, turn: float) -> None:
-        """Wheels as v [m/s] and ω [rad/s] say; zero is a stop."""
+        """Drive at v [m/s] and ω [rad/s]; zeros stop the robot."""
         ...
 
     def move(self, odometer: Odometer) -> None:
-        """Asks where the robot is."""
+        """Request odometry and update `odometer`."""
         ...
 
     def ranges(self) -> tuple[Array, Array]:
@@ -156,7 +156,7 @@ class Driver(Protocol):
         ...
 
     def battery(self) -> float:
-        """Charge, 0 to 1; NaN if the protocol does not say."""
+        """Charge, 0 to 1; NaN if the protocol has no such value."""
         ...
 
 
@@ -172,12 +172,12 @@ class Park:
 
     def drive(self, v: float, turn: float) -> None:
         """See `Driver`."""
-        self._say(protocol.park_drive(v, turn) if v or turn else b"stop")
+        self._send_command(protocol.park_drive(v, turn) if v or turn else b"stop")
 
     def move(self, odometer: Odometer) -> None:
         """See `Driver`."""
         kind = self._settings.odometry
-        values = self._ask(b"p", 3 if kind == "pose" else 2, 'does device = { odometry = "..." } fit its server?')
+        values = self._request(b"p", 3 if kind == "pose" else 2, 'does device = { odometry = "..." } fit its server?')
         stamp = time.monotonic()
         if kind == "pose":
             x, y, theta = values
@@ -192,27 +192,27 @@ class Park:
     def ranges(self) -> tuple[Array, Array]:
         """See `Driver`."""
         count = len(protocol.SOUND_BEARING)
-        sound = self._ask(b"get_data", count, "if its server does not know get_data: device = { ranges = false }")
+        sound = self._request(b"get_data", count, "if its server does not know get_data: device = { ranges = false }")
         return protocol.SOUND_BEARING, protocol.sound_distance(np.array(sound))
 
     def battery(self) -> float:
         """See `Driver`."""
         return math.nan
 
-    def _say(self, command: bytes) -> None:
-        time.sleep(max(0.0, self._free - time.monotonic()))  # two commands in one segment are one to the server
+    def _send_command(self, command: bytes) -> None:
+        time.sleep(max(0.0, self._free - time.monotonic()))  # the server reads two commands in one segment as one
         self._wire.send(command)
         self._free = time.monotonic() + protocol.GAP_S
 
-    def _ask(self, command: bytes, count: int, remedy: str) -> list[float]:
-        self._say(command)
+    def _request(self, command: bytes, count: int, remedy: str) -> list[float]:
+        self._send_command(command)
         try:
             answer = self._wire.receive(time.monotonic() + self._settings.silence_s).decode("ascii", "replace")
         except TimeoutError as error:
             raise TimeoutError(f"no answer to {command.decode()}; {remedy}") from error
         values = protocol.numbers(answer.strip("\0\r\n "))
         if len(values) != count:
-            raise Unintelligible(f"answers {command.decode()} with {answer[:40]!r}, not with {count} numbers; {remedy}")
+            raise UnknownAnswer(f"answers {command.decode()} with {answer[:40]!r}, not with {count} numbers; {remedy}")
         return values
 
 
@@ -224,35 +224,35 @@ class KTeam:
 
     def begin(self) -> None:
         """See `Driver`."""
-        self._ask("B")
+        self._request("B")
         if self._settings.ranges:
-            self._ask("U,31")
+            self._request("U,31")
 
     def drive(self, v: float, turn: float) -> None:
         """See `Driver`."""
         left, right = protocol.units(v, turn)
-        self._ask(f"D,{left},{right}")
+        self._request(f"D,{left},{right}")
 
     def move(self, odometer: Odometer) -> None:
         """See `Driver`."""
-        left, right = self._ask("R", 2)[:2]
+        left, right = self._request("R", 2)[:2]
         odometer.wheels(left, right, time.monotonic())
 
     def ranges(self) -> tuple[Array, Array]:
         """See `Driver`."""
         sound, light = len(protocol.SOUND_BEARING), len(protocol.LIGHT_BEARING)
         distances = (
-            protocol.sound_distance(np.array(self._ask("G", sound)[:sound])),
-            protocol.light_distance(np.array(self._ask("N", light)[:light])),
+            protocol.sound_distance(np.array(self._request("G", sound)[:sound])),
+            protocol.light_distance(np.array(self._request("N", light)[:light])),
         )
         return np.concatenate([protocol.SOUND_BEARING, protocol.LIGHT_BEARING]), np.concatenate(distances)
 
     def battery(self) -> float:
         """See `Driver`."""
-        return 0.01 * self._ask("V,5", 1)[0]
+        return 0.01 * self._request("V,5", 1)[0]
 
-    def _ask(self, request: str, count: int = 0) -> list[float]:
-        """Numbers of the answer, at least `count` of them."""
+    def _request(self, request: str, count: int = 0) -> list[float]:
+        """Send a request; returns the numbers of the answer, at least `count`."""
         self._wire.send(f"{request}\r".encode())
         until = time.monotonic() + self._settings.silence_s
         answer = b""
@@ -264,136 +264,131 @@ class KTeam:
         letter, _, rest = answer.decode("ascii", "replace").strip().rpartition("\n")[2].partition(",")
         values = protocol.numbers(rest)
         if letter != request[0].lower() or len(values) < count:
-            raise Unintelligible(f"answers {request} with {answer[:40]!r}; is it K-Team's kh4server?")
+            raise UnknownAnswer(f"answers {request} with {answer[:40]!r}; is it K-Team's kh4server?")
         return values
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What a robot said last; `stamp` is when, monotonic [s]."""
+class Odometry:
+    """Newest odometry of a robot, in the experiment's frame."""
 
-    stamp: float = -math.inf
-    x: float = math.nan
-    y: float = math.nan
-    yaw: float = math.nan
-    velocity: tuple[float, float] = (math.nan, math.nan)
+    stamp: float = -math.inf  # time of reception, monotonic [s]
+    x: float = math.nan  # [m]
+    y: float = math.nan  # [m]
+    yaw: float = math.nan  # [rad]
+    velocity: tuple[float, float] = (math.nan, math.nan)  # [m/s]
 
 
 class Link:
-    """The thread of one robot. What it heard and what it shall do are exchanged whole, so nobody waits for anybody.
-
-    Attributes:
-        heard: The newest odometry.
-        scan: When the range sensors were read, their bearings and distances; None before.
-        battery: Charge, 0 to 1, or NaN.
-        wanted: v [m/s], ω [rad/s], and when they were given, monotonic [s].
-        halted: Since when it must stand, monotonic [s]; infinity if it need not.
-        trouble: Why there is no connection, for people; empty if there is one.
-    """
+    """Thread of one robot. Odometry and setpoint are exchanged as whole objects, so neither side waits."""
 
     def __init__(
         self, name: str, address: Address, chosen: protocol.Settings, start: tuple[float, float, float]
     ) -> None:
-        self.heard = Heard()
-        self.scan: tuple[float, Array, Array] | None = None
-        self.battery = math.nan
-        self.wanted = (0.0, 0.0, -math.inf)
-        self.halted = math.inf
-        self.trouble = f"{address}: not connected yet"
+        self.odometry = Odometry()
+        self.scan: tuple[float, Array, Array] | None = None  # monotonic time [s], bearings [rad], distances [m]
+        self.battery = math.nan  # charge, 0 to 1
+        self.setpoint = (0.0, 0.0, -math.inf)  # v [m/s], ω [rad/s], monotonic time of the command [s]
+        self.halted_since = math.inf  # monotonic [s]; infinity while the robot may move
+        self.trouble = f"{address}: not connected yet"  # for users; empty while connected
         self._address, self._settings = address, chosen
         self._odometer = Odometer(*start)
-        self._stands = True  # as far as it was told, and that was answered
-        self._until = math.inf
+        self._stands = True  # by the last command that was answered
+        self._stop_deadline = math.inf
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"{name} link", daemon=True)
 
     def start(self) -> None:
-        """Connects, in the background and for ever."""
+        """Start the thread, which connects and reconnects until `end`."""
         self._thread.start()
 
     def drive(self, v: float, turn: float, now: float) -> None:
-        """Must move at v [m/s], ω [rad/s] until told otherwise, or until nobody has said so for `FRESH_S`."""
+        """Drive at v [m/s], ω [rad/s] until the next command, for `FRESH_S` at most."""
         if v or turn:
-            self.halted = math.inf
-        self.wanted = (v, turn, now)
+            self.halted_since = math.inf
+        self.setpoint = (v, turn, now)
 
     def halt(self, now: float) -> None:
-        """Must stand."""
-        self.halted = min(self.halted, now)
-        self.wanted = (0.0, 0.0, now)
+        """Stop the robot."""
+        self.halted_since = min(self.halted_since, now)
+        self.setpoint = (0.0, 0.0, now)
 
     def unanswered(self, now: float) -> bool:
-        """Whether it was told to stand, and is not known to."""
-        return now - self.halted > ANSWER_S and not (self._stands and math.hypot(*self.heard.velocity) < STANDING)
+        """Whether a halt is not confirmed by odometry in time."""
+        return now - self.halted_since > ANSWER_S and not (
+            self._stands and math.hypot(*self.odometry.velocity) < STANDING
+        )
 
     def end(self) -> None:
-        """Has the thread stop the wheels and let go of the robot; `join` waits for it."""
-        self._until = time.monotonic() + FAREWELL_S
+        """Ask the thread to stop the wheels and end; `join` waits for it."""
+        self._stop_deadline = time.monotonic() + STOP_TRIES_S
         self._ending.set()
 
     def join(self) -> None:
-        """Waits until the robot was let go of."""
+        """Wait for the end of the thread."""
         if self._thread.ident is not None:
             self._thread.join()
 
     @property
-    def exhausted(self) -> bool:
-        """Whether its battery is too low to drive on."""
+    def battery_empty(self) -> bool:
+        """Whether the battery is too low to drive."""
         return self.battery < self._settings.low_battery
 
     def _run(self) -> None:
-        while not self._over:
+        while not self._finished:
             try:
                 wire = self._address.connect()
             except OSError as error:
                 self.trouble = f"{self._address}: {error.strerror or error}; {self._remedy(error)}"
             else:
                 try:
-                    self._converse(KTeam(wire, self._settings) if self._address.kteam else Park(wire, self._settings))
-                except TROUBLE as error:  # whatever it is, the wheels must stop
+                    self._run_connection(
+                        KTeam(wire, self._settings) if self._address.kteam else Park(wire, self._settings)
+                    )
+                except TROUBLE as error:  # of any kind: the wheels must stop
                     why = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
                     self.trouble = f"{self._address}: {why or error}"
                     if isinstance(error, TimeoutError):
-                        self.trouble += "; another program may hold it, or it speaks the other protocol"
+                        self.trouble += "; another program may hold it, or the robot uses the other protocol"
                 finally:
                     wire.close()
                 self._odometer.reconnected()
             if not self._ending.wait(RETRY_S):
                 continue
-            if not self._over:
-                time.sleep(AGAIN_S)
+            if not self._finished:
+                time.sleep(STOP_RETRY_S)
 
     @property
-    def _over(self) -> bool:
-        """Whether it is let go of, which must not move then."""
-        return self._ending.is_set() and (self._stands or time.monotonic() > self._until)
+    def _finished(self) -> bool:
+        """Whether the thread may end: asked to, and the wheels stand or the time for that is over."""
+        return self._ending.is_set() and (self._stands or time.monotonic() > self._stop_deadline)
 
     def _remedy(self, error: OSError) -> str:
         if isinstance(error, BlockingIOError):
             return "end it first"
         if self._address.serial:
-            return "is it plugged in, and may you use it (group dialout)?"
+            return "is the line plugged in, and are you permitted to use it (group dialout)?"
         if isinstance(error, ConnectionRefusedError):
             return "start the server on the robot"
         return "is the robot on, and is the address right?"
 
-    def _converse(self, driver: Driver) -> None:
-        """One connection, until it breaks or the process ends."""
+    def _run_connection(self, driver: Driver) -> None:
+        """Loop of one connection, until it breaks or the link ends."""
         driver.begin()
         driver.drive(0.0, 0.0)
-        driver.move(self._odometer)  # before it moves: one that counts from zero has been switched on anew
+        driver.move(self._odometer)  # before any motion: counters at zero show that the robot was switched on anew
         self._stands = True
         period = 1.0 / self._settings.poll_hz
         ranges_due = battery_due = due = time.monotonic()
         while not self._ending.wait(max(0.0, due - time.monotonic())):
             due = max(due + period, time.monotonic())
-            twist = self._due_twist()
+            twist = self._current_twist()
             self._stands = self._stands and not any(twist)
             driver.drive(*twist)
             driver.move(self._odometer)
             self._stands = not any(twist)
             now, at = time.monotonic(), self._odometer
-            self.heard = Heard(now, at.x, at.y, at.yaw, at.velocity)
+            self.odometry = Odometry(now, at.x, at.y, at.yaw, at.velocity)
             self.trouble = ""
             if self._settings.ranges and now >= ranges_due:
                 ranges_due = now + RANGES_S
@@ -406,8 +401,8 @@ class Link:
             driver.drive(0.0, 0.0)
         self._stands = True
 
-    def _due_twist(self) -> tuple[float, float]:
-        v, turn, since = self.wanted
-        if self.exhausted or time.monotonic() - since > FRESH_S:
+    def _current_twist(self) -> tuple[float, float]:
+        v, turn, since = self.setpoint
+        if self.battery_empty or time.monotonic() - since > FRESH_S:
             return 0.0, 0.0
         return v, turn

@@ -1,4 +1,4 @@
-"""Odometry: a pose in the experiment's frame, from what a robot counts in units and a frame of its own."""
+"""Odometry: a pose in the experiment's frame, from a robot's counters in its own units and frame."""
 
 from __future__ import annotations
 
@@ -9,28 +9,22 @@ from agents.protocols import khepera4 as protocol
 
 
 class Odometer:
-    """A pose in the experiment's frame, moved on by what the robot counts. It survives the connection.
-
-    Attributes:
-        x, y: [m].
-        yaw: [rad].
-        velocity: In the world [m/s].
-    """
+    """Pose in the experiment's frame, integrated from the robot's counters; kept over reconnections."""
 
     def __init__(self, x: float, y: float, yaw: float) -> None:
-        self.x, self.y, self.yaw = x, y, yaw
-        self.velocity = (0.0, 0.0)
+        self.x, self.y, self.yaw = x, y, yaw  # [m], [m], [rad]
+        self.velocity = (0.0, 0.0)  # in the world [m/s]
         self._last: tuple[float, ...] | None = None
         self._stamp = math.nan
-        self._doubt = False
+        self._maybe_reset = False
 
     def reconnected(self) -> None:
-        """The robot may have been switched on anew: if it now counts from zero, it has."""
-        self._doubt = True
+        """Note that the robot may have been switched off and on; counters at zero will confirm it."""
+        self._maybe_reset = True
 
     def pose(self, x: float, y: float, theta: float, stamp: float) -> None:
-        """The robot says its pose in a frame of its own."""
-        last = self._since((x, y, theta))
+        """Add a pose in the robot's own frame [m, rad]."""
+        last = self._last_count((x, y, theta))
         if last is not None:
             dx, dy = x - last[0], y - last[1]
             frame = self.yaw - last[2]
@@ -39,26 +33,26 @@ class Odometer:
             self._move(cos * dx - sin * dy, sin * dx + cos * dy, turn, stamp)
 
     def wheels(self, left: float, right: float, stamp: float) -> None:
-        """The robot says its encoders [pulses]."""
-        last = self._since((left, right))
+        """Add readings of the wheel encoders [pulses]."""
+        last = self._last_count((left, right))
         if last is not None:
             self._arc(*protocol.rolled(left - last[0], right - last[1]), stamp)
 
     def steps(self, way: float, turn: float, stamp: float) -> None:
-        """The robot says what it did since it was last asked [m, rad]."""
-        if self._since((way, turn)) is not None:
+        """Add distance [m] and turn [rad] since the last request."""
+        if self._last_count((way, turn)) is not None:
             self._arc(way, turn, stamp)
 
     def heading(self, way: float, theta: float, stamp: float) -> None:
-        """The robot says its way since it was last asked [m], and its yaw in a frame of its own."""
-        last = self._since((way, theta))
+        """Add distance since the last request [m] and yaw in the robot's own frame [rad]."""
+        last = self._last_count((way, theta))
         if last is not None:
             self._arc(way, math.remainder(theta - last[1], 2.0 * math.pi), stamp)
 
-    def _since(self, counted: tuple[float, ...]) -> tuple[float, ...] | None:
+    def _last_count(self, counted: tuple[float, ...]) -> tuple[float, ...] | None:
         last, self._last = self._last, counted
-        anew, self._doubt = self._doubt and not any(counted), False
-        return None if anew else last
+        reset, self._maybe_reset = self._maybe_reset and not any(counted), False
+        return None if reset else last
 
     def _arc(self, way: float, turn: float, stamp: float) -> None:
         middle = self.yaw + 0.5 * turn

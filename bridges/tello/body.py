@@ -1,7 +1,7 @@
-"""DJI Tello through djitellopy: rows of drones that take velocities and are told by others where they are.
+"""Body of several DJI Tellos through djitellopy: velocity commands, external positions.
 
-Of the library we use its sockets, its parser and its sends that do not wait (`bridges.tello.pilot` says why); one
-thread for all rows is the pilots'.
+Of the library only sockets, parser and non-blocking sends are used (reasons in `bridges.tello.pilot`); one thread runs
+the pilots of all drones.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from agents.body.interface import FRESH_S, TROUBLE, BodyError, BodyRequest, Body
 from agents.protocols import tello as protocol
 from bridges.tello.pilot import Duty, Pilot, Vendor
 
-OPEN_S: Final = 3.0  # for the first state line of a drone
+OPEN_S: Final = 3.0  # deadline of a drone's first state line
 
 
 class TelloBody:
-    """Rows of Tellos; implements `agents.body.interface.Body`. One process flies all Tellos of a computer."""
+    """Tellos; implements `agents.body.interface.Body`. One process flies all Tellos of a computer."""
 
     def __init__(self, request: BodyRequest) -> None:
         self._names, self._kinds = request.names, request.kinds
-        self._places = [protocol.endpoint(*row) for row in zip(request.names, request.addresses, strict=True)]
+        self._endpoints = [protocol.endpoint(*row) for row in zip(request.names, request.addresses, strict=True)]
         self._settings = [settings(protocol.Settings, *row) for row in zip(request.names, request.device, strict=True)]
         for row, name in enumerate(self._names):
             if not request.external[row]:
-                raise BodyError(f'{name}: a Tello does not know where it is: write position = "external"')
-            if self._places[row][0] in [host for host, _ in self._places[:row]]:
-                raise BodyError(f"{name}: another Tello of this process has the address {self._places[row][0]}")
-        self._claims = Claims(self._names, [f"tello://{host}" for host, _ in self._places])
+                raise BodyError(f'{name}: a Tello does not measure its position: write position = "external"')
+            if self._endpoints[row][0] in [host for host, _ in self._endpoints[:row]]:
+                raise BodyError(f"{name}: another Tello of this process has the address {self._endpoints[row][0]}")
+        self._claims = Claims(self._names, [f"tello://{host}" for host, _ in self._endpoints])
         rows = len(self._names)
         self._start_yaw = request.yaw
         self._external = External(rows)
@@ -50,45 +50,45 @@ class TelloBody:
         self._pilots: list[Pilot] = []
         self._lock = threading.Lock()
         self._ending = threading.Event()
-        self._attended = -math.inf
+        self._last_read = -math.inf
         self._thread: threading.Thread | None = None
 
     def open(self) -> None:
-        """See `Body.open`. Drones that do not answer are waited for in flight of the others."""
+        """See `Body.open`. Drones without answer are retried while the others fly."""
         self._claims.take()
         try:
-            make = _library()
+            make = _load_library()
         except BodyError:
             self._claims.release()
             raise
         self._pilots = [
             Pilot(make(*place), kind, chosen)
-            for place, kind, chosen in zip(self._places, self._kinds, self._settings, strict=True)
+            for place, kind, chosen in zip(self._endpoints, self._kinds, self._settings, strict=True)
         ]
         self._ending.clear()
         self._thread = threading.Thread(target=self._run, name="tello pilots", daemon=True)
         self._thread.start()
         deadline = time.monotonic() + OPEN_S
-        while time.monotonic() < deadline and any(pilot.heard == -math.inf for pilot in self._pilots):
+        while time.monotonic() < deadline and any(pilot.state_received == -math.inf for pilot in self._pilots):
             self._ending.wait(0.02)
-        if all(pilot.heard == -math.inf for pilot in self._pilots):
+        if all(pilot.state_received == -math.inf for pilot in self._pilots):
             now = time.monotonic()
-            whys = [
+            reasons = [
                 f"{name} at {host}:{port}: {pilot.note(now)}"
-                for name, (host, port), pilot in zip(self._names, self._places, self._pilots, strict=True)
+                for name, (host, port), pilot in zip(self._names, self._endpoints, self._pilots, strict=True)
             ]
             self.close()
             remedy = f"switch it on, join its Wi-Fi, let UDP {protocol.STATE_PORT} through the firewall"
-            raise BodyError(f"{'; '.join(whys)} ({remedy})")
+            raise BodyError(f"{'; '.join(reasons)} ({remedy})")
 
     def read(self, t: float) -> BodyState:
         """See `Body.read`."""
         rows = len(self._names)
         nowhere = np.full((rows, 3), np.nan)
         with self._lock:
-            now = self._attended = time.monotonic()
+            now = self._last_read = time.monotonic()
             yaw = self._start_yaw + [pilot.turned for pilot in self._pilots]
-            heard = np.array([pilot.heard for pilot in self._pilots]) - now + t
+            received = np.array([pilot.state_received for pilot in self._pilots]) - now + t
             silent = np.array([pilot.silent(now) for pilot in self._pilots])
             state = BodyState(
                 np.full(rows, t),
@@ -106,8 +106,8 @@ class TelloBody:
             for row, pilot in enumerate(self._pilots):
                 x, y, z = state.position[row].tolist() if fresh[row] else (math.nan,) * 3
                 pilot.position, pilot.yaw = (x, y, z), float(state.yaw[row])
-            # whoever is not heard cannot be flown, however well others see it
-            state.time[silent] = np.minimum(state.time, heard)[silent]
+            # a drone without telemetry cannot be flown, even if its external position is fresh
+            state.time[silent] = np.minimum(state.time, received)[silent]
         return state
 
     def command(self, setpoint: Array) -> None:
@@ -116,13 +116,13 @@ class TelloBody:
             now = time.monotonic()
             for pilot, (x, y, z, turn) in zip(self._pilots, setpoint.tolist(), strict=True):
                 if math.isfinite(x + y + z + turn) and pilot.duty in (Duty.HOLD, Duty.FLY):
-                    pilot.duty, pilot.setpoint, pilot.set_at = Duty.FLY, (x, y, z, turn), now
+                    pilot.duty, pilot.setpoint, pilot.setpoint_time = Duty.FLY, (x, y, z, turn), now
 
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Body.takeoff`."""
         with self._lock:
             for row, to in zip(rows.tolist(), height.tolist(), strict=True):
-                self._pilots[row].rise(to, time.monotonic())
+                self._pilots[row].take_off(to, time.monotonic())
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
@@ -159,19 +159,19 @@ class TelloBody:
                 now = time.monotonic()
                 for pilot in self._pilots:
                     try:
-                        pilot.step(now, self._attended)
+                        pilot.step(now, self._last_read)
                     except TROUBLE as error:  # the others fly on
                         pilot.trouble = f"cannot be driven: {type(error).__name__}: {error}"
 
 
-class _Make(Protocol):
+class _TelloFactory(Protocol):
     def __call__(self, host: str, port: int, /) -> Vendor: ...
 
 
-def _library() -> _Make:
-    """djitellopy, made ready: what makes a drone for an address."""
+def _load_library() -> _TelloFactory:
+    """Import and prepare djitellopy; returns the function that creates a drone for an address."""
     if "av" not in sys.modules and importlib.util.find_spec("av") is None:
-        sys.modules["av"] = types.ModuleType("av")  # only its video, which we do not use, would need it
+        sys.modules["av"] = types.ModuleType("av")  # only needed by the library's video, which is not used
     try:
         library = importlib.import_module("djitellopy.tello")
     except ModuleNotFoundError as error:
@@ -179,14 +179,14 @@ def _library() -> _Make:
             f"flying a Tello needs djitellopy, which is not installed ({error.name} is missing): "
             "pip install -e '.[tello]'"
         ) from error
-    library.Tello.LOGGER.setLevel(logging.ERROR)  # it says every command
+    library.Tello.LOGGER.setLevel(logging.ERROR)  # else it logs every command
     if not library.threads_initialized:
         for port in (protocol.CONTROL_PORT, protocol.STATE_PORT):
             _check_free(port)
 
     def make(host: str, port: int) -> Vendor:
         drone = library.Tello(host=host, retry_count=1)
-        drone.address = (host, port)  # the library itself knows but one port, here and there
+        drone.address = (host, port)  # the library itself supports only the default ports
         vendor: Vendor = drone
         return vendor
 
@@ -194,7 +194,7 @@ def _library() -> _Make:
 
 
 def _check_free(port: int) -> None:
-    """The library binds its ports in threads that die unseen when they are taken."""
+    """Raise an error if a port is taken: the library binds its ports in threads, which then die without a message."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(("", port))
@@ -206,5 +206,5 @@ def _check_free(port: int) -> None:
 
 
 def open_tello(request: BodyRequest) -> TelloBody:
-    """The entry point `tello` of the group `zenpark.bodies`."""
+    """Entry point `tello` of the group `zenpark.bodies`."""
     return TelloBody(request)

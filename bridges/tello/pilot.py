@@ -1,7 +1,7 @@
-"""One DJI Tello as its pilot sees it: what is wanted of it, what was said to it, what it says of itself.
+"""Control of one DJI Tello: current duty, commands sent, state received.
 
-djitellopy's blocking calls are not used: they wait seconds for an answer, take a late one for that of the next
-command, and repeat relative moves. A pilot sends without waiting, and says again what was not answered.
+djitellopy's blocking calls are not used: they wait seconds for an answer, take a late answer for that of the next
+command, and repeat relative moves. A pilot sends without waiting, and repeats commands without an answer.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from agents.body.interface import FRESH_S, UNANSWERED
 from agents.body.kinds import Kind
 from agents.protocols import tello as protocol
 
-ASK_S: Final = 0.5  # between two attempts to enter SDK mode
-INSIST_S: Final = 1.0  # between two `land` that are not answered
-REPEAT_TAKEOFF_S: Final = 6.0  # likewise of `takeoff`, to which a drone answers when it is up
-QUICKEST_S: Final = 1.0  # no drone is up before
-TAKEOFF_S: Final = 20.0  # then it will not fly any more
-LAST: Final = 5  # the last command of a process is sent so many times, for a datagram may be lost
-STOOD_S: Final = 1.5  # its motors stand when the seconds that it counts while they run stay the same for so long,
-CUT_S: Final = 2.5  # which is known so long after an emergency stop, if that was heard
-ATTENDED_S: Final = 2.0  # a process that did not read for longer does not drive its robots: they land
-STILL_S: Final = 3.0  # low for this long, motors not running: it is on the ground
-GONE_S: Final = 20.0  # silent for this long: it has landed by itself
-LOW: Final = 30  # [cm] the height that it reports is rounded and drifts
+SDK_RETRY_S: Final = 0.5  # between two attempts to enter SDK mode
+LAND_RETRY_S: Final = 1.0  # between two `land` without an answer
+TAKEOFF_RETRY_S: Final = 6.0  # likewise of `takeoff`, which a drone answers when it is up
+SHORTEST_TAKEOFF_S: Final = 1.0  # no drone is up earlier
+TAKEOFF_S: Final = 20.0  # after this time the take-off has failed
+LAST_REPEATS: Final = 5  # the last command of a process is sent so many times: a datagram may be lost
+MOTORS_STOPPED_S: Final = 1.5  # the motors stand once the drone's counter of motor seconds is constant for so long,
+CUT_S: Final = 2.5  # which is known so long after an emergency stop that was received
+UNREAD_S: Final = 2.0  # drones land when their process has not read the state for longer
+ON_GROUND_S: Final = 3.0  # low for this long, motors not running: on the ground
+LANDED_ALONE_S: Final = 20.0  # silent for this long: landed by itself
+LOW: Final = 30  # [cm] the reported height is rounded and drifts
 
-STILL: Final = (0, 0, 0, 0)
+ZERO_STICKS: Final = (0, 0, 0, 0)
 
 
 class Vendor(Protocol):
-    """What is used of `djitellopy.Tello`."""
+    """The part of `djitellopy.Tello` that is used."""
 
     def send_rc_control(self, right: int, forward: int, up: int, clockwise: int, /) -> None: ...
     def send_command_without_return(self, command: str, /) -> None: ...
@@ -43,99 +43,94 @@ class Vendor(Protocol):
 
 
 class Duty(Enum):
-    """What a drone is wanted to do."""
+    """Task of a drone."""
 
     REST = "on the ground"
     RISE = "taking off"
     HOLD = "climbing to its height"
-    FLY = "as the setpoints say"
+    FLY = "following setpoints"
     LAND = "landing"
     CUT = "motors off"
 
 
 class Pilot:
-    """One drone: what is wanted of it, what was said to it, what it says of itself. Times are monotonic [s].
-
-    Attributes:
-        duty: What it is wanted to do.
-        heard: When its last state came; minus infinity before the first.
-        battery: Charge, 0 to 1.
-        turned: Its own yaw since it was opened, counter-clockwise [rad].
-        trouble: What went wrong last, for people.
-        position: (3,) from outside [m]; NaN if there is no fresh one.
-        yaw: From outside, or else its own [rad].
-        setpoint: Velocity in the world and yaw rate.
-        set_at: When that was given.
-    """
+    """One drone: duty, commands sent, state received. Times are monotonic [s]."""
 
     def __init__(self, drone: Vendor, kind: Kind, chosen: protocol.Settings) -> None:
         self._drone, self._kind, self._settings = drone, kind, chosen
         self.duty = Duty.REST
-        self.heard = -math.inf
-        self.battery, self.turned, self.trouble = math.nan, 0.0, ""
-        self.position, self.yaw = (math.nan,) * 3, 0.0
-        self.setpoint, self.set_at = (0.0,) * 4, -math.inf
-        self.place = (math.nan,) * 3  # that it climbs to and holds until setpoints come
+        self.state_received = -math.inf  # time of the last state; -inf before the first
+        self.battery = math.nan  # charge, 0 to 1
+        self.turned = 0.0  # yaw by its own sensors since `open`, counter-clockwise [rad]
+        self.trouble = ""  # last fault, for users
+        self.position = (math.nan,) * 3  # external [m]; NaN unless fresh
+        self.yaw = 0.0  # external, else its own [rad]
+        self.setpoint, self.setpoint_time = (0.0,) * 4, -math.inf  # velocity in the world [m/s], yaw rate [rad/s]
+        self.hold_position = (math.nan,) * 3  # [m] goal of the climb, held until setpoints come
         self._state: Mapping[str, Any] = {}
         self._zero_yaw: int | None = None
         self._height, self._motors = 0, -1
         self._running = self._aloft = -math.inf  # when the motors' clock last moved, when it was last not low
-        self._began = self._said = self._proof = -math.inf
-        self._unsent = ""
+        self._began_at = self._sent_at = self._cut_at = -math.inf
+        self._send_error = ""
 
     @property
     def flying(self) -> bool:
-        """Motors on, as far as is known: until the drone says that they stand."""
+        """Motors on, as far as known: until the drone reports that they stand."""
         return self.duty is not Duty.REST
 
     def silent(self, now: float) -> bool:
-        """Whether its state has not come for too long."""
-        return now - self.heard > self._settings.silence_s
+        """Whether the last state is too old."""
+        return now - self.state_received > self._settings.silence_s
 
     def note(self, now: float) -> str:
-        """What people should know of it; empty if all is well."""
-        if self.heard == -math.inf:
-            return self._unsent or "no answer"
-        unanswered = UNANSWERED if self.duty is Duty.CUT and now - self._began > CUT_S else ""
-        silence = f"silent for {now - self.heard:.0f} s (off, out of reach, or taken over)" if self.silent(now) else ""
-        return "; ".join(part for part in (unanswered, self._unsent, silence, self.trouble) if part)
+        """Faults for users; empty if none."""
+        if self.state_received == -math.inf:
+            return self._send_error or "no answer"
+        unanswered = UNANSWERED if self.duty is Duty.CUT and now - self._began_at > CUT_S else ""
+        silence = (
+            f"silent for {now - self.state_received:.0f} s (off, out of reach, or taken over)"
+            if self.silent(now)
+            else ""
+        )
+        return "; ".join(part for part in (unanswered, self._send_error, silence, self.trouble) if part)
 
-    # ------------------------------------------------------------------ what is wanted
+    # ------------------------------------------------------------------ orders
 
-    def rise(self, height: float, now: float) -> None:
-        """Take off, then climb to `height` [m] over this place; a drone that cannot says why."""
+    def take_off(self, height: float, now: float) -> None:
+        """Take off, then climb to `height` [m] above this place; on refusal, `trouble` gives the reason."""
         if self.duty is not Duty.REST:
             return
         if self.silent(now):
-            self.trouble = "does not take off: no state comes from it"
+            self.trouble = "no take-off: no state received"
         elif not math.isfinite(self.position[0]):
-            self.trouble = "does not take off: no fresh external position; is the positioning system running?"
+            self.trouble = "no take-off: no fresh external position; is the positioning system running?"
         elif self.battery < self._settings.low_battery:
-            self.trouble = f"does not take off: battery at {self.battery:.0%}"
+            self.trouble = f"no take-off: battery at {self.battery:.0%}"
         else:
-            self.place = (self.position[0], self.position[1], height)
+            self.hold_position = (self.position[0], self.position[1], height)
             self.trouble = ""
             self._begin(Duty.RISE, "takeoff", now)
 
-    def land(self, now: float, why: str = "") -> None:
-        """Come down here."""
+    def land(self, now: float, reason: str = "") -> None:
+        """Land at the current place; `reason` is for users."""
         if self.duty in (Duty.RISE, Duty.HOLD, Duty.FLY):
-            self.trouble = why or self.trouble
+            self.trouble = reason or self.trouble
             self._begin(Duty.LAND, "land", now)
 
     def cut(self, now: float) -> None:
-        """Motors off: said again until the drone says that they stand, or has been silent for `GONE_S`."""
+        """Cut the motors: repeated until the drone reports that they stand, or is silent for `LANDED_ALONE_S`."""
         if self.duty is not Duty.CUT:
-            self._proof = -math.inf if self.duty is Duty.REST else now
-            self._began = now
+            self._cut_at = -math.inf if self.duty is Duty.REST else now
+            self._began_at = now
         self.duty = Duty.CUT
-        self._say("emergency", now)
+        self._send_and_await("emergency", now)
 
     def leave(self) -> None:
-        """Nobody flies it any more: what is in the air is told to land, and the library to forget it."""
+        """End the pilot: land or stop a drone in the air, and release the library's object."""
         last = "emergency" if self.duty is Duty.CUT else "land" if self.flying else ""
         try:
-            for _ in range(LAST if last else 0):
+            for _ in range(LAST_REPEATS if last else 0):
                 self._send(last)
                 time.sleep(0.02)
         finally:
@@ -143,94 +138,94 @@ class Pilot:
 
     # ------------------------------------------------------------------ the thread
 
-    def step(self, now: float, attended: float) -> None:
-        """Hears, and says what is due; `attended` is when the process last read the state."""
-        self._listen(now)
+    def step(self, now: float, last_read: float) -> None:
+        """Process received state and answers, send due commands; `last_read`: the process's last read of the state."""
+        self._receive(now)
         if self.duty is Duty.REST:
-            if self.silent(now) and now - self._said >= ASK_S:
-                self._say("command", now)
-        elif now - self.heard > GONE_S:
-            self.duty, self.trouble = Duty.REST, "it must have landed by itself"
+            if self.silent(now) and now - self._sent_at >= SDK_RETRY_S:
+                self._send_and_await("command", now)
+        elif now - self.state_received > LANDED_ALONE_S:
+            self.duty, self.trouble = Duty.REST, "silent: must have landed by itself"
         elif self.duty is Duty.CUT:
-            if self._stands():
+            if self._motors_stopped():
                 self.duty = Duty.REST
             else:
                 self._send("emergency")
         elif self.duty is Duty.RISE:
-            self._rise(now)
+            self._take_off(now)
         elif self.duty is Duty.LAND:
-            if self._down(now):  # the answer was lost
+            if self._on_ground(now):  # the answer was lost
                 self.duty = Duty.REST
-            elif now - self._said >= INSIST_S:
-                self._say("land", now)
+            elif now - self._sent_at >= LAND_RETRY_S:
+                self._send_and_await("land", now)
         else:
-            self._fly(now, attended)
+            self._send_sticks(now, last_read)
 
-    def _stands(self) -> bool:
-        """Whether a state that came long enough after its motors' clock moved last, and after the stop, shows the same.
+    def _motors_stopped(self) -> bool:
+        """Whether the counter of motor seconds has been constant long enough, also since the stop.
 
-        A firmware that does not say that clock must have been low for as long.
+        For a firmware without that counter: whether the drone has been low for as long.
         """
         ran = self._running if self._motors >= 0 else self._aloft
-        return self.heard - max(ran, self._proof) > STOOD_S
+        return self.state_received - max(ran, self._cut_at) > MOTORS_STOPPED_S
 
-    def _down(self, now: float) -> bool:
-        """Whether what it says of itself leaves no doubt that it stands on the ground."""
-        return not self.silent(now) and now - max(self._aloft, self._running) > STILL_S
+    def _on_ground(self, now: float) -> bool:
+        """Whether the drone's state proves that it is on the ground."""
+        return not self.silent(now) and now - max(self._aloft, self._running) > ON_GROUND_S
 
-    def _fly(self, now: float, attended: float) -> None:
-        if now - attended > ATTENDED_S:
-            self.land(now, f"landing: its process did nothing for {ATTENDED_S:.0f} s")
+    def _send_sticks(self, now: float, last_read: float) -> None:
+        if now - last_read > UNREAD_S:
+            self.land(now, f"landing: its process did nothing for {UNREAD_S:.0f} s")
         elif self.battery < self._settings.low_battery:
             self.land(now, f"landing: battery at {self.battery:.0%}")
-        elif self._down(now):
-            self.duty, self.trouble = Duty.REST, f"it has landed by itself, battery at {self.battery:.0%}"
+        elif self._on_ground(now):
+            self.duty, self.trouble = Duty.REST, f"landed by itself, battery at {self.battery:.0%}"
         else:
             try:
-                self._drone.send_rc_control(*self._sticks(now, attended))
+                self._drone.send_rc_control(*self._sticks(now, last_read))
             except OSError as error:
-                self._unsent = f"cannot send: {error.strerror}"
+                self._send_error = f"cannot send: {error.strerror}"
 
-    def _rise(self, now: float) -> None:
-        if now - self._began > TAKEOFF_S:
+    def _take_off(self, now: float) -> None:
+        if now - self._began_at > TAKEOFF_S:
             self.land(now, f"did not take off in {TAKEOFF_S:.0f} s")
-        elif self._aloft > self._began and now - self._said > REPEAT_TAKEOFF_S:
-            self._up(now)  # the answer was lost
-        elif now - self._said > REPEAT_TAKEOFF_S:
-            self._say("takeoff", now)
+        elif self._aloft > self._began_at and now - self._sent_at > TAKEOFF_RETRY_S:
+            self._airborne(now)  # the answer was lost
+        elif now - self._sent_at > TAKEOFF_RETRY_S:
+            self._send_and_await("takeoff", now)
 
-    def _up(self, now: float) -> None:
+    def _airborne(self, now: float) -> None:
         self.duty = Duty.HOLD
         self._running = self._aloft = now
 
-    def _sticks(self, now: float, attended: float) -> tuple[int, int, int, int]:
-        """Toward the place to hold, as the setpoint says, or at rest where neither is fresh."""
-        if now - attended > FRESH_S:
-            return STILL
-        if self.duty is Duty.FLY and now - self.set_at <= FRESH_S:
+    def _sticks(self, now: float, last_read: float) -> tuple[int, int, int, int]:
+        """Stick values for the setpoint or toward the position to hold; zeros if neither is fresh."""
+        if now - last_read > FRESH_S:
+            return ZERO_STICKS
+        if self.duty is Duty.FLY and now - self.setpoint_time <= FRESH_S:
             x, y, z, turn = self.setpoint
             return protocol.sticks((x, y, z), turn, self.yaw)
         if self.duty is Duty.HOLD and math.isfinite(self.position[0]):
             limit, response = self._kind.speed, self._kind.response
             x, y, z = (
                 max(-limit, min(limit, response * (there - here)))
-                for there, here in zip(self.place, self.position, strict=True)
+                for there, here in zip(self.hold_position, self.position, strict=True)
             )
             return protocol.sticks((x, y, z), 0.0, self.yaw)
-        return STILL
+        return ZERO_STICKS
 
-    def _listen(self, now: float) -> None:
+    def _receive(self, now: float) -> None:
         state = self._drone.get_current_state()
-        if state is not self._state and state:  # the library stamps nothing, but makes a new table of each state line
-            self._state, self.heard, self._unsent = state, now, ""
-            self._learn(state, now)
+        if state is not self._state and state:  # the library has no time stamps, but a new dict for each state line
+            self._state, self.state_received, self._send_error = state, now, ""
+            self._store_state(state, now)
         answers: list[bytes] = self._drone.get_own_udp_object()["responses"]
         while answers:
-            self._take(answers.pop(0).decode("ascii", "replace").strip(), now)
+            self._process_answer(answers.pop(0).decode("ascii", "replace").strip(), now)
 
-    def _learn(self, state: Mapping[str, Any], now: float) -> None:
+    def _store_state(self, state: Mapping[str, Any], now: float) -> None:
         charge, yaw, height, motors = (state.get(key) for key in ("bat", "yaw", "h", "time"))
-        if isinstance(charge, int) and 0 <= charge <= 100:  # text over UDP can be anything
+        if isinstance(charge, int) and 0 <= charge <= 100:  # text from UDP may hold any value
             self.battery = 0.01 * charge
         if isinstance(yaw, int) and abs(yaw) <= 360:
             self._zero_yaw = yaw if self._zero_yaw is None else self._zero_yaw
@@ -242,24 +237,26 @@ class Pilot:
         if isinstance(motors, int) and motors != self._motors:
             self._motors, self._running = motors, now
 
-    def _take(self, answer: str, now: float) -> None:
-        """An answer, believed only where it fits: `command`, `emergency` and some firmware's `rc` are answered too."""
+    def _process_answer(self, answer: str, now: float) -> None:
+        """Use an answer where it fits the duty: `command`, `emergency` and some firmware's `rc` are answered too."""
         refused = answer.startswith(("error", "out of range", "unknown"))
         if self.duty is Duty.RISE:
-            if (answer == "ok" and now - self._began > QUICKEST_S) or (refused and self._aloft > self._began):
-                self._up(now)  # told twice, it refuses the second time
+            if (answer == "ok" and now - self._began_at > SHORTEST_TAKEOFF_S) or (
+                refused and self._aloft > self._began_at
+            ):
+                self._airborne(now)  # a drone in the air refuses the second of two commands
             elif refused:
                 self.duty, self.trouble = Duty.REST, f"refuses to take off: {answer!r}, battery at {self.battery:.0%}"
         elif self.duty is Duty.LAND and (answer == "ok" or refused) and self._height < LOW:
             self.duty = Duty.REST
 
     def _begin(self, duty: Duty, command: str, now: float) -> None:
-        self.duty, self._began = duty, now
-        self._say(command, now)
+        self.duty, self._began_at = duty, now
+        self._send_and_await(command, now)
 
-    def _say(self, command: str, now: float) -> None:
-        """Sends a command whose answer matters: what came before it is none."""
-        self._said = now
+    def _send_and_await(self, command: str, now: float) -> None:
+        """Send a command whose answer is used; discard earlier answers."""
+        self._sent_at = now
         self._drone.get_own_udp_object()["responses"].clear()
         self._send(command)
 
@@ -267,4 +264,4 @@ class Pilot:
         try:
             self._drone.send_command_without_return(command)
         except OSError as error:
-            self._unsent = f"cannot send: {error.strerror}"
+            self._send_error = f"cannot send: {error.strerror}"

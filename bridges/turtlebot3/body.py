@@ -1,4 +1,4 @@
-"""TurtleBot3 over Zenoh: through zenoh-bridge-ros2dds (`ros2dds://`) or rmw_zenoh (`rmw://`)."""
+"""Body of several TurtleBot3 over Zenoh: zenoh-bridge-ros2dds (`ros2dds://`) or rmw_zenoh (`rmw://`)."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from agents.protocols.ros2_node import Participant
 from bridges.turtlebot3.robot import SILENCE_S, Robot
 
 OPEN_S: Final = 4.5  # from the first attempt to reach the router to odometry of every robot
-DIAGNOSIS_S: Final = 0.3  # how long `open` asks who else is there before it gives up
+DIAGNOSIS_S: Final = 0.3  # how long a failing `open` looks for other robots, to name them in the error
 POLL_S: Final = 0.01
-FAREWELL_S: Final = 3.0  # how long `close` waits for the robots to stand
+STANDSTILL_S: Final = 3.0  # how long `close` waits for the robots to stand
 
 Clock = Callable[[], float]
 
 
 class TurtleBot3:
-    """Rows of TurtleBot3; implements `agents.body.interface.Body`. Everything is polled: no threads.
+    """TurtleBot3 robots; implements `agents.body.interface.Body`. All topics are polled: no threads.
 
     Args:
-        request: What to open.
+        request: Robots to open.
         clock: Monotonic [s].
 
     Raises:
@@ -46,17 +46,17 @@ class TurtleBot3:
         self._robots = [Robot(request, row) for row in range(len(request.names))]
         self._claims = Claims([robot.name for robot in self._robots], [robot.device for robot in self._robots])
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
-        self._outside = np.flatnonzero(request.external)
+        self._external_rows = np.flatnonzero(request.external)
         self._external = External(len(self._robots))
 
     def open(self) -> None:
-        """See `Body.open`: returns when every robot's odometry was heard."""
+        """See `Body.open`: returns after the first odometry of every robot."""
         self._claims.take()
         deadline = self._clock() + OPEN_S
         try:
             participants: dict[tuple[object, ...], Participant] = {}
             for robot in self._robots:
-                where = robot.where
+                where = robot.address
                 session = self._session(robot, deadline)
                 which = (robot.endpoints, where.style, where.distro, where.domain)
                 if which not in participants:
@@ -64,12 +64,12 @@ class TurtleBot3:
                         session, ros2.types(where.distro), style=where.style, domain=where.domain
                     )
                 robot.join(participants[which])
-            while missing := [robot for robot in self._robots if robot.heard == -np.inf]:
+            while missing := [robot for robot in self._robots if robot.odometry_received == -np.inf]:
                 if self._clock() > deadline:
-                    raise BodyError("; ".join(self._absent(robot) for robot in missing))
+                    raise BodyError("; ".join(self._missing_odometry(robot) for robot in missing))
                 time.sleep(POLL_S)
                 for robot in self._robots:
-                    robot.hear(-np.inf, self._clock())
+                    robot.receive_messages(-np.inf, self._clock())
         except BaseException:
             self._close()
             raise
@@ -86,9 +86,9 @@ class TurtleBot3:
             self._sessions[robot.endpoints] = session
         return self._sessions[robot.endpoints]
 
-    def _absent(self, robot: Robot) -> str:
-        """Why a robot's odometry may not have come, and what to do."""
-        where = robot.where
+    def _missing_odometry(self, robot: Robot) -> str:
+        """Diagnosis and remedy for a robot without odometry."""
+        where = robot.address
         session = self._sessions[robot.endpoints]
         topic = ros2.absolute(where.namespace, turtlebot3.ODOMETRY)
         hint = (
@@ -118,10 +118,10 @@ class TurtleBot3:
         now = self._clock()
         robots = self._robots
         for robot in robots:
-            robot.hear(t, now)
-            if robot.time == -np.inf and robot.heard > -np.inf:
-                robot.time = t - (now - robot.heard)  # heard while it was opened
-            robot.speak(now)
+            robot.receive_messages(t, now)
+            if robot.time == -np.inf and robot.odometry_received > -np.inf:
+                robot.time = t - (now - robot.odometry_received)  # received during `open`
+            robot.send_command(now)
         rows = len(robots)
         pose = np.array([robot.pose for robot in robots])
         speed = np.array([robot.speed[0] for robot in robots])
@@ -141,10 +141,10 @@ class TurtleBot3:
             notes=tuple(robot.note(now, linked[robot.endpoints]) for robot in robots),
             rays=Rays.gather([robot.scan for robot in robots]),
         )
-        if len(self._outside):
+        if len(self._external_rows):
             odometry = state.time.copy()
-            self._external.fill(state, self._outside)
-            # a robot that is seen from outside and does not answer is still out of reach
+            self._external.fill(state, self._external_rows)
+            # a robot with external positions but without odometry is still out of reach
             state.time = np.where(t - odometry > SILENCE_S, np.minimum(state.time, odometry), state.time)
         state.velocity[:, 0], state.velocity[:, 1] = speed * np.cos(state.yaw), speed * np.sin(state.yaw)
         state.velocity[:, 2] = 0.0
@@ -156,10 +156,10 @@ class TurtleBot3:
         for robot, (v, w, _, _) in zip(self._robots, setpoint.tolist(), strict=True):
             if np.isfinite(v) and np.isfinite(w):
                 robot.drive(v, w, now)
-            robot.speak(now)
+            robot.send_command(now)
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Body.takeoff`: does nothing, a ground robot is where it should be."""
+        """See `Body.takeoff`: no effect on a ground robot."""
 
     def land(self, rows: Index) -> None:
         """See `Body.land`."""
@@ -176,16 +176,16 @@ class TurtleBot3:
         self._external.update(row, t, position, yaw)
 
     def close(self) -> None:
-        """Stops every robot, waits a moment until they stand, and leaves the network."""
+        """Stop all robots, wait until they stand (3 s at most), and leave the network."""
         if not self._sessions:
             return
-        until = self._clock() + FAREWELL_S
+        until = self._clock() + STANDSTILL_S
         try:
             self.stop(np.arange(len(self._robots)))
             while (now := self._clock()) < until:
                 for robot in self._robots:
-                    robot.hear(robot.time, now)
-                call_all(partial(robot.speak, now) for robot in self._robots)
+                    robot.receive_messages(robot.time, now)
+                call_all(partial(robot.send_command, now) for robot in self._robots)
                 if all(robot.settled for robot in self._robots):
                     break
                 time.sleep(POLL_S)
@@ -200,7 +200,7 @@ class TurtleBot3:
 
 
 def open_turtlebot3(request: BodyRequest) -> Body:
-    """The entry points `ros2dds` and `rmw` of the group `zenpark.bodies`.
+    """Entry points `ros2dds` and `rmw` of the group `zenpark.bodies`.
 
     Raises:
         BodyError: As `TurtleBot3`.

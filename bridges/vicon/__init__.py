@@ -1,1 +1,1 @@
-"""Motion capture: a DataStream client, and the process that publishes poses."""
+"""Vicon motion capture: a DataStream client, and the process that publishes poses."""

@@ -1,6 +1,6 @@
-"""A client of the Vicon DataStream in plain Python: one socket, one caller, no vendor library.
+"""Client of the Vicon DataStream in plain Python: one socket, no threads, no vendor library.
 
-The vendor's own client holds the interpreter while it connects and never returns once its server has died.
+The vendor's own client blocks the interpreter while it connects, and never returns once its server has died.
 """
 
 from __future__ import annotations
@@ -15,36 +15,29 @@ from typing import Final
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment, Subject
 
-CHUNK: Final = 1 << 18  # [bytes] read at once: some ten frames of twenty bodies
-OLDEST_S: Final = 1.0  # a frame that claims to be older has a broken latency
+CHUNK: Final = 1 << 18  # [bytes] read at once: about ten frames of twenty bodies
+OLDEST_S: Final = 1.0  # a larger latency in a frame is invalid
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What motion capture saw at one moment.
+    """One frame of motion capture."""
 
-    Attributes:
-        number: As the server counts.
-        latency_s: How old it was when it was sent [s].
-        poses: The root segment of each subject that the server knows; None while it is occluded.
-        z_up: Whether the z axis points up.
-    """
-
-    number: int
-    latency_s: float
-    poses: dict[str, Segment | None]
+    number: int  # of the server
+    latency_s: float  # age when sent
+    poses: dict[str, Segment | None]  # root segment of each subject; None while occluded
     z_up: bool
 
 
 class Decoder:
-    """Makes frames of packets; remembers names and axes, which are not in each of them."""
+    """Decodes packets to frames; keeps subject names and axes, which are not in every packet."""
 
     def __init__(self) -> None:
         self._subjects: dict[int, Subject] = {}
         self._z_up = True
 
     def frame(self, body: bytes) -> Frame | None:
-        """The frame in the body of a packet, or None if it has only names, axes or answers.
+        """Decode the body of a packet; None if the packet has only names, axes or answers.
 
         Raises:
             Malformed: If the packet is damaged.
@@ -66,7 +59,7 @@ class Decoder:
             elif kind == Kind.APPLICATION_INFO:
                 self._z_up = payload[:1] == bytes([vicon_datastream.Z_UP])
         if named:
-            self._subjects = named  # all of them are sent again when one changes
+            self._subjects = named  # the server resends all when one changes
         if number is None:
             return None
         poses = {
@@ -77,18 +70,18 @@ class Decoder:
 
 
 class Reader:
-    """A connection to a DataStream server, which sends every frame as it comes."""
+    """Connection to a DataStream server, which streams every frame."""
 
     def __init__(self, host: str, port: int = vicon_datastream.PORT, timeout_s: float = 2.0) -> None:
-        """Connects and asks for frames.
+        """Connect and request the stream.
 
         Raises:
-            OSError: If nobody answers there in time.
-            Malformed: If whoever answers does not speak DataStream, or has no poses to offer.
+            OSError: If no answer comes in time.
+            Malformed: If the answer is not DataStream, or the server offers no poses.
         """
         deadline = time.monotonic() + timeout_s
         self._framer, self._decoder = Framer(), Decoder()
-        self._waiting: deque[bytes] = deque()  # packets that came with the server's first word
+        self._waiting: deque[bytes] = deque()  # packets received, not decoded yet
         self._socket = socket.create_connection((host, port), timeout_s)
         self._socket.setblocking(False)
         try:
@@ -104,12 +97,12 @@ class Reader:
             raise
 
     def newest(self, timeout_s: float) -> Frame | None:
-        """The newest frame that has arrived, or None if none comes in time.
+        """Newest frame received, or None at the timeout.
 
-        Older ones that wait with it are left out: nobody could tell any more when they arrived.
+        Older frames are dropped: their time of arrival is unknown.
 
         Raises:
-            OSError: If the server is gone.
+            OSError: If the connection is lost.
             Malformed: If the stream is damaged.
         """
         deadline = time.monotonic() + timeout_s
@@ -123,13 +116,13 @@ class Reader:
                 return None
 
     def close(self) -> None:
-        """Ends the connection."""
+        """Close the connection."""
         self._socket.close()
 
     def _offered(self, deadline: float) -> set[int]:
         while True:
             if not self._readable(deadline):
-                raise TimeoutError("it is silent")
+                raise TimeoutError("no answer")
             self._drain()
             while self._waiting:
                 for kind, payload in vicon_datastream.blocks(self._waiting.popleft()):
@@ -142,7 +135,7 @@ class Reader:
         return bool(waiting.poll(1000.0 * max(0.0, deadline - time.monotonic())))
 
     def _drain(self) -> None:
-        """Takes in all packets that have arrived."""
+        """Read all packets that have arrived."""
         while True:
             try:
                 received = self._socket.recv(CHUNK)

@@ -1,8 +1,6 @@
-"""Positions from a Vicon for robots that get theirs from outside: `python -m bridges.vicon.publisher HOST --map
-CF01=cf_1`.
+"""Positions from a Vicon for robots with external positions: `python -m bridges.vicon.publisher HOST --map CF01=cf_1`.
 
-What motion capture did not see, or saw somewhere else than any robot can be, is not published: a robot notices silence,
-but would fly by a wrong pose.
+Occluded and implausible poses are not published: a robot notices silence, but would fly by a wrong pose.
 """
 
 from __future__ import annotations
@@ -30,17 +28,17 @@ from agents.runtime.command_line import add_network, reached, told_to_end
 from agents.runtime.lifeline import Lifeline
 from bridges.vicon.client import Frame, Reader
 
-FIRST_S: Final = 5.0  # who has not answered by then is not there
+FIRST_S: Final = 5.0  # deadline of the first answer of the server
 ATTEMPT_S: Final = 2.0  # deadline of each attempt to connect
 PAUSE_S: Final = 0.5  # between attempts
-SILENCE_S: Final = 2.0  # without a frame the connection is made anew
-LOST_S: Final = 0.5  # not seen for so long is worth a line; half a second is also what robots bear
-LOOK_S: Final = 0.2  # how soon the end of the process is noticed
-SKEW: Final = 1e-3  # how far from orthonormal a rotation may be
+SILENCE_S: Final = 2.0  # without a frame for so long, reconnect
+LOST_S: Final = 0.5  # occlusions of so long are reported; robots hold on for half a second as well
+POLL_S: Final = 0.2  # how soon the end of the process is noticed
+SKEW: Final = 1e-3  # tolerance of a rotation's orthonormality
 
 
 def heading(rotation: Sequence[float]) -> float:
-    """Yaw [rad] of a rotation to the room (9,), row by row; NaN if it is no rotation, as zeros are none."""
+    """Yaw [rad] of a rotation matrix (9,), row by row; NaN for an invalid one, such as zeros."""
     a, b, c, d, e, f, g, h, i = rotation  # plain numbers: numpy takes ten times as long for three rows
     worst = max(
         abs(a * a + b * b + c * c - 1.0),
@@ -53,63 +51,63 @@ def heading(rotation: Sequence[float]) -> float:
     return math.atan2(d, a) if worst < SKEW and math.isfinite(sum(rotation)) else math.nan
 
 
-class Sieve:
-    """Lets through what a frame says of robots, if it can be true."""
+class PoseFilter:
+    """Keeps the plausible poses of the robots in each frame, and reports changes in visibility."""
 
-    def __init__(self, subjects: Mapping[str, str], say: Callable[[str], None]) -> None:
-        """`subjects` are those of the robots, by robot; `say` takes a line for people."""
+    def __init__(self, subjects: Mapping[str, str], print_line: Callable[[str], None]) -> None:
+        """`subjects`: subject name by robot; `print_line` prints a line for users."""
         self._subjects = dict(subjects)
-        self._say = say
+        self._print_line = print_line
         self._last = External(len(self._subjects))
-        self._since = np.full(len(self._subjects), -np.inf)  # when each was seen last
-        self._told: list[str | None] = [None] * len(self._subjects)
-        self._turned = False
-        self._broken = 0
+        self._seen_at = np.full(len(self._subjects), -np.inf)  # time of each robot's last pose [s]
+        self._reported: list[str | None] = [None] * len(self._subjects)
+        self._not_z_up = False
+        self._invalid = 0
 
     @property
     def refused(self) -> int:
-        """Poses that were no pose, or jumps farther than any robot moves."""
-        return self._broken + self._last.refused
+        """Number of poses refused: no rotation, not finite, or a jump faster than any robot."""
+        return self._invalid + self._last.refused
 
-    def sift(self, frame: Frame, arrived: float) -> list[tuple[str, float, Segment, float]]:
-        """Of each robot that was seen: its name, when [s], where, and its yaw [rad].
+    def filter_poses(self, frame: Frame, arrived: float) -> list[tuple[str, float, Segment, float]]:
+        """Name, time of measurement [s], segment and yaw [rad] of each robot with a plausible pose.
 
         Args:
-            frame: What motion capture says.
-            arrived: When it arrived, on any steady clock [s]; "when" is on the same clock.
+            frame: Frame of motion capture.
+            arrived: Time of arrival on any steady clock [s]; the times of measurement are on the same clock.
         """
         measured = arrived - frame.latency_s
-        if frame.z_up is self._turned:
-            self._turned = not frame.z_up
-            self._say("the z axis points up" if frame.z_up else TURNED)
-        believed = []
+        if frame.z_up is self._not_z_up:
+            self._not_z_up = not frame.z_up
+            self._print_line("the z axis points up" if frame.z_up else NOT_Z_UP)
+        poses = []
         for row, (robot, subject) in enumerate(self._subjects.items()):
             segment = frame.poses.get(subject)
             if segment is not None and frame.z_up:
                 yaw = heading(segment.rotation)
                 position = np.array(segment.position)
                 if math.isnan(yaw) or not all(map(math.isfinite, segment.position)):
-                    self._broken += 1
+                    self._invalid += 1
                 elif self._last.update(row, measured, position, yaw):
-                    self._since[row] = arrived
-                    believed.append((robot, measured, segment, yaw))
+                    self._seen_at[row] = arrived
+                    poses.append((robot, measured, segment, yaw))
             self._report(row, robot, subject, frame, arrived)
-        return believed
+        return poses
 
     def _report(self, row: int, robot: str, subject: str, frame: Frame, now: float) -> None:
-        if now - self._since[row] < LOST_S:
+        if now - self._seen_at[row] < LOST_S:
             state = f"{robot} is seen as '{subject}'"
         elif subject not in frame.poses:
             others = ", ".join(sorted(frame.poses)) or "none"
             state = f"{robot}: no subject '{subject}' (there are: {others}); name another with --map {robot}=SUBJECT"
         else:
             state = f"{robot} is not seen: markers hidden, or subject '{subject}' is switched off"
-        if self._told[row] != state:
-            self._told[row] = state
-            self._say(state)
+        if self._reported[row] != state:
+            self._reported[row] = state
+            self._print_line(state)
 
 
-TURNED: Final = "no positions: the server's z axis does not point up; set it so in its options"
+NOT_Z_UP: Final = "no positions: the server's z axis does not point up; change this in its options"
 
 
 class Positions:
@@ -120,21 +118,23 @@ class Positions:
         self._publishers = {robot: pubsub.publisher(session, keys.position(robot), mime) for robot in robots}
 
     def publish(self, robot: str, stamp: float, segment: Segment, yaw: float) -> None:
-        """Says where a robot was at UTC time `stamp` [s]."""
+        """Publish the pose of a robot at UTC time `stamp` [s]."""
         self._publishers[robot].put(messages.encode(messages.position(robot, stamp, segment.position, yaw)))
 
 
 class Bridge:
-    """Reads a DataStream server for ever, over any number of its restarts."""
+    """Publishes the stream of a DataStream server; reconnects after its restarts."""
 
-    def __init__(self, host: str, port: int, sieve: Sieve, positions: Positions, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, host: str, port: int, pose_filter: PoseFilter, positions: Positions, print_line: Callable[[str], None]
+    ) -> None:
         self._host, self._port = host, port
-        self._sieve, self._positions, self._say = sieve, positions, say
+        self._filter, self._positions, self._print_line = pose_filter, positions, print_line
         self._clock = Clock()
         self._state = ""
 
     def run(self, over: Callable[[], bool]) -> bool:
-        """Bridges until it is over; False if nobody answered in the first seconds."""
+        """Run until `over()`; False if the server did not answer in the first 5 s."""
         begun = time.monotonic()
         pause = threading.Event()
         ever = False
@@ -145,15 +145,15 @@ class Bridge:
             try:
                 reader = Reader(self._host, self._port, ATTEMPT_S if ever else min(ATTEMPT_S, max(0.1, left)))
             except (OSError, Malformed) as error:
-                self._tell(f"no connection to {self._host}:{self._port}: {reason(error)}; trying again")
+                self._report_once(f"no connection to {self._host}:{self._port}: {describe_error(error)}; trying again")
                 pause.wait(PAUSE_S)
                 continue
             ever = True
-            self._tell(f"connected to {self._host}:{self._port}")
+            self._report_once(f"connected to {self._host}:{self._port}")
             try:
                 self._pump(reader, over)
             except (OSError, Malformed) as error:
-                self._tell(f"lost {self._host}:{self._port}: {reason(error)}; trying again")
+                self._report_once(f"lost {self._host}:{self._port}: {describe_error(error)}; trying again")
             finally:
                 reader.close()
             pause.wait(PAUSE_S)
@@ -162,28 +162,28 @@ class Bridge:
     def _pump(self, reader: Reader, over: Callable[[], bool]) -> None:
         heard = time.monotonic()
         while not over():
-            frame = reader.newest(LOOK_S)
+            frame = reader.newest(POLL_S)
             now = time.monotonic()
             if frame is None:
                 if now - heard > SILENCE_S:
                     raise TimeoutError(f"no frame for {SILENCE_S:g} s (is the system live, and not paused?)")
                 continue
             heard = now
-            for robot, measured, segment, yaw in self._sieve.sift(frame, now):
+            for robot, measured, segment, yaw in self._filter.filter_poses(frame, now):
                 self._positions.publish(robot, self._clock.at(measured), segment, yaw)
 
-    def _tell(self, state: str) -> None:
+    def _report_once(self, state: str) -> None:
         if state != self._state:
             self._state = state
-            self._say(state)
+            self._print_line(state)
 
 
-def reason(error: OSError | Malformed) -> str:
-    """What went wrong, without numbers of the operating system."""
+def describe_error(error: OSError | Malformed) -> str:
+    """Text of an error, without the operating system's numbers."""
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
-def bridge(
+def run_bridge(
     server: str,
     subjects: Mapping[str, str],
     endpoints: Sequence[str],
@@ -192,24 +192,24 @@ def bridge(
     lifeline: bool = False,
     identity: str = "positioning",
 ) -> int:
-    """Bridges until SIGINT, SIGTERM or the loss of its lifeline (and of the robots); returns the exit code.
+    """Run the bridge until SIGINT, SIGTERM or the loss of its lifeline (and of the robots); returns the exit code.
 
     Args:
         server: "HOST" or "HOST:PORT" of the DataStream server.
-        subjects: The subject that each robot is, by robot.
+        subjects: Subject name by robot.
         endpoints: Routers.
         realm: First chunk of the keys.
         lifeline: Whether standard input is a lifeline.
-        identity: Whose certificate is shown, in a lab.
+        identity: Name on the certificate, in a lab.
 
     Raises:
         network.Unreachable: If no router answers.
         EndpointError: If an endpoint is malformed.
     """
-    host, port = split(server)
+    host, port = parse_server(server)
     stop, lost = threading.Event(), threading.Event()
 
-    def say(line: str) -> None:
+    def print_line(line: str) -> None:
         print(f"vicon: {line}", file=sys.stderr, flush=True)
 
     if lifeline:
@@ -220,17 +220,17 @@ def bridge(
     ):
         keys, robots = Keys(realm), list(subjects)
         farewell = Farewell(session, keys, robots, lost)
-        made = Bridge(host, port, Sieve(subjects, say), Positions(session, keys, robots), say)
+        made = Bridge(host, port, PoseFilter(subjects, print_line), Positions(session, keys, robots), print_line)
         if made.run(lambda: stop.is_set() or farewell.over()):
             return 0
-    say(
-        f"nobody answered at {host}:{port} in {FIRST_S:g} s. Is that the computer that runs Tracker or Nexus, is it on "
+    print_line(
+        f"no answer from {host}:{port} in {FIRST_S:g} s. Is that the computer that runs Tracker or Nexus, is it on "
         f"this network (ping {host}), and does its firewall let TCP port {port} in?"
     )
     return 2
 
 
-def split(server: str) -> tuple[str, int]:
+def parse_server(server: str) -> tuple[str, int]:
     """Host and port of "HOST" or "HOST:PORT".
 
     Raises:
@@ -242,11 +242,11 @@ def split(server: str) -> tuple[str, int]:
     return host, int(port) if colon else vicon_datastream.PORT
 
 
-def pairs(maps: Sequence[str]) -> dict[str, str]:
-    """Subjects by robot, of "ROBOT=SUBJECT" or "ROBOT", whose subject has its name.
+def parse_maps(maps: Sequence[str]) -> dict[str, str]:
+    """Subject by robot, from texts "ROBOT=SUBJECT" or "ROBOT" (subject of the same name).
 
     Raises:
-        ValueError: If one is neither, or a robot or subject comes twice.
+        ValueError: If a text has neither form, or a robot or subject occurs twice.
     """
     found: dict[str, str] = {}
     for each in maps:
@@ -255,7 +255,7 @@ def pairs(maps: Sequence[str]) -> dict[str, str]:
             raise ValueError(f"'{each}' is neither ROBOT nor ROBOT=SUBJECT")
         subject = subject or robot
         if robot in found or subject in found.values():
-            raise ValueError(f"'{each}' names a robot or a subject that another --map has named")
+            raise ValueError(f"'{each}' names a robot or a subject of another --map")
         found[robot] = subject
     return found
 
@@ -267,14 +267,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "server", metavar="HOST[:PORT]", help=f"where Tracker or Nexus runs; port {vicon_datastream.PORT}"
     )
     parser.add_argument(
-        "--map", action="append", required=True, metavar="ROBOT[=SUBJECT]", help="a robot, and what the Vicon calls it"
+        "--map", action="append", required=True, metavar="ROBOT[=SUBJECT]", help="a robot, and its subject in the Vicon"
     )
     add_network(parser, "positioning")
     chosen = parser.parse_args(arguments)
     try:
-        return bridge(
+        return run_bridge(
             chosen.server,
-            pairs(chosen.map),
+            parse_maps(chosen.map),
             reached(chosen),
             realm=chosen.realm,
             lifeline=chosen.lifeline,

@@ -121,7 +121,7 @@ def test_parameters_are_set():
         ({"parameters": {"no.such": 1.0}}, "no parameter no.such"),
         ({"parameters": {"deck.bcLoco": 1.0}}, "read-only"),
         ({"parameters": {"senseless": 1.0}}, "senseless"),
-        ({"positioning": {"system": "loco"}}, "no anchor knows where it is"),
+        ({"positioning": {"system": "loco"}}, "no anchor knows its position"),
         (
             {"positioning": {"system": "lighthouse"}, "converge_s": 1.2},
             r"not settled after 1.2 s: misses geometry or calibration",
@@ -175,7 +175,7 @@ def test_external_position():
         assert np.isnan(process.state.position[0]).all()
         assert "no position from outside" in process.state.notes[0]
         process.body.takeoff(np.array([0]), np.array([0.5]))
-        process.until(lambda: "does not know where it is" in process.state.notes[0], "refusal")
+        process.until(lambda: "position estimate has not settled" in process.state.notes[0], "refusal")
         assert not process.state.flying[0]
 
         tick = process.tick

@@ -61,7 +61,7 @@ def test_each_fails_in_its_own_way_and_the_others_fly_on():
         assert truth(twin, mute)[2] == truth(twin, blinking)[2] == truth(twin, empty)[2] == 0.0
         assert any("no pose for" in note for note in said[mute])
         assert any("link lost" in note for note in said[blinking])
-        assert any("landed it: battery low" in note for note in said[empty])
+        assert any("landed: battery low" in note for note in said[empty])
         assert any("link lost" in note for note in said[killed])
         assert process.t - process.state.time[mute] > 0.5  # the robot's loop sees how old its position is
         assert said[well] == {""}
@@ -71,7 +71,7 @@ def test_each_fails_in_its_own_way_and_the_others_fly_on():
         )
         assert process.t - process.state.time[well] < 0.5
         process.body.takeoff(np.array([empty]), np.array([0.5]))
-        process.until(lambda: "does not take off: battery low" in process.state.notes[empty], "refusal")
+        process.until(lambda: "no take-off: battery low" in process.state.notes[empty], "refusal")
         process.body.stop(np.arange(6))
         process.until(lambda: not process.state.flying.any(), "motors off")
     finally:
@@ -90,7 +90,7 @@ def test_loop_that_stops_commanding():
         process.run(0.2)
         until(lambda: truth(twin)[2] == 0.0, "it was landed")
         assert supervised(twin) != State.LOCKED
-        assert "nobody commanded" in process.tick().notes[0]
+        assert "no commands from" in process.tick().notes[0]
 
 
 @pytest.mark.system
@@ -98,7 +98,7 @@ def test_refused_arming():
     with flown(refuse_arming=True) as (twin, process):
         process.tick()
         process.body.takeoff(np.array([0]), np.array([0.5]))
-        process.until(lambda: "refuses to be armed" in process.state.notes[0], "refusal")
+        process.until(lambda: "arming refused" in process.state.notes[0], "refusal")
         process.until(lambda: not process.state.flying[0], "not flying")
         assert truth(twin)[2] == 0.0
 
@@ -110,7 +110,7 @@ def test_absent():
         mute.bind(("127.0.0.1", 0))
         address = f"udp://127.0.0.1:{mute.getsockname()[1]}"
         begin = time.monotonic()
-        with pytest.raises(BodyError, match=f"R0: nobody answers at {address}: is the simulation running there"):
+        with pytest.raises(BodyError, match=f"R0: no answer at {address}: is the simulation running there"):
             open_crazyflie(request("crazyflie", [address])).open()
         assert time.monotonic() - begin < 6.0
     begin = time.monotonic()
@@ -179,15 +179,15 @@ def test_firmware_without_supervisor():
     blocks = {}
 
     class Old:
-        def log(self, name, _rate, variables, logged):
+        def start_log(self, name, _rate, variables, logged):
             blocks[name] = variables, logged
 
-    telemetry.listen(Old(), log_hz=50.0, status_hz=10.0, ranges_hz=None)
+    telemetry.start_logging(Old(), log_hz=50.0, status_hz=10.0, ranges_hz=None)
     blocks["status"][1](1.0, {"pm.vbat": 3.6, "pm.state": 3, "sys.canfly": 1, "sys.isFlying": 1, "sys.isTumbled": 0})
     assert telemetry.info == Info.ARMED | Info.CAN_FLY | Info.FLYING
     assert board.battery[0] == pytest.approx(0.5)
-    assert telemetry.low
-    assert telemetry.words() == "battery low"
+    assert telemetry.battery_low
+    assert telemetry.status_text() == "battery low"
 
 
 def test_two_at_one_address():

@@ -25,7 +25,7 @@ class Air:
         self.board = Board(1)
         self.telemetry = Telemetry(self.board, 0, lighthouse=False)
         self.flight = Flight(Settings(**chosen), self.telemetry, self.pause)
-        self.flight.link = types.SimpleNamespace(cf=self, error=None, reply=lambda _command: (0, 0))
+        self.flight.link = types.SimpleNamespace(cf=self, error=None, planner_reply=lambda _command: (0, 0))
         self.supervisor = self.commander = self.high_level_commander = self
         self.flying, self.info = True, Info.ARMED | Info.CAN_FLY
 
@@ -38,7 +38,7 @@ class Air:
         self.now += seconds
 
     def fly(self):
-        self.board.placed[:], self.board.pose[0] = True, [0.1, 0.2, 0.5, 0.0, 0.0, 0.0, 0.0]
+        self.board.settled[:], self.board.pose[0] = True, [0.1, 0.2, 0.5, 0.0, 0.0, 0.0, 0.0]
         self.flight._enter(Phase.CLIMBING)
         return self.pass_(0.1)
 
@@ -47,11 +47,11 @@ class Air:
         end = self.now + seconds
         while self.now < end:
             self.now += 0.02
-            self.board.told[0] = self.now
+            self.board.status_time[0] = self.now
             self.board.info[0] = int(self.info | (Info.FLYING if self.flying else 0))
-            self.flight.aim(self.now, PLACE)
-            self.flight.watch(self.now)
-            self.flight.guide(self.now)
+            self.flight.set_target(self.now, PLACE)
+            self.flight.update_phase(self.now)
+            self.flight.send_due(self.now)
         return self
 
     def times(self, *whats):
@@ -102,7 +102,7 @@ def test_a_firmware_that_does_not_say_that_it_is_locked_says_that_it_does_not_fl
 def test_a_stop_outlives_the_link(monkeypatch):
     air = Air(monkeypatch, control="high-level").fly()
     air.flight.stop()
-    air.flight.doubt()
+    air.flight.mark_out_of_reach()
     assert air.flight.airborne
     assert air.flight.resume()
     air.sent.clear()

@@ -154,7 +154,7 @@ def test_it_says_whose_position_is_missing_and_why(
     )
     far.hush()
     for message, words in (
-        ({"stamp": 12.5, "yaw": None}, "stamps are UTC seconds, not the time of the simulation"),
+        ({"stamp": 12.5, "yaw": None}, "stamps are UTC seconds, not simulation time"),
         ({"stamp": time.time() - 7.0, "yaw": None}, "s ago by its stamp"),
         ({"stamp": None, "yaw": None}, "no yaw, without which a robot on wheels cannot steer"),
     ):
@@ -188,7 +188,7 @@ def test_what_is_no_position_is_said_and_so_are_settings_and_routers(
     thread = threading.Thread(target=run)
     thread.start()
     try:
-        with pytest.raises(BodyError, match="what is published on park/CF01/position is no position: not a Position"):
+        with pytest.raises(BodyError, match="samples on park/CF01/position are not positions: not a Position"):
             body.open()
     finally:
         stop.set()

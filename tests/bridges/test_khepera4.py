@@ -20,7 +20,7 @@ from agents.decision.position_control import PositionController
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import body as khepera4
 from bridges.khepera4.body import OPEN_S, open_khepera4
-from bridges.khepera4.link import Address, Heard, Link
+from bridges.khepera4.link import Address, Link, Odometry
 from bridges.khepera4.odometry import Odometer
 from tests.twins.loopback import Served, reached, request
 from tests.waiting import until
@@ -148,7 +148,7 @@ def test_velocity_follows_with_a_tenth_of_a_second():
     ],
 )
 def test_addresses(address, expected):
-    assert Address.of("K", address) == expected
+    assert Address.parse("K", address) == expected
 
 
 @pytest.mark.parametrize("address", ["khepera4", "khepera4://", "kteam://10.0.0.3", "khepera4://h:port", "kteam:"])
@@ -175,7 +175,7 @@ def test_nobody_there_is_said_with_the_remedy(impatient):
     assert 1.0 < time.monotonic() - begin < 2.5
     assert OPEN_S < 5.0
     assert f"R0: 127.0.0.1:{port}: Connection refused; start the server on the robot" in str(caught.value)
-    assert "R1: /dev/ttyNONE: No such file or directory; is it plugged in" in str(caught.value)
+    assert "R1: /dev/ttyNONE: No such file or directory; is the line plugged in" in str(caught.value)
 
 
 # ---------------------------------------------------------------------- with twins
@@ -250,7 +250,7 @@ def test_what_goes_wrong_with_one_leaves_the_others_driving(served):
     assert notes[1].startswith("silent for")
     assert "Connection refused" in notes[1] or "closed the connection" in notes[1]
     assert "no answer to" in notes[2]
-    assert notes[3] == "battery at 3%: it does not drive on"
+    assert notes[3] == "battery at 3%: too low to drive"
     assert empty.truth()[0][0, 0] == 0.0
     assert "Connection refused; start the server" in notes[4]
     assert np.isnan(drive.state.position[4]).all()
@@ -321,7 +321,7 @@ def test_the_wrong_protocol_is_named(served, impatient):
     crossed = [park.addresses[0].replace("khepera4", "kteam"), kteam.addresses[0].replace("kteam", "khepera4")]
     with pytest.raises(BodyError) as caught:
         open_khepera4(request("khepera4", crossed)).open()
-    assert str(caught.value).count("it speaks the other protocol") == 2
+    assert str(caught.value).count("the robot uses the other protocol") == 2
     older = served(request("khepera4", ["-"], device=PARK | {"odometry": "increments"}))
     with pytest.raises(BodyError, match=r'answers p with .*, not with 3 numbers; does device = { odometry = "..." }'):
         open_khepera4(request("khepera4", older.addresses)).open()
@@ -388,24 +388,24 @@ def test_wheels_whose_link_breaks_at_the_end_are_stopped_over_another():
 
 
 def test_a_stop_that_is_not_answered_is_said():
-    link = Link("KH01", Address.of("KH01", "khepera4://127.0.0.1"), protocol.Settings(), (0.0, 0.0, 0.0))
+    link = Link("KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Settings(), (0.0, 0.0, 0.0))
     link.drive(0.2, 0.0, 100.0)
-    link.heard = Heard(100.0, 0.0, 0.0, 0.0, (0.2, 0.0))
+    link.odometry = Odometry(100.0, 0.0, 0.0, 0.0, (0.2, 0.0))
     link.halt(100.0)
     link.halt(101.0)  # again, by the watchdog
     assert not link.unanswered(102.0)
     assert link.unanswered(103.0)
-    link.heard = Heard(103.0, 0.0, 0.0, 0.0, (0.0, 0.0))
+    link.odometry = Odometry(103.0, 0.0, 0.0, 0.0, (0.0, 0.0))
     assert not link.unanswered(103.0)
     link.drive(0.2, 0.0, 104.0)
-    link.heard = Heard(110.0, 0.0, 0.0, 0.0, (0.2, 0.0))
+    link.odometry = Odometry(110.0, 0.0, 0.0, 0.0, (0.2, 0.0))
     assert not link.unanswered(110.0)
 
 
 @pytest.mark.system
 def test_a_serial_line_that_another_process_has_is_left_alone():
     ours, theirs = os.openpty()
-    address = Address.of("KH01", f"kteam://{os.ttyname(theirs)}")
+    address = Address.parse("KH01", f"kteam://{os.ttyname(theirs)}")
     first = address.connect()
     link = Link("KH02", address, protocol.Settings(), (0.0, 0.0, 0.0))
     link.start()

@@ -28,7 +28,7 @@ def crazyflie(port):
 
 
 def khepera(port):
-    address = Address.of("R0", f"kteam://localhost:{port}")
+    address = Address.parse("R0", f"kteam://localhost:{port}")
     return open_khepera4(request("khepera4", [f"khepera4://127.0.0.1:{port}"])), address.device
 
 

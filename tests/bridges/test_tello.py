@@ -86,7 +86,7 @@ class Cockpit:
         """In the air, at its place, its motors' clock running."""
         self.pass_(0.2)
         self.pilot.position = (1.0, 2.0, 0.0)
-        self.pilot.rise(0.6, self.now)
+        self.pilot.take_off(0.6, self.now)
         self.pass_(3.0, h=80, time=3)
         self.drone.responses.append(b"ok")
         self.pass_(0.05)
@@ -100,7 +100,7 @@ def test_a_take_off_is_said_once_and_answered_when_it_is_up():
     cockpit.pilot.position = (1.0, 2.0, 0.0)
     cockpit.drone.said.clear()
     cockpit.drone.responses.append(b"ok")  # of something that was said before
-    cockpit.pilot.rise(0.6, cockpit.now)
+    cockpit.pilot.take_off(0.6, cockpit.now)
     assert cockpit.pilot.flying
     cockpit.pass_(0.5)
     assert cockpit.pilot.duty is Duty.RISE
@@ -121,7 +121,11 @@ def test_it_climbs_to_its_height_and_holds_its_place_until_setpoints_come():
     cockpit.pilot.position = (np.nan,) * 3
     cockpit.pass_(0.05)
     assert cockpit.drone.sticks[-1] == (0, 0, 0, 0)
-    cockpit.pilot.duty, cockpit.pilot.setpoint, cockpit.pilot.set_at = Duty.FLY, (0.0, 0.3, 0.0, 0.0), cockpit.now
+    cockpit.pilot.duty, cockpit.pilot.setpoint, cockpit.pilot.setpoint_time = (
+        Duty.FLY,
+        (0.0, 0.3, 0.0, 0.0),
+        cockpit.now,
+    )
     cockpit.pass_(0.5)
     assert cockpit.drone.sticks[-1] == (-30, 0, 0, 0)
     cockpit.pass_(0.1)
@@ -141,7 +145,7 @@ def test_a_drone_that_refuses_says_so(answer):
     cockpit = Cockpit()
     cockpit.pass_(0.2)
     cockpit.pilot.position = (0.0, 0.0, 0.0)
-    cockpit.pilot.rise(0.6, cockpit.now)
+    cockpit.pilot.take_off(0.6, cockpit.now)
     cockpit.drone.responses.append(answer)
     cockpit.pass_(0.1)
     assert cockpit.pilot.duty is Duty.REST
@@ -153,7 +157,7 @@ def test_lost_answers_and_lost_commands():
     cockpit.pass_(0.2)
     cockpit.pilot.position = (0.0, 0.0, 0.0)
     cockpit.drone.said.clear()
-    cockpit.pilot.rise(0.6, cockpit.now)
+    cockpit.pilot.take_off(0.6, cockpit.now)
     cockpit.pass_(6.5)  # nothing happens: the command was lost
     assert cockpit.drone.said == ["takeoff", "takeoff"]
     cockpit.pass_(6.5, h=80, time=6)  # it is up: the answer was lost
@@ -170,7 +174,7 @@ def test_a_second_take_off_that_is_refused_means_that_it_flies():
     cockpit = Cockpit()
     cockpit.pass_(0.2)
     cockpit.pilot.position = (0.0, 0.0, 0.0)
-    cockpit.pilot.rise(0.6, cockpit.now)
+    cockpit.pilot.take_off(0.6, cockpit.now)
     cockpit.pass_(2.0, h=80)
     cockpit.drone.responses.append(b"error")
     cockpit.pass_(0.1)
@@ -181,7 +185,7 @@ def test_a_drone_that_never_gets_up_is_landed():
     cockpit = Cockpit()
     cockpit.pass_(0.2)
     cockpit.pilot.position = (0.0, 0.0, 0.0)
-    cockpit.pilot.rise(0.6, cockpit.now)
+    cockpit.pilot.take_off(0.6, cockpit.now)
     cockpit.pass_(20.2)
     assert cockpit.drone.said[-1] == "land"
     assert not cockpit.pilot.flying
@@ -247,7 +251,7 @@ def test_a_take_off_that_is_stopped_at_once_is_told_until_it_stands():
     cockpit = Cockpit()
     cockpit.pass_(5.0)
     cockpit.pilot.position = (1.0, 2.0, 0.0)
-    cockpit.pilot.rise(0.6, cockpit.now)
+    cockpit.pilot.take_off(0.6, cockpit.now)
     cockpit.pass_(0.1)
     cockpit.pilot.cut(cockpit.now)  # its motors' clock has not moved yet
     cockpit.pass_(1.4)
@@ -287,7 +291,7 @@ def test_a_drone_that_landed_by_itself_is_seen():
     cockpit = Cockpit().fly()
     cockpit.pass_(3.5, h=0)
     assert not cockpit.pilot.flying
-    assert cockpit.pilot.note(cockpit.now) == "it has landed by itself, battery at 80%"
+    assert cockpit.pilot.note(cockpit.now) == "landed by itself, battery at 80%"
 
 
 def test_a_silent_drone_is_told_to_land_until_it_must_have_landed():
@@ -433,7 +437,7 @@ def test_what_goes_wrong_with_one_leaves_the_others_flying():
     assert flown["opened"] > 1.0
     assert flown["flying"] == [True, True, True, True, False, False]
     assert (said["absent"], said["absent takeoff"], said["blind"]) == ("no answer", "no answer", True)
-    assert said["empty"] == "does not take off: battery at 8%"
+    assert said["empty"] == "no take-off: battery at 8%"
     assert said["killed"].startswith("silent for")
     assert said["silent"].startswith("silent for")
     assert said["weak"] == "landing: battery at 9%"
@@ -446,7 +450,7 @@ def test_what_does_not_take_off_says_why():
     flown = fly("refusals")
     assert flown["seconds"] < 5.0
     assert flown["said"]["absent"].startswith("R0 at 127.0.0.77:18889: no answer (switch it on, join its Wi-Fi")
-    assert flown["said"]["nowhere"].startswith("does not take off: no fresh external position")
+    assert flown["said"]["nowhere"].startswith("no take-off: no fresh external position")
     assert flown["said"]["hung"] == "landing: its process did nothing for 2 s"
     assert flown["said"]["second"].startswith("UDP port 8889 of this computer is taken")
     assert not flown["flying"]

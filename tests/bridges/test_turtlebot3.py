@@ -334,7 +334,7 @@ def test_the_wrong_type_of_command_moves_nothing_and_is_said(hub, style):
         assert stage.moved(1.0, stage.constant(0.2))[0] == 0.0
         assert stage.twin.heard == [0]
         assert stage.state.notes[0] == (
-            "does not hear cmd_vel: it hears a geometry_msgs/msg/Twist, "
+            "cmd_vel is not received: the robot expects a geometry_msgs/msg/Twist, "
             "we send a geometry_msgs/msg/TwistStamped as on jazzy: set distro or stamped"
         )
 
@@ -347,7 +347,7 @@ def test_a_robot_that_does_not_move_is_said_so(hub):
         stage.run(1.0, stage.constant(0.2))
         assert stage.state.notes == ("",)
         stage.run(1.0, stage.constant(0.2))
-        assert stage.state.notes[0].startswith("is told to move and does not: motors on?")
+        assert stage.state.notes[0].startswith("does not move despite commands: motors on?")
         stage.run(0.1, stage.constant(0.0))
         assert stage.state.notes == ("",)
 
@@ -452,7 +452,7 @@ def test_a_killed_robot_goes_stale_and_comes_back(hub, eventually):
     last = read()
     assert time.monotonic() - zero - last.time[0] > 0.5
     twin = TwinProcess(hub.endpoint)  # counts from zero again
-    eventually(lambda: read().notes[0].startswith("odometry was started anew"))
+    eventually(lambda: read().notes[0].startswith("odometry was restarted"))
     assert abs(read().position[0, 0] - last.position[0, 0]) < 0.1
     eventually(lambda: read().position[0, 0] > last.position[0, 0] + 0.1)
     body.close()

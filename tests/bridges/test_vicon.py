@@ -25,7 +25,7 @@ from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Segment
 from bridges.vicon import publisher
 from bridges.vicon.client import Frame
-from bridges.vicon.publisher import Sieve, heading, pairs, split
+from bridges.vicon.publisher import PoseFilter, heading, parse_maps, parse_server
 from experiments.file import document
 from tests.conftest import ROOT, RouterProcess
 from tests.system.lab import RobotProcess, Watcher, until
@@ -68,8 +68,8 @@ def test_a_step_of_the_wall_clock_moves_no_position(monkeypatch: pytest.MonkeyPa
         def publish(self, _robot: str, stamp: float, *_: object) -> None:
             stamps.append(stamp)
 
-    sieve = Sieve({"CF01": "CF01"}, lambda _: None)
-    bridge = publisher.Bridge("nowhere", 1, sieve, Ear(), lambda _: None)  # type: ignore[arg-type]
+    pose_filter = PoseFilter({"CF01": "CF01"}, lambda _: None)
+    bridge = publisher.Bridge("nowhere", 1, pose_filter, Ear(), lambda _: None)  # type: ignore[arg-type]
     assert bridge.run(lambda: Frames.steady > 7.0)
     assert len(stamps) > 150
     np.testing.assert_allclose(np.diff(stamps), 0.01, atol=1e-6)
@@ -97,19 +97,21 @@ def test_the_heading_is_where_the_nose_points_and_only_of_rotations(
 
 def test_what_was_not_seen_is_not_said() -> None:
     said: list[str] = []
-    sieve = Sieve({"CF01": "cf_1", "KH01": "kh_1"}, said.append)
+    pose_filter = PoseFilter({"CF01": "cf_1", "KH01": "kh_1"}, said.append)
     nan = Segment(0, (math.nan, 0.0, 0.0), UPRIGHT)
     flat = Segment(0, (0.0, 0.0, 0.0), (0.0,) * 9)
-    (first,) = sieve.sift(frame(cf_1=(0.1, 0.2, 0.3), kh_1=None, other=(0.0, 0.0, 0.0), latency=0.004), 1.0)
+    (first,) = pose_filter.filter_poses(
+        frame(cf_1=(0.1, 0.2, 0.3), kh_1=None, other=(0.0, 0.0, 0.0), latency=0.004), 1.0
+    )
     assert first == ("CF01", 0.996, Segment(0, (0.1, 0.2, 0.3), UPRIGHT), pytest.approx(0.3))
     for pose in (nan, flat, None):
-        assert sieve.sift(frame(cf_1=pose, kh_1=pose), 1.1) == []
-    assert sieve.refused == 4
+        assert pose_filter.filter_poses(frame(cf_1=pose, kh_1=pose), 1.1) == []
+    assert pose_filter.refused == 4
     assert said == [
         "CF01 is seen as 'cf_1'",
         "KH01 is not seen: markers hidden, or subject 'kh_1' is switched off",
     ]
-    sieve.sift(frame(other=(0.0, 0.0, 0.0)), 1.6)
+    pose_filter.filter_poses(frame(other=(0.0, 0.0, 0.0)), 1.6)
     assert said[2:] == [
         "CF01: no subject 'cf_1' (there are: other); name another with --map CF01=SUBJECT",
         "KH01: no subject 'kh_1' (there are: other); name another with --map KH01=SUBJECT",
@@ -117,46 +119,48 @@ def test_what_was_not_seen_is_not_said() -> None:
 
 
 def test_a_jump_is_not_believed_until_it_has_lasted() -> None:
-    sieve = Sieve({"CF01": "CF01"}, lambda _: None)
+    pose_filter = PoseFilter({"CF01": "CF01"}, lambda _: None)
     believed = []
     for tick in range(200):
         t = 0.01 * tick
         x = 0.5 * t  # half a metre a second, with an excursion of one frame and one that stays
         jump = 1.0 if tick == 50 or tick >= 100 else 0.0
-        believed += [(tick, s.position[0]) for _, _, s, _ in sieve.sift(frame(CF01=(x + jump, 0.0, 1.0)), t)]
+        believed += [
+            (tick, s.position[0]) for _, _, s, _ in pose_filter.filter_poses(frame(CF01=(x + jump, 0.0, 1.0)), t)
+        ]
     ticks = [tick for tick, _ in believed]
     assert [tick for tick in range(200) if tick not in ticks] == [
         50,
         *range(100, 121),
     ]  # 1 m in 0.22 s a robot could just have flown
-    assert sieve.refused == 22
+    assert pose_filter.refused == 22
     steps = np.diff([x for _, x in believed])
     assert np.sort(steps)[-2:] == pytest.approx([0.01, 1.11], abs=1e-9)
 
 
 def test_frames_that_overtake_each_other_and_axes_that_lie_are_left_out() -> None:
     said: list[str] = []
-    sieve = Sieve({"CF01": "CF01"}, said.append)
-    assert len(sieve.sift(frame(CF01=(0.0, 0.0, 1.0)), 1.00)) == 1
-    assert sieve.sift(frame(CF01=(0.0, 0.0, 1.0), latency=0.02), 1.01) == []  # measured before the last
-    assert sieve.sift(frame(CF01=(0.0, 0.0, 1.0), z_up=False), 1.02) == []
-    assert len(sieve.sift(frame(CF01=(0.0, 0.0, 1.0)), 1.03)) == 1
+    pose_filter = PoseFilter({"CF01": "CF01"}, said.append)
+    assert len(pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0)), 1.00)) == 1
+    assert pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0), latency=0.02), 1.01) == []  # measured before the last
+    assert pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0), z_up=False), 1.02) == []
+    assert len(pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0)), 1.03)) == 1
     assert said[1:] == [
-        "no positions: the server's z axis does not point up; set it so in its options",
+        "no positions: the server's z axis does not point up; change this in its options",
         "the z axis points up",
     ]
 
 
 def test_the_command_line_is_understood_or_refused() -> None:
-    assert split("vicon") == ("vicon", 801)
-    assert split("10.0.0.7:8801") == ("10.0.0.7", 8801)
-    assert pairs(["CF01=cf_1", "KH01"]) == {"CF01": "cf_1", "KH01": "KH01"}
+    assert parse_server("vicon") == ("vicon", 801)
+    assert parse_server("10.0.0.7:8801") == ("10.0.0.7", 8801)
+    assert parse_maps(["CF01=cf_1", "KH01"]) == {"CF01": "cf_1", "KH01": "KH01"}
     for wrong in ("", ":801", "host:", "host:0", "host:99999", "host:x"):
         with pytest.raises(ValueError, match="neither HOST nor HOST:PORT"):
-            split(wrong)
+            parse_server(wrong)
     for maps in (["=cf_1"], ["CF01="], ["CF01", "CF01=a"], ["CF01=a", "CF02=a"]):
         with pytest.raises(ValueError, match=r"neither ROBOT|another --map"):
-            pairs(maps)
+            parse_maps(maps)
 
 
 # ---------------------------------------------------------------------- the process
@@ -343,7 +347,7 @@ def test_a_wrong_host_is_said_and_ends_it(
     assert publisher.main([f"127.0.0.1:{port}", "--map", "CF01", "--connect", router.endpoint]) == 2
     first, *_, last = capsys.readouterr().err.splitlines()
     assert first == f"vicon: no connection to 127.0.0.1:{port}: Connection refused; trying again"
-    assert f"nobody answered at 127.0.0.1:{port} in 0.8 s" in last
+    assert f"no answer from 127.0.0.1:{port} in 0.8 s" in last
     assert "firewall let TCP port" in last
     wrong = start("127.0.0.1:vicon", "--map", "CF01")
     assert wrong.wait() == 2

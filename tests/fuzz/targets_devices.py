@@ -91,7 +91,7 @@ def khepera_bridge() -> Iterator[Target]:
         else:
             driver = Park(line, Settings(odometry="pose" if which[:1] == b"p" else "increments"))
             driver._free = -np.inf
-            driver._say = line.send  # type: ignore[method-assign]  # without the pause
+            driver._send_command = line.send  # type: ignore[method-assign]  # without the pause
         driver.begin()
         if isinstance(driver, KTeam):
             driver.drive(0.1, 0.2)
@@ -131,10 +131,10 @@ def _vicon_stream() -> list[bytes]:
 def vicon_bridge() -> Iterator[Target]:
     """What a DataStream server sends, in chunks."""
     from bridges.vicon.client import Decoder  # noqa: PLC0415
-    from bridges.vicon.publisher import Sieve  # noqa: PLC0415
+    from bridges.vicon.publisher import PoseFilter  # noqa: PLC0415
 
     def make():
-        decoder, sieve, t = Decoder(), Sieve({"CF01": "cf1", "KH01": "kh1"}, lambda _: None), 0.0
+        decoder, pose_filter, t = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None), 0.0
 
         def take(data: bytes) -> None:
             nonlocal t
@@ -147,7 +147,7 @@ def vicon_bridge() -> Iterator[Target]:
                             vicon_datastream.unpack_kinds(payload)
                     frame = decoder.frame(body)
                     if frame is not None:
-                        for _, measured, segment, yaw in sieve.sift(frame, t):
+                        for _, measured, segment, yaw in pose_filter.filter_poses(frame, t):
                             assert np.isfinite((measured, yaw, *segment.position)).all()
 
         return take

@@ -194,7 +194,7 @@ def tello_pilot() -> Iterator[Target]:
             drone.state = parsed
             drone.responses.append(answer)
             if len(data) % 8 == 0:
-                pilot.rise(0.5, now)
+                pilot.take_off(0.5, now)
             pilot.step(now, now)
             assert isinstance(pilot.note(now), str)
 

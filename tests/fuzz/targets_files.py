@@ -344,7 +344,7 @@ def words() -> Iterator[Target]:
     from agents.protocols import crazyflie, khepera4, tello, turtlebot3  # noqa: PLC0415
     from bridges.crazyflie.positioning import stations  # noqa: PLC0415
     from bridges.khepera4.link import Address  # noqa: PLC0415
-    from bridges.vicon.publisher import split  # noqa: PLC0415
+    from bridges.vicon.publisher import parse_server  # noqa: PLC0415
     from experiments.definition.links import pairs  # noqa: PLC0415
     from tools.commands.network import KeyExpressionError, key_expression  # noqa: PLC0415
     from twins.devices import vicon  # noqa: PLC0415
@@ -366,10 +366,10 @@ def words() -> Iterator[Target]:
         read: dict[str, Callable[[str], object]] = {
             "endpoint": lambda text: sessions.config(sessions.settings("client", connect=[text], listen=[text])),
             "crazyflie": lambda text: crazyflie.address("R1", text),
-            "khepera": lambda text: Address.of("R1", text),
+            "khepera": lambda text: Address.parse("R1", text),
             "tello": lambda text: tello.endpoint("R1", text),
             "turtlebot": lambda text: turtlebot3.address("R1", text, turtlebot3.Settings()),
-            "vicon": split,
+            "vicon": parse_server,
             "listen": vicon._address,
             "faults": vicon._faults,
             "device": device,
