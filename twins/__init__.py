@@ -1,1 +1,4 @@
-"""Bodies that are simulated: row-wise models of the robots and what nature adds to them."""
+"""Simulated bodies: models of robots in rows, engines, sensors, disturbances, and protocol twins of devices.
+
+May import agents.
+"""

@@ -1,4 +1,4 @@
-"""The twin: simulated bodies behind the same seam as the hardware, alone in a process or together in a world."""
+"""Simulated bodies behind the same interface as the hardware, in the robot's process or together in a world."""
 
 from __future__ import annotations
 
@@ -17,33 +17,28 @@ from twins.models.noise import Noise
 from twins.scene import World
 from twins.sensing.range_sensors import RangeSensors
 
-CATCH_UP_S = 1.0  # a process that was frozen for longer resumes where it was: time it could not see did not pass
-FULL_WOBBLE = 0.2  # [m] from the ground up to here hover jitter grows: a robot that stands does not wobble
+CATCH_UP_S = 1.0  # a process that was frozen for longer resumes where it was: the lost time is not simulated
+FULL_WOBBLE = 0.2  # [m] hover jitter grows from the ground up to this height: a standing robot has none
 ENDURANCE_S = {"crazyflie": 420.0, "tello": 780.0, "khepera4": 18000.0, "turtlebot3": 9000.0}  # makers' figures
 
 
 class TwinBody:
-    """Rows of any simulated kinds; implements `agents.body.interface.Body`. Advances itself to the time at which it is
-    read.
-
-    Attributes:
-        engine: What moves the rows.
-        begun_at: Time of the common start on the clock of `read` [s], NaN while that is not known: what moves
-            by a plan begins then.
-    """
+    """Simulated robots of any kinds; implements `agents.body.interface.Body`. Advances to the time of each `read`."""
 
     def __init__(self, request: BodyRequest, world: World | None = None) -> None:
-        """Without a world every row is by itself.
+        """Without a world every row is alone.
 
         Raises:
-            BodyError: If there is no twin of one of the kinds, or the engine cannot be had.
-            plugins.PluginError: If there is no such engine.
+            BodyError: If a kind has no twin, or the engine's library is missing.
+            plugins.PluginError: If the engine is unknown.
         """
         kinds = request.kinds
         rows = len(kinds)
         self._dt = 1.0 / request.rate_hz
         self._t = 0.0
-        self.begun_at = np.nan
+        self.begun_at = (
+            np.nan
+        )  # common start on the clock of `read` [s], NaN while unknown; obstacles' plans start then
         self._world = world if world is not None else World.alone(rows)
         stage = Stage(
             kinds, request.start, request.yaw, self._dt, self._world.copy, self._world.mirrored, self._world.scene
@@ -66,7 +61,7 @@ class TwinBody:
         self._sensors = RangeSensors(request, self._world) if any(self._world.sensors) else None
         self._endurance = np.array([ENDURANCE_S[k.name] for k in kinds])
         self._used = np.zeros(rows)
-        self._outside = np.flatnonzero(request.external)
+        self._external_rows = np.flatnonzero(request.external)
         self._external = External(rows)
         self._measured_at, self._measured, self._velocity = -inf, np.zeros((rows, 3)), np.zeros((rows, 3))
         self._state = self._measure()
@@ -110,24 +105,24 @@ class TwinBody:
         self._external.update(row, t, position, yaw)
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask, velocity: Array | None = None) -> None:
-        """Puts rows somewhere: (len(rows), 3) [m], (len(rows),) [rad]; flying rows hold that place.
+        """Set positions (len(rows), 3) [m] and yaws (len(rows),) [rad]; flying rows hold them.
 
-        They are at rest, or move with a `velocity` (len(rows), 3) [m/s] if the engine is of point masses.
+        The rows are at rest, or move with `velocity` (len(rows), 3) [m/s] in the point-mass engine.
         """
         self.engine.place(rows, position, yaw, flying)
         if velocity is not None and isinstance(self.engine, PointMassEngine):
             self.engine.push(rows, velocity)
         self._state = self._measure()
         self._velocity = self._velocity.copy()
-        self._velocity[rows] = 0.0 if velocity is None else velocity  # the way to the place was no motion
+        self._velocity[rows] = 0.0 if velocity is None else velocity  # the jump to the place is no motion
         self._state.velocity = self._velocity
 
     def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
-        """Where mirrored rows are: (len(rows), 3) [m], (len(rows),) [rad], (len(rows), 3) [m/s]; NaN: not there."""
+        """Set the state of mirrored rows: (len(rows), 3) [m], (len(rows),) [rad], (len(rows), 3) [m/s]; NaN: absent."""
         self.engine.mirror(rows, position, yaw, velocity)
 
     def touches(self) -> list[Touch]:
-        """Contacts that began since this was asked last."""
+        """Contacts that began since the last call."""
         return self.engine.touches()
 
     def close(self) -> None:
@@ -136,13 +131,13 @@ class TwinBody:
     def _advance(self, t: float) -> None:
         engine = self.engine
         if self._latency.present:
-            engine.command(self._latency.pass_on(self._command))
-            self._command = np.full_like(self._command, np.nan)  # one command moves a body once: silence must show
+            engine.command(self._latency.delay(self._command))
+            self._command = np.full_like(self._command, np.nan)  # a command acts once, so that silence has its effect
         before = engine.position[:, :2].copy() if self._drift.present else None
         if self._jitter.present:
             self._jitter.advance()
             share = np.minimum(engine.position[self._in_air, 2] / FULL_WOBBLE, 1.0)
-            self._wobble = np.zeros((len(self._used), 2))  # engines may keep the last one
+            self._wobble = np.zeros((len(self._used), 2))  # a new array: engines may keep the last one
             self._wobble[self._in_air] = share[:, None] * self._jitter.displacement
         engine.advance(t - self.begun_at if isfinite(self.begun_at) else -inf, self._wobble)
         self._used += self._dt * (engine.flying | self._drives)
@@ -175,28 +170,28 @@ class TwinBody:
             rays=None if self._sensors is None else self._sensors.rays,
             attitude=engine.attitude,
         )
-        if len(self._outside):
+        if len(self._external_rows):
             state.position, state.velocity, state.yaw = measured.copy(), self._velocity.copy(), heading.copy()
-            self._external.fill(state, self._outside)
+            self._external.fill(state, self._external_rows)
         return state
 
     def _estimate(self, measured: Array) -> None:
-        """Velocity as robots know theirs: from what they measure, wobble and noise included.
+        """Estimate velocities from measured positions, hover jitter and noise included.
 
-        Motion capture measures positions (`External`), a Khepera's odometry as well. A Crazyflie with a positioning
-        system of its own estimates its velocity on board with its accelerometer too (Mueller, Hamer and D'Andrea,
-        ICRA 2015), hence with less noise; the wobble, which is a motion of its, it knows as well.
+        Motion capture measures positions (`External`), and so does a Khepera's odometry. A Crazyflie with a positioning
+        system on board also uses its accelerometer (Mueller, Hamer and D'Andrea, ICRA 2015), hence has less noise; it
+        also measures its own hover jitter.
         """
         since = self._t - self._measured_at
         if since >= PATIENCE_S:
             self._velocity = np.zeros_like(self._velocity)
         elif since > 0.0:
             velocity = velocity_after(self._velocity, measured - self._measured, since)
-            known = np.isfinite(velocity)  # a mirrored robot may be out of sight
+            known = np.isfinite(velocity)  # a mirrored robot may be absent
             self._velocity = velocity if every(known) else np.where(known, velocity, 0.0)
         self._measured_at, self._measured = self._t, measured
 
 
 def open_twin(request: BodyRequest) -> TwinBody:
-    """The entry point `twin` of the group `zenpark.bodies`."""
+    """Entry point `twin` of the group `zenpark.bodies`."""
     return TwinBody(request)

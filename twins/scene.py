@@ -1,4 +1,4 @@
-"""What stands in an arena, seen from above: outlines, and how far points are from them."""
+"""Scene: arena and obstacles as outlines in the plane, their motion, and distances from points to them."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Obstacle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     wall: Annotated[
         Annotated[list[Planar], Meta(min_length=2)] | None, Meta(description="points of a thin wall, x, y [m]")
     ] = None
-    at: Annotated[Planar, Meta(description="its middle, x, y [m]; a wall's points are counted from there")] = (0.0, 0.0)
+    at: Annotated[Planar, Meta(description="centre x, y [m]; a wall's points are relative to it")] = (0.0, 0.0)
     yaw: Annotated[float, Meta(description="[rad]")] = 0.0
     height: Annotated[Positive | None, Meta(description="[m]; left out: up to the ceiling")] = None
-    bottom: Annotated[NotNegative, Meta(description="how high over the floor it begins [m]")] = 0.0
-    mass: Annotated[Positive | None, Meta(description="[kg]: it can be pushed; left out: it stands fast")] = None
-    friction: Annotated[NotNegative, Meta(description="with the floor, of one that can be pushed")] = 0.5
-    plan: Annotated[str | dict[str, Any] | None, Meta(description="a planner that moves it")] = None
+    bottom: Annotated[NotNegative, Meta(description="height of the lower side above the floor [m]")] = 0.0
+    mass: Annotated[Positive | None, Meta(description="[kg], can be pushed; left out: fixed")] = None
+    friction: Annotated[NotNegative, Meta(description="with the floor, of an obstacle with a mass")] = 0.5
+    plan: Annotated[str | dict[str, Any] | None, Meta(description="planner that moves the obstacle")] = None
 
     def __post_init__(self) -> None:
         if sum(part is not None for part in (self.box, self.radius, self.wall)) != 1:
@@ -47,43 +47,29 @@ class Obstacle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 @dataclass(frozen=True)
 class Scene:
-    """An arena as engines and sensors see it; obstacles (M), their poses in rows of x, y, yaw.
+    """Arena and M obstacles, as used by engines and sensors."""
 
-    Attributes:
-        low: (3,) corner of the arena [m].
-        high: (3,) the other corner [m].
-        walled: The arena's border is a wall.
-        names: Of the obstacles (M).
-        outline: Corners (k, 2) of each box in its own frame, against the clock; points of a wall; None of a cylinder.
-        closed: Whether the outline is one of a box (a wall is open).
-        radius: (M,) of cylinders [m], 0 of the others.
-        pose: (M, 3) x, y [m], yaw [rad] at the common start.
-        bottom: (M,) [m].
-        top: (M,) [m].
-        mass: (M,) [kg], infinite where it cannot be pushed.
-        friction: (M,) with the floor.
-        plans: What moves each; None: nothing.
-    """
-
-    low: Array
-    high: Array
-    walled: bool
-    names: tuple[str, ...]
-    outline: tuple[Array | None, ...]
-    closed: tuple[bool, ...]
-    radius: Array
-    pose: Array
-    bottom: Array
-    top: Array
-    mass: Array
-    friction: Array
-    plans: tuple[Planner | None, ...]
+    low: Array  # (3,) corner of the arena [m]
+    high: Array  # (3,) opposite corner [m]
+    walled: bool  # the arena's border is a wall
+    names: tuple[str, ...]  # of the obstacles (M)
+    outline: tuple[
+        Array | None, ...
+    ]  # own frame: corners (k, 2) of a box, anticlockwise; points of a wall; None: cylinder
+    closed: tuple[bool, ...]  # box; a wall is open
+    radius: Array  # (M,) of cylinders [m], 0 for others
+    pose: Array  # (M, 3) x, y [m], yaw [rad] at the common start
+    bottom: Array  # (M,) [m]
+    top: Array  # (M,) [m]
+    mass: Array  # (M,) [kg], infinite if fixed
+    friction: Array  # (M,) with the floor
+    plans: tuple[Planner | None, ...]  # planner of each moving obstacle; None: not moved
 
     @classmethod
     def furnished(
         cls, size: Sequence[float], obstacles: Mapping[str, Obstacle], plans: Mapping[str, Planner], *, walled: bool
     ) -> Scene:
-        """An arena of `size` (3) [m], centred on the origin, with obstacles; `plans` of those that move."""
+        """Arena of `size` (3) [m], centred on the origin, with obstacles; `plans`: planners of moving obstacles."""
         x, y, z = size
         given = tuple(obstacles.values())
         return cls(
@@ -104,7 +90,7 @@ class Scene:
 
     @classmethod
     def empty(cls, size: Sequence[float] = (1e3, 1e3, 1e3)) -> Scene:
-        """Room without walls or obstacles."""
+        """Arena without walls or obstacles."""
         return cls.furnished(size, {}, {}, walled=False)
 
     @property
@@ -113,7 +99,7 @@ class Scene:
         return np.array([k for k, plan in enumerate(self.plans) if plan is not None], dtype=np.intp)
 
     def along(self, time: Array) -> Array:
-        """Poses (T, M, 3) at times (T,) after the common start [s]; what can be pushed is where it stood then."""
+        """Planned poses (T, M, 3) at times (T,) after the common start [s]; obstacles without a plan stay in place."""
         pose = np.tile(self.pose, (len(time), 1, 1))
         elapsed = np.maximum(time, 0.0)
         for k, plan in enumerate(self.plans):
@@ -129,9 +115,9 @@ class Scene:
         return np.asarray(self.along(np.array([t]))[0])
 
     def edges(self) -> tuple[Array, Index]:
-        """Straight edges (S, 2, 2), each in the frame of its obstacle, and the number (S,) of that obstacle.
+        """Straight edges (S, 2, 2), each in the frame of its obstacle, and that obstacle's number (S,).
 
-        The arena's own walls come last, in the frame of the room, under the number −1.
+        The arena's own walls come last, in the world frame, under the number −1.
         """
         edges: list[Array] = []
         owners: list[int] = []
@@ -160,14 +146,14 @@ def _outline(obstacle: Obstacle) -> Array | None:
 
 
 def corners(outline: Array, pose: Array) -> Array:
-    """Corners (..., k, 2) in the room [m] of an outline (k, 2) at poses (..., 3)."""
+    """Corners (..., k, 2) in the world frame [m] of an outline (k, 2) at poses (..., 3)."""
     cos, sin = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
     x, y = outline[:, 0], outline[:, 1]
     return np.stack([cos * x - sin * y + pose[..., 0, None], sin * x + cos * y + pose[..., 1, None]], axis=-1)
 
 
 def reach(scene: Scene, obstacle: int) -> tuple[Array, Array]:
-    """Least and largest x, y (2,) [m] that an obstacle reaches to, where it stands at the start."""
+    """Smallest and largest x, y (2,) [m] of an obstacle at the start."""
     pose, outline = scene.pose[obstacle], scene.outline[obstacle]
     if outline is None:
         return pose[:2] - scene.radius[obstacle], pose[:2] + scene.radius[obstacle]
@@ -179,9 +165,9 @@ def distance(scene: Scene, obstacle: int, pose: Array, point: Array) -> Array:
     """Distance (...) in the plane from points to an obstacle [m]; negative inside a box or a cylinder.
 
     Args:
-        scene: Where it stands.
-        obstacle: Its number.
-        pose: (..., 3) where it is, x, y [m] and yaw [rad].
+        scene: Scene of the obstacle.
+        obstacle: Number of the obstacle.
+        pose: (..., 3) x, y [m] and yaw [rad] of the obstacle.
         point: (..., 2) [m].
     """
     outline = scene.outline[obstacle]
@@ -203,12 +189,12 @@ def distance(scene: Scene, obstacle: int, pose: Array, point: Array) -> Array:
 
 
 def at_height(scene: Scene, obstacle: int, low: Array | float, high: Array | float) -> Mask:
-    """Whether bodies from `low` to `high` (...) [m] are at the height of an obstacle."""
+    """Whether bodies between heights `low` and `high` (...) [m] overlap an obstacle in height."""
     return np.asarray((low < scene.top[obstacle]) & (high > scene.bottom[obstacle]))
 
 
 def outside(scene: Scene, obstacle: int) -> bool:
-    """Whether all of an obstacle stands outside the arena at the start."""
+    """Whether an obstacle is entirely outside the arena at the start."""
     pose, outline = scene.pose[obstacle], scene.outline[obstacle]
     low, high = scene.low[:2], scene.high[:2]
     if outline is None:
@@ -221,7 +207,7 @@ def outside(scene: Scene, obstacle: int) -> bool:
 
 
 def _apart(polygon: Array, low: Array, high: Array) -> bool:
-    """Whether a convex polygon (k, 2), or a segment, and a rectangle have no point in common: some line parts them."""
+    """Whether a convex polygon (k, 2) or segment and a rectangle are disjoint, by the separating axis theorem."""
     edge = np.roll(polygon, -1, axis=0) - polygon
     axes = np.concatenate([np.eye(2), np.stack([-edge[:, 1], edge[:, 0]], axis=1)])
     rectangle = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
@@ -232,26 +218,16 @@ def _apart(polygon: Array, low: Array, high: Array) -> bool:
 
 @dataclass(frozen=True)
 class World:
-    """The place that twins share.
+    """World shared by twins."""
 
-    Attributes:
-        copy: (n,) which copy of it a row is in: repetitions of an experiment are as many copies.
-        scene: What stands there.
-        engine: A registered engine: its name, or a table with its `kind` and parameters.
-        sensors: The range sensors of each row, by name (`twins.sensing.range_sensors.SENSORS`).
-        sensor_noise: Of the range sensors, as a multiple of the real ones'.
-        mirrored: (n,) rows that are elsewhere in reality, and appear here where they are said to be.
-    """
-
-    copy: Index
+    copy: Index  # (n,) copy of the scene of each row; one copy per repetition of an experiment
     scene: Scene
-    engine: str | Mapping[str, object]
-    sensors: tuple[tuple[str, ...], ...]
-    sensor_noise: float
-    mirrored: Mask
+    engine: str | Mapping[str, object]  # registered engine: name, or table with `kind` and parameters
+    sensors: tuple[tuple[str, ...], ...]  # range sensors of each row, by name (`twins.sensing.range_sensors.SENSORS`)
+    sensor_noise: float  # of the range sensors, as a multiple of the real noise
+    mirrored: Mask  # (n,) robots that really are elsewhere, shown here at their received poses
 
     @classmethod
     def alone(cls, rows: int) -> World:
-        """Every row by itself, in a room without end."""
-        nobody = np.zeros(rows, dtype=bool)
-        return cls(np.arange(rows), Scene.empty(), "point-mass", ((),) * rows, 1.0, nobody)
+        """Every row alone in an unlimited empty scene."""
+        return cls(np.arange(rows), Scene.empty(), "point-mass", ((),) * rows, 1.0, np.zeros(rows, dtype=bool))

@@ -435,7 +435,7 @@ def test_kteam_over_a_serial_line():
                 *lines, begun = (begun + os.read(ours, 255)).split(b"\r")
                 for line in lines:
                     heard.append(line.decode())
-                    os.write(ours, f"{twin.kteam(robot, line.decode())}\r\n".encode())
+                    os.write(ours, f"{twin.answer_kteam(robot, line.decode())}\r\n".encode())
 
     server = threading.Thread(target=serve, daemon=True)
     server.start()

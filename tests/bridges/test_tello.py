@@ -366,7 +366,7 @@ def test_wrong_addresses_are_named(address):
 
 
 def test_rows_that_cannot_be_flown():
-    with pytest.raises(BodyError, match='R0: a Tello does not know where it is: write position = "external"'):
+    with pytest.raises(BodyError, match='R0: a Tello does not measure its position: write position = "external"'):
         open_tello(request("tello", ["tello"]))
     with pytest.raises(BodyError, match=r"R1: another Tello of this process has the address 10\.0\.0\.2"):
         open_tello(request("tello", ["tello://10.0.0.2", "tello://10.0.0.2:1"], external=True))

@@ -149,7 +149,7 @@ def test_drives_to_goals(hub, style, distro):
         state = stage.run(0.1)
         np.testing.assert_allclose(state.position[:, :2], start, atol=1e-6)
         np.testing.assert_allclose(state.yaw, (1.0, -2.0), atol=1e-6)
-        assert stage.twin.heard == [0, 0]  # rows of NaN are not sent
+        assert stage.twin.commands_received == [0, 0]  # rows of NaN are not sent
         state = stage.run(9.0, stage.toward(goal))
         assert np.linalg.norm(stage.place - goal, axis=1).max() < 0.01
         assert np.linalg.norm(state.position[:, :2] - stage.place, axis=1).max() < 0.005
@@ -243,9 +243,9 @@ def test_speeds_are_within_the_limits_and_commands_are_repeated(hub):
         stage.run(1.0, stage.constant(9.0))
         v = stage.run(0.5, stage.constant(9.0)).velocity[0, 0]
         assert v == pytest.approx(0.22, abs=1e-6)
-        before = stage.twin.heard[0]
+        before = stage.twin.commands_received[0]
         stage.run(2.0, stage.constant(9.0))
-        assert 20 <= stage.twin.heard[0] - before <= 60  # 20 Hz
+        assert 20 <= stage.twin.commands_received[0] - before <= 60  # 20 Hz
 
 
 @pytest.mark.system
@@ -332,7 +332,7 @@ def test_the_wrong_type_of_command_moves_nothing_and_is_said(hub, style):
         stage.body = open_turtlebot3(replace(asked, addresses=stage.twin.addresses, device=({},)))
         stage.body.open()
         assert stage.moved(1.0, stage.constant(0.2))[0] == 0.0
-        assert stage.twin.heard == [0]
+        assert stage.twin.commands_received == [0]
         assert stage.state.notes[0] == (
             "cmd_vel is not received: the robot expects a geometry_msgs/msg/Twist, "
             "we send a geometry_msgs/msg/TwistStamped as on jazzy: set distro or stamped"

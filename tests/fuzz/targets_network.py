@@ -245,18 +245,18 @@ def external_body() -> Iterator[Target]:
 
 def vicon_truths() -> Iterator[Target]:
     """The simulated Vicon hears where twins are."""
-    from twins.devices.vicon import Truths, ViconTwin  # noqa: PLC0415
+    from twins.devices.vicon import TruthSubscription, ViconTwin  # noqa: PLC0415
 
     with Net().worn() as net:
         vicon = ViconTwin(["KH01", "KH02"])
-        truths = Truths(net.session, KEYS, ["KH01", "KH02"])  # type: ignore[arg-type]
+        truths = TruthSubscription(net.session, KEYS, ["KH01", "KH02"])  # type: ignore[arg-type]
         t = 0.0
 
         def take(data: bytes) -> None:
             nonlocal t
             t += 0.01
             net.deliver(data)
-            truths.show(vicon, time.time())
+            truths.update(vicon, time.time())
             vicon.advance(t)
 
         try:

@@ -23,7 +23,7 @@ from twins.scene import Obstacle, Scene
 
 pytest.importorskip("mujoco", reason="the engine mujoco is the extra [mujoco]: ./zenpark install mujoco-core")
 
-from twins.engines.mujoco_engine import FOLLOWED, Drones, RigidBody
+from twins.engines.mujoco_engine import TRACKED_SHARE, Drones, RigidBody
 
 DT = 0.01
 
@@ -356,7 +356,7 @@ def test_hover_jitter_is_flown():
     assert 0.36 < share < 0.62  # after 0.5 s; 1/e would be without the drone's inertia
     lean = np.degrees(2.0 * np.abs(np.array([state.attitude[:, 1:3] for state in states]))).std()
     assert 0.1 < lean < 1.0  # it leans for it
-    assert 0.5 < FOLLOWED < 1.0
+    assert 0.5 < TRACKED_SHARE < 1.0
 
 
 def test_ground_robots_drive_as_in_the_point_mass_engine():

@@ -349,7 +349,7 @@ def test_nature_is_that_of_the_other_twin():
 
 
 def test_other_robots_and_wrong_settings():
-    with pytest.raises(BodyError, match="flies no tello"):
+    with pytest.raises(BodyError, match="is no twin of a tello"):
         open_device(DeviceRequest(request("tello", ["x"]), Faults()))
     with pytest.raises(BodyError, match="contrl"):
         open_device(DeviceRequest(request("crazyflie", ["x"], device={"contrl": 1}), Faults()))

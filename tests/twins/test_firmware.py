@@ -18,7 +18,9 @@ def guided(offset=NONE, velocity=NONE, wanted=None, yaw=0.0):
     made = Firmware(1, DT)
     by_velocity = np.array([wanted is not None])
     flown = NONE if wanted is None else np.array([wanted])
-    made.guide(np.array(offset, dtype=float), np.array(velocity, dtype=float), flown, by_velocity, np.array([yaw]))
+    made.advance_outer_loops(
+        np.array(offset, dtype=float), np.array(velocity, dtype=float), flown, by_velocity, np.array([yaw])
+    )
     return made
 
 
@@ -52,12 +54,12 @@ def test_limits_of_speed_tilt_and_thrust():
     assert np.degrees(far.tilt[0, 1]) == pytest.approx(25.0 * 0.1 + 0.1 * OUTER * DT)  # only 0.1 m/s are missing
     assert np.degrees(guided([[9.0, -9.0, 0.0]]).tilt[0]).tolist() == pytest.approx([TILT, TILT])
     level = (NONE, NONE, np.zeros(1))
-    up = guided([[0.0, 0.0, 9.0]]).motors(*level)
+    up = guided([[0.0, 0.0, 9.0]]).advance_inner_loops(*level)
     lift = 25.0 * SPEED + 15.0 * SPEED * OUTER * DT
     np.testing.assert_allclose(up, np.full((1, 4), (BASE + 1000.0 * lift) / FULL))
-    down = guided([[0.0, 0.0, -9.0]]).motors(*level)
+    down = guided([[0.0, 0.0, -9.0]]).advance_inner_loops(*level)
     np.testing.assert_allclose(down, np.full((1, 4), LEAST / FULL))
-    rest = guided().motors(*level)
+    rest = guided().advance_inner_loops(*level)
     np.testing.assert_allclose(4 * 0.12 * rest[0, 0], 0.995 * 0.027 * 9.81, rtol=1e-3)
 
 
@@ -72,18 +74,18 @@ def test_torques_turn_the_right_way():
     step = math.radians(1.0)
     rate = 6.0 + 3.0 * DT  # deg/s asked for by one degree
     units = (250.0 + 500.0 * DT) * rate
-    leaning = made.motors(np.array([[-step, 0.0, 0.0]]), NONE, np.zeros(1))
+    leaning = made.advance_inner_loops(np.array([[-step, 0.0, 0.0]]), NONE, np.zeros(1))
     np.testing.assert_allclose(FULL * leaning[0] - BASE, 0.5 * units * np.array([-1.0, -1.0, 1.0, 1.0]))
-    nose_up = guided().motors(np.array([[0.0, -step, 0.0]]), NONE, np.zeros(1))
+    nose_up = guided().advance_inner_loops(np.array([[0.0, -step, 0.0]]), NONE, np.zeros(1))
     np.testing.assert_allclose(FULL * nose_up[0] - BASE, 0.5 * units * np.array([-1.0, 1.0, 1.0, -1.0]))
-    turn = guided().motors(NONE, NONE, np.array([step]))
+    turn = guided().advance_inner_loops(NONE, NONE, np.array([step]))
     yawing = (120.0 + 16.7 * DT) * (6.0 + 1.0 * DT)
     np.testing.assert_allclose(FULL * turn[0] - BASE, yawing * np.array([-1.0, 1.0, -1.0, 1.0]))
 
 
 @given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
 def test_yaw_turns_the_short_way(yaw, heading):
-    motors = guided().motors(np.array([[0.0, 0.0, yaw]]), NONE, np.array([heading]))[0]
+    motors = guided().advance_inner_loops(np.array([[0.0, 0.0, yaw]]), NONE, np.array([heading]))[0]
     way = math.remainder(heading - yaw, 2.0 * math.pi)
     if 1e-3 < abs(way) < math.pi - 1e-3:
         assert (motors[1] > motors[0]) == (way > 0.0)
@@ -93,8 +95,8 @@ def test_yaw_turns_the_short_way(yaw, heading):
 def test_motors_stay_in_their_range_and_keep_their_torque(numbers):
     values = np.array(numbers).reshape(4, 1, 3)
     made = Firmware(1, DT)
-    made.guide(values[0], values[1], NONE, np.array([False]), values[2, :, 2])
-    motors = made.motors(values[2], 5.0 * values[3], np.zeros(1))
+    made.advance_outer_loops(values[0], values[1], NONE, np.array([False]), values[2, :, 2])
+    motors = made.advance_inner_loops(values[2], 5.0 * values[3], np.zeros(1))
     assert motors.min() >= 0.0
     assert motors.max() <= 1.0
 
@@ -103,9 +105,9 @@ def test_the_outer_loops_run_at_a_fifth_of_the_rate():
     made = guided([[0.1, 0.0, 0.0]])
     before = made.tilt.copy()
     for _ in range(OUTER - 1):
-        made.guide(np.array([[0.0, 0.1, 0.0]]), NONE, NONE, np.array([False]), np.zeros(1))
+        made.advance_outer_loops(np.array([[0.0, 0.1, 0.0]]), NONE, NONE, np.array([False]), np.zeros(1))
         np.testing.assert_array_equal(made.tilt, before)
-    made.guide(np.array([[0.0, 0.1, 0.0]]), NONE, NONE, np.array([False]), np.zeros(1))
+    made.advance_outer_loops(np.array([[0.0, 0.1, 0.0]]), NONE, NONE, np.array([False]), np.zeros(1))
     assert np.degrees(made.tilt[0, 0]) < -4.9
 
 
@@ -119,9 +121,11 @@ def test_rows_do_not_know_of_each_other():
         if tick == 20:
             together.reset(np.array([2]))
             alone[2].reset(np.array([0]))
-        together.guide(given_[0], given_[1], given_[2], by_velocity, yaw)
-        motors = together.motors(given_[3], given_[4], yaw)
+        together.advance_outer_loops(given_[0], given_[1], given_[2], by_velocity, yaw)
+        motors = together.advance_inner_loops(given_[3], given_[4], yaw)
         for row, single in enumerate(alone):
             one = slice(row, row + 1)
-            single.guide(given_[0][one], given_[1][one], given_[2][one], by_velocity[one], yaw[one])
-            np.testing.assert_array_equal(single.motors(given_[3][one], given_[4][one], yaw[one])[0], motors[row])
+            single.advance_outer_loops(given_[0][one], given_[1][one], given_[2][one], by_velocity[one], yaw[one])
+            np.testing.assert_array_equal(
+                single.advance_inner_loops(given_[3][one], given_[4][one], yaw[one])[0], motors[row]
+            )

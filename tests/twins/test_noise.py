@@ -93,7 +93,7 @@ def test_the_variance_of_odometry_grows_with_the_way():
 def test_latency_is_exact_in_ticks_row_by_row():
     latency = Latency([Disturbance(), Disturbance(latency_s=0.01), Disturbance(latency_s=0.03)], 0.01)
     assert latency.present
-    got = [latency.pass_on(np.full((3, 4), float(k)))[:, 0] for k in range(8)]
+    got = [latency.delay(np.full((3, 4), float(k)))[:, 0] for k in range(8)]
     np.testing.assert_array_equal(np.array(got)[:, 0], range(8))
     np.testing.assert_array_equal(np.array(got)[:, 1], [np.nan, *range(7)])
     np.testing.assert_array_equal(np.array(got)[:, 2], [np.nan] * 3 + list(range(5)))

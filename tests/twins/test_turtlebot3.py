@@ -110,7 +110,7 @@ class Listener:
         self.publisher.put(raw, attachment=struct.pack("<qqB16s", self.sent, time.time_ns(), 16, bytes(range(16))))
 
     def obeyed(self, count):
-        self.wait(lambda: self.advance(0.01) or self.twin.heard[0] >= count)
+        self.wait(lambda: self.advance(0.01) or self.twin.commands_received[0] >= count)
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def test_obeys_its_type_of_command_and_no_other(listen, style, distro):
     listener.tell(0.1, 0.0)
     listener.obeyed(1)
     listener.advance(1.0)
-    assert listener.twin.heard == [1]
+    assert listener.twin.commands_received == [1]
     listener.settle()
     assert listener.inbox["odom"][-1][0].twist.twist.linear.x == pytest.approx(0.1)
 
@@ -179,7 +179,7 @@ def test_obeys_its_type_of_command_and_no_other(listen, style, distro):
 def test_cuts_and_limits_speeds_and_holds_them(listen):
     listener = listen()
     for command, made in (((0.139, -0.999), (0.13, -0.99)), ((0.29, 0.0), (0.22, 0.0)), ((0.0, -9.0), (0.0, -2.84))):
-        count = listener.twin.heard[0]
+        count = listener.twin.commands_received[0]
         listener.tell(*command)
         listener.obeyed(count + 1)
         listener.advance(5.0)  # no watchdog: one command is for ever
@@ -241,7 +241,7 @@ def test_its_scanner_sees_what_it_is_shown(listen):
             away = (1.0 - position[0]) / np.cos(bearing)
         return np.where(away > 0.0, away, inf)
 
-    listener.twin.sight = wall
+    listener.twin.surroundings = wall
     listener.advance(0.5)
     listener.settle()
     scan = listener.inbox["scan"][-1][0]
@@ -282,7 +282,7 @@ def test_loss_is_a_share_of_what_it_says_and_hears(listen):
             listener.tell(0.0, 0.0)
         listener.settle()
         listener.advance(0.01)
-    assert 0.55 < listener.twin.heard[0] / 200 < 0.85
+    assert 0.55 < listener.twin.commands_received[0] / 200 < 0.85
 
 
 @pytest.mark.system
@@ -303,7 +303,7 @@ def test_silence_is_of_both_directions_and_ends(listen):
     listener.tell(0.0, 0.0)
     listener.settle()
     listener.advance(0.1)
-    assert listener.twin.heard == [1]
+    assert listener.twin.commands_received == [1]
     assert listener.twin.truth()[0][0, 0] > 0.2  # it went on
     assert listener.count(1.5) >= 10  # a second of it is left, less what the loaded machine has not delivered yet
 

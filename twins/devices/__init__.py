@@ -1,1 +1,1 @@
-"""Protocol twins: simulated devices that speak the real wire protocol."""
+"""Protocol twins: simulated devices with the real wire protocol, to which the unmodified vendor library connects."""

@@ -1,7 +1,7 @@
-"""Protocol twins: simulated devices at the far end of a real wire, to which the unmodified vendor library connects.
+"""Interface of protocol twins: simulated devices with a real wire protocol, for the unmodified vendor library.
 
-A device moves its robots with the models of `twins` (there is no second model) and speaks its protocol on loopback
-sockets. `twins.protocol` runs one in a process of its own.
+A device moves its robots with the models of `twins.models` (there is no second model) and serves its protocol on
+loopback sockets. `experiments.real_time.processes.protocol_twins` runs devices in a process.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from agents.body.interface import BodyRequest
 
 
 class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """What goes wrong on purpose; everything left out goes right. Devices ignore what they cannot have."""
+    """Injected faults; by default none. Devices ignore faults that they cannot have."""
 
     loss: float = 0.0  # share of packets lost, in each direction
     delay_s: float = 0.0  # [s] of each packet that the device sends
-    silent_from_s: float | None = None  # [s] from when on, by the device's clock, it says nothing and hears nothing
-    silent_for_s: float = 1e9  # [s] for how long
+    silent_from_s: float | None = None  # [s] begin of silence on the device's clock: nothing sent, nothing received
+    silent_for_s: float = 1e9  # [s] duration of the silence
     battery: float = 1.0  # charge at the start, 0 to 1
-    drain: float = 1.0  # how many times faster than the maker says the battery drains
+    drain: float = 1.0  # battery drain as a multiple of the maker's figure
     refuse_arming: bool = False
-    occluded_from_s: float | None = None  # [s] motion capture does not see the robots
-    occluded_for_s: float = 1e9  # [s] for how long
+    occluded_from_s: float | None = None  # [s] begin of an occlusion of all robots from motion capture
+    occluded_for_s: float = 1e9  # [s] duration of the occlusion
 
     def silent(self, t: float) -> bool:
         """Whether the device is silent at time `t` [s]."""
@@ -42,38 +42,34 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Device(Protocol):
-    """A simulated device for some robots of one kind.
+    """Simulated device for some robots of one kind."""
 
-    Attributes:
-        addresses: One per row: the body's address by which the bridge reaches it, such as "udp://127.0.0.1:19850".
-    """
-
-    addresses: tuple[str, ...]
+    addresses: tuple[str, ...]  # one per row: the body's address for the bridge, such as "udp://127.0.0.1:19850"
 
     def sockets(self) -> Sequence[socket.socket]:
-        """What to wait on; asked again after every call of `serve`, for clients come and go."""
+        """Sockets to wait on; read again after every `serve`, because clients come and go."""
         ...
 
     def serve(self, ready: socket.socket, t: float) -> None:
-        """Something can be read from one of the sockets, at time `t` [s]. Never blocks."""
+        """Read from a socket that is ready, at time `t` [s]. Never blocks."""
         ...
 
     def advance(self, t: float) -> None:
-        """Once per tick of `request.rate_hz`: the models move on to `t` [s]; what is due is sent."""
+        """Advance the models to `t` [s] and send due packets; called once per tick of `request.rate_hz`."""
         ...
 
     def truth(self) -> tuple[Array, Array]:
-        """Where the robots really are: (n, 3) [m] and yaw (n,) [rad]."""
+        """True positions (n, 3) [m] and yaws (n,) [rad] of the robots."""
         ...
 
     def close(self) -> None:
-        """Closes the sockets."""
+        """Close the sockets."""
         ...
 
 
 @dataclass(frozen=True)
 class DeviceRequest:
-    """What a device is made with: its robots as a body would get them, and what goes wrong on purpose."""
+    """Input of a device: its robots, as for a body, and the injected faults."""
 
     body: BodyRequest
     faults: Faults

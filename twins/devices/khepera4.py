@@ -1,4 +1,4 @@
-"""Protocol twin of Khepera IV robots: Robotic Park's server, or K-Team's over TCP; each robot has its own port."""
+"""Protocol twin of Khepera IV robots: Robotic Park's server or K-Team's, over TCP; each robot has its own port."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from twins.models.disturbance import Drift, Latency
 from twins.models.noise import Noise
 
 SCHEMES: Final = {"park": "khepera4", "kteam": "kteam"}
-BOARD_GOAL: Final = {  # park's controller on board, for `g`
+BOARD_GOAL: Final = {  # Robotic Park's controller on board, for `g`
     "response": np.array([KHEPERA4.response]),
     "turn_response": np.array([KHEPERA4.turn_response]),
     "speed": np.array([KHEPERA4.speed]),
@@ -31,7 +31,7 @@ BOARD_GOAL: Final = {  # park's controller on board, for `g`
 
 
 class _Robot:
-    """What a robot's server knows: odometry since it was switched on, and what the wheels shall do."""
+    """State of a robot's server: odometry since power-on, and commands of the wheels."""
 
     def __init__(self, chosen: protocol.Settings, faults: Faults) -> None:
         self.odometry = chosen.odometry
@@ -39,31 +39,31 @@ class _Robot:
         self.pose = np.zeros(3)  # x, y [m], theta [rad]
         self.pulses = [0.0, 0.0]
         self.speed = (0.0, 0.0)  # units
-        self.wanted = (0.0, 0.0)  # v [m/s], ω [rad/s]
+        self.twist = (0.0, 0.0)  # v [m/s], ω [rad/s]
         self.goal: tuple[float, float] | None = None
-        self.told = (0.0, 0.0, 0.0)  # way and turn since switched on, as of the last `p`
+        self.last_answer = (0.0, 0.0, 0.0)  # way [m] and turn [rad] since power-on, at the last `p`
         self.way = self.turn = 0.0
         self.sounding = 31  # mask of the ultrasonic sensors
 
     def drive(self, left: int, right: int) -> None:
-        """Speeds of the wheels in units, as far as the motors go."""
+        """Set the wheel speeds in units, within the motors' limits."""
         limit = protocol.FASTEST
         self.goal = None
-        self.wanted = protocol.twist(max(-limit, min(limit, left)), max(-limit, min(limit, right)))
+        self.twist = protocol.twist(max(-limit, min(limit, left)), max(-limit, min(limit, right)))
 
     def halt(self) -> None:
-        """Both wheels stop."""
-        self.goal, self.wanted = None, (0.0, 0.0)
+        """Stop both wheels."""
+        self.goal, self.twist = None, (0.0, 0.0)
 
-    def board(self) -> None:
-        """The controller on board, if it has a goal."""
+    def run_goal_controller(self) -> None:
+        """Run the controller on board, if there is a goal."""
         if self.goal is not None:
             way = np.array([[self.goal[0] - self.pose[0], self.goal[1] - self.pose[1]]])
             v, turn = drive(way, self.pose[2:], np.array([np.nan]), **BOARD_GOAL)[0].tolist()
-            self.wanted = protocol.twist(*protocol.units(v, turn))
+            self.twist = protocol.twist(*protocol.units(v, turn))
 
-    def rolled(self, ahead: float, moved: Array, turn: float, dt: float) -> None:
-        """One step: way along the nose [m], motion (2,) [m] in the frame of its odometry, turn [rad]."""
+    def add_motion(self, ahead: float, moved: Array, turn: float, dt: float) -> None:
+        """Add one step: way along the nose [m], motion (2,) [m] in the frame of odometry, turn [rad]."""
         self.pose[:2] += moved
         self.pose[2] = math.remainder(self.pose[2] + turn, 2.0 * math.pi)
         self.way, self.turn = self.way + ahead, self.turn + turn
@@ -73,15 +73,15 @@ class _Robot:
         self.speed = (ahead - half) / dt / protocol.UNIT, (ahead + half) / dt / protocol.UNIT
 
 
-def park(robot: _Robot, received: bytes) -> bytes:
-    """Answer of Robotic Park's server, for which one read is one command; most commands have none."""
+def answer_park(robot: _Robot, received: bytes) -> bytes:
+    """Answer of Robotic Park's server, which reads one command per read; most commands have no answer."""
     text = received.decode("ascii", "replace").strip("\0\r\n ")
     if text == "stop":
         robot.halt()
     elif text == "get_data":
         return b",".join([str(protocol.SOUND_NOTHING).encode()] * len(protocol.SOUND_BEARING))
     elif text[:1] in ("p", "t"):
-        return _place(robot, text[0])
+        return _answer_pose(robot, text[0])
     else:
         values = protocol.scanned(text[1:])
         if text[:1] == "d" and len(values) >= 2:
@@ -93,20 +93,20 @@ def park(robot: _Robot, received: bytes) -> bytes:
     return b""
 
 
-def _place(robot: _Robot, letter: str) -> bytes:
-    """The three variants of `p` over the years, and `t`."""
+def _answer_pose(robot: _Robot, letter: str) -> bytes:
+    """Answer to `p`, of which three variants exist, and to `t`."""
     x, y, theta = robot.pose.tolist()
-    way, turn = robot.way - robot.told[0], robot.turn - robot.told[1]
+    way, turn = robot.way - robot.last_answer[0], robot.turn - robot.last_answer[1]
     if letter == "t":
         return f"{way:.4f},{theta:.4f}".encode()
     if robot.odometry == "pose":
         return f"{x:.4f},{y:.4f},{theta:.4f}".encode()
-    robot.told = (robot.way, robot.turn, 0.0)
+    robot.last_answer = (robot.way, robot.turn, 0.0)
     return f"{way:.6f},{turn if robot.odometry == 'increments' else theta:.6f}".encode()
 
 
-def kteam(robot: _Robot, line: str) -> str:
-    """Answer of K-Team's `kh4server` to a line; `$` to what it does not know."""
+def answer_kteam(robot: _Robot, line: str) -> str:
+    """Answer of K-Team's `kh4server` to a line; `$` for an unknown command."""
     letter = line[:1]
     try:
         values = [int(word) for word in line[2:].split(",") if word]
@@ -148,23 +148,23 @@ def kteam(robot: _Robot, line: str) -> str:
 
 
 class _Server:
-    """One robot's port: it serves one client; others wait unanswered until that one has gone."""
+    """Port of one robot: serves one client; others wait until that client has left."""
 
     def __init__(self, robot: _Robot, chosen: protocol.Settings, faults: Faults, listener: socket.socket) -> None:
         self.robot, self.listener = robot, listener
-        self._speaks, self._stops_alone, self._faults = chosen.protocol, chosen.stops_alone, faults
+        self._protocol, self._stops_alone, self._faults = chosen.protocol, chosen.stops_alone, faults
         self._client: socket.socket | None = None
-        self._begun = b""
+        self._partial = b""
         self._outbox: deque[tuple[float, bytes]] = deque()
 
-    def sockets(self, *, mute: bool) -> list[socket.socket]:
-        """What to wait on."""
+    def sockets(self, *, silent: bool) -> list[socket.socket]:
+        """Sockets to wait on."""
         if self._client is not None:
             return [self._client]
-        return [] if mute else [self.listener]
+        return [] if silent else [self.listener]
 
-    def serve(self, ready: socket.socket, t: float, *, mute: bool) -> None:
-        """A client comes, speaks, or goes."""
+    def serve(self, ready: socket.socket, t: float, *, silent: bool) -> None:
+        """Accept a client, answer a command, or close the connection."""
         try:
             if ready is self.listener:
                 self._client, _ = self.listener.accept()
@@ -178,12 +178,12 @@ class _Server:
             received = b""
         if not received:
             self.hang_up()
-        elif not mute:
+        elif not silent:
             self._outbox.append((t + self._faults.delay_s, self._answer(received)))
             self.flush(t)
 
     def flush(self, t: float) -> None:
-        """Sends what is due."""
+        """Send due answers."""
         while self._outbox and self._outbox[0][0] <= t:
             _, answer = self._outbox.popleft()
             if self._client is not None and answer:
@@ -193,27 +193,24 @@ class _Server:
                     self.hang_up()
 
     def hang_up(self) -> None:
-        """The client has gone: the robot stops if its server does that, else it drives on."""
+        """Close the client's connection: the robot stops if its server does that, else it drives on."""
         if self._client is not None:
             self._client.close()
-        self._client, self._begun = None, b""
+        self._client, self._partial = None, b""
         self._outbox.clear()
         if self._stops_alone:
             self.robot.halt()
 
     def _answer(self, received: bytes) -> bytes:
-        if self._speaks == "park":
-            return park(self.robot, received)
-        *lines, self._begun = (self._begun + received).replace(b"\n", b"\r").split(b"\r")
-        answers = [kteam(self.robot, line.decode("ascii", "replace")) for line in lines if line]
+        if self._protocol == "park":
+            return answer_park(self.robot, received)
+        *lines, self._partial = (self._partial + received).replace(b"\n", b"\r").split(b"\r")
+        answers = [answer_kteam(self.robot, line.decode("ascii", "replace")) for line in lines if line]
         return "".join(f"{answer}\r\n" for answer in answers).encode()
 
 
 class KheperaDevice:
-    """Rows of Khepera IV robots; implements `twins.devices.device.Device`.
-
-    Nothing is in reach of their range sensors.
-    """
+    """Khepera IV robots; implements `twins.devices.device.Device`. Their range sensors measure nothing."""
 
     def __init__(self, request: DeviceRequest) -> None:
         body, self._faults = request.body, request.faults
@@ -239,13 +236,13 @@ class KheperaDevice:
 
     def sockets(self) -> Sequence[socket.socket]:
         """See `Device.sockets`."""
-        return [wire for server in self._servers for wire in server.sockets(mute=self._mute(server, self._t))]
+        return [wire for server in self._servers for wire in server.sockets(silent=self._silent(server, self._t))]
 
     def serve(self, ready: socket.socket, t: float) -> None:
         """See `Device.serve`."""
         for server in self._servers:
-            if ready in server.sockets(mute=False):
-                server.serve(ready, t, mute=self._mute(server, t))
+            if ready in server.sockets(silent=False):
+                server.serve(ready, t, silent=self._silent(server, t))
 
     def advance(self, t: float) -> None:
         """See `Device.advance`."""
@@ -269,7 +266,7 @@ class KheperaDevice:
             server.hang_up()
             server.listener.close()
 
-    def _mute(self, server: _Server, t: float) -> bool:
+    def _silent(self, server: _Server, t: float) -> bool:
         return self._faults.silent(t) or server.robot.charge <= 0.0
 
     def _step(self) -> None:
@@ -279,10 +276,10 @@ class KheperaDevice:
             robot.charge = max(0.0, robot.charge - self._faults.drain * self._dt / ENDURANCE_S["khepera4"])
             if robot.charge <= 0.0:
                 robot.halt()
-            robot.board()
-            wanted[row, :2] = robot.wanted
+            robot.run_goal_controller()
+            wanted[row, :2] = robot.twist
         if self._latency.present:
-            wanted = self._latency.pass_on(wanted)
+            wanted = self._latency.delay(wanted)
         place, yaw = self._model.position.copy(), self._model.yaw.copy()
         self._model.command(wanted[:, :2])
         self._model.advance()
@@ -298,18 +295,16 @@ class KheperaDevice:
             cos, sin = math.cos(frame), math.sin(frame)
             x, y = moved[row].tolist()
             own = np.array([cos * x - sin * y, sin * x + cos * y])
-            server.robot.rolled(float(ahead[row]), own, float(turn[row]), self._dt)
+            server.robot.add_motion(float(ahead[row]), own, float(turn[row]), self._dt)
 
 
 def _listen(name: str, address: str) -> socket.socket:
-    """A listening socket where the address says, else on any free port of this host's loopback."""
+    """Listening socket at the address, else on a free port of this host's loopback."""
     place = address.partition("://")[2]
     host, _, port = place.partition(":")
     host = host or "127.0.0.1"
     if not host.startswith("127.") or not (port or "0").isdecimal():
-        raise BodyError(
-            f"{name}: {address}: a twin lives on a loopback address, such as khepera4-twin://127.0.0.1:50000"
-        )
+        raise BodyError(f"{name}: {address}: a twin needs a loopback address, such as khepera4-twin://127.0.0.1:50000")
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -323,5 +318,5 @@ def _listen(name: str, address: str) -> socket.socket:
 
 
 def open_device(request: DeviceRequest) -> KheperaDevice:
-    """The entry point `khepera4-twin` of the group `zenpark.devices`."""
+    """Entry point `khepera4-twin` of the group `zenpark.devices`."""
     return KheperaDevice(request)

@@ -1,4 +1,4 @@
-"""Protocol twin of DJI Tellos: the SDK 2.0 text protocol, each drone on a loopback address of its own."""
+"""Protocol twin of DJI Tellos: the SDK 2.0 text protocol, each drone on its own loopback address."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from twins.models.noise import Noise
 from twins.models.quadrotor import Quadrotor
 
 PORT: Final = 18889  # not the drone's own 8889: djitellopy binds that on every address of this host
-HOSTS: Final = range(2, 255)  # of 127.0.0.x: djitellopy tells drones apart by address alone
-REFUSES: Final = 0.10  # charge below which it does not take off
-GIVES_UP: Final = 0.05  # charge at which it lands by itself
-NEAR: Final = 0.03  # [m] a move that is nearer than this to its goal is over
-AIMED: Final = 0.01  # [rad] likewise a turn
+HOSTS: Final = range(2, 255)  # of 127.0.0.x: djitellopy distinguishes drones by address only
+LOWEST_TAKEOFF_CHARGE: Final = 0.10  # with less charge take-offs are refused
+LANDING_CHARGE: Final = 0.05  # charge of an automatic landing
+NEAR: Final = 0.03  # [m] distance from the goal at which a move is complete
+NEAR_YAW: Final = 0.01  # [rad] likewise for a turn
 MOVES: Final = {
     "forward": (1.0, 0.0, 0.0),
     "back": (-1.0, 0.0, 0.0),
@@ -39,11 +39,11 @@ MOVES: Final = {
 
 
 class Mode(Enum):
-    """What a drone is doing."""
+    """State of a drone."""
 
     GROUND = "on the ground"
     CLIMB = "taking off"
-    STICKS = "hovering, or as the sticks say"
+    STICKS = "hovering or flying by the sticks"
     MOVE = "on the way to a point"
     TURN = "turning"
     LAND = "landing"
@@ -51,15 +51,15 @@ class Mode(Enum):
 
 
 class _Drone:
-    """One drone's side of the conversation, and what it is told to do."""
+    """Socket, client and commands of one drone."""
 
     def __init__(self, wire: socket.socket, faults: Faults, chance: np.random.Generator) -> None:
         self.wire, self.faults, self._chance = wire, faults, chance
         self.mode = Mode.GROUND
         self.sdk = False
-        self.peer: tuple[str, int] | None = None  # who spoke last
-        self.waits: tuple[str, int] | None = None  # who gets the answer when the manoeuvre is over
-        self.heard = 0.0
+        self.peer: tuple[str, int] | None = None  # sender of the last command
+        self.answer_to: tuple[str, int] | None = None  # receiver of the answer at the end of the manoeuvre
+        self.last_command = 0.0
         self.sticks = (0, 0, 0, 0)
         self.goal = np.zeros(3)
         self.heading = 0.0
@@ -71,42 +71,42 @@ class _Drone:
 
     @property
     def aloft(self) -> bool:
-        """Whether it can be steered."""
+        """Whether the drone accepts motion commands."""
         return self.mode in (Mode.STICKS, Mode.MOVE, Mode.TURN)
 
     def hover(self) -> None:
-        """Stays where it is, if it can be steered."""
+        """Hover at the current place, if the drone is in controlled flight."""
         if self.aloft:
             self.mode, self.sticks = Mode.STICKS, (0, 0, 0, 0)
 
     def lost(self) -> bool:
-        """Whether the air swallows this packet."""
+        """Whether this packet is lost."""
         return self.faults.loss > 0.0 and float(self._chance.random()) < self.faults.loss
 
     def send(self, text: str, to: tuple[str, int], t: float) -> None:
-        """Queues a packet; it leaves at once, or after the delay that it was given."""
+        """Queue a packet; sent at once, or after the injected delay."""
         if not self.lost():
             self._outbox.append((t + self.faults.delay_s, text.encode("ascii", "replace"), to))
             self.flush(t)
 
     def flush(self, t: float) -> None:
-        """Sends what is due."""
+        """Send due packets."""
         while self._outbox and self._outbox[0][0] <= t:
             _, packet, to = self._outbox.popleft()
             try:
                 self.wire.sendto(packet, to)
             except OSError:
-                continue  # nobody there: the drone does not know
+                continue  # no client there: unknown to the drone
 
     def finish(self, text: str, t: float) -> None:
-        """The manoeuvre is over: its sender gets the answer."""
-        if self.waits is not None:
-            self.send(text, self.waits, t)
-        self.waits = None
+        """Answer the sender of a completed manoeuvre."""
+        if self.answer_to is not None:
+            self.send(text, self.answer_to, t)
+        self.answer_to = None
 
 
 class TelloDevice:
-    """Rows of Tellos; implements `twins.devices.device.Device`."""
+    """Tellos; implements `twins.devices.device.Device`."""
 
     def __init__(self, request: DeviceRequest) -> None:
         body = request.body
@@ -145,7 +145,7 @@ class TelloDevice:
                 except OSError:
                     return
                 if not (drone.faults.silent(t) or drone.lost()):
-                    self._hear(row, packet, sender, t)
+                    self._receive(row, packet, sender, t)
 
     def advance(self, t: float) -> None:
         """See `Device.advance`."""
@@ -159,7 +159,7 @@ class TelloDevice:
             if drone.sdk and drone.peer is not None and t >= drone.state_due - 0.5 * self._dt:
                 late = t - drone.state_due
                 period = 1.0 / protocol.STATE_HZ
-                drone.state_due += period if late < period else late + period  # what was missed is not made up for
+                drone.state_due += period if late < period else late + period  # missed packets are not repeated
                 if not drone.faults.silent(t):
                     drone.send(self._state(row), (drone.peer[0], protocol.STATE_PORT), t)
             drone.flush(t)
@@ -175,7 +175,7 @@ class TelloDevice:
 
     # ------------------------------------------------------------------ the protocol
 
-    def _hear(self, row: int, packet: bytes, sender: tuple[str, int], t: float) -> None:
+    def _receive(self, row: int, packet: bytes, sender: tuple[str, int], t: float) -> None:
         words = packet.decode("ascii", "replace").split()
         if not words:
             return
@@ -183,9 +183,9 @@ class TelloDevice:
         if word == "command":
             drone.sdk = True
         if not drone.sdk:
-            return  # until then it is the phone's
-        drone.peer, drone.heard = sender, t
-        answer = self._answer(row, word) if word.endswith("?") else self._obey(row, word, words[1:], sender)
+            return  # before `command` the drone listens to the phone only
+        drone.peer, drone.last_command = sender, t
+        answer = self._answer(row, word) if word.endswith("?") else self._execute(row, word, words[1:], sender)
         if answer:
             drone.send(answer, sender, t)
 
@@ -208,8 +208,8 @@ class TelloDevice:
         }
         return answers.get(question, f"unknown command: {question}")
 
-    def _obey(self, row: int, word: str, arguments: list[str], sender: tuple[str, int]) -> str:
-        """Does what a command says; its answer, or nothing if there is none yet, or none at all."""
+    def _execute(self, row: int, word: str, arguments: list[str], sender: tuple[str, int]) -> str:
+        """Execute a command; returns the answer, empty if there is none, or none yet."""
         drone = self._drones[row]
         try:
             values = [int(argument) for argument in arguments]
@@ -218,7 +218,7 @@ class TelloDevice:
         if word in (*MOVES, "go", "cw", "ccw"):
             return self._manoeuvre(row, word, values, sender) if drone.aloft else "error Motor stop"
         if word in ("takeoff", "land", "emergency"):
-            return self._by_itself(row, word, sender)
+            return self._start_automatic(row, word, sender)
         if word == "rc" and len(values) == 4:
             right, forward, up, clockwise = (max(-protocol.STICK, min(protocol.STICK, value)) for value in values)
             drone.sticks = (right, forward, up, clockwise)
@@ -234,24 +234,24 @@ class TelloDevice:
             answer = "ok" if word in known else "error" if word == "rc" else f"unknown command: {word}"
         return answer
 
-    def _by_itself(self, row: int, word: str, sender: tuple[str, int]) -> str:
-        """What the drone does without sticks, and answers when it is done."""
+    def _start_automatic(self, row: int, word: str, sender: tuple[str, int]) -> str:
+        """Start an automatic manoeuvre: take-off, landing or emergency stop; returns an immediate answer, or empty."""
         drone, rows = self._drones[row], np.array([row])
         if word == "emergency":
             self._model.stop(rows)
-            drone.mode, drone.waits, drone.sticks = Mode.FALL, None, (0, 0, 0, 0)
+            drone.mode, drone.answer_to, drone.sticks = Mode.FALL, None, (0, 0, 0, 0)
             return "ok"
         if word == "takeoff":
-            if drone.mode is not Mode.GROUND or drone.charge < REFUSES:
+            if drone.mode is not Mode.GROUND or drone.charge < LOWEST_TAKEOFF_CHARGE:
                 return "error"
             self._model.takeoff(rows, np.array([protocol.TAKEOFF_HEIGHT]))
-            drone.mode, drone.waits, drone.sticks = Mode.CLIMB, sender, (0, 0, 0, 0)
+            drone.mode, drone.answer_to, drone.sticks = Mode.CLIMB, sender, (0, 0, 0, 0)
             return ""
         if drone.mode in (Mode.GROUND, Mode.FALL):
             return "error"
-        if drone.mode is not Mode.LAND:  # told again, it goes on as it was
+        if drone.mode is not Mode.LAND:  # a repeated command changes nothing
             self._model.land(rows)
-        drone.mode, drone.waits = Mode.LAND, sender
+        drone.mode, drone.answer_to = Mode.LAND, sender
         return ""
 
     def _manoeuvre(self, row: int, word: str, values: list[int], sender: tuple[str, int]) -> str:
@@ -260,7 +260,7 @@ class TelloDevice:
             if len(values) != 1 or not 1 <= values[0] <= 360:
                 return "out of range"
             drone.heading = yaw + math.radians(values[0]) * (-1.0 if word == "cw" else 1.0)
-            drone.mode, drone.waits = Mode.TURN, sender
+            drone.mode, drone.answer_to = Mode.TURN, sender
             return ""
         if word == "go":
             if len(values) != 4 or max(map(abs, values[:3])) > 500 or not 10 <= values[3] <= 100:
@@ -275,11 +275,11 @@ class TelloDevice:
         cos, sin = math.cos(yaw), math.sin(yaw)
         turned = np.array([cos * way[0] - sin * way[1], sin * way[0] + cos * way[1], way[2]])
         drone.goal = self._model.position[row] + turned
-        drone.mode, drone.waits = Mode.MOVE, sender
+        drone.mode, drone.answer_to = Mode.MOVE, sender
         return ""
 
     def _yaw(self, row: int) -> int:
-        """As the drone says it: degrees clockwise from where it was switched on, -180 to 179."""
+        """Yaw as reported: degrees clockwise from the yaw at power-on, -180 to 179."""
         return (round(-math.degrees(float(self._model.yaw[row] - self._start_yaw[row]))) + 180) % 360 - 180
 
     def _state(self, row: int) -> str:
@@ -298,8 +298,8 @@ class TelloDevice:
     def _step(self, t: float) -> None:
         self._setpoint[:] = np.nan
         for row, drone in enumerate(self._drones):
-            self._setpoint[row] = self._wanted(row, drone)
-        setpoint = self._latency.pass_on(self._setpoint) if self._latency.present else self._setpoint
+            self._setpoint[row] = self._model_setpoint(row, drone)
+        setpoint = self._latency.delay(self._setpoint) if self._latency.present else self._setpoint
         self._model.command(setpoint)
         self._model.advance()
         self._truth[:] = self._model.position
@@ -308,9 +308,9 @@ class TelloDevice:
             share = np.minimum(self._model.position[:, 2] / FULL_WOBBLE, 1.0)
             self._truth[:, :2] += share[:, None] * self._jitter.displacement
         for row, drone in enumerate(self._drones):
-            self._live(row, drone, t)
+            self._update(row, drone, t)
 
-    def _wanted(self, row: int, drone: _Drone) -> tuple[float, float, float, float]:
+    def _model_setpoint(self, row: int, drone: _Drone) -> tuple[float, float, float, float]:
         yaw = float(self._model.yaw[row])
         if drone.mode is Mode.STICKS:
             return protocol.motion(drone.sticks, yaw)
@@ -324,8 +324,8 @@ class TelloDevice:
             return x, y, z, 0.0
         return math.nan, math.nan, math.nan, math.nan
 
-    def _live(self, row: int, drone: _Drone, t: float) -> None:
-        """What happens to a drone in a step: manoeuvres end, the battery drains, patience runs out."""
+    def _update(self, row: int, drone: _Drone, t: float) -> None:
+        """Update a drone after a step: end of manoeuvres, battery, automatic landing."""
         model = self._model
         z = float(model.position[row, 2])
         flying = bool(model.flying[row])
@@ -344,25 +344,25 @@ class TelloDevice:
             return
         drone.motors_s += self._dt
         drone.charge = max(0.0, drone.charge - drone.faults.drain * self._dt / ENDURANCE_S["tello"])
-        alone = t - drone.heard > protocol.AUTO_LAND_S
-        if drone.mode is not Mode.LAND and (alone or drone.charge <= GIVES_UP):
+        alone = t - drone.last_command > protocol.AUTO_LAND_S
+        if drone.mode is not Mode.LAND and (alone or drone.charge <= LANDING_CHARGE):
             model.land(np.array([row]))
             drone.finish("error Auto land", t)
             drone.mode = Mode.LAND
 
     def _arrived(self, row: int, drone: _Drone) -> bool:
         if drone.mode is Mode.TURN:
-            return abs(drone.heading - float(self._model.yaw[row])) < AIMED
+            return abs(drone.heading - float(self._model.yaw[row])) < NEAR_YAW
         return float(np.abs(drone.goal - self._model.position[row]).max()) < NEAR
 
 
 def _listen(name: str, address: str) -> socket.socket:
-    """A socket where the address says, else on the first loopback host that has no Tello yet."""
+    """Socket at the address, else on the first loopback host without a Tello."""
     _, named, place = address.partition("://")
     if named:
         host, port = protocol.endpoint(name, f"tello://{place}")
         if not host.startswith("127."):
-            raise BodyError(f"{name}: {address}: a twin lives on a loopback address, such as tello-twin://127.0.0.2")
+            raise BodyError(f"{name}: {address}: a twin needs a loopback address, such as tello-twin://127.0.0.2")
         hosts, port = [host], port if ":" in place else PORT
     else:
         hosts, port = [f"127.0.0.{number}" for number in HOSTS], PORT
@@ -381,5 +381,5 @@ def _listen(name: str, address: str) -> socket.socket:
 
 
 def open_device(request: DeviceRequest) -> TelloDevice:
-    """The entry point `tello-twin` of the group `zenpark.devices`."""
+    """Entry point `tello-twin` of the group `zenpark.devices`."""
     return TelloDevice(request)

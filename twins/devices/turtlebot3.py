@@ -1,8 +1,8 @@
-"""Protocol twin of the TurtleBot3 Burger: the topics of turtlebot3_node on Zenoh, moved by the model of `twins`.
+"""Protocol twin of the TurtleBot3 Burger: the topics of turtlebot3_node on Zenoh, with the motion model of `twins`.
 
-It polls its session, so it has no sockets to wait on. As on the robot, a command holds until the next one: OpenCR stops
-the wheels when its ROS node falls silent (500 ms without heartbeat), and turtlebot3_node lets cmd_vel be silent as long
-as it likes. `watchdog_s` in the robot's settings adds what careful people run on theirs.
+The Zenoh session is polled, so there are no sockets to wait on. As on the robot, a command holds until the next one:
+OpenCR stops the wheels when its ROS node is silent (500 ms without heartbeat), but turtlebot3_node has no time limit
+for cmd_vel. `watchdog_s` in the robot's settings adds such a limit.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Measurement
 from twins.models.noise import Noise
 
-CATCH_UP_S: Final = 1.0  # as for the twin in the robot's process: time it could not see did not pass
-JOIN_S: Final = 5.0  # to find the router
+CATCH_UP_S: Final = 1.0  # a process that was frozen for longer resumes where it was: the lost time is not simulated
+JOIN_S: Final = 5.0  # deadline of the router's answer
 
-Sight = Callable[[Array, float, Array], Array]
-"""What surrounds a robot: position (3,) [m], yaw and world bearings (360,) [rad] to distances (360,) [m], inf: none."""
+Surroundings = Callable[[Array, float, Array], Array]
+"""Distances (360,) [m] around a robot, inf: none; from position (3,) [m], yaw and world bearings (360,) [rad]."""
 
 
 def nothing(position: Array, yaw: float, bearing: Array) -> Array:
@@ -59,12 +59,7 @@ class _Row:
 
 
 class TurtleBot3Twin:
-    """Rows of TurtleBot3 behind ROS topics; implements `twins.devices.device.Device`.
-
-    Attributes:
-        addresses: One per row.
-        heard: Commands that were obeyed, per row.
-        sight: What the laser scanners see.
+    """TurtleBot3 robots behind ROS topics; implements `twins.devices.device.Device`.
 
     Raises:
         BodyError: If a setting is wrong.
@@ -81,17 +76,17 @@ class TurtleBot3Twin:
         rows = len(body.names)
         self._twist = np.zeros((rows, 2))
         self._top: Array = np.array([TURTLEBOT3.speed, TURTLEBOT3.turn_rate])  # the maker's limits
-        self._told = self._model.yaw.copy()
+        self._last_yaw = self._model.yaw.copy()
         self._used = 0.0
         self._measurement = Measurement(
             body.disturbance, np.tile([1.0, 1.0, 0.0], (rows, 1)), Noise(body.names, body.seeds, "measurement", 4)
         )
         self._drift = Drift(body.disturbance, Noise(body.names, body.seeds, "odometry", 2))
         self._chance = np.random.default_rng([body.seeds[0], 0x7B3])
-        self._late: deque[tuple[float, Publisher, bytes]] = deque()
+        self._delayed: deque[tuple[float, Publisher, bytes]] = deque()
         self._bearing: Array = np.arange(turtlebot3.RAYS, dtype=float) * (2.0 * pi / turtlebot3.RAYS)
-        self.sight: Sight = nothing
-        self.heard = [0] * rows
+        self.surroundings: Surroundings = nothing  # for the laser scanners
+        self.commands_received = [0] * rows  # executed commands
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
         self._rows: list[_Row] = []
         addresses = []
@@ -124,7 +119,7 @@ class TurtleBot3Twin:
             ros2.types(where.distro),
             style=where.style,
             domain=where.domain,
-            announces=True,  # with ros2dds it stands for the bridge on the robot as well
+            announces=True,  # with ros2dds the twin includes the bridge on the robot
         )
 
     def sockets(self) -> Sequence[socket.socket]:
@@ -141,24 +136,24 @@ class TurtleBot3Twin:
             steps = 1
         self._t = t
         silent = self._faults.silent(t)
-        self._listen(t, silent)
+        self._receive_commands(t, silent)
         for _ in range(steps):
-            self._model.command(self._twist)  # held: the model's own patience is not this robot's
+            self._model.command(self._twist)  # repeated: this robot has no timeout, unlike the model
             before = self._model.position[:, :2].copy()
             self._model.advance()
             if self._drift.present:
                 self._drift.advance(self._model.position[:, :2] - before)
             self._used += self._dt
             self._ticks += 1
-            for rate, say in (
+            for rate, publish in (
                 (turtlebot3.ODOMETRY_HZ, self._odometry),
                 (turtlebot3.SCAN_HZ, self._scan),
                 (turtlebot3.BATTERY_HZ, self._battery),
             ):
                 if self._ticks % max(1, round(1.0 / (rate * self._dt))) == 0 and not silent:
-                    say(t)
-        while self._late and self._late[0][0] <= t:
-            _, publisher, payload = self._late.popleft()
+                    publish(t)
+        while self._delayed and self._delayed[0][0] <= t:
+            _, publisher, payload = self._delayed.popleft()
             if not silent:
                 publisher.send(payload)
 
@@ -172,9 +167,9 @@ class TurtleBot3Twin:
             session.close()  # type: ignore[no-untyped-call]
         self._sessions.clear()
 
-    # ------------------------------------------------------------------ what it hears
+    # ------------------------------------------------------------------ commands
 
-    def _listen(self, t: float, silent: bool) -> None:
+    def _receive_commands(self, t: float, silent: bool) -> None:
         for index, row in enumerate(self._rows):
             for message in row.command.received():
                 if silent or self._lost():
@@ -186,21 +181,21 @@ class TurtleBot3Twin:
                 twist: Array = np.array([turtlebot3.cut(v), turtlebot3.cut(w)])
                 self._twist[index] = clamp(twist, -self._top, self._top)
                 row.commanded = t
-                self.heard[index] += 1
+                self.commands_received[index] += 1
             if t - row.commanded > row.watchdog:
                 self._twist[index] = 0.0
 
     def _lost(self) -> bool:
         return self._faults.loss > 0.0 and bool(self._chance.random() < self._faults.loss)
 
-    # ------------------------------------------------------------------ what it says
+    # ------------------------------------------------------------------ published topics
 
-    def _say(self, publisher: Publisher, types: ros2.Types, message: Message, t: float) -> None:
+    def _publish(self, publisher: Publisher, types: ros2.Types, message: Message, t: float) -> None:
         if self._lost():
             return
         payload = types.encode(message, publisher.kind)
         if self._faults.delay_s > 0.0:
-            self._late.append((t + self._faults.delay_s, publisher, payload))
+            self._delayed.append((t + self._faults.delay_s, publisher, payload))
         else:
             publisher.send(payload)
 
@@ -211,9 +206,9 @@ class TurtleBot3Twin:
             position, yaw = position + noise[:, :2], yaw + noise[:, 3]
         if self._drift.present:
             position = position + self._drift.error
-        # as the node does it: speeds are what happened since the last odometry
-        turn = (self._model.yaw - self._told) * turtlebot3.ODOMETRY_HZ
-        self._told = self._model.yaw.copy()
+        # as in the robot's node: speeds are averages since the last odometry
+        turn = (self._model.yaw - self._last_yaw) * turtlebot3.ODOMETRY_HZ
+        self._last_yaw = self._model.yaw.copy()
         velocity = self._model.velocity
         speed = velocity[:, 0] * np.cos(self._model.yaw) + velocity[:, 1] * np.sin(self._model.yaw)
         now = self._clock.utc()
@@ -238,13 +233,13 @@ class TurtleBot3Twin:
                 pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
                 twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
             )
-            self._say(row.odometry, row.types, message, t)
+            self._publish(row.odometry, row.types, message, t)
 
     def _scan(self, t: float) -> None:
         now = self._clock.utc()
         for index, row in enumerate(self._rows):
             yaw = float(self._model.yaw[index])
-            distance = self.sight(self._model.position[index], yaw, self._bearing + yaw)
+            distance = self.surroundings(self._model.position[index], yaw, self._bearing + yaw)
             seen = (distance >= turtlebot3.NEAREST) & (distance <= turtlebot3.FARTHEST)
             message = row.types.make(
                 ros2.LASER_SCAN,
@@ -259,7 +254,7 @@ class TurtleBot3Twin:
                 ranges=np.where(seen, distance, inf).astype(np.float32),
                 intensities=np.zeros(turtlebot3.RAYS, np.float32),
             )
-            self._say(row.scan, row.types, message, t)
+            self._publish(row.scan, row.types, message, t)
 
     def _battery(self, t: float) -> None:
         spent = self._used * self._faults.drain / ENDURANCE_S["turtlebot3"]
@@ -276,7 +271,7 @@ class TurtleBot3Twin:
                 charge=nan,
                 capacity=nan,
                 design_capacity=1.8,
-                percentage=100.0 * charge,  # not what ROS asks for, but what the robot says
+                percentage=100.0 * charge,  # as the robot does; ROS defines 0 to 1
                 power_supply_status=0,
                 power_supply_health=0,
                 power_supply_technology=0,
@@ -286,7 +281,7 @@ class TurtleBot3Twin:
                 location="",
                 serial_number="",
             )
-            self._say(row.battery, row.types, message, t)
+            self._publish(row.battery, row.types, message, t)
 
 
 def _row(participant: Participant, where: Address, chosen: Settings, start: tuple[float, float, float]) -> _Row:
@@ -306,7 +301,7 @@ def _row(participant: Participant, where: Address, chosen: Settings, start: tupl
 
 
 def open_device(request: DeviceRequest) -> Device:
-    """The entry point `turtlebot3-twin` of the group `zenpark.devices`.
+    """Entry point `turtlebot3-twin` of the group `zenpark.devices`.
 
     Raises:
         BodyError, Unreachable: As `TurtleBot3Twin`.

@@ -1,6 +1,6 @@
-"""Protocol twin of a Vicon: a DataStream server that shows clients where the other twins really are.
+"""Protocol twin of a Vicon: a DataStream server with the true poses of the other twins.
 
-`python -m twins.devices.vicon --robots CF01 KH01` hears the truth on Zenoh; as a class it is told the poses directly.
+`python -m twins.devices.vicon --robots CF01 KH01` receives the true poses on Zenoh; the class takes them directly.
 """
 
 from __future__ import annotations
@@ -34,35 +34,30 @@ from agents.runtime.command_line import add_network, reached, told_to_end
 from agents.runtime.lifeline import Lifeline
 from twins.devices.device import Faults
 
-BACKLOG: Final = 1 << 18  # [bytes] that may wait for a client; a slower one misses frames
-REACH: Final = (1e3, 1e3, 1e3)  # [m] any room
-FRESH_S: Final = 0.5  # a robot whose truth is older is not there to be seen
+BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames
+REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
+FRESH_S: Final = 0.5  # a robot whose true pose is older is not visible
 
 
 def upright(yaw: float) -> Array:
-    """Rotation (3, 3) to the room of a body that stands upright at `yaw` [rad]."""
+    """Rotation (3, 3) to the world of an upright body at `yaw` [rad]."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(eq=False)
 class _Client:
-    """A connection: what came in half, what could not go out yet, and which frames were asked for."""
+    """Connection of a client."""
 
     framer: Framer = field(default_factory=Framer)
     unsent: bytearray = field(default_factory=bytearray)
     streams: bool = False
-    asked: int = 0
-    named: bool = False  # has been told the names of the subjects
+    asked: int = 0  # single frames requested
+    named: bool = False  # names of the subjects were sent
 
 
 class ViconTwin:
-    """A DataStream server for subjects whose poses it is told.
-
-    Attributes:
-        address: "127.0.0.1:PORT".
-        latency_s: How old it says that its frames are [s].
-    """
+    """DataStream server for subjects whose poses are set by `place`."""
 
     def __init__(
         self,
@@ -75,27 +70,27 @@ class ViconTwin:
         host: str = "127.0.0.1",
         port: int = 0,
     ) -> None:
-        """Begins to listen.
+        """Start to listen.
 
         Args:
             subjects: Names of the bodies, as clients see them.
             rate_hz: Frames per second.
             sigma: White noise of the positions, per axis [m].
-            rng: Where the noise comes from; needed if there is any.
+            rng: Generator of the noise.
             faults: Silence, delay, occlusion.
-            host: Where to listen.
-            port: 0 for any free one.
+            host: Address to listen on.
+            port: 0 for any free port.
 
         Raises:
-            OSError: If it cannot listen there.
+            OSError: If listening fails.
         """
         self._subjects = list(subjects)
         self._rate, self._sigma, self._rng = rate_hz, sigma, rng or np.random.default_rng(0)
         self._faults = faults or Faults()
         self._position = np.zeros((len(self._subjects), 3))
         self._rotation = np.repeat(np.eye(3)[None], len(self._subjects), axis=0)
-        self._seen = np.zeros(len(self._subjects), dtype=bool)
-        self.latency_s = 0.0
+        self._visible = np.zeros(len(self._subjects), dtype=bool)
+        self.latency_s = 0.0  # reported age of the frames
         self._frames = 0
         self._delayed: deque[tuple[float, bytes]] = deque()
         self._names = b"".join(
@@ -108,15 +103,15 @@ class ViconTwin:
         self.address = f"{host}:{self._listener.getsockname()[1]}"
 
     def place(self, row: int, position: Array, rotation: Array) -> None:
-        """Puts a subject somewhere, in full view: (3,) [m], rotation to the room (3, 3)."""
-        self._position[row], self._rotation[row], self._seen[row] = position, rotation, True
+        """Set position (3,) [m] and rotation to the world (3, 3) of a subject, and make it visible."""
+        self._position[row], self._rotation[row], self._visible[row] = position, rotation, True
 
     def hide(self, row: int) -> None:
-        """Takes a subject out of view."""
-        self._seen[row] = False
+        """Make a subject invisible."""
+        self._visible[row] = False
 
-    def spoil(self, faults: Faults) -> None:
-        """From now on these things go wrong, and no others."""
+    def set_faults(self, faults: Faults) -> None:
+        """Replace the injected faults."""
         self._faults = faults
 
     def sockets(self) -> Sequence[socket.socket]:
@@ -126,15 +121,15 @@ class ViconTwin:
     def serve(self, ready: socket.socket, t: float) -> None:
         """See `twins.devices.device.Device.serve`."""
         if ready is self._listener:
-            self._admit()
+            self._accept()
         elif ready in self._clients:
-            self._hear(ready, t)
+            self._receive(ready, t)
 
     def advance(self, t: float) -> None:
-        """Sends the frame that is due at `t` [s], if one is."""
+        """Send the frame that is due at `t` [s], if any."""
         due = int(t * self._rate + 1e-6)
         if due > self._frames:
-            self._frames = due  # cameras do not make up for frames that were missed
+            self._frames = due  # missed frames are not repeated
             if not self._faults.silent(t):
                 self._delayed.append((t + self._faults.delay_s, self._frame(t)))
         while self._delayed and self._delayed[0][0] <= t:
@@ -148,17 +143,17 @@ class ViconTwin:
             connection.close()
         self._clients.clear()
 
-    def _admit(self) -> None:
+    def _accept(self) -> None:
         try:
             connection, _ = self._listener.accept()
-        except OSError:  # it has left already
+        except OSError:  # the client has left already
             return
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._clients[connection] = _Client(unsent=bytearray(vicon_datastream.pack_kinds(vicon_datastream.POSES)))
         self._flush(connection, self._clients[connection])
 
-    def _hear(self, connection: socket.socket, t: float) -> None:
+    def _receive(self, connection: socket.socket, t: float) -> None:
         client = self._clients[connection]
         try:
             received = connection.recv(65536)
@@ -183,11 +178,11 @@ class ViconTwin:
         connection.close()
 
     def _frame(self, t: float) -> bytes:
-        """The blocks of a frame."""
+        """Blocks of the current frame."""
         position = self._position
         if self._sigma > 0.0:
             position = position + self._rng.normal(0.0, self._sigma, position.shape)
-        seen = self._seen & (not self._faults.occluded(t))
+        seen = self._visible & (not self._faults.occluded(t))
         frame = [
             vicon_datastream.pack_frame_number(self._frames),
             vicon_datastream.pack_latency([("Data Collected", self.latency_s)]),
@@ -217,8 +212,8 @@ class ViconTwin:
             self._drop(connection)
 
 
-class Truths:
-    """Where the twins of robots really are, as they say on Zenoh."""
+class TruthSubscription:
+    """True poses of the robots' twins, received on Zenoh."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str]) -> None:
         self._robots = list(robots)
@@ -228,8 +223,8 @@ class Truths:
         ]
         self._stamp = np.full(len(self._robots), -np.inf)
 
-    def show(self, vicon: ViconTwin, now: float) -> None:
-        """Places every robot that was heard of lately, at UTC time `now` [s], and hides the others."""
+    def update(self, vicon: ViconTwin, now: float) -> None:
+        """Place every robot with a fresh pose at UTC time `now` [s], and hide the others."""
         check = partial(validation.check_position, now=now, reach=REACH)
         for row, inbox in enumerate(self._inboxes):
             for truth in inbox.read(check):
@@ -242,8 +237,8 @@ class Truths:
         vicon.latency_s = max(0.0, float(age[fresh].mean())) if fresh.any() else 0.0
 
 
-def serve(vicon: ViconTwin, truths: Truths, rate_hz: float, over: Callable[[], bool]) -> None:
-    """Serves until it is over, with a frame every 1 / `rate_hz` [s]."""
+def serve(vicon: ViconTwin, truth: TruthSubscription, rate_hz: float, over: Callable[[], bool]) -> None:
+    """Serve until `over()`, with a frame every 1 / `rate_hz` [s]."""
     zero, clock = time.monotonic(), Clock()
     frame = 0
     while not over():
@@ -254,7 +249,7 @@ def serve(vicon: ViconTwin, truths: Truths, rate_hz: float, over: Callable[[], b
             vicon.serve(waiting, t)
         if int(t * rate_hz) > frame:
             frame = int(t * rate_hz)
-            truths.show(vicon, clock.utc())
+            truth.update(vicon, clock.utc())
         vicon.advance(t)
 
 
@@ -281,7 +276,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="frames per second")
     parser.add_argument("--sigma", type=float, default=0.0003, metavar="METRES", help="noise of the positions")
     parser.add_argument("--seed", type=int, default=0, help="of the noise")
-    parser.add_argument("--faults", type=_faults, default=Faults(), metavar="JSON", help="what goes wrong on purpose")
+    parser.add_argument("--faults", type=_faults, default=Faults(), metavar="JSON", help="injected faults")
     chosen = parser.parse_args(arguments)
     if not (1.0 <= chosen.rate <= 1000.0 and 0.0 <= chosen.sigma < 1.0 and chosen.seed >= 0):
         parser.error("--rate is 1 to 1000 Hz, --sigma 0 to 1 m, --seed not negative")
@@ -308,8 +303,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             try:
                 keys = Keys(chosen.realm)
                 farewell = Farewell(session, keys, chosen.robots, lost)
-                truths = Truths(session, keys, chosen.robots)
-                serve(vicon, truths, chosen.rate, lambda: stop.is_set() or farewell.over())
+                truth = TruthSubscription(session, keys, chosen.robots)
+                serve(vicon, truth, chosen.rate, lambda: stop.is_set() or farewell.over())
             finally:
                 vicon.close()
     except (network.Unreachable, EndpointError) as error:

@@ -1,1 +1,1 @@
-"""What moves a world: point masses, pymunk, MuJoCo. One small interface."""
+"""Physics engines behind one interface: point masses, pymunk (planar rigid bodies), MuJoCo (rigid quadrotors)."""

@@ -1,10 +1,10 @@
-"""The Crazyflie firmware's cascade of PID controllers (paper, figure 6): position, velocity, attitude, rate, motors.
+"""Cascade of PID controllers of the Crazyflie firmware (paper, figure 6): position, velocity, attitude, rate, motors.
 
-Written anew for rows, from its structure, gains and limits. Inside it is in degrees and in 1/65535 of a motor's full
-thrust, because the firmware's gains are: they would not be recognised in other units. Seen from outside it is SI.
+Written for rows from the firmware's structure, gains and limits. Internal units are degrees and 1/65535 of a motor's
+full thrust, because the firmware's gains are in these units; the interface is in SI units.
 
-What is left out: the estimators (it is given the true state), the gyroscope's low-pass filter of 80 Hz, and the
-compensation of the battery's voltage, which is there to make thrust proportional to the command, as it is here.
+Left out: the estimators (the true state is given), the gyroscope's low-pass filter of 80 Hz, and the compensation of
+the battery's voltage, which makes thrust proportional to the command, as here.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ import numpy as np
 from agents.arrays import Array, Index, Mask, clamp, some
 
 RATE_HZ: Final = 500.0  # of the attitude and rate loops
-OUTER: Final = 5  # the position and velocity loops are that much slower: 100 Hz
+OUTER: Final = 5  # divisor of the rate for the position and velocity loops: 100 Hz
 FULL: Final = 65535.0  # of a motor
 TORQUE_LIMIT: Final = 32767.0  # of the rate loops' output
-BASE: Final = 36000.0  # thrust to which the vertical loop adds: 0.995 of the weight
+BASE: Final = 36000.0  # thrust before the vertical loop's output is added: 0.995 of the weight
 LEAST: Final = 20000.0
 THRUST_SCALE: Final = 1000.0
-SPEED: Final = 1.0 * 1.1  # [m/s] per axis; the firmware leaves its position loop a tenth more than its limit
+SPEED: Final = 1.0 * 1.1  # [m/s] per axis; the firmware allows its position loop 10 % more than its limit
 TILT: Final = 20.0  # [deg]
-# motors: front right, back right, back left, front left; how much each adds to a torque about x, y (nose down) and z
+# motors: front right, back right, back left, front left; share of each in a torque about x, y (nose down) and z
 MIX: Final = np.array([[-0.5, -0.5, -1.0], [-0.5, 0.5, 1.0], [0.5, 0.5, -1.0], [0.5, -0.5, 1.0]])
 
 
 @dataclass(frozen=True)
 class Gains:
-    """Of three axes: proportional, integral, derivative, and the limit of the integral."""
+    """PID gains of three axes, and the limit of the integral."""
 
     p: tuple[float, float, float]
     i: tuple[float, float, float]
@@ -46,7 +46,7 @@ RATE: Final = Gains((250.0, 250.0, 120.0), (500.0, 500.0, 16.7), (2.5, 2.5, 0.0)
 
 
 class Pid:
-    """Three PID controllers of each row; the derivative is of the measured value: setpoints do not kick."""
+    """Three PID controllers per row; the derivative acts on the measured value, so setpoint steps cause no kick."""
 
     def __init__(self, gains: Gains, rows: int, dt: float) -> None:
         self._p, self._i = np.array(gains.p), np.array(gains.i)
@@ -57,12 +57,12 @@ class Pid:
         self._before = np.full((rows, 3), np.nan)
 
     def reset(self, rows: Index | Mask) -> None:
-        """As at the first step."""
+        """Reset rows to the state before the first step."""
         self._integral[rows] = 0.0
         self._before[rows] = np.nan
 
     def preset(self, rows: Index, output: Array) -> None:
-        """Integrals of rows that give (len(rows), 3) without any error; of axes without an integral, zero."""
+        """Set integrals so that the output without error is (len(rows), 3); zero for axes without integral gain."""
         self._integral[rows] = np.divide(output, self._i, out=np.zeros_like(output), where=self._i != 0.0)
 
     def advance(self, error: Array, measured: Array) -> Array:
@@ -77,14 +77,10 @@ class Pid:
 
 
 class Firmware:
-    """The cascades of rows of quadrotors.
-
-    Attributes:
-        tilt: (n, 2) roll and pitch that the velocity loops ask for [rad].
-    """
+    """Controller cascades of n quadrotors."""
 
     def __init__(self, rows: int, dt: float) -> None:
-        """`dt` is the period of `motors` [s]: 1/RATE_HZ, or what divides the engine's step."""
+        """`dt`: period of the inner loops [s], 1/RATE_HZ or a divisor of the engine's step."""
         self._position, self._velocity = Pid(POSITION, rows, OUTER * dt), Pid(VELOCITY, rows, OUTER * dt)
         self._attitude, self._rate = Pid(ATTITUDE, rows, dt), Pid(RATE, rows, dt)
         self._thrust = np.full(rows, BASE)
@@ -93,28 +89,28 @@ class Firmware:
 
     @property
     def tilt(self) -> Array:
-        """See the class."""
+        """(n, 2) roll and pitch setpoints of the velocity loops [rad]."""
         return np.radians(self._angles[:, :2])
 
     def reset(self, rows: Index | Mask) -> None:
-        """Rows whose motors begin to turn."""
+        """Reset rows at the start of their motors."""
         for loop in (self._position, self._velocity, self._attitude, self._rate):
             loop.reset(rows)
         self._thrust[rows], self._angles[rows] = BASE, 0.0
 
-    def trim(self, rows: Index, share: Array) -> None:
-        """Rows that hover already, with (len(rows),) of their motors' full thrust."""
+    def preset_hover(self, rows: Index, share: Array) -> None:
+        """Initialise rows in hover, with the share (len(rows),) of their motors' full thrust."""
         lift = np.zeros((len(rows), 3))
         lift[:, 2] = (FULL * share - BASE) / THRUST_SCALE
         self._velocity.preset(rows, lift)
 
-    def guide(self, offset: Array, velocity: Array, wanted: Array, by_velocity: Mask, yaw: Array) -> None:
-        """The two outer loops, on every OUTER-th call.
+    def advance_outer_loops(self, offset: Array, velocity: Array, wanted: Array, by_velocity: Mask, yaw: Array) -> None:
+        """Advance the two outer loops on every OUTER-th call.
 
         Args:
-            offset: (n, 3) from where a row believes to be to its target [m].
+            offset: (n, 3) from the estimated position to the target [m].
             velocity: (n, 3) [m/s].
-            wanted: (n, 3) velocity that rows `by_velocity` fly at instead [m/s].
+            wanted: (n, 3) velocity setpoint of rows `by_velocity` [m/s].
             by_velocity: (n,)
             yaw: (n,) [rad].
         """
@@ -122,10 +118,10 @@ class Firmware:
         if (self._tick - 1) % OUTER:
             return
         cos, sin = np.cos(yaw), np.sin(yaw)
-        reference = clamp(self._position.advance(_turned(offset, cos, sin), offset), -SPEED, SPEED)
+        reference = clamp(self._position.advance(_to_level_frame(offset, cos, sin), offset), -SPEED, SPEED)
         if some(by_velocity):
-            reference = np.where(by_velocity[:, None], _turned(wanted, cos, sin), reference)
-        moving = _turned(velocity, cos, sin)
+            reference = np.where(by_velocity[:, None], _to_level_frame(wanted, cos, sin), reference)
+        moving = _to_level_frame(velocity, cos, sin)
         output = self._velocity.advance(reference - moving, moving)
         # forward is nose down, to the left is left side down
         self._angles = np.stack([-output[:, 1], output[:, 0], np.zeros(len(yaw))], axis=1)
@@ -133,13 +129,13 @@ class Firmware:
         lift = clamp(output[:, 2], -0.5 * FULL / THRUST_SCALE, 0.5 * FULL / THRUST_SCALE)
         self._thrust = clamp(BASE + THRUST_SCALE * lift, LEAST, FULL)
 
-    def motors(self, angles: Array, rates: Array, heading: Array) -> Array:
-        """The two inner loops and the mixer: (n, 4) thrust of each motor as a share of its full thrust.
+    def advance_inner_loops(self, angles: Array, rates: Array, heading: Array) -> Array:
+        """Advance the two inner loops and the mixer; returns (n, 4) thrust of each motor as a share of full thrust.
 
         Args:
             angles: (n, 3) roll, pitch (nose down) and yaw [rad].
             rates: (n, 3) angular velocity in the robot's frame [rad/s].
-            heading: (n,) yaw to turn to [rad].
+            heading: (n,) yaw setpoint [rad].
         """
         measured, turning = np.degrees(angles), np.degrees(rates)
         error = self._angles - measured
@@ -149,12 +145,12 @@ class Firmware:
         # no product of matrices: its rounding depends on the number of rows
         roll, pitch, yaw = (torque[:, axis, None] * MIX[:, axis] for axis in range(3))
         motors = self._thrust[:, None] + roll + pitch + yaw
-        # the torque is kept and the thrust given up where a motor can do no more
+        # at saturation of a motor the torque is kept and the thrust reduced
         excess = np.maximum(motors.max(axis=1) - FULL, 0.0)
         return np.asarray(clamp(motors - excess[:, None], 0.0, FULL) / FULL)
 
 
-def _turned(vectors: Array, cos: Array, sin: Array) -> Array:
-    """(n, 3) in the frame that is turned with the robots, and level."""
+def _to_level_frame(vectors: Array, cos: Array, sin: Array) -> Array:
+    """Vectors (n, 3) in the level frame with the robots' yaw."""
     x, y = vectors[:, 0], vectors[:, 1]
     return np.stack([cos * x + sin * y, cos * y - sin * x, vectors[:, 2]], axis=1)

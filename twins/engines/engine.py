@@ -1,4 +1,4 @@
-"""The small interface behind which different engines move twins: the same rows, in one place or in many copies of it.
+"""Interface of the engines that move twins, in one scene or in many copies of it.
 
 Engines are found by the entry-point group `zenpark.engines`: a frozen struct of parameters with a method `build`.
 """
@@ -15,120 +15,93 @@ from twins.scene import Scene
 
 @dataclass(frozen=True)
 class Stage:
-    """What an engine is built with; arrays over its rows (n).
+    """Input of an engine: n rows and the scene."""
 
-    Attributes:
-        kinds: Of the rows.
-        start: (n, 3) [m].
-        yaw: (n,) [rad].
-        dt: Length of a step of `Engine.advance` [s].
-        copy: (n,) which copy of the place a row is in; only rows of one copy can touch each other.
-        mirrored: (n,) rows that are elsewhere in reality: they are where they are put, and nothing moves them.
-        scene: What else stands there; every copy has its own.
-    """
-
-    kinds: tuple[Kind, ...]
-    start: Array
-    yaw: Array
-    dt: float
-    copy: Index
-    mirrored: Mask
-    scene: Scene
+    kinds: tuple[Kind, ...]  # of the rows
+    start: Array  # (n, 3) [m]
+    yaw: Array  # (n,) [rad]
+    dt: float  # step of `Engine.advance` [s]
+    copy: Index  # (n,) copy of the scene of each row; only rows of one copy can touch each other
+    mirrored: Mask  # (n,) robots that really are elsewhere: moved by `Engine.mirror` only
+    scene: Scene  # every copy has its own obstacles
 
 
 @dataclass(frozen=True)
 class Touch:
-    """The beginning of a contact.
+    """Beginning of a contact."""
 
-    Attributes:
-        time: Since the engine was built [s].
-        first: Row.
-        second: Row, or −1 − k for obstacle k of the scene, or −1 − M for a wall of the arena (M obstacles).
-        impulse: [N s], of the step in which the contact began.
-        overlap: [m]
-    """
-
-    time: float
-    first: int
-    second: int
-    impulse: float
-    overlap: float
+    time: float  # since the engine was built [s]
+    first: int  # row
+    second: int  # row, or −1 − k for obstacle k of the scene, or −1 − M for a wall of the arena (M obstacles)
+    impulse: float  # of the step in which the contact began [N s]
+    overlap: float  # [m]
 
 
 class Engine(Protocol):
-    """Rows of robots, and what moves them.
-
-    Attributes:
-        position: (n, 3) the truth, wobble included [m].
-        velocity: (n, 3) of what the robot's own controller knows: without wobble [m/s].
-        yaw: (n,) [rad].
-        flying: (n,) motors on, off the ground or about to be.
-        attitude: (n, 4) unit quaternion w, x, y, z from robot to room; None: upright, with `yaw`.
-        obstacles: (copies, M, 3) poses of the obstacles now: x, y [m], yaw [rad].
-    """
+    """Motion of n robots and of the obstacles."""
 
     @property
-    def position(self) -> Array: ...
+    def position(self) -> Array: ...  # (n, 3) true position, hover jitter included [m]
     @property
-    def velocity(self) -> Array: ...
+    def velocity(self) -> Array: ...  # (n, 3) as known by the robot's controller: without hover jitter [m/s]
     @property
-    def yaw(self) -> Array: ...
+    def yaw(self) -> Array: ...  # (n,) [rad]
     @property
-    def flying(self) -> Mask: ...
+    def flying(self) -> Mask: ...  # (n,) motors on, in the air or about to be
     @property
-    def attitude(self) -> Array | None: ...
+    def attitude(self) -> Array | None: ...  # (n, 4) unit quaternion w, x, y, z from robot to world; None: upright
     @property
-    def obstacles(self) -> Array: ...
+    def obstacles(self) -> Array: ...  # (copies, M, 3) current poses: x, y [m], yaw [rad]
 
     def command(self, setpoint: Array) -> None:
-        """Setpoints (n, 4) as in `agents.body.interface.Body.command`; rows of NaN keep theirs."""
+        """Set setpoints (n, 4) as in `agents.body.interface.Body.command`; rows of NaN keep theirs."""
         ...
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """Flying rows climb to `height` (len(rows),) [m]."""
+        """Make flying rows climb to `height` (len(rows),) [m]."""
         ...
 
     def land(self, rows: Index) -> None:
-        """Flying rows descend and switch off, ground robots halt."""
+        """Make flying rows descend and switch off, and ground robots halt."""
         ...
 
     def stop(self, rows: Index) -> None:
-        """Motors off, at once."""
+        """Switch motors off at once."""
         ...
 
     def advance(self, t: float, wobble: Array) -> None:
-        """One step of dt, to `t` [s] after the common start (negative before).
+        """Advance one step of dt, to `t` [s] after the common start (negative before).
 
         Args:
-            t: For obstacles that move by a plan.
-            wobble: (n, 2) horizontal displacement that nature adds to each row at the end of the step [m].
+            t: Time for obstacles with a plan.
+            wobble: (n, 2) hover jitter: horizontal displacement added to each row at the end of the step [m].
         """
         ...
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """Puts rows somewhere, at rest: (len(rows), 3) [m], (len(rows),) [rad]; flying rows hold that place."""
+        """Set positions (len(rows), 3) [m] and yaws (len(rows),) [rad], at rest; flying rows hold them."""
         ...
 
     def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
-        """Where mirrored rows are now, and how they move: (len(rows), 3) [m], [m/s]; NaN: they are not there."""
+        """Set state of mirrored rows: (len(rows), 3) [m], (len(rows),) [rad], (len(rows), 3) [m/s]; NaN: absent."""
         ...
 
     def touches(self) -> list[Touch]:
-        """Contacts that began since this was asked last; an engine without contacts has none."""
+        """Contacts that began since the last call; always empty in an engine without contacts."""
         ...
 
 
 class EngineFactory(Protocol):
-    """The parameters of an engine.
+    """Parameters of an engine.
 
-    One whose engines find contacts says so by the class variable `contacts = True`: that a run has none recorded then
-    means that nothing touched. Of others, what touched is worked out from the recorded positions.
+    The class variable `contacts = True` declares that the engine detects contacts: a run without recorded contacts then
+    had none. For other engines contacts are computed from the recorded positions.
     """
 
     def build(self, stage: Stage) -> Engine:
-        """An engine with these parameters.
+        """Build an engine with these parameters.
 
         Raises:
-            BodyError: If it has no twin of one of the kinds, or a library is missing, with the remedy.
+            BodyError: If a kind has no twin, or a library is missing, with the remedy.
         """
         ...

@@ -1,9 +1,9 @@
-"""The MuJoCo engine: drones are rigid bodies on four motors, flown by the firmware's cascade, for whom attitude counts.
+"""MuJoCo engine: drones are rigid bodies on four motors, controlled by the firmware's cascade; attitude is simulated.
 
-Every row is a simulation of its own of one small model, and one call advances them all: rows cannot disturb each
-other, to the last bit, and the cost of a row does not grow with their number, as it does in one model of them all.
-Drones touch the floor, the walls and the obstacles that no plan moves. They fly through each other and through ground
-robots: for contacts among robots there is the engine `pymunk`.
+Every row is a simulation of its own small model, and one call advances all: rows are independent to the last bit, and
+the cost of a row does not grow with their number, as in one model of all. Drones touch the floor, the walls and the
+obstacles without a plan. They fly through each other and through ground robots: contacts among robots are simulated by
+the engine `pymunk`.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from twins.engines.crazyflie_cascade import RATE_HZ, Firmware
 from twins.engines.engine import Stage
 from twins.engines.mujoco_model import AIRFRAMES, mjcf
 from twins.engines.point_mass import PointMassEngine
-from twins.models.onboard_flight import Piloted
+from twins.models.onboard_flight import OnboardFlight
 from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene
 
 SUBSTEPS: Final = 2  # of MuJoCo in a step of the firmware
-QUIET_S: Final = 0.1  # what lies still for so long with its motors off is not moved any more
-STILL: Final = 0.005  # [m/s], and ten times that in rad/s
-TIPPED: Final = 0.5  # cosine of the tilt from which a drone does not take off, as the firmware's supervisor has it
-# the loop follows a wandering estimate with less than its full size: at a correlation time of 0.5 s with this share
-FOLLOWED: Final = 0.84
+QUIET_S: Final = 0.1  # a drone at rest for so long with its motors off is no longer simulated
+AT_REST: Final = 0.005  # [m/s], and ten times that in rad/s
+TIPPED: Final = 0.5  # cosine of the largest tilt for a take-off, as in the firmware's supervisor
+# the loop follows a random error of the estimate in part: with this share at a correlation time of 0.5 s
+TRACKED_SHARE: Final = 0.84
 FULL_STATE: Final = 18  # time, then:
 PLACE, TURN, SPEED, SPIN, LIFT = slice(1, 4), slice(4, 8), slice(8, 11), slice(11, 14), slice(14, 18)
 
 
 class RigidBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Its parameters."""
+    """Parameters of the MuJoCo engine."""
 
     contacts: ClassVar[bool] = False
 
@@ -64,46 +64,40 @@ class RigidBodyEngine(PointMassEngine):
             return self._drones
 
         super().__init__(stage, drones)
-        self._lean()
+        self._update_attitude()
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
         """See `Engine.place`."""
         super().place(rows, position, yaw, flying)
-        self._lean()
+        self._update_attitude()
 
     def advance(self, t: float, wobble: Array) -> None:
         """See `Engine.advance`."""
         super().advance(t, wobble)
-        self._lean()
+        self._update_attitude()
 
     def _fly(self, wobble: Array) -> None:
-        """The wobble is an error of the drones' own estimate of where they are: they really fly it."""
-        self._drones.wander(wobble[self.air])
+        """Advance flying rows by one step; hover jitter is an error of the drones' own estimate, which they follow."""
+        self._drones.set_position_error(wobble[self.air])
         self._drones.advance()
-        self._adopt()
+        self._copy_flight_state()
 
-    def _lean(self) -> None:
-        self.attitude = _upright(self.yaw)
+    def _update_attitude(self) -> None:
+        self.attitude = _upright_quaternions(self.yaw)
         self.attitude[self.air] = self._drones.attitude
-        self.attitude[self._mirrored] = _upright(self.yaw[self._mirrored])
+        self.attitude[self._mirrored] = _upright_quaternions(self.yaw[self._mirrored])
 
 
-class Drones(Piloted):
-    """Rows of rigid quadrotors; implements `twins.engines.point_mass.Flight`.
+class Drones(OnboardFlight):
+    """N rigid quadrotors; implements `twins.engines.point_mass.Flight`.
 
-    Attributes:
-        position: (n, 3) of the centre of mass, over where it is when standing on the floor [m].
-        velocity: (n, 3) [m/s].
-        yaw: (n,) [rad], without jumps.
-        attitude: (n, 4) unit quaternion w, x, y, z from robot to room.
-        thrust: (n, 4) of each motor [N].
-        flying: (n,) motors on.
+    Heights are those of the centre of mass relative to standing on the floor [m]; yaw has no jumps.
     """
 
     def __init__(
         self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float, *, scene: Scene, motor_lag: float
     ) -> None:
-        """Steps of `dt` [s] are divided for the firmware so that it runs at its own rate or faster.
+        """Steps of `dt` [s] are divided so that the firmware runs at its own rate or faster.
 
         Raises:
             BodyError: If MuJoCo is not installed.
@@ -113,8 +107,7 @@ class Drones(Piloted):
             from mujoco import rollout  # noqa: PLC0415
         except ImportError:
             raise BodyError(
-                "the engine mujoco needs a library that is an extra: ./zenpark install mujoco-core, or "
-                "pip install -e '.[mujoco]'"
+                "the engine mujoco needs an extra library: ./zenpark install mujoco-core, or pip install -e '.[mujoco]'"
             ) from None
         super().__init__(kinds, start, yaw, dt)
         rows = len(kinds)
@@ -136,64 +129,64 @@ class Drones(Piloted):
         self._wobble, self._drift = np.zeros((rows, 2)), np.zeros((rows, 2))
         self._angles = np.zeros((rows, 3))
         self._heading = np.array(yaw, dtype=float)
-        self._put(np.arange(rows), start, yaw, self.flying)
+        self._set_state(np.arange(rows), start, yaw, self.flying)
 
     @property
     def attitude(self) -> Array:
-        """See the class."""
+        """(n, 4) unit quaternion w, x, y, z from robot to world."""
         return self._state[:, TURN]
 
     @property
     def thrust(self) -> Array:
-        """See the class."""
+        """(n, 4) of each motor [N]."""
         return self._state[:, LIFT]
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Engine.takeoff`; what lies on its side or back stays there."""
-        upright = self._up(rows) > TIPPED
+        """See `Engine.takeoff`; no effect on a drone that lies on its side or back."""
+        upright = self._tilt_cosine(rows) > TIPPED
         rows, height = rows[upright], height[upright]
         fresh = rows[~self.flying[rows]]
         self._firmware.reset(fresh)
         self._heading[fresh] = self.yaw[fresh]
-        self._pilot.heading[fresh] = self.yaw[fresh]
+        self._orders.yaw_setpoint[fresh] = self.yaw[fresh]
         self._quiet[rows] = 0.0
         super().takeoff(rows, height)
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
         """See `Engine.place`."""
-        self._pilot.place(rows, position, yaw, flying)
+        self._orders.place(rows, position, yaw, flying)
         self._firmware.reset(rows)
         aloft = rows[flying]
-        self._firmware.trim(aloft, self._hover[aloft] / self._full[aloft, 0])
-        self._put(rows, position, yaw, flying)
+        self._firmware.preset_hover(aloft, self._hover[aloft] / self._full[aloft, 0])
+        self._set_state(rows, position, yaw, flying)
 
-    def wander(self, wobble: Array) -> None:
-        """By how much the drones are wrong about where they are, until the next step: (n, 2) [m]."""
+    def set_position_error(self, wobble: Array) -> None:
+        """Set the error of the drones' position estimates until the next step: (n, 2) [m]."""
         self._drift = (wobble - self._wobble) / (self._dt * self._ticks)
         self._wobble = wobble
 
     def advance(self) -> None:
-        """One step of dt."""
-        pilot, state = self._pilot, self._state
-        climbing = pilot.climbing
+        """Advance one step of dt."""
+        orders, state = self._orders, self._state
+        climbing = orders.climbing
         if some(climbing):
-            pilot.advance(climbing)
+            orders.advance(climbing)
         awake = np.flatnonzero(self.flying | (self._quiet < QUIET_S))
         if not len(awake):
             return
         alone = len(awake) < len(state)
         models = [self._models[row] for row in awake] if alone else self._models
         any_flies = some(self.flying)
-        by_velocity = pilot.by_velocity & ~climbing
-        target = pilot.target.copy()
-        target[:, :2] += self._wobble / FOLLOWED
-        wanted = clamp(pilot.wanted, -self._speed, self._speed)
-        if pilot.any_by_velocity:
+        by_velocity = orders.by_velocity & ~climbing
+        target = orders.target.copy()
+        target[:, :2] += self._wobble / TRACKED_SHARE
+        wanted = clamp(orders.velocity_setpoint, -self._speed, self._speed)
+        if orders.any_by_velocity:
             wanted[:, :2] += self._drift
         force = np.zeros((len(state), 4))
         for _ in range(self._ticks):
             if any_flies:
-                force = self._flown(target, wanted, by_velocity)
+                force = self._motor_forces(target, wanted, by_velocity)
             before = state[awake] if alone else state
             control = np.repeat((force[awake] if alone else force)[:, None], SUBSTEPS, axis=1)
             path = np.empty((len(awake), SUBSTEPS, FULL_STATE))
@@ -202,58 +195,58 @@ class Drones(Piloted):
                 state=path, sensordata=np.empty((len(awake), SUBSTEPS, 0)),
             )  # fmt: skip
             state[awake] = path[:, -1]
-            self._see()
-        self._settle()
+            self._update_angles()
+        self._update_grounded()
 
-    def _flown(self, target: Array, wanted: Array, by_velocity: Mask) -> Array:
-        """(n, 4) thrust that the firmware asks of each motor [N]."""
-        state, pilot, firmware = self._state, self._pilot, self._firmware
-        self._heading = np.where(by_velocity, self._heading + self._dt * pilot.yaw_rate, pilot.heading)
-        firmware.guide(target - state[:, PLACE], state[:, SPEED], wanted, by_velocity, self.yaw)
-        share = firmware.motors(self._angles, state[:, SPIN], self._heading)
+    def _motor_forces(self, target: Array, wanted: Array, by_velocity: Mask) -> Array:
+        """Thrust setpoints of the motors, by the firmware's cascade: (n, 4) [N]."""
+        state, orders, firmware = self._state, self._orders, self._firmware
+        self._heading = np.where(by_velocity, self._heading + self._dt * orders.yaw_rate, orders.yaw_setpoint)
+        firmware.advance_outer_loops(target - state[:, PLACE], state[:, SPEED], wanted, by_velocity, self.yaw)
+        share = firmware.advance_inner_loops(self._angles, state[:, SPIN], self._heading)
         return np.where(self.flying[:, None], self._full * share, 0.0)
 
-    def _see(self) -> None:
-        """Roll, pitch (nose down) and yaw of each row; yaw goes on where it would jump."""
+    def _update_angles(self) -> None:
+        """Update roll, pitch (nose down) and yaw of each row; yaw without jumps."""
         w, x, y, z = self._state[:, TURN].T
         yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         self.yaw = yaw + 2.0 * np.pi * np.round((self.yaw - yaw) / (2.0 * np.pi))
         roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
         self._angles = np.stack([roll, np.arcsin(clamp(2.0 * (w * y - z * x), -1.0, 1.0)), self.yaw], axis=1)
 
-    def _settle(self) -> None:
-        """Touchdown, and rest."""
+    def _update_grounded(self) -> None:
+        """End completed landings and bring drones on the ground to rest."""
         state = self._state
         self.position, self.velocity = state[:, PLACE].copy(), state[:, SPEED].copy()
-        self._pilot.touch_down(self.position[:, 2])
+        self._orders.touch_down(self.position[:, 2])
         if some(self.flying):
-            # what is on its back flies no more: the firmware's supervisor switches off
-            over = np.flatnonzero(self.flying & (self._up(slice(None)) < 0.0))
+            # the firmware's supervisor switches the motors off when the drone is upside down
+            over = np.flatnonzero(self.flying & (self._tilt_cosine(slice(None)) < 0.0))
             if len(over):
-                self._pilot.stop(over)
-        moving = self.flying | (norm(state[:, SPEED]) > STILL) | (norm(state[:, SPIN]) > 10.0 * STILL)
+                self._orders.stop(over)
+        moving = self.flying | (norm(state[:, SPEED]) > AT_REST) | (norm(state[:, SPIN]) > 10.0 * AT_REST)
         self._quiet = np.where(moving, 0.0, self._quiet + self._dt * self._ticks)
         if some(rests := self._quiet >= QUIET_S):
             state[rests, SPEED] = state[rests, SPIN] = 0.0
             self.velocity[rests] = 0.0
 
-    def _up(self, rows: Index | slice) -> Array:
+    def _tilt_cosine(self, rows: Index | slice) -> Array:
         """Cosine of the tilt."""
         turn = self._state[rows, TURN]
         return np.asarray(1.0 - 2.0 * (turn[:, 1] ** 2 + turn[:, 2] ** 2))
 
-    def _put(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
+    def _set_state(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
         state = self._state
         state[rows] = 0.0
-        state[rows, PLACE], state[rows, TURN] = position, _upright(yaw)
+        state[rows, PLACE], state[rows, TURN] = position, _upright_quaternions(yaw)
         state[rows, LIFT] = np.where(flying, self._hover[rows], 0.0)[:, None]
         self._quiet[rows] = 0.0
         self.yaw[rows] = self._heading[rows] = yaw
         self.position, self.velocity = state[:, PLACE].copy(), state[:, SPEED].copy()
-        self._see()
+        self._update_angles()
 
 
-def _upright(yaw: Array) -> Array:
-    """(n, 4) quaternions of rows that stand upright."""
+def _upright_quaternions(yaw: Array) -> Array:
+    """Quaternions (n, 4) of upright rows."""
     zero = np.zeros(len(yaw))
     return np.stack([np.cos(0.5 * yaw), zero, zero, np.sin(0.5 * yaw)], axis=1)

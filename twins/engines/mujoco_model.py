@@ -1,4 +1,4 @@
-"""Rigid quadrotors: their figures, and the place that one of them flies in, as MuJoCo reads it."""
+"""MuJoCo model: parameters of the airframes, and the scene of one quadrotor as MJCF."""
 
 from __future__ import annotations
 
@@ -13,34 +13,25 @@ from agents.arrays import Array
 from twins.scene import Scene
 
 WALL: Final = 0.005  # [m] half the thickness of thin walls
-STIFF: Final = 0.004  # [s] time constant of a contact: what stands sinks in by a tenth of a millimetre
-# front right, back right, back left, front left: where along x and y, and the torque's sign: neighbours turn opposite
+STIFF: Final = 0.004  # [s] time constant of a contact: a standing drone sinks in by 0.1 mm
+# front right, back right, back left, front left: direction along x and y, sign of the torque (neighbours turn opposite)
 MOTORS: Final = ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1))
 
 
 @dataclass(frozen=True)
 class Airframe:
-    """A quadrotor, its motors at 45° to its nose.
+    """Quadrotor with motors at 45° to its nose."""
 
-    Attributes:
-        mass: [kg]
-        inertia: About its own x, y, z [kg m²].
-        arm: From the middle to a motor [m].
-        thrust: Of a motor at full command [N].
-        torque: Of a motor about its axis, as a share of its thrust [m].
-        size: Of the box that touches things [m].
-    """
-
-    mass: float
-    inertia: tuple[float, float, float]
-    arm: float
-    thrust: float
-    torque: float
-    size: tuple[float, float, float]
+    mass: float  # [kg]
+    inertia: tuple[float, float, float]  # about its own x, y, z [kg m²]
+    arm: float  # from the centre to a motor [m]
+    thrust: float  # of a motor at full command [N]
+    torque: float  # of a motor about its axis, per thrust [m]
+    size: tuple[float, float, float]  # of the collision box [m]
 
 
 def _scaled(frame: Airframe, mass: float, arm: float, size: tuple[float, float, float]) -> Airframe:
-    """The same design, larger: thrust with the mass, inertia with mass and arm squared, torque with the arm."""
+    """Scale a design: thrust with the mass, inertia with mass and arm squared, torque with the arm."""
     heavier, longer = mass / frame.mass, arm / frame.arm
     x, y, z = (each * heavier * longer**2 for each in frame.inertia)
     return Airframe(mass, (x, y, z), arm, frame.thrust * heavier, frame.torque * longer, size)
@@ -62,13 +53,13 @@ AIRFRAMES: Final[dict[str, Airframe]] = {
 
 
 def mjcf(frame: Airframe, scene: Scene, step: float, motor_lag: float) -> str:
-    """One quadrotor in a scene, in MuJoCo's format; heights are counted from that of one that stands on the floor.
+    """One quadrotor in a scene, as MJCF; heights are relative to standing on the floor.
 
-    Its state is place, quaternion, velocity in the room, angular velocity in its own frame, and the motors' thrusts.
+    The state is position, quaternion, velocity in the world, angular velocity in the robot's frame, and motor thrusts.
 
     Args:
-        frame: The quadrotor.
-        scene: Of which what stands fast is taken.
+        frame: Airframe of the quadrotor.
+        scene: Only obstacles without a plan are used.
         step: Of the simulation [s].
         motor_lag: Time constant of a motor's thrust [s].
     """
@@ -106,7 +97,7 @@ def _walls(scene: Scene) -> list[str]:
 
 
 def _obstacles(scene: Scene, floor: float) -> list[str]:
-    """Those that nothing moves: boxes, cylinders, and the pieces of walls."""
+    """Obstacles without a plan: boxes, cylinders, and segments of walls."""
     geoms = []
     for k, (outline, closed) in enumerate(zip(scene.outline, scene.closed, strict=True)):
         if scene.plans[k] is not None:

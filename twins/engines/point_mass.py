@@ -1,4 +1,4 @@
-"""The point-mass engine: every row moves by its own model and nothing is in anything's way. For thousands of robots."""
+"""Point-mass engine: every row moves by its own model, without contacts; for thousands of robots."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ from twins.models.quadrotor import RESPONSES, Quadrotor
 
 
 class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Its parameters."""
+    """Parameters of the point-mass engine."""
 
     leaning: Annotated[
-        bool, Meta(description="quadrotors must lean before they accelerate: truer, and formation gains must be lower")
+        bool,
+        Meta(
+            description="quadrotors must tilt before they accelerate: more accurate, and formation gains must be lower"
+        ),
     ] = False
 
     contacts: ClassVar[bool] = False
@@ -33,7 +36,7 @@ class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Flight(Protocol):
-    """What moves rows that fly; methods as of `twins.models.quadrotor.Quadrotor`."""
+    """Motion model of flying rows; methods as in `twins.models.quadrotor.Quadrotor`."""
 
     position: Array
     velocity: Array
@@ -52,14 +55,7 @@ Flights = Callable[[Sequence[Kind], Array, Array, float], Flight]  # kinds, star
 
 
 class Models:
-    """The models of rows of any kinds: quadrotors for those that fly, differential drives for the others.
-
-    Attributes:
-        air: Rows that fly.
-        floor: Rows that drive.
-        quadrotor: Of the rows `air`.
-        differential: Of the rows `floor`.
-    """
+    """Motion models of rows of any kinds: quadrotors for flying rows (`air`), differential drives for the `floor`."""
 
     def __init__(self, stage: Stage, flights: Flights = Quadrotor) -> None:
         kinds = stage.kinds
@@ -87,13 +83,13 @@ class Models:
 
     def land(self, rows: Index) -> None:
         """See `Engine.land`."""
-        self.quadrotor.land(self._among(self.in_air, rows))
-        self.differential.halt(self._among(self.on_floor, rows))
+        self.quadrotor.land(self._indices_in(self.in_air, rows))
+        self.differential.halt(self._indices_in(self.on_floor, rows))
 
     def stop(self, rows: Index) -> None:
         """See `Engine.stop`."""
-        self.quadrotor.stop(self._among(self.in_air, rows))
-        self.differential.halt(self._among(self.on_floor, rows))
+        self.quadrotor.stop(self._indices_in(self.in_air, rows))
+        self.differential.halt(self._indices_in(self.on_floor, rows))
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
         """See `Engine.place`."""
@@ -103,14 +99,14 @@ class Models:
             model.place(at, position[which], yaw[which], flying[which])
 
     def push(self, rows: Index, velocity: Array) -> None:
-        """Gives rows a velocity (len(rows), 3) [m/s]; drives the part of it that is along their heading."""
+        """Set velocities (len(rows), 3) [m/s]; of ground robots the component along their heading."""
         flies = np.isin(rows, self.in_air)
         self.quadrotor.velocity[np.searchsorted(self.in_air, rows[flies])] = velocity[flies]
         self.differential.roll(np.searchsorted(self.on_floor, rows[~flies]), velocity[~flies])
 
     @staticmethod
-    def _among(part: Index, rows: Index) -> Index:
-        """Where in `part` those of `rows` stand that belong to it."""
+    def _indices_in(part: Index, rows: Index) -> Index:
+        """Indices in `part` of the `rows` that belong to it."""
         return np.searchsorted(part, rows[np.isin(rows, part)])
 
 
@@ -127,7 +123,7 @@ class PointMassEngine(Models):
         self._moves = len(stage.scene.moving) > 0
         self._mirrored = np.flatnonzero(stage.mirrored)
         count = len(self._mirrored)
-        self._seen = np.full((count, 3), np.nan), np.zeros((count, 3)), np.zeros(count)
+        self._mirrored_state = np.full((count, 3), np.nan), np.zeros((count, 3)), np.zeros(count)
         self.position = np.array(stage.start, dtype=float)
         self.velocity, self.yaw = np.zeros((rows, 3)), np.array(stage.yaw, dtype=float)
         self.flying = np.zeros(rows, dtype=bool)
@@ -146,18 +142,18 @@ class PointMassEngine(Models):
             self._fly(wobble)
         if len(self._mirrored):
             rows = self._mirrored
-            self.position[rows], self.velocity[rows], self.yaw[rows] = self._seen
+            self.position[rows], self.velocity[rows], self.yaw[rows] = self._mirrored_state
         if self._moves:
             self.obstacles = np.tile(self._scene.at(t), (self._copies, 1, 1))
 
     def _fly(self, wobble: Array) -> None:
-        """A step of the rows that fly; the wobble is no motion of theirs, it is added to where they are."""
+        """Advance flying rows by one step; hover jitter is added to the position, not to the motion."""
         self.quadrotor.advance()
-        self._adopt()
+        self._copy_flight_state()
         self.position[self.air, :2] += wobble[self.air]
 
-    def _adopt(self) -> None:
-        """Takes over where the rows that fly are."""
+    def _copy_flight_state(self) -> None:
+        """Copy the state of flying rows from their model."""
         flight, air = self.quadrotor, self.air
         self.position[air], self.velocity[air], self.yaw[air] = flight.position, flight.velocity, flight.yaw
         self.flying[air] = flight.flying
@@ -170,8 +166,8 @@ class PointMassEngine(Models):
     def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
         """See `Engine.mirror`."""
         at = np.searchsorted(self._mirrored, rows)
-        self._seen[0][at], self._seen[1][at], self._seen[2][at] = position, velocity, yaw
+        self._mirrored_state[0][at], self._mirrored_state[1][at], self._mirrored_state[2][at] = position, velocity, yaw
 
     def touches(self) -> list[Touch]:
-        """See `Engine.touches`: nothing touches."""
+        """See `Engine.touches`: always empty."""
         return []

@@ -1,4 +1,4 @@
-"""Which bodies of one pymunk space may touch, how gently, and what touched what."""
+"""Contacts of one pymunk space: which bodies may touch, restitution, and detection of new contacts."""
 
 from __future__ import annotations
 
@@ -11,68 +11,53 @@ import pymunk
 from agents.arrays import Array
 from twins.engines.engine import Touch
 
-APART_S: Final = 0.1  # a pair that is apart for a shorter time has not ended its contact
+APART_S: Final = 0.1  # a shorter separation does not end a contact
 CORRECTION: Final = 0.2  # share of an overlap that one step removes
-SLOP: Final = 1e-4  # [m] overlap that is left alone, so that what rests against something keeps contact
-AT_REST: Final = 1e-9  # [m/s], [N s] slower or weaker than this is nothing
+SLOP: Final = 1e-4  # [m] overlap that is not corrected, so that resting bodies keep contact
+AT_REST: Final = 1e-9  # [m/s], [N s] smaller values count as zero
 
 
 @dataclass
 class Layers:
-    """Vertical extents of everything that can touch, by number: rows, and −1 − k as in `Touch.second`.
+    """Vertical extents of rows and obstacles, by number: rows, and −1 − k as in `Touch.second`."""
 
-    Attributes:
-        bottom: (n + M + 1,) [m]; negative numbers count from its end.
-        top: (n + M + 1,) [m]
-    """
-
-    bottom: Array
-    top: Array
+    bottom: Array  # (n + M + 1,) [m]; negative numbers count from the end
+    top: Array  # (n + M + 1,) [m]
 
 
 @dataclass
 class Contacts:
-    """The contacts of one space.
+    """Contact handling of one space.
 
-    Pymunk finds a contact when bodies overlap already: at 0.5 m/s and steps of 5 ms that is 2.5 mm too late. Its
-    shapes therefore carry a skin, in which a contact is known but not yet felt: bodies that would overlap at the end
-    of a step bounce in it, and bodies that keep pushing are let come just so near that they touch.
-
-    Attributes:
-        numbers: Row (or negative number of an obstacle) of each shape.
-        layers: Only bodies at one height touch; kept up to date by the engine.
-        step: [s]
-        skin: Of each shape [m].
-        restitution: Of a blow; what keeps pushing does not bounce.
-        slide: How fast bodies that got into one another from above slide apart [m/s].
-        found: Contacts that began; the engine's own list.
-        time: Of the step, since the engine was built [s]; set by the engine.
+    Pymunk detects a contact only when bodies overlap already: at 0.5 m/s and steps of 5 ms that is 2.5 mm too late. Its
+    shapes therefore have a skin, in which a contact is detected without force: bodies that would overlap at the end of
+    a step bounce in the skin, and bodies that keep pushing approach until they just touch.
     """
 
-    numbers: dict[pymunk.Shape, int]
-    layers: Layers
-    step: float
-    skin: float
-    restitution: float
-    slide: float
-    found: list[Touch]
-    time: float = 0.0
-    _last: dict[tuple[int, int], float] = field(default_factory=dict)  # when each pair touched last
+    numbers: dict[pymunk.Shape, int]  # row of each shape, or negative number of an obstacle
+    layers: Layers  # only bodies that overlap in height touch; updated by the engine
+    step: float  # [s]
+    skin: float  # of each shape [m]
+    restitution: float  # of an impact; bodies that keep pushing do not bounce
+    slide: float  # speed at which bodies that overlapped from above separate [m/s]
+    found: list[Touch]  # new contacts; the engine's own list
+    time: float = 0.0  # of the step, since the engine was built [s]; set by the engine
+    _last: dict[tuple[int, int], float] = field(default_factory=dict)  # time of each pair's last contact
     _fresh: dict[tuple[int, int], float] = field(default_factory=dict)  # overlaps of pairs that may begin to touch
 
-    def watch(self, space: pymunk.Space) -> None:
-        """Takes charge of the contacts of a space."""
+    def attach(self, space: pymunk.Space) -> None:
+        """Install the callbacks in a space."""
         space.collision_slop = 2.0 * self.skin + SLOP
         space.collision_bias = (1.0 - CORRECTION) ** (1.0 / self.step)
-        space.on_collision(pre_solve=self._before, post_solve=self._after)
+        space.on_collision(pre_solve=self._pre_solve, post_solve=self._post_solve)
 
-    def forget(self, rows: list[int]) -> None:
-        """Rows that were taken elsewhere begin their contacts anew."""
+    def reset_rows(self, rows: list[int]) -> None:
+        """Forget earlier contacts of rows that were moved to another place."""
         gone = set(rows)
         for pair in [pair for pair in self._last if not gone.isdisjoint(pair)]:
             del self._last[pair]
 
-    def _before(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: Any) -> None:  # noqa: ANN401 - pymunk's
+    def _pre_solve(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: Any) -> None:  # noqa: ANN401 - pymunk's
         one, other = arbiter.shapes
         a, b = self.numbers[one], self.numbers[other]
         bottom, top = self.layers.bottom, self.layers.top
@@ -81,7 +66,7 @@ class Contacts:
         if apart or (a < 0 and b < 0):
             return
         contacts = arbiter.contact_point_set
-        point = contacts.points[0]  # one of the two is a disc: there is no second point
+        point = contacts.points[0]  # the only point, because one shape is a disc
         gap = point.distance + 2.0 * self.skin
         nx, ny = contacts.normal
         (ux, uy), (vx, vy) = _velocity(one, point.point_a), _velocity(other, point.point_b)
@@ -98,7 +83,7 @@ class Contacts:
         elif meets or touching:
             self._last[pair] = self.time
         if touching:
-            self._hold_back(arbiter, contacts, gap)
+            self._limit_depth(arbiter, contacts, gap)
         if new and meets:
             arbiter.restitution = self.restitution
         elif touching:
@@ -107,15 +92,15 @@ class Contacts:
             # a negative restitution leaves just the speed that closes the gap by the end of the step
             arbiter.restitution = -gap / (self.step * closing)
 
-    def _hold_back(self, arbiter: pymunk.Arbiter, contacts: pymunk.ContactPointSet, gap: float) -> None:
-        """Lets what is deep in something else come out as if it slid off a roof, not as from a spring."""
+    def _limit_depth(self, arbiter: pymunk.Arbiter, contacts: pymunk.ContactPointSet, gap: float) -> None:
+        """Limit the depth of an overlap, so that bodies separate at the speed `slide` instead of being thrown apart."""
         deepest = SLOP + self.slide * self.step / CORRECTION
         if -gap > deepest:
             point = contacts.points[0]
             point.point_a = point.point_b + contacts.normal * (deepest + 2.0 * self.skin)
             arbiter.contact_point_set = contacts
 
-    def _after(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: Any) -> None:  # noqa: ANN401 - likewise
+    def _post_solve(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: Any) -> None:  # noqa: ANN401 - likewise
         if not self._fresh:
             return
         one, other = arbiter.shapes
@@ -130,12 +115,12 @@ class Contacts:
 
 
 def _pair(a: int, b: int) -> tuple[int, int]:
-    """The rows of a pair in their order, a row before an obstacle."""
+    """Pair with sorted rows, a row before an obstacle."""
     return (b, a) if a < 0 or 0 <= b < a else (a, b)
 
 
 def _velocity(shape: pymunk.Shape, point: tuple[float, float]) -> tuple[float, float]:
-    """Of a point of a shape's body; a disc's turning does not bring it nearer to anything."""
+    """Velocity of a point of a shape's body; a disc's rotation is ignored, because it closes no gap."""
     body = shape.body
     if body is None:
         return 0.0, 0.0

@@ -1,4 +1,4 @@
-"""The pymunk engine: rigid bodies in the plane, in layers by height, that push each other and stop at walls."""
+"""Pymunk engine: planar rigid bodies in layers by height, with contacts between robots, obstacles and walls."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ PLACE, YAW, MOVE, TURN, PUSH = slice(0, 2), 2, slice(3, 5), 5, slice(6, 8)  # co
 WIDTH: Final = 8
 POSE: Final = slice(0, 3)
 RATE: Final = slice(3, 6)
-AWAY: Final = 1e6  # [m] where mirrored robots are that are not there
-UNFELT: Final = 1e-12  # [m/s] change of speed that is only rounding
-LEAP: Final = 10.0  # [m/s] what a plan moves faster than this, it puts there
+AWAY: Final = 1e6  # [m] position of absent mirrored robots
+UNFELT: Final = 1e-12  # [m/s] smaller changes of speed are rounding
+LEAP: Final = 10.0  # [m/s] faster motion of a plan is a jump
 
 Share = Annotated[float, Meta(ge=0, le=1)]
 Friction = Annotated[float, Meta(ge=0, le=10)]
 
 
 class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Parameters of the pymunk engine; all are choices, of hulls of plastic and wheels of rubber."""
+    """Parameters of the pymunk engine; all are chosen for plastic hulls and rubber wheels."""
 
     step_s: Annotated[float, Meta(gt=0, le=0.05, description="longest internal step [s]")] = 0.005
     friction: Annotated[Friction, Meta(description="coefficient between robots")] = 0.3
@@ -63,13 +63,13 @@ class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class PlanarEngine(Models):
     """Implements `twins.engines.engine.Engine`.
 
-    The models say how fast a row would move after this tick; wheels pull it there with what grip they have, a tilted
-    quadrotor with what its thrust allows, and pymunk's solver weighs that against the contacts. Where nothing touches,
-    the tick is the one of the point-mass engine. Pymunk moves bodies at the beginning of a step and finds their
-    velocities at its end; a position here is therefore one step ahead of pymunk's: where the next step begins.
+    The motion models compute the velocity of each row after this tick; forces within the grip of the wheels, or the
+    thrust of a tilted quadrotor, change the velocity to that, and pymunk's solver adds the contacts. Without contact a
+    tick equals that of the point-mass engine. Pymunk moves bodies at the beginning of a step and computes velocities at
+    its end; positions here are therefore one step ahead of pymunk's: those at the beginning of the next step.
 
-    Each copy of the place has a space of its own: the order in which contacts are solved, and so the last digits of
-    a crowd, would otherwise depend on what happens in other copies.
+    Each copy of the scene has its own space: otherwise the order in which contacts are solved, and so the last digits
+    of a crowd, would depend on other copies.
     """
 
     attitude = None
@@ -83,17 +83,17 @@ class PlanarEngine(Models):
         self._fastest = GRAVITY * math.tan(choice.tilt) * stage.dt  # change of speed in a tick [m/s]
         self._found: list[Touch] = []
         rows = len(stage.kinds)
-        self._layers = _layers(stage)
+        self._layers = _build_layers(stage)
         self._tall = np.array([stage.kinds[row].height for row in self.in_air])
         mass = np.array([MASSES[stage.kinds[row].name] for row in self.in_air])
-        self._force = (mass / self._step)[:, None]  # that changes the speed by 1 m/s in one step
-        self._settle(stage, choice)
+        self._force = (mass / self._step)[:, None]  # changes the speed by 1 m/s in one step
+        self._build_copies(stage, choice)
         self._wobble = np.zeros((rows, 2))
         self._scene = stage.scene
         self._pose = stage.scene.pose.copy()
         self._mirrored = np.flatnonzero(stage.mirrored)
         seen = len(self._mirrored)
-        self._seen = np.full((seen, 3), np.nan), np.zeros((seen, 3)), np.zeros(seen)
+        self._mirrored_state = np.full((seen, 3), np.nan), np.zeros((seen, 3)), np.zeros(seen)
         self.position = np.array(stage.start, dtype=float)
         self.velocity, self.yaw = np.zeros((rows, 3)), np.array(stage.yaw, dtype=float)
         self.flying = np.zeros(rows, dtype=bool)
@@ -101,8 +101,8 @@ class PlanarEngine(Models):
         self.place(np.arange(rows), self.position, self.yaw, self.flying)
         self.position[self._mirrored] = np.nan
 
-    def _settle(self, stage: Stage, choice: Planar) -> None:
-        """Builds the copies, and notes where in the state each body stands."""
+    def _build_copies(self, stage: Stage, choice: Planar) -> None:
+        """Build the copies, and record the index of each body in the state."""
         skin = 0.5 * choice.approach * self._step
         surfaces = Surfaces(choice.friction, choice.wall_friction, choice.traction, skin)
         self._copies: list[_Copy] = []
@@ -129,7 +129,7 @@ class PlanarEngine(Models):
             feet |= place.feet
             self._copies.append(copy)
             begin = copy.block.stop
-        # one copy's state is pymunk's own memory: nothing needs to be carried to and fro
+        # one copy's state is pymunk's own memory: nothing needs to be copied
         alone = len(self._copies) == 1
         self._state = self._copies[0].state if alone else np.concatenate([copy.state for copy in self._copies])
         self._bodies = span(bodies)
@@ -153,11 +153,11 @@ class PlanarEngine(Models):
             state[wheels, MOVE] = drive.velocity[:, :2]
             state[wheels, TURN] = (drive.yaw - self.yaw[self.floor]) / dt
         if len(self.in_air):
-            target, drift = self._thrust(wobble)
+            target, drift = self._push_flying(wobble)
         if len(self._mirrored):
-            self._reflect()
+            self._update_mirrors()
         if len(self._planned):
-            self._carry(t)
+            self._move_planned(t)
         for copy in self._copies:
             copy.advance(state, self._ticks * dt, step, self._steps)
         self._ticks += 1
@@ -175,7 +175,7 @@ class PlanarEngine(Models):
             blow = velocity[air, :2] - (target + drift)
             felt = np.abs(blow) > UNFELT
             if some(felt):
-                # it stops first what nature did, which the robot does not know of
+                # a contact first stops the hover jitter, which the robot does not know
                 known = blow - clamp(blow, np.minimum(-drift, 0.0), np.maximum(-drift, 0.0))
                 target += np.where(felt, known, 0.0)
             flight.velocity[:, :2] = target
@@ -185,7 +185,7 @@ class PlanarEngine(Models):
             self._wobble[air] = wobble[air]
         if len(self._mirrored):
             rows = self._mirrored
-            position[rows], velocity[rows], yaw[rows] = self._seen
+            position[rows], velocity[rows], yaw[rows] = self._mirrored_state
         self.position, self.velocity, self.yaw = position, velocity, yaw
         if len(self._movable):
             self.obstacles = self.obstacles.copy()
@@ -200,12 +200,12 @@ class PlanarEngine(Models):
         self._state[slots, RATE] = 0.0
         self._wobble[rows] = 0.0
         for copy in self._copies:
-            copy.contacts.forget(rows.tolist())
+            copy.contacts.reset_rows(rows.tolist())
 
     def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
         """See `Engine.mirror`."""
         at = np.searchsorted(self._mirrored, rows)
-        self._seen[0][at], self._seen[1][at], self._seen[2][at] = position, velocity, yaw
+        self._mirrored_state[0][at], self._mirrored_state[1][at], self._mirrored_state[2][at] = position, velocity, yaw
 
     def touches(self) -> list[Touch]:
         """See `Engine.touches`."""
@@ -213,8 +213,8 @@ class PlanarEngine(Models):
         self._found.clear()
         return found
 
-    def _thrust(self, wobble: Array) -> tuple[Array, Array]:
-        """Pushes flying rows to the speeds (n_air, 2) that their controllers want and that nature adds [m/s]."""
+    def _push_flying(self, wobble: Array) -> tuple[Array, Array]:
+        """Apply forces to flying rows; returns the velocities (n_air, 2) of controllers and jitter [m/s]."""
         flight, air = self.quadrotor, self.air
         before = flight.velocity[:, :2].copy()
         flight.advance()
@@ -227,25 +227,25 @@ class PlanarEngine(Models):
             change *= flight.flying[:, None]
         drift = (wobble[air] - self._wobble[air]) / self._dt
         target, height = before + change, flight.position[:, 2]
-        # all in the first step of the tick: then the tick is one of the point-mass engine, whose steps are ticks
+        # all in the first step of the tick: then the tick equals one of the point-mass engine, whose steps are ticks
         bodies = self._bodies_in_air
         self._state[bodies, PUSH] = (target + drift - self._state[bodies, MOVE]) * self._force
         self._layers.bottom[air], self._layers.top[air] = height, height + self._tall
         if not aloft or some(self._stands):
-            self._stand(~flight.flying & (height <= TOUCHDOWN) & (drift == 0.0).all(axis=1))
+            self._set_floor_grip(~flight.flying & (height <= TOUCHDOWN) & (drift == 0.0).all(axis=1))
         return target, drift
 
-    def _stand(self, stands: Mask) -> None:
-        """Lets the floor hold flying rows (n_air,) that stand on it, and no others."""
+    def _set_floor_grip(self, stands: Mask) -> None:
+        """Switch the floor's friction on for flying rows (n_air,) that stand on the floor, and off for others."""
         stands = stands[self._footed]
         for k in np.flatnonzero(stands != self._stands).tolist():
             joint, force = self._feet[k]
             joint.max_force = force if stands[k] else 0.0
         self._stands = stands
 
-    def _reflect(self) -> None:
-        """Puts mirrored rows where they are in reality; the solver then sees them move from there."""
-        position, velocity, yaw = self._seen
+    def _update_mirrors(self) -> None:
+        """Set mirrored rows to their received poses; the solver sees their motion from there."""
+        position, velocity, yaw = self._mirrored_state
         here = np.isfinite(position[:, :2]).all(axis=1)
         moves = np.where(here[:, None], np.nan_to_num(velocity[:, :2]), 0.0)
         slots, state = self._slots[self._mirrored], self._state
@@ -257,8 +257,8 @@ class PlanarEngine(Models):
         tall = self._tall[np.searchsorted(self.in_air, rows)]
         self._layers.bottom[rows], self._layers.top[rows] = height, height + tall
 
-    def _carry(self, t: float) -> None:
-        """Moves obstacles by their plans, with the speed that takes them there in this tick."""
+    def _move_planned(self, t: float) -> None:
+        """Move obstacles by their plans, with the velocity that reaches the planned pose in this tick."""
         pose = self._scene.at(t)
         before, now = self._pose[self._planned], pose[self._planned]
         rate = now - before
@@ -272,12 +272,12 @@ class PlanarEngine(Models):
 
 
 class _Copy:
-    """The space of one copy, and the rows `block` of the engine's state that are its bodies'."""
+    """Pymunk space of one copy; its bodies are the rows `block` of the engine's state."""
 
     def __init__(self, space: pymunk.Space, contacts: Contacts, iterations: int, begin: int) -> None:
         self._space, self.contacts = space, contacts
         space.iterations = iterations
-        contacts.watch(space)
+        contacts.attach(space)
         identities = pymunk.batch.Buffer()
         pymunk.batch.get_space_bodies(space, pymunk.batch.BodyFields.BODY_ID, identities)
         order = np.frombuffer(identities.int_buf(), dtype=np.uintp).tolist()
@@ -285,15 +285,15 @@ class _Copy:
         self.block = slice(begin, begin + len(order))
         self._buffer = pymunk.batch.Buffer()
         pymunk.batch.get_space_bodies(space, FIELDS, self._buffer)
-        # pymunk fills the same memory at every call, because nothing is added or removed any more
+        # pymunk fills the same memory at every call, because no body is added or removed any more
         self.state: Array = np.frombuffer(self._buffer.float_buf()).reshape(-1, WIDTH)
 
     def slot(self, body: pymunk.Body) -> int:
-        """Where in the engine's state a body stands."""
+        """Index of a body in the engine's state."""
         return self._slots[body.id]
 
     def advance(self, state: Array, begin: float, step: float, steps: int) -> None:
-        """Moves the bodies from what `state` says, and says there what came of it."""
+        """Advance the bodies from `state`, and write the result to `state`."""
         alone = state is self.state
         if not alone:
             self.state[:] = state[self.block]
@@ -307,9 +307,9 @@ class _Copy:
             state[self.block] = self.state
 
 
-def _layers(stage: Stage) -> Layers:
+def _build_layers(stage: Stage) -> Layers:
     scene, rows = stage.scene, len(stage.kinds)
-    # negative numbers count from the end: obstacle 0 stands last, and before all of them the arena's walls
+    # negative numbers count from the end: obstacle 0 is last, and the arena's walls come before all obstacles
     bottom = np.concatenate([np.zeros(rows), [-np.inf], scene.bottom[::-1]])
     top = np.concatenate([[kind.height for kind in stage.kinds], [np.inf], scene.top[::-1]])
     return Layers(bottom, top)

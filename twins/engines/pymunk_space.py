@@ -1,4 +1,4 @@
-"""One copy of a place as pymunk sees it: discs of robots, wheels that grip the floor, obstacles, walls."""
+"""Pymunk space of one copy of a scene: robots as discs, wheels with grip, obstacles, walls."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene
 
 MASSES: Final = {"crazyflie": 0.027, "tello": 0.080, "khepera4": 0.540, "turtlebot3": 1.0}  # [kg], makers' figures
-WALL_DEPTH: Final = 1.0  # [m] of the arena's walls, outwards: nothing gets through
+WALL_DEPTH: Final = 1.0  # [m] thickness of the arena's walls, outwards: nothing passes through
 GRAIN: Final = 32  # points per side for the mean lever of the friction under a box
 
-# What can be pushed has two shapes: one with a skin (see `twins.engines.pymunk_contacts`) for robots, which come fast,
-# and a bare one for everything else, so that a box comes to lie flush against a wall.
+# Obstacles with a mass have two shapes: one with a skin (see `twins.engines.pymunk_contacts`) for robots, which are
+# fast, and one without for everything else, so that a box can rest flush against a wall.
 ROBOT, FIXED, FIXED_BARE, LOOSE, LOOSE_BARE = (1 << k for k in range(5))
 MEETS: Final = {
     ROBOT: ROBOT | FIXED | LOOSE,
@@ -30,7 +30,7 @@ MEETS: Final = {
     LOOSE: ROBOT,
     LOOSE_BARE: FIXED_BARE | LOOSE_BARE,
 }
-UNMOVED: Final = 1  # group of all that nothing moves: its members do not touch each other
+UNMOVED: Final = 1  # group of fixed bodies, which do not touch each other
 
 
 @dataclass(frozen=True)
@@ -45,38 +45,29 @@ class Surfaces:
 
 @dataclass
 class Place:
-    """One copy of the place, and which body is what.
-
-    Attributes:
-        surfaces: Of everything in it.
-        walls: The number of the arena's walls, −1 − M.
-        space: With everything in it.
-        numbers: Row of each shape, or −1 − k of obstacle k, or `walls`.
-        rows: Bodies of rows.
-        wheels: Of rows on the floor: a body without shape that moves as their wheels want.
-        feet: Grip of flying rows on the floor, and its force while they stand [N].
-        obstacles: Bodies of obstacles that move or can be pushed.
-    """
+    """One copy of the scene with its robots."""
 
     surfaces: Surfaces
-    walls: int
+    walls: int  # number of the arena's walls, −1 − M
     space: pymunk.Space = field(default_factory=pymunk.Space)
-    numbers: dict[pymunk.Shape, int] = field(default_factory=dict)
-    rows: dict[int, pymunk.Body] = field(default_factory=dict)
-    wheels: dict[int, pymunk.Body] = field(default_factory=dict)
-    feet: dict[int, tuple[pymunk.PivotJoint, float]] = field(default_factory=dict)
-    obstacles: dict[int, pymunk.Body] = field(default_factory=dict)
+    numbers: dict[pymunk.Shape, int] = field(
+        default_factory=dict
+    )  # row of each shape, or −1 − k of obstacle k, or walls
+    rows: dict[int, pymunk.Body] = field(default_factory=dict)  # robots
+    wheels: dict[int, pymunk.Body] = field(default_factory=dict)  # of ground robots: shapeless, moves as commanded
+    feet: dict[int, tuple[pymunk.PivotJoint, float]] = field(default_factory=dict)  # grip of landed rows, its force [N]
+    obstacles: dict[int, pymunk.Body] = field(default_factory=dict)  # with a plan or a mass
 
     def __post_init__(self) -> None:
-        self._floor = self.space.static_body  # first of all bodies: those of one sort then follow one another
+        self._floor = self.space.static_body  # first of all bodies, so that bodies of one sort are contiguous
 
     def add_robot(self, row: int, kind: Kind, *, mirrored: bool) -> None:
-        """A robot; a mirrored one pushes and cannot be pushed."""
+        """Add a robot; a mirrored robot pushes others and cannot be pushed."""
         mass = MASSES[kind.name]
         if mirrored:
             body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         else:
-            # no blow turns a flying robot: its yaw is its model's
+            # contacts do not turn a flying robot: its model computes the yaw
             body = pymunk.Body(mass, math.inf if kind.flies else pymunk.moment_for_circle(mass, 0.0, kind.radius))
         self.space.add(body)
         self.rows[row] = body
@@ -91,7 +82,7 @@ class Place:
             self.feet[row] = self._grip(self._floor, body, force, 0.0), force
 
     def furnish(self, scene: Scene) -> None:
-        """Obstacles and walls."""
+        """Add obstacles and walls."""
         loose = bool(np.isfinite(scene.mass).any())
         for k, outline in enumerate(scene.outline):
             x, y, yaw = scene.pose[k].tolist()
@@ -130,7 +121,7 @@ class Place:
             self._cover(body, self.walls, [pymunk.Poly(body, each, radius=skin) for each in corners], part, True)
 
     def _cover(self, body: pymunk.Body, number: int, shapes: list[pymunk.Shape], part: int, unmoved: bool) -> None:
-        # pymunk multiplies the coefficients of the two that touch
+        # pymunk multiplies the coefficients of both shapes
         robots = math.sqrt(self.surfaces.robots)
         against = self.surfaces.walls / robots if robots > 0.0 else 0.0
         for shape in shapes:
@@ -140,7 +131,7 @@ class Place:
             self.space.add(shape)
 
     def _grip(self, on: pymunk.Body, body: pymunk.Body, force: float, torque: float) -> pymunk.PivotJoint:
-        """Friction with the floor: draws a body toward the velocity of `on`, within its limits [N], [N m]."""
+        """Add friction with the floor: pulls a body to the velocity of `on`, within force [N] and torque [N m]."""
         hold = pymunk.PivotJoint(on, body, (0.0, 0.0), (0.0, 0.0))
         joints: list[pymunk.Constraint] = [hold]
         hold.max_force = force
@@ -148,7 +139,7 @@ class Place:
             joints.append(pymunk.GearJoint(on, body, 0.0, 1.0))
             joints[1].max_force = torque
         for joint in joints:
-            joint.max_bias = 0.0  # velocities only: where it was does not matter
+            joint.max_bias = 0.0  # velocities only, no correction of positions
         self.space.add(*joints)
         return hold
 
@@ -170,7 +161,7 @@ def _moment(mass: float, scene: Scene, k: int) -> float:
 
 
 def _lever(scene: Scene, k: int) -> float:
-    """Mean distance of the floor under an obstacle from its middle [m]: friction brakes its turning with that lever."""
+    """Mean lever of the friction under an obstacle that turns [m]."""
     outline = scene.outline[k]
     if outline is None:
         return 2.0 / 3.0 * float(scene.radius[k])

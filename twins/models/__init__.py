@@ -1,1 +1,1 @@
-"""How robots move: rows of differential and flying robots, disturbances, noise."""
+"""Motion models in rows: differential and flying robots, on-board flight control, disturbances, noise."""

@@ -1,8 +1,8 @@
-"""Differential robots: a unicycle on two wheels with limits of speed and acceleration.
+"""Differential drive: unicycle on two wheels with limits of speed and acceleration.
 
-Without a new command the wheels stop after `FRESH_S`, for this model stands for a robot together with its bridge: the
-bridges of Khepera IV and TurtleBot3 do that. The robots themselves do not: when the process of the bridge is frozen or
-dead they drive on (docs/hanging.md). Their protocol twins show that.
+Without a new command the wheels stop after `FRESH_S`: this model is a robot together with its bridge, and the bridges
+of Khepera IV and TurtleBot3 do that. The robots themselves drive on when the bridge's process is frozen or dead
+(docs/hanging.md), and so do their protocol twins.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from agents.body.kinds import Kind
 
 @dataclass(frozen=True)
 class Drive:
-    """A pair of driven wheels: distance between them [m], largest rim speed [m/s] and acceleration [m/s²]."""
+    """Two driven wheels."""
 
-    base: float
-    speed: float
-    acceleration: float
+    base: float  # distance between the wheels [m]
+    speed: float  # largest rim speed [m/s]
+    acceleration: float  # largest, of the rim [m/s²]
 
 
 DRIVES: Final[dict[str, Drive]] = {
@@ -34,31 +34,25 @@ DRIVES: Final[dict[str, Drive]] = {
 
 
 class Differential:
-    """Rows of differential robots.
-
-    Attributes:
-        position: (n, 3) [m]; z stays 0.
-        yaw: (n,) [rad].
-        velocity: (n, 3) [m/s].
-    """
+    """N differential robots."""
 
     def __init__(self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float) -> None:
         drives = [DRIVES[kind.name] for kind in kinds]
         self._dt = dt
         self._half_base = np.array([0.5 * d.base for d in drives])
-        self._turn = np.array([dt / d.base for d in drives])  # yaw of a step, per difference of the rim speeds
+        self._turn = np.array([dt / d.base for d in drives])  # change of yaw in a step per difference of the rim speeds
         self._limit = np.array([d.speed for d in drives])
         self._change = np.array([d.acceleration * dt for d in drives])
         self._least = -self._change
         self._wheels = np.zeros((2, len(drives)))  # rim speeds, left and right [m/s]
         self._wanted = np.zeros((2, len(drives)))
         self._patience = np.full(len(drives), np.inf)
-        self.position = np.array(start, dtype=float)
-        self.yaw = np.array(yaw, dtype=float)
-        self.velocity = np.zeros_like(self.position)
+        self.position = np.array(start, dtype=float)  # (n, 3) [m]; z stays 0
+        self.yaw = np.array(yaw, dtype=float)  # (n,) [rad]
+        self.velocity = np.zeros_like(self.position)  # (n, 3) [m/s]
 
     def command(self, twist: Array) -> None:
-        """Sets v [m/s] and ω [rad/s], (n, 2); rows of NaN keep theirs."""
+        """Set v [m/s] and ω [rad/s], (n, 2); rows of NaN keep their command."""
         v, half = twist[:, 0], self._half_base * twist[:, 1]
         wanted = np.empty((2, len(half)))
         wanted[0], wanted[1] = v - half, v + half
@@ -71,16 +65,16 @@ class Differential:
             self._patience[given] = FRESH_S
 
     def halt(self, rows: Index) -> None:
-        """Wheels to zero speed."""
+        """Command zero wheel speed."""
         self._wanted[:, rows] = 0.0
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """Puts rows at (len(rows), 3) [m] with yaw [rad], at rest."""
+        """Set positions (len(rows), 3) [m] and yaws [rad], at rest."""
         self.position[rows], self.yaw[rows], self.velocity[rows] = position, yaw, 0.0
         self._wanted[:, rows] = self._wheels[:, rows] = 0.0
 
     def roll(self, rows: Index, velocity: Array) -> None:
-        """Lets rows go straight ahead, with what of a velocity (len(rows), 3) [m/s] is along their heading."""
+        """Drive rows straight ahead with the component of a velocity (len(rows), 3) [m/s] along their heading."""
         speed = velocity[:, 0] * np.cos(self.yaw[rows]) + velocity[:, 1] * np.sin(self.yaw[rows])
         self._wanted[:, rows] = self._wheels[:, rows] = speed
 
@@ -88,7 +82,7 @@ class Differential:
         """One step of dt, along an arc: no side-slip (paper, eq. (1))."""
         self._patience -= self._dt
         wanted = self._wanted * (self._patience >= 0.0)
-        # both wheels are slowed by the same factor, so that a curve stays that curve
+        # both wheels are slowed by the same factor, which keeps the curvature
         speed = np.abs(wanted)
         over = np.maximum(speed[0], speed[1]) / self._limit
         wanted /= np.maximum(over, 1.0)

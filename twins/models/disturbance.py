@@ -1,4 +1,4 @@
-"""What nature adds to a model: wobble, measurement noise, drift of odometry, and the time from command to effect."""
+"""Disturbances of a model: hover jitter, measurement noise, drift of odometry, and command latency."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from twins.models.noise import Noise
 
 
 class HoverJitter:
-    """Ornstein-Uhlenbeck displacement of each horizontal axis about the place that the robot's own controller holds."""
+    """Ornstein-Uhlenbeck displacement of each horizontal axis about the position held by the robot's controller."""
 
     def __init__(self, disturbance: Sequence[Disturbance], noise: Noise, dt: float) -> None:
         jitter = [d.hover_jitter for d in disturbance]
@@ -34,7 +34,7 @@ class Measurement:
     """White noise on the measured position and yaw."""
 
     def __init__(self, disturbance: Sequence[Disturbance], spatial: Array, noise: Noise) -> None:
-        """`spatial` (n, 3) says on which axes a row's position is measured at all."""
+        """`spatial` (n, 3): 1 on the axes on which a row's position is measured, else 0."""
         sigma = np.array([d.position_sigma or 0.0 for d in disturbance])
         yaw = np.array([d.yaw_sigma or 0.0 for d in disturbance])
         self._sigma = np.concatenate([sigma[:, None] * spatial, yaw[:, None]], axis=1)
@@ -42,12 +42,12 @@ class Measurement:
         self.present = bool(self._sigma.any())
 
     def draw(self) -> Array:
-        """(n, 4): x, y, z [m], yaw [rad]."""
+        """Noise (n, 4): x, y, z [m], yaw [rad]."""
         return self._sigma * self._noise.draw()
 
 
 class Drift:
-    """Error of odometry: a random walk of the measured position whose variance grows with the way driven."""
+    """Error of odometry: a random walk of the measured position whose variance grows with the distance driven."""
 
     def __init__(self, disturbance: Sequence[Disturbance], noise: Noise) -> None:
         self._rate = np.array([d.odometry_drift or 0.0 for d in disturbance])
@@ -70,8 +70,8 @@ class Latency:
         self._now = 0
         self.present = bool(self._ticks.any())
 
-    def pass_on(self, command: Array) -> Array:
-        """Takes this tick's command in, gives the one that takes effect."""
+    def delay(self, command: Array) -> Array:
+        """Store this tick's command; returns the command that takes effect now."""
         self._now = (self._now + 1) % len(self._past)
         self._past[self._now] = command
         return np.asarray(self._past[(self._now - self._ticks) % len(self._past), self._rows])

@@ -1,4 +1,4 @@
-"""Random numbers for rows: each row has streams of its own, so its noise is the same alone and in a swarm."""
+"""Random numbers in rows: each row has its own streams, so its noise is the same alone and in a swarm."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from agents.arrays import Array
 
-BLOCK = 256  # draws per refill: the generator's overhead is shared by this many ticks
+BLOCK = 256  # draws per refill: spreads the generator's overhead over this many ticks
 
 
 class Noise:

@@ -1,4 +1,4 @@
-"""Flying robots as their users see them: position or velocity control on board, with limits and lag."""
+"""Quadrotors as point masses under on-board position or velocity control, with limits and lag."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, clamp, every, some
 from agents.body.kinds import Kind
-from twins.models.onboard_flight import TOUCHDOWN, Piloted
+from twins.models.onboard_flight import TOUCHDOWN, OnboardFlight
 
 GRAVITY: Final = 9.81  # [m/s²]
 
 
 @dataclass(frozen=True)
 class Response:
-    """Closed loop on board, for x, y and z: position and velocity gains [1/s], speed limits [m/s].
+    """Closed loop on board, for x, y and z."""
 
-    `tilt` is the rate [1/s] at which the acceleration that is wanted comes about, because a quadrotor has to lean
-    first; infinite: at once. `turn` is the rate at which a yaw error closes [1/s]; None: that of the kind.
-    """
-
-    position: tuple[float, float, float]
-    velocity: tuple[float, float, float]
-    speed: tuple[float, float, float]
-    tilt: tuple[float, float, float] = (math.inf, math.inf, math.inf)
-    turn: float | None = None
+    position: tuple[float, float, float]  # gains [1/s]
+    velocity: tuple[float, float, float]  # gains [1/s]
+    speed: tuple[float, float, float]  # limits [m/s]
+    tilt: tuple[float, float, float] = (
+        math.inf,
+        math.inf,
+        math.inf,
+    )  # lag of the acceleration by tilting [1/s]; inf: none
+    turn: float | None = None  # rate of convergence of yaw [1/s]; None: that of the kind
 
 
 RESPONSES: Final[dict[str, Response]] = {
@@ -40,16 +40,16 @@ RESPONSES: Final[dict[str, Response]] = {
 
 LEANING: Final[dict[str, Response]] = {
     **RESPONSES,
-    # fitted to the steps of the rigid body under the firmware's cascade (docs/mujoco.md)
+    # fitted to step responses of the rigid body under the firmware's cascade (docs/mujoco.md)
     "crazyflie": Response((2.0, 2.0, 2.8), (5.0, 5.0, 3.5), (1.1, 1.1, 1.4), (5.0, 5.0, math.inf), 7.6),
 }
 
 
-class Quadrotor(Piloted):
-    """Rows of quadrotors; `position` is where the on-board controller has them."""
+class Quadrotor(OnboardFlight):
+    """N quadrotors; `position` is that of the on-board controller, without hover jitter."""
 
     def __init__(self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float, *, leaning: bool = False) -> None:
-        """With `leaning` they have to lean before they accelerate."""
+        """With `leaning`, accelerations lag because the quadrotor must tilt first."""
         super().__init__(kinds, start, yaw, dt)
         responses = [(LEANING if leaning else RESPONSES)[kind.name] for kind in kinds]
         rows = len(responses)
@@ -60,26 +60,26 @@ class Quadrotor(Piloted):
         self._slowest = -self._speed
         self._tilt = np.minimum(dt * np.array([r.tilt for r in responses]).reshape(rows, 3), 1.0)
         self._leaning = leaning
-        self._change = np.zeros((rows, 3))  # of velocity in a step, as it comes about [m/s]
+        self._change = np.zeros((rows, 3))  # of velocity in a step, with the lag of tilting [m/s]
         turns = [kind.turn_response if r.turn is None else r.turn for kind, r in zip(kinds, responses, strict=True)]
         self._turn = np.array(turns)
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """Puts rows at (len(rows), 3) [m] with yaw [rad], at rest; those that fly hold that place."""
+        """Set positions (len(rows), 3) [m] and yaws [rad], at rest; flying rows hold them."""
         self.position[rows], self.velocity[rows], self.yaw[rows] = position, 0.0, yaw
         self._change[rows] = 0.0
-        self._pilot.place(rows, position, yaw, flying)
+        self._orders.place(rows, position, yaw, flying)
 
     def advance(self) -> None:
-        """One step of dt: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v), which leaning delays."""
-        pilot = self._pilot
-        if pilot.anybody_climbs:
-            pilot.advance(pilot.climbing)
-        wanted = self._kp * (pilot.target - self.position)
-        turn = self._turn * (pilot.heading - self.yaw)
-        if pilot.any_by_velocity:
-            wanted = np.where((pilot.by_velocity & ~pilot.climbing)[:, None], pilot.wanted, wanted)
-            turn = np.where(pilot.by_velocity, pilot.yaw_rate, turn)
+        """Advance one step of dt: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v), delayed by tilting."""
+        orders = self._orders
+        if orders.any_climbing:
+            orders.advance(orders.climbing)
+        wanted = self._kp * (orders.target - self.position)
+        turn = self._turn * (orders.yaw_setpoint - self.yaw)
+        if orders.any_by_velocity:
+            wanted = np.where((orders.by_velocity & ~orders.climbing)[:, None], orders.velocity_setpoint, wanted)
+            turn = np.where(orders.by_velocity, orders.yaw_rate, turn)
         wanted = clamp(wanted, self._slowest, self._speed)
         change = self._gain * (wanted - self.velocity)
         if self._leaning:
@@ -92,7 +92,7 @@ class Quadrotor(Piloted):
         self.velocity = velocity
         self.position += self._dt * velocity
         self.yaw += self._dt * turn
-        if not aloft or some(pilot.landing):
+        if not aloft or some(orders.landing):
             self._touch_down()
 
     def _falling(self) -> Array:
@@ -100,7 +100,7 @@ class Quadrotor(Piloted):
         return np.where((self.position[:, 2] > 0.0)[:, None], fall, 0.0)
 
     def _touch_down(self) -> None:
-        self._pilot.touch_down(self.position[:, 2])
+        self._orders.touch_down(self.position[:, 2])
         grounded = ~self.flying & (self.position[:, 2] <= TOUCHDOWN)
         self.position[grounded, 2] = 0.0
         self.velocity[grounded] = self._change[grounded] = 0.0

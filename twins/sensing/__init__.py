@@ -1,1 +1,1 @@
-"""Range sensors: which there are, and ray casting."""
+"""Range sensors of twins, and ray casting."""

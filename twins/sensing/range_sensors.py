@@ -1,7 +1,8 @@
-"""Range sensors of twins: where each looks, how far, how often and how well.
+"""Range sensors of twins: direction, range, rate and noise of each.
 
-A new sensor is a new entry of `SENSORS`: a `Sensor` with its rays and figures. A robot carries it when its `sensors` in
-the experiment file names it, or, for all robots of a kind, when `OF_KIND` does. Nothing else knows of sensors by name.
+A new sensor is a new entry of `SENSORS`: a `Sensor` with its rays and parameters. A robot has a sensor when its
+`sensors` in the experiment file names it, or, for all robots of a kind, when `OF_KIND` does. No other module knows
+sensor names.
 
 Accuracies that makers give as limits (±) are read as two standard deviations of white noise: 95 % within them.
 """
@@ -30,39 +31,24 @@ ON_TIME: Final = 1e-6  # [s] ticks are multiples of a period, but for rounding
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sensor:
-    """One kind of range sensor; ranges count from the sensor itself.
+    """One kind of range sensor; ranges are measured from the sensor itself."""
 
-    Attributes:
-        bearing: (m,) of its rays from the robot's nose, to the left [rad].
-        elevation: (m,) 0 or ±π/2 [rad].
-        mount: From the robot's centre out to the sensor, along each ray [m].
-        height: Over the robot's position, which is the lowest point of its body [m].
-        nearest: Range below which it reports nothing [m]; where that is 0, what touches it is at 0.
-        farthest: Range beyond which it reports nothing [m].
-        rate_hz: How often it measures.
-        sigma: Standard deviation of a reading [m],
-        relative: and as a share of the range, from `relative_from` on.
-        relative_from: [m]
-        dropout: Probability that a ray reports nothing whatever there is.
-        resolution: Step of its readings [m]; 0: none.
-    """
-
-    bearing: Array
-    elevation: Array
-    mount: float = 0.0
-    height: float
-    nearest: float = 0.0
-    farthest: float
+    bearing: Array  # (m,) of the rays from the robot's nose, to the left [rad]
+    elevation: Array  # (m,) 0 or ±π/2 [rad]
+    mount: float = 0.0  # from the robot's centre to the sensor, along each ray [m]
+    height: float  # above the robot's position, which is the lowest point of its body [m]
+    nearest: float = 0.0  # closer objects are not reported [m]; with 0, an object that touches the sensor is at 0
+    farthest: float  # farther objects are not reported [m]
     rate_hz: float
-    sigma: float
-    relative: float = 0.0
-    relative_from: float = inf
-    dropout: float = 0.0
-    resolution: float = 0.0
+    sigma: float  # standard deviation of a reading [m]
+    relative: float = 0.0  # standard deviation as a share of the range, from `relative_from` on
+    relative_from: float = inf  # [m]
+    dropout: float = 0.0  # probability that a ray reports nothing
+    resolution: float = 0.0  # step of the readings [m]; 0: none
 
     @property
     def fan(self) -> Fan:
-        """Its rays, from the robot's centre."""
+        """The sensor's rays, from the robot's centre."""
         return Fan(self.bearing, self.elevation, self.height, self.mount + self.farthest)
 
 
@@ -87,14 +73,14 @@ SENSORS: Final[dict[str, Sensor]] = {
         farthest=2.0,
         rate_hz=10.0,
         sigma=0.005,
-        dropout=0.01,  # an echo that is lost
-        resolution=0.01,  # its protocols count in centimetres
+        dropout=0.01,  # lost echoes
+        resolution=0.01,  # its protocols use centimetres
     ),
     # TurtleBot3: ±15 mm below 0.5 m, ±5 % beyond; the dropout is a choice
     "lds01": Sensor(
         bearing=np.radians(np.arange(360.0)),
         elevation=np.zeros(360),
-        height=0.182,  # it stands on top: lower robots pass under its plane
+        height=0.182,  # mounted on top: lower robots are below its plane
         nearest=0.12,
         farthest=3.5,
         rate_hz=5.0,
@@ -125,15 +111,11 @@ OF_KIND: Final[dict[str, tuple[str, ...]]] = {
 
 
 class RangeSensors:
-    """The range sensors of all rows of a world. Rays of a row stand together, in the order of its sensors.
-
-    Attributes:
-        rays: What they saw last, each ray at the time of its own sensor; None before the first sweep.
-    """
+    """Range sensors of all rows of a world. Rays of a row are contiguous, in the order of its sensors."""
 
     def __init__(self, request: BodyRequest, world: World) -> None:
-        """Raises BodyError for a sensor that is not known."""
-        self.rays: Rays | None = None
+        """Raises BodyError for an unknown sensor."""
+        self.rays: Rays | None = None  # last readings, each ray at the time of its own sensor; None before the first
         carried = [tuple(dict.fromkeys(own)) for own in world.sensors]
         for robot, own in zip(request.names, carried, strict=True):
             for name in own:
@@ -158,13 +140,13 @@ class RangeSensors:
         self._beams: dict[tuple[int, ...], Beams] = {}
 
     def sweep(self, t: float, engine: Engine) -> None:
-        """Measures what is due at `t` [s]; everything the first time. What a sensor missed it does not make up for."""
+        """Measure with the sensors that are due at `t` [s], at first with all; missed measurements are not repeated."""
         if t < self._next:
             return
         due = tuple(k for k, when in enumerate(self._due) if when <= t)
         beams = self._beams.get(due)
         if beams is None:
-            beams = self._beams[due] = _laid_out([self._mounted[k] for k in due])
+            beams = self._beams[due] = _arrange_beams([self._mounted[k] for k in due])
         truth = self._caster.cast(beams, engine.position, engine.yaw, engine.obstacles)
         time, distance = self._time.copy(), self._distance.copy()
         begin = 0
@@ -182,26 +164,21 @@ class RangeSensors:
         self._next = min(self._due)
 
 
-def _laid_out(mounted: Sequence[_Mounted]) -> Beams:
-    """Rays of these sensors, sensor after sensor."""
+def _arrange_beams(mounted: Sequence[_Mounted]) -> Beams:
+    """Arrange the rays of these sensors, sensor after sensor."""
     rows = [one.rows for one in mounted]
     which = np.repeat(np.arange(len(mounted)), [len(each) for each in rows])
     return Beams([one.sensor.fan for one in mounted], np.concatenate(rows), which)
 
 
 class _Mounted:
-    """One kind of sensor on the rows that carry it.
-
-    Attributes:
-        rows: (k,)
-        rays: (k, m) numbers of their rays among all.
-    """
+    """One kind of sensor on the rows that have it."""
 
     def __init__(self, name: str, rows: Index, first: Index, request: BodyRequest, scale: float) -> None:
         sensor = self.sensor = SENSORS[name]
         width = len(sensor.bearing)
-        self.rows = rows
-        self.rays = first[:, None] + np.arange(width)
+        self.rows = rows  # (k,)
+        self.rays = first[:, None] + np.arange(width)  # (k, m) numbers of their rays among all
         self._scale = scale
         share = min(sensor.dropout * scale, 1.0)
         self._lost = NormalDist().inv_cdf(share) if 0.0 < share < 1.0 else inf
@@ -211,9 +188,9 @@ class _Mounted:
         self._dropouts = Noise(names, seeds, f"{name} dropouts", width, ahead) if share > 0.0 else None
 
     def read(self, truth: Array) -> Array:
-        """What it reports, from the robots' centres (k, m), where that is the truth; NaN where it sees nothing."""
+        """Readings for true distances from the robots' centres (k, m) [m]; NaN where nothing is reported."""
         sensor = self.sensor
-        reading = np.maximum(truth - sensor.mount, 0.0)  # what has been run into touches the rim
+        reading = np.maximum(truth - sensor.mount, 0.0)  # an object in contact touches the rim
         if self._noise is not None:
             sigma = np.where(reading < sensor.relative_from, sensor.sigma, sensor.relative * reading)
             reading = np.maximum(reading + self._scale * sigma * self._noise.draw(), 0.0)

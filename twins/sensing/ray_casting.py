@@ -1,9 +1,9 @@
-"""Ray casting: how far range sensors would see, for all rays of all robots of all copies of a place at once.
+"""Ray casting: true distances for all range sensors of all robots in all copies of a scene at once.
 
-Things are upright: cylinders (robots, round obstacles), and straight edges (boxes, thin walls, the arena's border),
+Objects are upright: cylinders (robots, round obstacles) and straight edges (boxes, thin walls, the arena's border),
 each from a bottom to a top. Rays are level or vertical; others are not supported, and a robot that tilts still sends
-them level. Angles decide which rays can meet a thing at all, so that the work grows with the width that things have in
-the robots' eyes and not with rays times things.
+them level. Only rays within the angles of an object are tested against it, so the work grows with the angular widths of
+the objects and not with rays times objects.
 """
 
 from __future__ import annotations
@@ -20,27 +20,20 @@ from agents.body.kinds import Kind
 from twins.scene import Scene
 
 STRIDE: Final = 16.0  # between the bearings of two fans in one sorted array: more than two turns
-SLACK: Final = 1e-9  # [rad] and share of an edge: a ray into the corner of two edges meets one of them
-BUDGET: Final = 1 << 18  # pairs that are worked on at once: a few MB for each number of a pair
-CROWDED: Final = 8  # things in the way of a ray that memory is laid out for; more cost more rounds
+SLACK: Final = 1e-9  # [rad] and share of an edge: a ray into the corner of two edges hits one of them
+BUDGET: Final = 1 << 18  # pairs processed at once: a few MB for each number of a pair
+CROWDED: Final = 8  # objects per ray for which memory is planned; more cost more rounds
 FULL: Final = 2.0 * np.pi
 
 
 @dataclass(frozen=True, eq=False)
 class Fan:
-    """What one kind of sensor sends out.
+    """Rays of one kind of sensor."""
 
-    Attributes:
-        bearing: (m,) from the robot's nose, to the left [rad].
-        elevation: (m,) 0, or ±π/2 [rad].
-        height: Of the sensor over the robot's position [m].
-        reach: From the robot's centre [m].
-    """
-
-    bearing: Array
-    elevation: Array
-    height: float
-    reach: float
+    bearing: Array  # (m,) from the robot's nose, to the left [rad]
+    elevation: Array  # (m,) 0, or ±π/2 [rad]
+    height: float  # of the sensor above the robot's position [m]
+    reach: float  # from the robot's centre [m]
 
     def __post_init__(self) -> None:
         """Raises ValueError for a ray that is neither level nor vertical."""
@@ -49,28 +42,20 @@ class Fan:
 
 
 class Beams:
-    """Fans of rays on rows, laid out for `Caster.cast`: fan after fan, each in its own order.
-
-    Attributes:
-        size: Number of rays (R).
-        row: (F,) that sends each fan.
-        first: (F,) number of its first ray.
-        height: (F,) over the row's position [m].
-        reach: (F,) from the row's centre [m].
-    """
+    """Fans of rays on rows, arranged for `Caster.cast`: fan after fan, each in its own order."""
 
     def __init__(self, fans: Sequence[Fan], row: Index, which: Index) -> None:
         """Row `row` (F,) sends `fans[which]` (F,)."""
         count = np.array([len(fan.bearing) for fan in fans], dtype=np.intp)[which]
-        self.size = int(count.sum())
+        self.size = int(count.sum())  # number of rays (R)
         self.row = row
-        self.first = np.cumsum(count) - count
-        self.height = np.array([fan.height for fan in fans])[which]
-        self.reach = np.array([fan.reach for fan in fans])[which]
+        self.first = np.cumsum(count) - count  # (F,) number of each fan's first ray
+        self.height = np.array([fan.height for fan in fans])[which]  # (F,) above the row's position [m]
+        self.reach = np.array([fan.reach for fan in fans])[which]  # (F,) from the row's centre [m]
         self.ray_reach = np.repeat(self.reach, count)
         self.widest = int(count.max(initial=0))
         self._base = STRIDE * which
-        slots, keys, bearings = [], [], []  # each level ray twice, a turn apart: no window then wraps
+        slots, keys, bearings = [], [], []  # each level ray twice, one turn apart: then no window wraps
         for k, fan in enumerate(fans):
             level = np.flatnonzero(fan.elevation == 0.0)
             angle = np.mod(fan.bearing[level], FULL)
@@ -86,15 +71,15 @@ class Beams:
         self.up = np.array([np.sign(fans[which[f]].elevation[ray]) for f, ray in ends])
 
     def within(self, fan: Index, start: Array, width: Array) -> Iterator[tuple[Index, Index, Array, Array]]:
-        """The rays of fans between two angles, in portions that memory can hold.
+        """Rays of fans between two angles, in portions of limited memory.
 
         Args:
             fan: (P,)
             start: (P,) from the row's nose [rad].
-            width: (P,) to the left of that, at most π [rad].
+            width: (P,) to the left of `start`, at most π [rad].
 
         Yields:
-            For each ray: which of the P, its number, and its direction's x and y in the row's frame.
+            For each ray: index in the P, number of the ray, x and y of its direction in the row's frame.
         """
         low = np.mod(start - SLACK, FULL) + self._base[fan]
         begin = np.searchsorted(self._key, low)
@@ -114,8 +99,8 @@ class Beams:
 
 
 @dataclass(frozen=True, eq=False)
-class _Room:
-    """Everything as it is now: flat arrays of cylinders (C), and edges (copies, S) by both ends."""
+class _Geometry:
+    """Current positions: flat arrays of cylinders (C), and edges (copies, S) by both ends."""
 
     x: Array
     y: Array
@@ -125,10 +110,10 @@ class _Room:
 
 
 class Caster:
-    """Casts rays in a scene of which there are copies: nothing of one copy is seen from another."""
+    """Casts rays in the copies of a scene; copies do not see each other."""
 
     def __init__(self, scene: Scene, kinds: Sequence[Kind], copy: Index) -> None:
-        """Rows are of these kinds (n) and in these copies (n,)."""
+        """`kinds` (n) and `copy` (n,) of the rows."""
         rows, copies = len(kinds), int(copy.max(initial=0)) + 1
         self._copy = copy
         self._size = np.array([kind.height for kind in kinds])
@@ -137,7 +122,7 @@ class Caster:
         self._span = np.tile(scene.bottom[self._round], copies), np.tile(scene.top[self._round], copies)
         radius = np.array([kind.radius for kind in kinds])
         self._radius = np.concatenate([radius, np.tile(scene.radius[self._round], copies), [0.0]])
-        # cylinders of each copy: its rows and its pillars; filled up with the last one, which is nowhere
+        # cylinders of each copy: its rows and its pillars; padded with the last one, which has no position
         order = np.argsort(copy, kind="stable")
         crew = np.bincount(copy, minlength=copies)
         place = np.arange(rows) - np.repeat(np.cumsum(crew) - crew, crew)
@@ -145,49 +130,49 @@ class Caster:
         self._cylinders[copy[order], pillars + place] = order
         self._cylinders[:, :pillars] = rows + np.arange(copies * pillars).reshape(copies, pillars)
         self._edges, self._owner = scene.edges()
-        room = (scene.low[2], scene.high[2])  # of the border, whose owner is −1: the last
-        self._bottom = np.append(scene.bottom, room[0])[self._owner]
-        self._top = np.append(scene.top, room[1])[self._owner]
+        border = (scene.low[2], scene.high[2])  # bottom and top; its owner is −1: the last
+        self._bottom = np.append(scene.bottom, border[0])[self._owner]
+        self._top = np.append(scene.top, border[1])[self._owner]
         self._solid = np.array([*scene.closed, False])[self._owner] if len(self._owner) else np.zeros(0, dtype=bool)
         along = self._edges[:, 1] - self._edges[:, 0]
         self._length2 = np.maximum((along**2).sum(axis=1), 1e-300)
-        self._floor, self._ceiling = float(room[0]), float(room[1]) if scene.walled else np.inf
+        self._floor, self._ceiling = float(border[0]), float(border[1]) if scene.walled else np.inf
 
     def cast(self, beams: Beams, position: Array, yaw: Array, obstacles: Array) -> Array:
-        """Distances (R,) from the centres of the rows that send the rays [m]; NaN where nothing is in reach.
+        """Distances (R,) from the centres of the sending rows [m]; NaN where nothing is in reach.
 
-        A level ray sees what spans its height. A ray that begins inside a thing does not see that thing. A vertical
-        one sees the nearest thing over (under) it in plan, else the ceiling of a walled arena (the floor).
+        A level ray hits objects that span its height, except an object that it begins in. A vertical ray hits the
+        nearest object above (below) in plan, else the ceiling of a walled arena (the floor).
 
         Args:
-            beams: The rays.
-            position: (n, 3) of all rows [m]; who is at NaN neither sees nor is seen.
+            beams: Rays.
+            position: (n, 3) of all rows [m]; a row at NaN neither sees nor is seen.
             yaw: (n,) [rad]
             obstacles: (copies, M, 3) poses: x, y [m], yaw [rad].
         """
         distance = np.full(beams.size, np.inf)
-        room = self._furnish(position, obstacles)
+        geometry = self._place_geometry(position, obstacles)
         share = self._cylinders.shape[1] + len(self._owner)
         step = max(1, BUDGET // (share + CROWDED * beams.widest))
         for begin in range(0, len(beams.row), step):
             fans = np.arange(begin, min(begin + step, len(beams.row)))
-            eyes = _Eyes(beams, fans, position, yaw, self._copy)
-            self._see_cylinders(distance, eyes, room)
+            origins = _FanOrigins(beams, fans, position, yaw, self._copy)
+            self._cast_on_cylinders(distance, origins, geometry)
             if len(self._owner):
-                self._see_edges(distance, eyes, room)
+                self._cast_on_edges(distance, origins, geometry)
         for begin in range(0, len(beams.upright), max(1, BUDGET // share)):
-            self._see_upright(distance, beams, slice(begin, begin + max(1, BUDGET // share)), position, room)
+            self._cast_on_upright(distance, beams, slice(begin, begin + max(1, BUDGET // share)), position, geometry)
         distance[~(distance <= beams.ray_reach)] = np.nan
         return distance
 
-    def _furnish(self, position: Array, obstacles: Array) -> _Room:
+    def _place_geometry(self, position: Array, obstacles: Array) -> _Geometry:
         copies = len(obstacles)
         pillars, nowhere = obstacles[:, self._round, :2].reshape(-1, 2), [np.nan]
-        pose = np.concatenate([obstacles, np.zeros((copies, 1, 3))], axis=1)[:, self._owner]  # last: the room's frame
+        pose = np.concatenate([obstacles, np.zeros((copies, 1, 3))], axis=1)[:, self._owner]  # last: the world frame
         c, s = np.cos(pose[..., 2:]), np.sin(pose[..., 2:])
         x, y = self._edges[..., 0], self._edges[..., 1]
         ends_x, ends_y = pose[..., :1] + c * x - s * y, pose[..., 1:2] + s * x + c * y
-        return _Room(
+        return _Geometry(
             np.concatenate([position[:, 0], pillars[:, 0], nowhere]),
             np.concatenate([position[:, 1], pillars[:, 1], nowhere]),
             np.concatenate([position[:, 2], self._span[0], nowhere]),
@@ -195,65 +180,69 @@ class Caster:
             np.stack([ends_x[..., 0], ends_y[..., 0], ends_x[..., 1], ends_y[..., 1]]),
         )
 
-    def _see_cylinders(self, distance: Array, eyes: _Eyes, room: _Room) -> None:
-        thing = self._cylinders[eyes.copy]
-        dx, dy, radius = room.x[thing] - eyes.x, room.y[thing] - eyes.y, self._radius[thing]
+    def _cast_on_cylinders(self, distance: Array, origins: _FanOrigins, geometry: _Geometry) -> None:
+        thing = self._cylinders[origins.copy]
+        dx, dy, radius = geometry.x[thing] - origins.x, geometry.y[thing] - origins.y, self._radius[thing]
         square = dx * dx + dy * dy
-        near = (square <= (eyes.reach + radius) ** 2) & (square > radius**2)  # who is inside, as the robot in itself
-        near &= (room.bottom[thing] <= eyes.z) & (eyes.z <= room.top[thing])
+        near = (square <= (origins.reach + radius) ** 2) & (
+            square > radius**2
+        )  # not from inside, as from the robot's own disc
+        near &= (geometry.bottom[thing] <= origins.z) & (origins.z <= geometry.top[thing])
         which = np.flatnonzero(near)
         if not len(which):
             return
-        seer = which // near.shape[1]
-        x, y = eyes.turned(seer, dx.ravel()[which], dy.ravel()[which])
+        fan_index = which // near.shape[1]
+        x, y = origins.rotate_to_robot(fan_index, dx.ravel()[which], dy.ravel()[which])
         radius = radius.ravel()[which]
         half = np.arcsin(radius / np.sqrt(square.ravel()[which]))
-        for pair, ray, c, s in eyes.beams.within(eyes.fans[seer], np.arctan2(y, x) - half, 2.0 * half):
+        for pair, ray, c, s in origins.beams.within(origins.fans[fan_index], np.arctan2(y, x) - half, 2.0 * half):
             ahead, aside = x[pair] * c + y[pair] * s, x[pair] * s - y[pair] * c
             depth = radius[pair] ** 2 - aside**2
             hit = np.where(depth >= 0.0, ahead - np.sqrt(np.maximum(depth, 0.0)), np.inf)
             np.minimum.at(distance, ray, hit)
 
-    def _see_edges(self, distance: Array, eyes: _Eyes, room: _Room) -> None:
-        ax, ay, bx, by = room.ends[:, eyes.copy]
-        ax, bx, ay, by = ax - eyes.x, bx - eyes.x, ay - eyes.y, by - eyes.y
+    def _cast_on_edges(self, distance: Array, origins: _FanOrigins, geometry: _Geometry) -> None:
+        ax, ay, bx, by = geometry.ends[:, origins.copy]
+        ax, bx, ay, by = ax - origins.x, bx - origins.x, ay - origins.y, by - origins.y
         ex, ey = bx - ax, by - ay
         area = ax * by - ay * bx
         foot = clamp(-(ax * ex + ay * ey) / self._length2, 0.0, 1.0)
-        near = (ax + foot * ex) ** 2 + (ay + foot * ey) ** 2 <= eyes.reach**2
-        near &= (self._bottom <= eyes.z) & (eyes.z <= self._top)
-        near &= (area < 0.0) | ((area > 0.0) & ~self._solid)  # corners go against the clock: a box's front is area < 0
+        near = (ax + foot * ex) ** 2 + (ay + foot * ey) ** 2 <= origins.reach**2
+        near &= (self._bottom <= origins.z) & (origins.z <= self._top)
+        near &= (area < 0.0) | ((area > 0.0) & ~self._solid)  # corners are anticlockwise: a box's front is area < 0
         which = np.flatnonzero(near)
         if not len(which):
             return
-        seer = which // near.shape[1]
+        fan_index = which // near.shape[1]
         area = area.ravel()[which]
-        ax, ay = eyes.turned(seer, ax.ravel()[which], ay.ravel()[which])
-        bx, by = eyes.turned(seer, bx.ravel()[which], by.ravel()[which])
+        ax, ay = origins.rotate_to_robot(fan_index, ax.ravel()[which], ay.ravel()[which])
+        bx, by = origins.rotate_to_robot(fan_index, bx.ravel()[which], by.ravel()[which])
         ex, ey = bx - ax, by - ay
         right = np.arctan2(np.where(area > 0.0, ay, by), np.where(area > 0.0, ax, bx))
         width = np.arctan2(np.abs(area), ax * bx + ay * by)
-        for pair, ray, c, s in eyes.beams.within(eyes.fans[seer], right, width):
+        for pair, ray, c, s in origins.beams.within(origins.fans[fan_index], right, width):
             slope = c * ey[pair] - s * ex[pair]
             with np.errstate(divide="ignore", invalid="ignore"):  # a ray along the edge
                 hit, share = area[pair] / slope, (ax[pair] * s - ay[pair] * c) / slope
             np.minimum.at(distance, ray, np.where((hit >= 0.0) & (np.abs(share - 0.5) <= 0.5 + SLACK), hit, np.inf))
 
-    def _see_upright(self, distance: Array, beams: Beams, part: slice, position: Array, room: _Room) -> None:
-        """Looking down is looking up with everything upside down."""
+    def _cast_on_upright(
+        self, distance: Array, beams: Beams, part: slice, position: Array, geometry: _Geometry
+    ) -> None:
+        """Vertical rays; downward rays are cast upwards in the scene turned upside down."""
         fan, up = beams.upright_fan[part], beams.up[part]
         row = beams.row[fan]
         x, y, z = position[row].T
         height = up * (z + beams.height[fan])
         thing = self._cylinders[self._copy[row]]
-        over = (room.x[thing] - x[:, None]) ** 2 + (room.y[thing] - y[:, None]) ** 2 < self._radius[thing] ** 2
+        over = (geometry.x[thing] - x[:, None]) ** 2 + (geometry.y[thing] - y[:, None]) ** 2 < self._radius[thing] ** 2
         over &= thing != row[:, None]
         nearest = np.where(up > 0.0, self._ceiling - height, -self._floor - height)
-        side = np.where(up[:, None] > 0.0, room.bottom[thing], -room.top[thing]) - height[:, None]
+        side = np.where(up[:, None] > 0.0, geometry.bottom[thing], -geometry.top[thing]) - height[:, None]
         nearest = np.fmin(nearest, np.where(over & (side >= 0.0), side, np.inf).min(axis=1, initial=np.inf))
         solid = np.flatnonzero(self._solid)
         if len(solid):
-            ax, ay, bx, by = room.ends[:, self._copy[row]][..., solid]
+            ax, ay, bx, by = geometry.ends[:, self._copy[row]][..., solid]
             inner = (ax - x[:, None]) * (by - y[:, None]) > (ay - y[:, None]) * (bx - x[:, None])
             first = np.flatnonzero(np.diff(self._owner[solid], prepend=-1))
             box = solid[first]
@@ -263,8 +252,8 @@ class Caster:
         distance[beams.upright[part]] = np.where((nearest >= 0.0) & np.isfinite(x), nearest, np.inf)
 
 
-class _Eyes:
-    """Where some of the fans are: columns (f, 1)."""
+class _FanOrigins:
+    """Positions of some fans: columns (f, 1)."""
 
     def __init__(self, beams: Beams, fans: Index, position: Array, yaw: Array, copy: Index) -> None:
         row = beams.row[fans]
@@ -275,7 +264,7 @@ class _Eyes:
         self.reach = beams.reach[fans, None]
         self._cos, self._sin = np.cos(yaw[row]), np.sin(yaw[row])
 
-    def turned(self, seer: Index, x: Array, y: Array) -> tuple[Array, Array]:
-        """Vectors (P,) of the room in the frames of their seers."""
-        c, s = self._cos[seer], self._sin[seer]
+    def rotate_to_robot(self, fan_index: Index, x: Array, y: Array) -> tuple[Array, Array]:
+        """Rotate vectors (P,) from the world to the frames of the rows that send the rays."""
+        c, s = self._cos[fan_index], self._sin[fan_index]
         return c * x + s * y, c * y - s * x

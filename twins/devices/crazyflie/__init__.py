@@ -1,1 +1,1 @@
-"""A Crazyflie 2.x at the far end of a wire: CRTP over UDP, to which an unmodified cflib connects."""
+"""Protocol twin of the Crazyflie 2.x: CRTP over UDP, for an unmodified cflib."""

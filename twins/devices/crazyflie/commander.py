@@ -1,4 +1,4 @@
-"""The commander: of all setpoints that a Crazyflie is sent, the one that counts, and what it means for the motion."""
+"""The commander: selects the setpoint that has priority, and converts it to a setpoint of the motion model."""
 
 from __future__ import annotations
 
@@ -15,16 +15,12 @@ NEITHER: Final = (np.nan, np.nan, np.nan)
 class Commander:
     """Setpoints of N rows: each axis of a row follows a position, a velocity, or nothing.
 
-    A low-level setpoint has priority over the planner for ever, unless the client says that it sends no more of them.
-
-    Attributes:
-        target: (N, 3) positions wanted [m], NaN on axes that follow none.
-        on: (N,) motors wanted.
+    A low-level setpoint has priority over the planner for ever, unless the client announces the end of its setpoints.
     """
 
     def __init__(self, rows: int) -> None:
-        self.target = np.full((rows, 3), np.nan)
-        self.on = np.zeros(rows, dtype=bool)
+        self.target = np.full((rows, 3), np.nan)  # position setpoints [m], NaN on axes without one
+        self.on = np.zeros(rows, dtype=bool)  # motors requested
         self._velocity = np.full((rows, 3), np.nan)
         self._body = np.zeros(rows, dtype=bool)
         self._heading = np.full(rows, np.nan)
@@ -44,16 +40,16 @@ class Commander:
         body: bool = False,
         on: bool = True,
     ) -> None:
-        """A low-level setpoint of a row.
+        """Set a low-level setpoint.
 
         Args:
-            row: Whose.
-            t: Now [s].
-            target: Position [m]; NaN on axes that follow none.
-            velocity: [m/s]; NaN on axes that follow none.
-            heading: Yaw [rad], or NaN: turn.
+            row: Row of the setpoint.
+            t: Current time [s].
+            target: Position [m]; NaN on axes without one.
+            velocity: [m/s]; NaN on axes without one.
+            heading: Yaw [rad], or NaN: use `turn`.
             turn: Yaw rate [rad/s].
-            body: The velocity is along the axes of the robot.
+            body: Velocity along the axes of the robot.
             on: Motors on.
         """
         self.target[row], self._velocity[row] = target, velocity
@@ -62,11 +58,11 @@ class Commander:
         self._low_level[row] = True
 
     def release(self, row: int) -> None:
-        """The client sends no more setpoints: what the planner says counts again, from now on."""
+        """End the client's setpoints: the planner's setpoints count again."""
         self._low_level[row] = False
 
-    def follow(self, t: float, goal: Array) -> Mask:
-        """Takes in what the planners want (N, 4), NaN for nothing; returns (N,) the rows that listen to them."""
+    def take_planned(self, t: float, goal: Array) -> Mask:
+        """Use the planners' setpoints (N, 4), NaN for none; returns the rows (N,) without low-level setpoints."""
         listening = ~self._low_level
         planned = listening & np.isfinite(goal[:, 0])
         self.target[listening], self._velocity[listening], self._body[listening] = goal[listening, :3], np.nan, False
@@ -75,20 +71,20 @@ class Commander:
         self._received[listening] = t
         return listening
 
-    def age(self, t: float) -> Array:
-        """(N,) of the setpoints that count [s]."""
+    def setpoint_age(self, t: float) -> Array:
+        """Age (N,) of the current setpoints [s]."""
         return t - self._received
 
-    def wanted(
+    def model_setpoint(
         self, position: Array, velocity: Array, yaw: Array, *, level: Mask, gain: Array, turn_gain: float
     ) -> Array:
-        """The same as positions and yaws (N, 4), which is what the model of motion takes.
+        """Setpoints as positions and yaws (N, 4), the input of the motion model.
 
         Args:
-            position: (N, 3) where the rows believe to be [m].
+            position: (N, 3) estimated positions [m].
             velocity: (N, 3) [m/s].
             yaw: (N,) [rad].
-            level: (N,) rows that follow nothing in the horizontal.
+            level: (N,) rows without horizontal setpoint.
             gain: (3,) of the model's position controller [1/s]: a velocity v is the position v / gain ahead.
             turn_gain: Likewise of its yaw controller [1/s].
         """
@@ -99,7 +95,7 @@ class Commander:
         speed[:, 1] = np.where(body, sin * v[:, 0] + cos * v[:, 1], v[:, 1])
         target = self.target.copy()
         target[level, :2] = speed[level, :2] = np.nan
-        speed = np.where(np.isnan(speed), velocity, speed)  # what follows nothing drifts on
+        speed = np.where(np.isnan(speed), velocity, speed)  # axes without setpoint keep their velocity
         target = np.where(np.isnan(target), position + speed / gain, target)
         turning = np.isnan(self._heading) | level
         heading = np.where(turning, yaw + np.where(level, 0.0, self._turn) / turn_gain, self._heading)

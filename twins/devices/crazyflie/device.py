@@ -1,4 +1,4 @@
-"""The device: sockets of the Crazyflies of one process, what goes wrong on them, and the clock of all of them."""
+"""The device: sockets of the Crazyflies of one process, injected losses and delays, and the common clock."""
 
 from __future__ import annotations
 
@@ -20,94 +20,80 @@ from twins.devices.device import DeviceRequest
 
 HOST: Final = "127.0.0.1"
 LARGEST: Final = 64  # [bytes]
-AT_ONCE: Final = 64  # packets that are taken from one socket before the others are looked at
+AT_ONCE: Final = 64  # packets read from one socket before the others are served
 RECEIVE_BYTES: Final = 1 << 20
 
 Peer = tuple[str, int]
 
 
-class Line:
-    """The link of one Crazyflie: its socket, its client, and its losses.
-
-    Attributes:
-        socket: Where its packets arrive.
-        peer: Its client, None before the first packet.
-        faults: What goes wrong on it.
-        t: Now [s].
-    """
+class LossyLink:
+    """Link of one Crazyflie: socket, client, losses and delays."""
 
     def __init__(self, random: np.random.Generator, request: DeviceRequest) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
         self.socket.bind((HOST, 0))
         self.socket.setblocking(False)
-        self.peer: Peer | None = None
-        self.t = 0.0
+        self.peer: Peer | None = None  # client; None before the first packet
+        self.t = 0.0  # current time [s]
         self.faults, self._random = request.faults, random
         self._waiting: deque[tuple[float, bytes]] = deque()
 
     @property
     def address(self) -> str:
-        """Where cflib finds it."""
+        """Address for cflib."""
         return f"udp://{HOST}:{self.socket.getsockname()[1]}"
 
     def lost(self) -> bool:
-        """Whether the packet at hand never arrives."""
+        """Whether the current packet is lost."""
         faults = self.faults
         return faults.silent(self.t) or (faults.loss > 0.0 and self._random.random() < faults.loss)
 
     def send(self, port: Port, channel: int, data: bytes) -> None:
-        """One packet to the client, if there is one."""
+        """Send a packet to the client, if there is one."""
         packet = bytes((header(port, channel),)) + data
         if self.faults.delay_s > 0.0:
             self._waiting.append((self.t + self.faults.delay_s, packet))
         else:
-            self._put(packet)
+            self._send_now(packet)
 
     def send_due(self) -> None:
-        """Sends what has been delayed for long enough."""
+        """Send delayed packets that are due."""
         while self._waiting and self._waiting[0][0] <= self.t:
-            self._put(self._waiting.popleft()[1])
+            self._send_now(self._waiting.popleft()[1])
 
     def receive(self) -> bytes | None:
-        """The next packet; None if there is none. The newest client is the client, as in Bitcraze's own simulation."""
+        """Next packet, or None. The newest sender becomes the client, as in Bitcraze's own simulation."""
         while True:
             try:
                 packet, sender = self.socket.recvfrom(LARGEST)
             except BlockingIOError:
                 return None
-            except ConnectionError:  # an earlier packet found nobody
+            except ConnectionError:  # an earlier packet was rejected
                 continue
             if packet and not self.lost():
                 self.peer = sender
                 return packet
 
-    def _put(self, packet: bytes) -> None:
+    def _send_now(self, packet: bytes) -> None:
         if self.peer is None or self.lost():
             return
         try:
             self.socket.sendto(packet, self.peer)
         except (BlockingIOError, ConnectionError):
-            return  # a radio loses packets as well
+            return  # lost, as on a radio
 
 
 class CrazyflieTwin:
-    """Crazyflies that speak CRTP over UDP; implements `twins.devices.device.Device`.
-
-    Attributes:
-        addresses: One per row.
-        flock: What moves.
-        drones: The protocol of each row.
-        lines: The link of each row.
-    """
+    """Crazyflies with CRTP over UDP; implements `twins.devices.device.Device`."""
 
     def __init__(self, request: DeviceRequest) -> None:
         body = request.body
         strange = sorted({kind.name for kind in body.kinds if kind != CRAZYFLIE})
         if strange:
-            raise BodyError(f"a Crazyflie's twin flies no {', '.join(strange)}; name another body")
+            raise BodyError(f"the Crazyflie twin is no twin of a {', '.join(strange)}; name another body")
         self.flock = Flock(body, request.faults)
-        self.lines = [Line(np.random.default_rng([seed, row]), request) for row, seed in enumerate(body.seeds)]
+        self.lines = [LossyLink(np.random.default_rng([seed, row]), request) for row, seed in enumerate(body.seeds)]
         self.drones = [Drone(self.flock, row, line.send) for row, line in enumerate(self.lines)]
         self.addresses = tuple(line.address for line in self.lines)
         self._row = {line.socket: row for row, line in enumerate(self.lines)}
@@ -154,9 +140,9 @@ class CrazyflieTwin:
 
 
 def open_device(request: DeviceRequest) -> CrazyflieTwin:
-    """The entry point `crazyflie-twin` of the group `zenpark.devices`.
+    """Entry point `crazyflie-twin` of the group `zenpark.devices`.
 
     Raises:
-        BodyError: If a row is no Crazyflie, or its settings make no sense.
+        BodyError: If a row is no Crazyflie, or has invalid settings.
     """
     return CrazyflieTwin(request)

@@ -1,4 +1,4 @@
-"""One Crazyflie as its link sees it: every packet in, every answer out."""
+"""CRTP protocol of one Crazyflie: decodes every packet, and sends the answers."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from twins.devices.crazyflie.tables import (
 
 Send = Callable[[Port, int, bytes], None]
 HOVER_THRUST: Final = 36000.0  # about what a Crazyflie hovers with
-LARGEST: Final = 2.0**32  # as large as whole parameters get; no length, angle or speed comes near it
-CLIMB_THRUST: Final = 24000.0  # that much more is a metre per second up, about
+LARGEST: Final = 2.0**32  # upper bound of whole parameters, far above any length, angle or speed
+CLIMB_THRUST: Final = 24000.0  # additional thrust for a climb of about 1 m/s
 
 
 @dataclass
 class Drone:
-    """Row `row` of a flock, at the far end of `send`.
+    """Row `row` of a flock; answers go to `send`.
 
-    A packet that is too short for what it claims to be raises `struct.error` or `IndexError`, one with numbers that are
-    none `ValueError`; the link drops it.
+    A packet that is too short raises `struct.error` or `IndexError`, one with invalid numbers `ValueError`; the device
+    drops such packets.
     """
 
     flock: Flock
@@ -74,19 +74,19 @@ class Drone:
         return self.values[PARAMETER_TABLE.number[name]]
 
     def receive(self, port: int, channel: int, data: bytes) -> None:
-        """One packet."""
+        """Process one packet."""
         answer = self._answer.get(port)
         if answer is not None:
             answer(channel, data)
 
     def console(self, text: str) -> None:
-        """Says something on the console."""
+        """Send text on the console port."""
         encoded = text.encode()
         for begin in range(0, len(encoded), crtp.MTU):
             self.send(Port.CONSOLE, 0, encoded[begin : begin + crtp.MTU])
 
     def send_logs(self, t: float) -> None:
-        """Sends the log blocks that are due at `t` [s]."""
+        """Send the log blocks that are due at `t` [s]."""
         for packet in self.logs.due(t):
             self.send(Port.LOG, 2, packet)
 
@@ -117,7 +117,7 @@ class Drone:
         elif channel == 1 and command == Safety.STOP:
             supervisor.stop(self.row)
         elif channel == 1 and command == Safety.WATCHDOG:
-            supervisor.feed(self.row, self.flock.t)
+            supervisor.reset_watchdog(self.row, self.flock.t)
 
     # ------------------------------------------------------------------ parameters, logs, memories
 
@@ -185,14 +185,14 @@ class Drone:
         return _typed(PARAMETERS[number].type, self.values[number])
 
     def _set(self, number: int, value: float) -> None:
-        """A parameter changes, and what hangs on it."""
+        """Set a parameter and apply its effect."""
         before, self.values[number] = self.values[number], value
         name, flock = PARAMETERS[number].name, self.flock
         if name == "kalman.resetEstimation" and value:
             place = np.array([self.value(f"kalman.initial{axis}") for axis in "XYZ"])
             flock.estimator.reset(self.row, place - flock.place[self.row])
         elif name == "lighthouse.systemType" and value != before:
-            flock.memories[self.row].forget_stations()
+            flock.memories[self.row].clear_stations()
         elif name == "stabilizer.stop" and value:
             flock.supervisor.stop(self.row)
 
@@ -201,7 +201,7 @@ class Drone:
             self._table(Port.LOG, LOG_TABLE, data, bytes((crtp.LOG_BLOCKS, crtp.LOG_VARIABLES)))
         elif channel == 1:
             block = data[1] if len(data) > 1 else 0
-            status = self.logs.obey(data[0], block, data[2:], self.flock.t)
+            status = self.logs.execute(data[0], block, data[2:], self.flock.t)
             self.send(Port.LOG, 1, bytes((data[0], block, status)))
 
     def _memory(self, channel: int, data: bytes) -> None:
@@ -291,42 +291,42 @@ class Drone:
     def _location(self, channel: int, data: bytes) -> None:
         flock, row = self.flock, self.row
         if channel == 0:
-            flock.estimator.hear(row, flock.t, _numbers(crtp.VECTOR, data))
+            flock.estimator.add_external(row, flock.t, _numbers(crtp.VECTOR, data))
             return
         kind, rest = data[0], data[1:]
         if kind == Location.POSE:
             x, y, z, *_ = _numbers(crtp.POSE, rest)
-            flock.estimator.hear(row, flock.t, (x, y, z))
+            flock.estimator.add_external(row, flock.t, (x, y, z))
         elif kind == Location.LPP and flock.loco[row]:
             if rest[1] == crtp.ANCHOR_POSITION and rest[0] < ANCHORS:
-                flock.memories[row].place(rest[0], *_numbers(crtp.VECTOR, rest[2:]))
+                flock.memories[row].set_anchor(rest[0], *_numbers(crtp.VECTOR, rest[2:]))
         elif kind == Location.STORE_LIGHTHOUSE:
             flock.memories[row].stored = struct.unpack_from("<HH", rest)
             self.send(Port.LOCATION, 1, bytes((Location.STORE_LIGHTHOUSE, 1)))
         elif kind == Location.STOP:
             flock.supervisor.stop(row)
         elif kind == Location.WATCHDOG:
-            flock.supervisor.feed(row, flock.t)
+            flock.supervisor.reset_watchdog(row, flock.t)
 
     @property
     def planned(self) -> Plan:
-        """What the planner is at."""
+        """State of the planner."""
         return Plan(self.flock.planner.plan[self.row])
 
 
 def _typed(kind: str, value: float) -> float:
-    """A value as its type wants it for packing."""
+    """Value converted for packing as `kind`."""
     return value if kind == "float" else int(value)
 
 
 def _numbers(packing: struct.Struct, data: bytes) -> tuple[Any, ...]:
-    """What is packed at the beginning of `data`.
+    """Numbers packed at the beginning of `data`.
 
     Raises:
-        struct.error: If it is too short.
-        ValueError: If a number is not finite, or absurdly large.
+        struct.error: If `data` is too short.
+        ValueError: If a number is not finite, or too large.
     """
     values = packing.unpack_from(data)
     if not all(abs(value) <= LARGEST for value in values):  # NaN fails too
-        raise ValueError(f"{values} are no numbers for a robot")
+        raise ValueError(f"{values} are not valid numbers for a robot")
     return values

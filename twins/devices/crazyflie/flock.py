@@ -1,4 +1,4 @@
-"""What moves: the rows of Crazyflies of one process, their motion, estimate, battery and on-board logic."""
+"""The Crazyflies of one process in rows: motion, estimator, battery and on-board logic."""
 
 from __future__ import annotations
 
@@ -21,42 +21,35 @@ from twins.models.disturbance import HoverJitter, Latency, Measurement
 from twins.models.noise import Noise
 from twins.models.quadrotor import RESPONSES, Quadrotor
 
-SETTLING_S: Final = 0.1  # time constant with which measurements pull the estimate and its variance
-PRECISE: Final = 1e-5  # [m²] variance that is reached
+SETTLING_S: Final = 0.1  # time constant of the convergence of estimate and variance with measurements
+PRECISE: Final = 1e-5  # [m²] final variance
 LOST: Final = 100.0  # [m²] variance after a reset
 GROWTH: Final = 1.0  # [m²/s] of the variance without measurements
-FRESH_S: Final = 0.5  # an external position older than this says nothing any more
+FRESH_S: Final = 0.5  # older external positions are ignored
 
 
 class Estimator:
-    """Estimators of N rows.
-
-    Attributes:
-        error: (N, 3) estimate less truth [m].
-        variance: (N,) of the estimate, per axis [m²].
-        external: (N, 3) the last position that came from outside [m].
-        received: (N,) how many came.
-    """
+    """Estimators of N rows."""
 
     def __init__(self, rows: int) -> None:
-        self.error = np.zeros((rows, 3))
-        self.variance = np.full(rows, LOST)
-        self.external = np.zeros((rows, 3))
-        self.received = np.zeros(rows, dtype=np.intp)
-        self._heard = np.full(rows, -np.inf)
+        self.error = np.zeros((rows, 3))  # estimate minus truth [m]
+        self.variance = np.full(rows, LOST)  # per axis [m²]
+        self.external = np.zeros((rows, 3))  # last external position [m]
+        self.received = np.zeros(rows, dtype=np.intp)  # number of external positions
+        self._external_time = np.full(rows, -np.inf)
 
     def reset(self, row: int, error: Array) -> None:
-        """Begins anew with the estimate that far (3,) from the truth."""
+        """Restart the estimator of a row with an error (3,) [m]."""
         self.error[row], self.variance[row] = error, LOST
 
-    def hear(self, row: int, t: float, position: tuple[float, float, float]) -> None:
-        """A position from outside."""
-        self.external[row], self._heard[row] = position, t
+    def add_external(self, row: int, t: float, position: tuple[float, float, float]) -> None:
+        """Add an external position (3) [m]."""
+        self.external[row], self._external_time[row] = position, t
         self.received[row] += 1
 
     def advance(self, t: float, dt: float, truth: Array, ready: Mask) -> None:
-        """One step of dt [s]; `ready` (N,) rows have a positioning system on board that works."""
-        outside = t - self._heard <= FRESH_S
+        """Advance one step of dt [s]; rows `ready` (N,) have a working positioning system on board."""
+        outside = t - self._external_time <= FRESH_S
         share = -np.expm1(-dt / SETTLING_S)
         wanted = np.where(ready[:, None], 0.0, self.external - truth)
         measured = ready | outside
@@ -68,28 +61,16 @@ class Estimator:
 FULL_V: Final = 4.2
 EMPTY_V: Final = 3.0
 LOW_V: Final = 3.2  # the firmware's own threshold
-ENOUGH_ANCHORS: Final = 4  # three dimensions and a common clock
+ENOUGH_ANCHORS: Final = 4  # for three dimensions and a common clock
 
 
 class Flock:
-    """Rows of Crazyflies; the protocol of each is a `twins.devices.crazyflie.drone.Drone`.
-
-    Attributes:
-        planner, commander, supervisor, estimator: On-board logic of the rows.
-        quadrotor: Their motion.
-        memories: Of each row.
-        charge: (N,) of the batteries, 0 to 1.
-        place: (N, 3) where they are [m].
-        estimate: (N, 3) where they say to be [m].
-        velocity: (N, 3) that they say, from what they measure [m/s].
-        dt: Of a tick [s].
-        t: Now [s].
-    """
+    """N Crazyflies; the protocol of each is a `twins.devices.crazyflie.drone.Drone`."""
 
     def __init__(self, request: BodyRequest, faults: Faults) -> None:
         rows = len(request.names)
-        self.dt = 1.0 / request.rate_hz
-        self.t = 0.0
+        self.dt = 1.0 / request.rate_hz  # tick [s]
+        self.t = 0.0  # current time [s]
         settings = [
             chosen(name, device, external=external)
             for name, device, external in zip(request.names, request.device, request.external, strict=True)
@@ -107,7 +88,7 @@ class Flock:
         self.estimator = Estimator(rows)
         self.quadrotor = Quadrotor(request.kinds, request.start, request.yaw, self.dt)
         self.memories = [Memories() for _ in range(rows)]
-        self.charge = np.full(rows, faults.battery)
+        self.charge = np.full(rows, faults.battery)  # 0 to 1
         self._drain = self.dt * faults.drain / ENDURANCE_S["crazyflie"]
         spatial = np.ones((rows, 3))
         noise = Noise(request.names, request.seeds, "measurement", 4)
@@ -118,27 +99,27 @@ class Flock:
         response, kind = RESPONSES["crazyflie"], request.kinds[0]
         self._gain, self._turn_gain = np.array(response.position), kind.turn_response
         self.estimator.error[~self._on_board] = -self.quadrotor.position[~self._on_board]
-        self.place = self.quadrotor.position.copy()
-        self.estimate = self.place + self.estimator.error
-        self.velocity = np.zeros((rows, 3))
-        self._seen = self.place
+        self.place = self.quadrotor.position.copy()  # (N, 3) true positions [m]
+        self.estimate = self.place + self.estimator.error  # (N, 3) reported positions [m]
+        self.velocity = np.zeros((rows, 3))  # reported, from measured positions [m/s]
+        self._last_measured = self.place
 
     def pose(self, row: int) -> Array:
-        """(4,) where a row believes to be: x, y, z [m], yaw [rad]."""
+        """Estimated pose (4,) of a row: x, y, z [m], yaw [rad]."""
         return np.append(self.quadrotor.position[row] + self.estimator.error[row], self.quadrotor.yaw[row])
 
     def voltage(self, row: int) -> float:
-        """Of a row's battery [V]."""
+        """Voltage of a row's battery [V]."""
         return EMPTY_V + (FULL_V - EMPTY_V) * float(self.charge[row])
 
     def power(self, row: int) -> Power:
-        """What a row's power management says."""
+        """State of a row's power management."""
         if self.charge[row] <= 0.0:
             return Power.SHUTDOWN
         return Power.LOW if self.voltage(row) < LOW_V else Power.BATTERY
 
     def info(self, row: int) -> Info:
-        """What a row's supervisor says."""
+        """Flags of a row's supervisor and planner."""
         info = self.supervisor.info(row)
         if self.planner.plan[row] != Plan.IDLE:
             info |= Info.PLANNER_ACTIVE
@@ -154,7 +135,7 @@ class Flock:
         return 2 if memories.geometries & memories.calibrations else 1
 
     def ready(self) -> Mask:
-        """(N,) rows whose positioning system on board works."""
+        """Rows (N,) with a working positioning system on board."""
         working = self._on_board.copy()
         for row, memories in enumerate(self.memories):
             if self.lighthouse[row]:
@@ -164,13 +145,13 @@ class Flock:
         return np.asarray(working)
 
     def arm(self, row: int, *, on: bool) -> bool:
-        """An arming request."""
+        """Arm or disarm a row; False if refused."""
         if on and self.refuse_arming:
             return False
         return self.supervisor.arm(row, self.t, on=on)
 
     def advance(self, t: float) -> Mask:
-        """On to time `t` [s], by steps of dt; returns (N,) which rows have been locked on the way."""
+        """Advance to time `t` [s] by steps of dt; returns the rows (N,) locked on the way."""
         steps = max(1, round((t - self.t) / self.dt))
         if steps * self.dt > CATCH_UP_S:
             steps = 1
@@ -182,13 +163,13 @@ class Flock:
     def _step(self, t: float) -> Mask:
         self.t = t
         quadrotor, commander, supervisor = self.quadrotor, self.commander, self.supervisor
-        commander.follow(t, self.planner.goal(t))
-        locked = supervisor.advance(t, quadrotor.flying, commander.age(t))
+        commander.take_planned(t, self.planner.goal(t))
+        locked = supervisor.advance(t, quadrotor.flying, commander.setpoint_age(t))
         for row in np.flatnonzero(locked):
             self.planner.stop(int(row))
-        quadrotor.stop(np.flatnonzero(quadrotor.flying & ~self._spinning()))
-        quadrotor.flying[self._spinning()] = True
-        setpoint = commander.wanted(
+        quadrotor.stop(np.flatnonzero(quadrotor.flying & ~self._motors_on()))
+        quadrotor.flying[self._motors_on()] = True
+        setpoint = commander.model_setpoint(
             quadrotor.position + self.estimator.error,
             quadrotor.velocity,
             quadrotor.yaw,
@@ -196,8 +177,8 @@ class Flock:
             gain=self._gain,
             turn_gain=self._turn_gain,
         )
-        setpoint[:, :3] -= self.estimator.error  # the controller flies the estimate, not the truth
-        quadrotor.command(self._latency.pass_on(setpoint) if self._latency.present else setpoint)
+        setpoint[:, :3] -= self.estimator.error  # the controller uses the estimate, not the truth
+        quadrotor.command(self._latency.delay(setpoint) if self._latency.present else setpoint)
         quadrotor.advance()
         self.place = quadrotor.position.copy()
         if self._jitter.present:
@@ -206,11 +187,12 @@ class Flock:
             self.place[:, :2] += share[:, None] * self._jitter.displacement
         np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
         self.estimator.advance(t, self.dt, self.place, self.ready())
-        seen = self.place + self._measurement.draw()[:, :3] if self._measurement.present else self.place
-        self.estimate = seen + self.estimator.error
-        self.velocity, self._seen = velocity_after(self.velocity, seen - self._seen, self.dt), seen
+        measured = self.place + self._measurement.draw()[:, :3] if self._measurement.present else self.place
+        self.estimate = measured + self.estimator.error
+        self.velocity = velocity_after(self.velocity, measured - self._last_measured, self.dt)
+        self._last_measured = measured
         return locked
 
-    def _spinning(self) -> Mask:
-        """(N,) motors turn."""
+    def _motors_on(self) -> Mask:
+        """Rows (N,) whose motors turn."""
         return np.asarray(self.commander.on & self.supervisor.may_fly & (self.charge > 0.0))

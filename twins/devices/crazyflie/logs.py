@@ -1,4 +1,4 @@
-"""Log blocks: what a client wants to be told, how often, and the packets that tell it."""
+"""Log blocks: variables and periods chosen by the client, and their packets."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from agents.protocols.crtp import Info, Log, Status
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.tables import LOG_FORMATS, LOGS
 
-ROOM: Final = (2.0, 2.0, 2.5)  # [m] to the walls from the origin, and height: what a Multi-ranger would see
+ROOM: Final = (2.0, 2.0, 2.5)  # [m] from the origin to the walls, and height: measured by the Multi-ranger
 REACH: Final = 4.0  # [m] of its sensors
-NOTHING_MM: Final = 32766  # what they say when nothing is in reach
+NOTHING_MM: Final = 32766  # reading when nothing is in reach
 SENSORS: Final = {"front": 0.0, "left": 0.5 * math.pi, "back": math.pi, "right": 1.5 * math.pi}
 MILLISECONDS: Final = 0xFFFFFF
-BEHIND_S: Final = 1.0  # a block that is later than this begins anew
+BEHIND_S: Final = 1.0  # a block that is later restarts its period
 
 Read = Callable[[], float]
 
@@ -47,8 +47,8 @@ class LogBlocks:
         known = _variables(flock, row, parameter)
         self._read: list[Read] = [known.get(variable.name, _zero) for variable in LOGS]
 
-    def obey(self, command: int, number: int, rest: bytes, t: float) -> Status:
-        """One command about block `number` at time `t` [s]."""
+    def execute(self, command: int, number: int, rest: bytes, t: float) -> Status:
+        """Execute a command for block `number` at time `t` [s]."""
         block = self._blocks.get(number)
         if command == Log.RESET:
             self._blocks.clear()
@@ -109,7 +109,7 @@ def _zero() -> float:
 
 
 def _wrapped(value: float, packing: Struct) -> int:
-    """A whole number as so many bytes hold it."""
+    """Whole number, wrapped to the size of the packing."""
     bits = 8 * packing.size
     whole = int(value) & ((1 << bits) - 1)
     signed = packing.format[-1].islower()
@@ -117,7 +117,7 @@ def _wrapped(value: float, packing: Struct) -> int:
 
 
 def _variables(flock: Flock, row: int, parameter: Callable[[str], float]) -> dict[str, Read]:
-    """How each log variable is read."""
+    """Functions that read the log variables."""
     quadrotor, memories = flock.quadrotor, flock.memories[row]
     read: dict[str, Read] = {}
     for i, axis in enumerate("xyz"):
@@ -151,7 +151,7 @@ def _variables(flock: Flock, row: int, parameter: Callable[[str], float]) -> dic
         "lighthouse.bsActive": lambda: memories.geometries & memories.calibrations,
         "lighthouse.bsGeoVal": lambda: memories.geometries,
         "lighthouse.bsCalVal": lambda: memories.calibrations,
-        "loco.mode": lambda: parameter("loco.mode") or 2.0,  # left to itself it finds TDoA 2
+        "loco.mode": lambda: parameter("loco.mode") or 2.0,  # mode "auto" finds TDoA 2
         "ranging.state": lambda: sum(1 << anchor for anchor in memories.anchors()),
     }
     return read
@@ -162,7 +162,7 @@ def _wrap(angle: float) -> float:
 
 
 def _distance(flock: Flock, row: int, bearing: float) -> float:
-    """From a row to the wall in the direction `bearing` of its nose [mm]."""
+    """Distance from a row to the wall in the direction `bearing` from its nose [mm]."""
     x, y, _ = flock.place[row]
     angle = float(flock.quadrotor.yaw[row]) + bearing
     ahead = []

@@ -1,4 +1,4 @@
-"""The memories of a Crazyflie: trajectories, Loco anchors, Lighthouse base stations, and one for testing the link."""
+"""Memories of a Crazyflie: trajectories, Loco anchors, Lighthouse base stations, and one for tests of the link."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ ANCHORS: Final = 8
 PAGE: Final = 0x100
 GEOMETRY_BYTES: Final = 49  # origin, rotation, valid
 CALIBRATION_BYTES: Final = 61  # two sweeps of seven floats, identifier, valid
-CALIBRATION: Final = 0x1000  # where the calibrations begin
-ACTIVE: Final = 0x1000  # where the list of active anchors is
+CALIBRATION: Final = 0x1000  # address of the calibrations
+ACTIVE: Final = 0x1000  # address of the list of active anchors
 ANCHOR_PAGES: Final = 0x2000
 
 SIZES: Final = {
@@ -31,17 +31,17 @@ class Memories:
     def __init__(self) -> None:
         self._bytes = {kind: bytearray(size) for kind, size in SIZES.items()}
         loco = self._bytes[Memory.LOCO]
-        for where in (0, ACTIVE):  # all anchors are on the air; where they are, nobody has said yet
+        for where in (0, ACTIVE):  # all anchors are active, without positions
             loco[where : where + 1 + ANCHORS] = bytes((ANCHORS, *range(ANCHORS)))
         self.stored = (0, 0)  # masks of the stations whose geometry and calibration would survive a restart
 
     @staticmethod
     def size(kind: Memory) -> int:
-        """Of a memory [bytes]."""
+        """Size of a memory [bytes]."""
         return SIZES[kind]
 
     def read(self, kind: Memory, address: int, count: int) -> bytes | None:
-        """`count` bytes from `address` on; None where there is nothing."""
+        """Read `count` bytes from `address` on; None at an invalid address."""
         if kind == Memory.TESTER:
             return bytes((address + k) & 0xFF for k in range(count))
         data = self._bytes[kind]
@@ -50,19 +50,19 @@ class Memories:
         return bytes(data[address : address + count])
 
     def write(self, kind: Memory, address: int, data: bytes) -> bool:
-        """Puts `data` at `address`; False where that cannot be."""
+        """Write `data` to `address`; False at an invalid address."""
         if kind == Memory.LOCO or address + len(data) > SIZES[kind] or not self._exists(kind, address):
             return False
         self._bytes[kind][address : address + len(data)] = data
         return True
 
-    def place(self, anchor: int, x: float, y: float, z: float) -> None:
-        """An anchor has been told where it is [m], and says so from now on."""
+    def set_anchor(self, anchor: int, x: float, y: float, z: float) -> None:
+        """Store the position of an anchor [m]."""
         where = ANCHOR_PAGES + PAGE * anchor
         self._bytes[Memory.LOCO][where : where + ANCHOR.size] = ANCHOR.pack(x, y, z, True)
 
     def anchors(self) -> dict[int, tuple[float, float, float]]:
-        """Positions [m] of the anchors that know theirs."""
+        """Positions [m] of the anchors that have one."""
         loco, known = self._bytes[Memory.LOCO], {}
         for anchor in range(ANCHORS):
             x, y, z, valid = ANCHOR.unpack_from(loco, ANCHOR_PAGES + PAGE * anchor)
@@ -70,8 +70,8 @@ class Memories:
                 known[anchor] = (x, y, z)
         return known
 
-    def forget_stations(self) -> None:
-        """Geometries and calibrations are gone: what a change of the Lighthouse version does."""
+    def clear_stations(self) -> None:
+        """Erase geometries and calibrations, as a change of the Lighthouse version does."""
         self._bytes[Memory.LIGHTHOUSE] = bytearray(SIZES[Memory.LIGHTHOUSE])
 
     @property
@@ -90,5 +90,5 @@ class Memories:
 
     @staticmethod
     def _exists(kind: Memory, address: int) -> bool:
-        """Whether anything is at an address: pages of base stations beyond the firmware's number are not."""
+        """Whether an address is valid: pages of base stations beyond the firmware's number are not."""
         return kind != Memory.LIGHTHOUSE or address % CALIBRATION < STATIONS * PAGE

@@ -1,7 +1,7 @@
-"""The high-level commander: trajectories that the Crazyflie flies by itself, polynomials of the 7th order.
+"""High-level commander: trajectories computed on board, polynomials of the 7th order.
 
-Position, velocity and acceleration at both ends are given and the jerk is zero there, which leaves one polynomial per
-axis (Richter, Bry and Roy, "Polynomial Trajectory Planning for Aggressive Quadrotor Flight", 2016).
+Position, velocity and acceleration at both ends are given and the jerk is zero there, which determines one polynomial
+per axis (Richter, Bry and Roy, "Polynomial Trajectory Planning for Aggressive Quadrotor Flight", 2016).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SHORTEST = 0.01  # [s]
 
 
 class Plan(IntEnum):
-    """What a planner is at."""
+    """State of a planner."""
 
     IDLE = 0
     FLYING = 1
@@ -58,20 +58,16 @@ def evaluate(coefficients: Array, t: Array) -> tuple[Array, Array, Array]:
 
 
 class Planner:
-    """Planners of N rows; a pose is (4,): x, y, z [m], yaw [rad].
-
-    Attributes:
-        plan: (N,) what each is at, a `Plan`.
-    """
+    """Planners of N rows; a pose is (4,): x, y, z [m], yaw [rad]."""
 
     def __init__(self, rows: int) -> None:
-        self.plan: NDArray[np.int8] = np.zeros(rows, dtype=np.int8)
+        self.plan: NDArray[np.int8] = np.zeros(rows, dtype=np.int8)  # (N,) `Plan` of each row
         self._begin = np.zeros(rows)
         self._span = np.ones(rows)
         self._coefficients = np.zeros((rows, 4, 8))
 
     def takeoff(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> Status:
-        """Straight up, or down, to `height` [m]; refused unless idle."""
+        """Plan a vertical motion to `height` [m]; refused unless idle."""
         if self.plan[row] != Plan.IDLE:
             return Status.REFUSED
         self._vertical(row, t, pose, height=height, yaw=yaw, span=span)
@@ -79,7 +75,7 @@ class Planner:
         return Status.OK
 
     def land(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> Status:
-        """To `height` [m], and then motors off; refused while landing."""
+        """Plan a vertical motion to `height` [m], then motors off; refused while landing."""
         if self.plan[row] == Plan.LANDING:
             return Status.REFUSED
         self._vertical(row, t, pose, height=height, yaw=yaw, span=span)
@@ -98,7 +94,7 @@ class Planner:
         relative: bool,
         linear: bool,
     ) -> Status:
-        """To the pose `goal`, from the trajectory under way if there is one, else from `pose` and `velocity` (3,)."""
+        """Plan a motion to the pose `goal`, from the current trajectory or else from `pose` and `velocity` (3,)."""
         span = max(span, SHORTEST)
         zero = np.zeros(4)
         speed, acceleration = np.append(velocity, 0.0), zero
@@ -106,33 +102,33 @@ class Planner:
             pose, speed, acceleration = self._state(row, t)
         if relative:
             goal = pose + goal
-        goal = self._near(pose, goal)
+        goal = self._shorter_turn(pose, goal)
         if linear:
             even = (goal - pose) / span
             ends = (pose, even, zero), (goal, even, zero)
         else:
             ends = (pose, speed, acceleration), (goal, zero, zero)
-        self._follow(row, t, span, polynomial(span, *ends))
+        self._start(row, t, span, polynomial(span, *ends))
         self.plan[row] = Plan.FLYING
         return Status.OK
 
     def stop(self, row: int) -> None:
-        """No plan any more."""
+        """Drop the plan of a row."""
         self.plan[row] = Plan.IDLE
 
     def finished(self, t: float) -> Mask:
-        """(N,) which are at the end of their plan, or have none."""
+        """Rows (N,) at the end of their plan, or without one."""
         return np.asarray((self.plan == Plan.IDLE) | (t - self._begin >= self._span))
 
     def goal(self, t: float) -> Array:
-        """Poses (N, 4) wanted now, NaN of idle rows; a row that has landed is idle from here on."""
+        """Current planned poses (N, 4), NaN for idle rows; a row that has landed becomes idle."""
         self.plan[(self.plan == Plan.LANDING) & (t - self._begin >= self._span)] = Plan.IDLE
         elapsed = np.clip(t - self._begin, 0.0, self._span)
         pose, _, _ = evaluate(self._coefficients, elapsed[:, None])
         return np.asarray(np.where((self.plan == Plan.IDLE)[:, None], np.nan, pose))
 
     def _state(self, row: int, t: float) -> tuple[Array, Array, Array]:
-        """Pose, speed and acceleration (4,) on the plan of a row; at rest after its end."""
+        """Pose, speed and acceleration (4,) on the plan of a row; at rest after the end of the plan."""
         elapsed = t - self._begin[row]
         pose, speed, acceleration = evaluate(self._coefficients[row], np.clip(elapsed, 0.0, self._span[row]))
         if elapsed >= self._span[row]:
@@ -141,14 +137,14 @@ class Planner:
 
     def _vertical(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> None:
         span, zero = max(span, SHORTEST), np.zeros(4)
-        goal = self._near(pose, np.array([pose[0], pose[1], height, yaw]))
-        self._follow(row, t, span, polynomial(span, (pose, zero, zero), (goal, zero, zero)))
+        goal = self._shorter_turn(pose, np.array([pose[0], pose[1], height, yaw]))
+        self._start(row, t, span, polynomial(span, (pose, zero, zero), (goal, zero, zero)))
 
-    def _follow(self, row: int, t: float, span: float, coefficients: Array) -> None:
+    def _start(self, row: int, t: float, span: float, coefficients: Array) -> None:
         self._begin[row], self._span[row], self._coefficients[row] = t, span, coefficients
 
     @staticmethod
-    def _near(pose: Array, goal: Array) -> Array:
-        """The goal with the yaw that is the shorter way round."""
+    def _shorter_turn(pose: Array, goal: Array) -> Array:
+        """Goal with the yaw of the shorter turn."""
         turn = (goal[3] - pose[3] + pi) % (2.0 * pi) - pi
         return np.array([*goal[:3], pose[3] + turn])

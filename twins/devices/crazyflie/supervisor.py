@@ -1,7 +1,7 @@
-"""The supervisor: whether the motors may turn, and when they must not.
+"""Supervisor: state machine that permits or forbids the motors.
 
-The table of states follows the firmware's, with the edge that it lacks: a Crazyflie that levelled out because nobody
-spoke to it does not become a landed one, it locks.
+The states follow the firmware's, with one transition that the firmware's table lacks: a Crazyflie that levelled out
+without setpoints does not count as landed; it locks.
 """
 
 from __future__ import annotations
@@ -15,53 +15,49 @@ from numpy.typing import NDArray
 from agents.arrays import Array, Mask
 from agents.protocols.crtp import Info
 
-LEVEL_S: Final = 0.5  # a low-level setpoint older than this is not followed any more
-LOCK_S: Final = 2.0  # and after this nobody will come back
-SPUN_S: Final = 2.0  # it counts as flying for so long after its motors turned
+LEVEL_S: Final = 0.5  # an older low-level setpoint is ignored: the drone levels out
+LOCK_S: Final = 2.0  # without setpoints for so long, the drone locks
+FLYING_S: Final = 2.0  # a drone counts as flying for so long after its motors turned
 LANDED_S: Final = 3.0  # from landing to disarming
 PREFLIGHT_S: Final = 30.0  # from arming to disarming, if it does not take off
-WATCHDOG_S: Final = 1.0  # between two packets of the emergency watchdog
+WATCHDOG_S: Final = 1.0  # longest time between two packets of the emergency watchdog
 
 
 class State(IntEnum):
-    """Where a supervisor stands."""
+    """State of a supervisor."""
 
     DISARMED = 0
     READY = 1
     FLYING = 2
-    LEVEL = 3  # setpoints have stopped coming: it holds its height and its attitude, not its place
+    LEVEL = 3  # setpoints have ceased: height and attitude are held, not the position
     LANDED = 4
-    LOCKED = 5  # for ever: only a restart helps
+    LOCKED = 5  # until a restart
 
 
 class Supervisor:
-    """Supervisors of N rows.
-
-    Attributes:
-        state: (N,) each a `State`.
-    """
+    """Supervisors of N rows."""
 
     def __init__(self, auto_arm: Mask) -> None:
         rows = len(auto_arm)
         self._auto = auto_arm
         self.state: NDArray[np.int8] = np.where(auto_arm, State.READY, State.DISARMED).astype(np.int8)
-        self._since = np.zeros(rows)  # armed, or landed
-        self._spun = np.full(rows, -np.inf)
-        self._fed = np.full(rows, np.inf)  # watchdog; infinity while it is not in use
+        self._since = np.zeros(rows)  # time of arming or landing [s]
+        self._motors_ran = np.full(rows, -np.inf)
+        self._watchdog = np.full(rows, np.inf)  # watchdog; infinity while it is not in use
         self._stop = np.zeros(rows, dtype=bool)
 
     @property
     def may_fly(self) -> Mask:
-        """(N,) motors may turn."""
+        """Rows (N,) whose motors may turn."""
         return np.asarray((self.state != State.DISARMED) & (self.state != State.LOCKED))
 
     @property
     def level(self) -> Mask:
-        """(N,) setpoints are not followed in the horizontal."""
+        """Rows (N,) that ignore horizontal setpoints."""
         return np.asarray(self.state == State.LEVEL)
 
     def arm(self, row: int, t: float, *, on: bool) -> bool:
-        """Arms or disarms; False if that is not possible now."""
+        """Arm or disarm a row; False if not possible in its state."""
         if on and self.state[row] == State.DISARMED:
             self.state[row], self._since[row] = State.READY, t
         elif not on and self.state[row] != State.LOCKED:
@@ -73,25 +69,25 @@ class Supervisor:
         return bool(self.may_fly[row])
 
     def stop(self, row: int) -> None:
-        """Emergency stop."""
+        """Request an emergency stop of a row."""
         self._stop[row] = True
 
-    def feed(self, row: int, t: float) -> None:
-        """A packet of the emergency watchdog: from the first one on they must keep coming."""
-        self._fed[row] = t
+    def reset_watchdog(self, row: int, t: float) -> None:
+        """Restart the emergency watchdog, which is active from its first packet on."""
+        self._watchdog[row] = t
 
     def advance(self, t: float, spinning: Mask, age: Array) -> Mask:
-        """One tick; returns (N,) which rows have just been locked.
+        """Advance one tick; returns the rows (N,) that have just been locked.
 
         Args:
-            t: Now [s].
+            t: Current time [s].
             spinning: (N,) motors turn.
             age: (N,) of the newest setpoint [s].
         """
-        self._spun[spinning] = t
-        flying, state = t - self._spun < SPUN_S, self.state
+        self._motors_ran[spinning] = t
+        flying, state = t - self._motors_ran < FLYING_S, self.state
         airborne = (state == State.FLYING) | (state == State.LEVEL)
-        lock = (state != State.LOCKED) & (self._stop | (t - self._fed > WATCHDOG_S) | (airborne & (age > LOCK_S)))
+        lock = (state != State.LOCKED) & (self._stop | (t - self._watchdog > WATCHDOG_S) | (airborne & (age > LOCK_S)))
         settled = t - self._since
         home = np.where(self._auto, State.READY, State.DISARMED)
         after = np.select(
@@ -112,7 +108,7 @@ class Supervisor:
         return np.asarray(lock)
 
     def info(self, row: int) -> Info:
-        """What a row says of itself, without the planner's part."""
+        """Flags of a row, without those of the planner."""
         state = State(self.state[row])
         info = Info(0)
         if state == State.DISARMED:

@@ -1,4 +1,4 @@
-"""The tables of contents: which parameters and log variables the firmware offers, as bytes on the wire."""
+"""Tables of contents: parameters and log variables of the firmware, as bytes on the wire."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LOG_FORMATS: Final = {number: (packing, name[0] in "ui") for name, (number, pack
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter: its type, its default, what may be done with it."""
+    """One parameter: type, default, access."""
 
     name: str
     type: str
@@ -44,7 +44,7 @@ class Parameter:
 
     @property
     def packing(self) -> Struct:
-        """Of its value."""
+        """Packing of the value."""
         return PARAMETER_TYPES[self.type][1]
 
     @property
@@ -67,7 +67,7 @@ class LogVariable:
 
 
 def entry(kind: int, name: str) -> bytes:
-    """One entry of a table; the last NUL is needed: cflib cuts one byte off, whatever it is."""
+    """One entry of a table; the last NUL is required, because cflib always cuts one byte off."""
     group, variable = name.split(".")
     return bytes((kind,)) + f"{group}\0{variable}\0".encode()
 
@@ -76,8 +76,8 @@ def entry(kind: int, name: str) -> bytes:
 class Table:
     """One table: entries as bytes, numbers by name, and a checksum.
 
-    cflib caches tables by checksum alone, those of parameters and of logs in one place: it must follow the content, and
-    differ between the two.
+    cflib caches tables by checksum only, those of parameters and of logs in one folder: the checksum must depend on the
+    content, and differ between the two.
     """
 
     items: tuple[bytes, ...]
@@ -85,8 +85,8 @@ class Table:
     crc: int
 
     @classmethod
-    def of(cls, entries: Sequence[Parameter | LogVariable], salt: bytes) -> Table:
-        """The table of these entries."""
+    def build(cls, entries: Sequence[Parameter | LogVariable], salt: bytes) -> Table:
+        """Build the table of these entries."""
         items = tuple(one.item for one in entries)
         return cls(items, {one.name: i for i, one in enumerate(entries)}, zlib.crc32(salt + b"".join(items)))
 
@@ -154,5 +154,5 @@ LOGS: Final = tuple(
     for name in names.split()
 )
 
-PARAMETER_TABLE: Final = Table.of(PARAMETERS, b"parameters")
-LOG_TABLE: Final = Table.of(LOGS, b"logs")
+PARAMETER_TABLE: Final = Table.build(PARAMETERS, b"parameters")
+LOG_TABLE: Final = Table.build(LOGS, b"logs")
