@@ -84,38 +84,23 @@ class BodyRequest:
 
 @dataclass(frozen=True)
 class RangeScan:
-    """One sweep of a robot's range sensors.
+    """One sweep of a robot's range sensors."""
 
-    Attributes:
-        time: When, on the clock of `Body.read` [s]; a newer scan has a newer time.
-        bearing: (m,) from the robot's nose, to the left [rad].
-        elevation: (m,) up [rad].
-        distance: (m,) from the robot's centre [m]; NaN where nothing is in reach.
-    """
-
-    time: float
-    bearing: Array
-    elevation: Array
-    distance: Array
+    time: float  # when, on the clock of `Body.read` [s]; a newer scan has a newer time
+    bearing: Array  # (m,) from the robot's nose, to the left [rad]
+    elevation: Array  # (m,) up [rad]
+    distance: Array  # (m,) from the robot's centre [m]; NaN where nothing is in reach
 
 
 @dataclass(frozen=True)
 class Rays:
-    """The newest readings of the range sensors of any rows, one entry per ray (R).
+    """The newest readings of the range sensors of any rows, one entry per ray (R)."""
 
-    Attributes:
-        row: (R,) whose ray it is; rays of one row follow one another.
-        time: (R,) when it was measured, on the clock of `Body.read` [s].
-        bearing: (R,) from the robot's nose, to the left [rad].
-        elevation: (R,) up [rad].
-        distance: (R,) from the robot's centre [m]; NaN where nothing is in reach.
-    """
-
-    row: Index
-    time: Array
-    bearing: Array
-    elevation: Array
-    distance: Array
+    row: Index  # (R,) whose ray it is; rays of one row follow one another
+    time: Array  # (R,) when it was measured, on the clock of `Body.read` [s]
+    bearing: Array  # (R,) from the robot's nose, to the left [rad]
+    elevation: Array  # (R,) up [rad]
+    distance: Array  # (R,) from the robot's centre [m]; NaN where nothing is in reach
 
     @classmethod
     def gather(cls, scans: Sequence[RangeScan | None]) -> Rays | None:
@@ -155,40 +140,27 @@ class Rays:
 
 @dataclass
 class BodyState:
-    """What a body knows of its rows. Unknown numbers are NaN.
+    """What a body knows of its rows. Unknown numbers are NaN."""
 
-    Attributes:
-        time: (n,) when the pose was measured, on the clock of `read` [s].
-        position: (n, 3) measured [m].
-        velocity: (n, 3) measured or estimated [m/s].
-        yaw: (n,) measured [rad].
-        true_position: (n, 3) the truth of a twin [m].
-        true_yaw: (n,) the truth of a twin [rad].
-        battery: (n,) charge, 0 to 1.
-        flying: (n,) motors on, off the ground or about to be.
-        notes: What each row's hardware says of itself (supervisor, link), for people; empty if nothing.
-        rays: What the rows' range sensors see; None if they have none.
-        attitude: (n, 4) unit quaternion w, x, y, z from the robot to the room, where a body knows more than yaw.
-        shadow_position: (n, 3) of the twin that runs beside each row [m], NaN for rows without one; None if there is
-            none at all (see `agents.body.shadow_twin`).
-        shadow_yaw: (n,) of that twin [rad].
-        ahead: (n,) how far ahead of its arrival the last position was stamped that something outside measured [s],
-            negative where behind; None if there is none.
-    """
-
-    time: Array
-    position: Array
-    velocity: Array
-    yaw: Array
-    true_position: Array
-    true_yaw: Array
-    battery: Array
-    flying: Mask
+    time: Array  # (n,) when the pose was measured, on the clock of `read` [s]
+    position: Array  # (n, 3) measured [m]
+    velocity: Array  # (n, 3) measured or estimated [m/s]
+    yaw: Array  # (n,) measured [rad]
+    true_position: Array  # (n, 3) the truth of a twin [m]
+    true_yaw: Array  # (n,) the truth of a twin [rad]
+    battery: Array  # (n,) charge, 0 to 1
+    flying: Mask  # (n,) motors on, off the ground or about to be
+    # what each row's hardware says of itself (supervisor, link), for people; empty if nothing
     notes: tuple[str, ...] = ()
-    rays: Rays | None = None
+    rays: Rays | None = None  # what the rows' range sensors see; None if they have none
+    # (n, 4) unit quaternion w, x, y, z from the robot to the room, where a body knows more than yaw
     attitude: Array | None = None
+    # (n, 3) of the twin that runs beside each row [m], NaN for rows without one; None if there is none at all (see
+    # `agents.body.shadow_twin`)
     shadow_position: Array | None = None
-    shadow_yaw: Array | None = None
+    shadow_yaw: Array | None = None  # (n,) of that twin [rad]
+    # (n,) how far ahead of its arrival the last position was stamped that something outside measured [s], negative
+    # where behind; None if there is none
     ahead: Array | None = None
 
 

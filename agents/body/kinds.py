@@ -11,30 +11,18 @@ Takes = Literal["position", "velocity", "twist"]
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of robot.
+    """One kind of robot."""
 
-    Attributes:
-        name: As in the experiment file.
-        takes: The setpoint that its body takes.
-        flies: Takes off and lands.
-        radius: Horizontal half-size [m].
-        height: Vertical size [m]; a position is that of the lowest point, so a body reaches from z to z + height.
-        speed: Largest speed [m/s]; per axis for flying robots.
-        turn_rate: Largest yaw rate [rad/s].
-        response: Rate at which its position controller closes a position error [1/s].
-        turn_response: Rate at which it closes a yaw error [1/s].
-        lag: Time constant with which its velocity follows what is commanded [s].
-    """
-
-    name: str
-    takes: Takes
-    flies: bool
-    radius: float
-    height: float
-    speed: float
-    turn_rate: float
-    response: float
-    turn_response: float
+    name: str  # as in the experiment file
+    takes: Takes  # the setpoint that its body takes
+    flies: bool  # takes off and lands
+    radius: float  # horizontal half-size [m]
+    height: float  # vertical size [m]; a position is that of the lowest point, so a body reaches from z to z + height
+    speed: float  # largest speed [m/s]; per axis for flying robots
+    turn_rate: float  # largest yaw rate [rad/s]
+    response: float  # rate at which its position controller closes a position error [1/s]
+    turn_response: float  # rate at which it closes a yaw error [1/s]
+    # time constant with which its velocity follows what is commanded [s]
     lag: float = 0.1  # of a robot on wheels at 2 m/s², from 0.3 m/s, and a tick or two
 
 

@@ -1,7 +1,7 @@
-"""Who may say, hear, ask and answer what: from rights in these words to the access control of a Zenoh router.
+"""Access control of a lab: rights to publish, subscribe and query, and the rules of a Zenoh router that follow.
 
-Zenoh checks kinds of messages, on their way in and out of the router. A verb here stands for all that one end of a
-conversation needs, the keys of advanced publishers included (`@adv`, which no wildcard of a rule matches by itself).
+Zenoh checks kinds of messages, on their way in and out of the router. A verb here stands for all messages that one end
+needs, the keys of advanced publishers included (`@adv`, which no wildcard of a rule matches by itself).
 Everything else is denied. There are no rules that deny: Zenoh asks whether the key of a rule *includes* that of the
 message, so that a put on `park/**` would slip through beside a rule that denies `park/*/order`.
 """
@@ -18,8 +18,8 @@ from agents.network.lab import LabError, Register
 
 Flow = Literal["ingress", "egress"]
 
-MOST_BYTES: Final = 64 * 1024  # of a message below a robot's name; what readers refuse need not travel
-ADMIN: Final = "@/**"  # Zenoh's own keys: who is connected to a router
+MOST_BYTES: Final = 64 * 1024  # of a message below the name of a robot, as readers accept
+ADMIN: Final = "@/**"  # keys of Zenoh itself: the connections of a router
 OWN_ADMIN: Final = "@/*/client/**"
 PASSED: Final = (
     "put", "query", "reply", "declare_subscriber", "declare_queryable",
@@ -28,47 +28,30 @@ PASSED: Final = (
 
 
 class Grant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """What somebody may do: key expressions by verb.
+    """Rights of an identity: key expressions by verb."""
 
-    Attributes:
-        say: Publish. To delete is no one's right.
-        hear: Subscribe, and ask for the last value that a publisher keeps.
-        answer: Be asked.
-        reached: Be reached by a query on this wildcard, which others have the right to ask; an answer to it stays
-            within `say` and `answer`.
-        ask: Query.
-        be: Hold a liveliness token.
-        watch: See liveliness tokens.
-    """
-
-    say: list[str] = []
-    hear: list[str] = []
-    answer: list[str] = []
+    say: list[str] = []  # publish (PUT only: DELETE is never allowed)
+    hear: list[str] = []  # subscribe, and ask for the last value that a publisher keeps
+    answer: list[str] = []  # declare a queryable
+    # receive queries on this wildcard, which others may send; a reply stays within `say` and `answer`
     reached: list[str] = []
-    ask: list[str] = []
-    be: list[str] = []
-    watch: list[str] = []
+    ask: list[str] = []  # query
+    be: list[str] = []  # hold a liveliness token
+    watch: list[str] = []  # subscribe to liveliness tokens
 
     def joined(self, other: Grant) -> Grant:
-        """What either of two may do."""
+        """Union of the rights of two."""
         both = (sorted({*getattr(self, verb), *getattr(other, verb)}) for verb in self.__struct_fields__)
         return Grant(*both)
 
 
 class Rights(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Who may do what in an experiment: each robot by its name, everybody else by its role.
+    """Rights in an experiment: of each robot by its name, of all others by their role."""
 
-    Attributes:
-        realm: First chunk of every key.
-        robots: By name.
-        roles: By role.
-        linked: Whether routers pass on to each other what they have let in; else a router may say nothing.
-    """
-
-    realm: str
-    robots: dict[str, Grant]
-    roles: dict[str, Grant]
-    linked: bool = False
+    realm: str  # first chunk of every key
+    robots: dict[str, Grant]  # by name
+    roles: dict[str, Grant]  # by role
+    linked: bool = False  # routers forward to each other what they have let in; else a router may publish nothing
 
     def joined(self, other: Rights) -> Rights:
         """The rights of two experiments that share a router.
@@ -89,7 +72,7 @@ def _joined(one: Mapping[str, Grant], other: Mapping[str, Grant]) -> dict[str, G
 
 
 def _messages(grant: Grant, realm: str) -> Iterator[tuple[Flow, tuple[str, ...], list[str]]]:
-    """Which messages, which way, on which keys."""
+    """Flow, kinds of messages and keys of each allowance."""
     said, heard = _kept(grant.say), _kept(grant.hear)
     yield "ingress", ("put", "reply"), [*grant.say, *said]
     yield "ingress", ("declare_queryable", "liveliness_token"), said
@@ -105,7 +88,7 @@ def _messages(grant: Grant, realm: str) -> Iterator[tuple[Flow, tuple[str, ...],
     yield "ingress", ("liveliness_token",), grant.be
     yield "ingress", ("liveliness_query", "declare_liveliness_subscriber"), grant.watch
     yield "egress", ("liveliness_token",), grant.watch
-    # a publisher that knows of no subscriber sends nothing: everybody learns who listens to what, not what is said
+    # a publisher that knows of no subscriber sends nothing: all learn the subscriptions, not the values
     everything = [f"{realm}/**", *_kept([f"{realm}/**"]), *grant.say, *said, *grant.ask]
     yield "egress", ("declare_subscriber", "declare_queryable"), everything
     yield "ingress", ("declare_queryable", "reply"), [OWN_ADMIN]
@@ -113,19 +96,19 @@ def _messages(grant: Grant, realm: str) -> Iterator[tuple[Flow, tuple[str, ...],
 
 
 def _kept(keys: Iterable[str]) -> list[str]:
-    """Where advanced publishers on these keys keep their last values, and say that they are there."""
+    """Keys of the caches and of the detection of advanced publishers."""
     return [f"{key}/@adv/**" for key in keys if not key.startswith("@")]
 
 
 def rules(rights: Rights, register: Register) -> dict[str, Any]:
-    """The `access_control` of a router: default deny, a subject for everybody who has a certificate that counts.
+    """The `access_control` of a router: default deny, one subject for each valid certificate.
 
     Args:
         rights: Of the experiment.
         register: Of the lab; robots that are not in it get no rights.
 
     Raises:
-        LabError: If the certificate on a robot's name is somebody else's.
+        LabError: If the name of a robot belongs to an identity of another role.
     """
     made: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
@@ -178,7 +161,7 @@ def _rules(name: str, grant: Grant, realm: str) -> Iterator[dict[str, Any]]:
 
 
 def _passed(name: str, rights: Rights) -> Iterator[dict[str, Any]]:
-    """The rules of a router that is linked with another: what either has let in passes, on keys of somebody's right."""
+    """The rules of a router that is linked with another: messages that either has let in pass, on keys of any right."""
     anybody = reduce(Grant.joined, (*rights.robots.values(), *rights.roles.values()), Grant())
     granted = {key for verb in Grant.__struct_fields__ for key in getattr(anybody, verb)}
     foreign = sorted(key for key in granted if not key.startswith((f"{rights.realm}/", "@/**")))
@@ -193,7 +176,7 @@ def _passed(name: str, rights: Rights) -> Iterator[dict[str, Any]]:
 
 
 def sizes(rights: Rights) -> list[dict[str, Any]]:
-    """The `low_pass_filter` of a router: below a robot's name nothing is larger than what readers take."""
+    """The `low_pass_filter` of a router: below the name of a robot no message is larger than readers accept."""
     named: Sequence[str] = [f"{rights.realm}/*/{part}" for part in ("**", "**/@adv/**")]
     # `run` holds the experiment, which grows with its robots
     below = [key.replace("*", name, 1) for name in (*rights.robots, "world", "centre") for key in named]

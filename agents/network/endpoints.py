@@ -1,4 +1,4 @@
-"""Zenoh endpoints, `protocol/host:port`, and behind `?` or `#` settings that only Zenoh reads; and which are free."""
+"""Zenoh endpoints, `protocol/host:port`, and behind `?` or `#` settings for Zenoh; and free ports."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DEFAULT_ENDPOINT: Final = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 UNIX: Final = "unixsock-stream"
 PROTOCOLS: Final = ("tcp", "tls", "quic", UNIX)
 _WHY_NOT: Final = {
-    "udp": "what it loses nobody says again, and who was killed is noticed late",
+    "udp": "lost messages are not repeated, and a killed process is noticed late",
     "ws": "it shows no certificates",
     "wss": "its certificates are not checked by name",
     "serial": "two ends of a wire are no network",
@@ -27,7 +27,7 @@ class EndpointError(ValueError):
 
 
 def refusal(endpoint: str) -> str:
-    """Why the protocol of an endpoint is not used, and what is; empty if it is."""
+    """Why the protocol of an endpoint is not supported, with the remedy; empty if it is."""
     protocol = endpoint.partition("/")[0]
     if protocol in PROTOCOLS:
         return ""
@@ -37,23 +37,16 @@ def refusal(endpoint: str) -> str:
 
 @dataclass(frozen=True)
 class Endpoint:
-    """An endpoint in its parts.
+    """An endpoint in its parts."""
 
-    Attributes:
-        protocol: tcp, tls, quic, ...
-        host: Name or address, without brackets; the path of a Unix socket.
-        port: 0 for a Unix socket.
-        rest: Settings, with the `?` or `#` before them.
-    """
-
-    protocol: str
-    host: str
-    port: int
-    rest: str = ""
+    protocol: str  # tcp, tls, quic, unixsock-stream
+    host: str  # name or address, without brackets; the path of a Unix socket
+    port: int  # 0 for a Unix socket
+    rest: str = ""  # settings, with the `?` or `#` before them
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Takes an endpoint apart.
+        """Parses an endpoint.
 
         Raises:
             ValueError: If it is none; says how one is written.
@@ -84,12 +77,12 @@ class Endpoint:
 
     @property
     def is_wildcard(self) -> bool:
-        """Whether it means every address of a machine, so that one can listen there but not connect."""
+        """Whether it stands for every address of a machine: for listening only."""
         address = self._address
         return address is not None and address.is_unspecified
 
     def at(self, host: str, port: int | None = None) -> Endpoint:
-        """The same under another name of its machine, or at another port."""
+        """The same endpoint with another host name or port."""
         return replace(self, host=host, port=self.port if port is None else port)
 
     @property
@@ -114,7 +107,7 @@ def free_endpoint(preferred_port: int = DEFAULT_PORT, protocol: str = "tcp") -> 
 
 
 def free_endpoints(count: int, protocol: str = "tcp") -> list[str]:
-    """So many different ones, of the usual port and those after it where they are free."""
+    """Different free loopback endpoints, from the default port upwards."""
     made: dict[str, None] = {}
     while len(made) < count:
         made[free_endpoint(DEFAULT_PORT + len(made), protocol)] = None
@@ -129,26 +122,20 @@ TOGETHER: Final = "+"  # between the names of robots that share a process
 
 @dataclass(frozen=True)
 class Ends:
-    """What a session does about endpoints.
+    """Mode and endpoints of a session."""
 
-    Attributes:
-        mode: What it is to Zenoh.
-        connect: Where it connects: a client at the first that answers, all others everywhere.
-        listen: Where it listens.
-    """
-
-    mode: Mode
-    connect: list[str]
+    mode: Mode  # client, peer or router
+    connect: list[str]  # a client connects to the first that answers, others to all
     listen: list[str]
 
     @property
     def visits(self) -> bool:
-        """Whether it comes into a mesh to which it does not belong."""
+        """Whether it joins a mesh without being a member."""
         return self.mode == "peer" and not self.listen
 
 
 def ends(endpoints: Sequence[str], name: str) -> Ends:
-    """What the session of this name does about the endpoints that it was given."""
+    """Mode and endpoints of the session of this name."""
     if not is_mesh(endpoints):
         return Ends("client", list(endpoints), [])
     own = next((number for number, each in enumerate(endpoints) if name in (owner(each), *owners(each))), None)
@@ -163,18 +150,18 @@ def is_mesh(endpoints: Sequence[str]) -> bool:
 
 
 def owned(endpoint: str, name: str) -> str:
-    """The endpoint of a member, which may carry its lab already."""
+    """The endpoint of a member of a mesh; it may carry its lab already."""
     plain, mark, folder = endpoint.partition(lab.MARK)
     return f"{plain}{OWNER}{name}{mark}{folder}"
 
 
 def owner(endpoint: str) -> str:
-    """Whose endpoint it is, several names with + between; empty for a router's."""
+    """Owner of an endpoint, several names with + between; empty for that of a router."""
     return endpoint.partition(lab.MARK)[0].partition(OWNER)[2]
 
 
 def owners(endpoint: str) -> list[str]:
-    """The same, name by name."""
+    """Owners of an endpoint, one by one."""
     return owner(endpoint).split(TOGETHER)
 
 
@@ -190,11 +177,11 @@ def bare(endpoints: Sequence[str]) -> list[str]:
 
 
 def near(endpoints: Sequence[str], hears: Mapping[str, set[str]], names: Sequence[str]) -> list[str]:
-    """What of a mesh concerns robots that share a process: their own endpoint, their neighbours', and the services'.
+    """Endpoints of a mesh for robots that share a process: their own, their neighbours', and those of services.
 
     Args:
         endpoints: Of all members.
-        hears: Whom each robot of the experiment hears.
+        hears: Neighbours of each robot of the experiment.
         names: The robots of the process.
     """
     if not is_mesh(endpoints):
@@ -205,6 +192,6 @@ def near(endpoints: Sequence[str], hears: Mapping[str, set[str]], names: Sequenc
 
 
 def from_here(endpoint: str) -> str:
-    """How this machine reaches what listens at an endpoint of it."""
+    """Endpoint with which this machine connects to a listener of its own."""
     parsed = Endpoint.parse(endpoint)
     return str(parsed.at("127.0.0.1")) if parsed.is_wildcard else endpoint

@@ -1,4 +1,4 @@
-"""Every Zenoh key expression of the project; nobody else spells a key."""
+"""Every Zenoh key expression of the project; no other module spells a key."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class Keys:
 
     @staticmethod
     def lives(alive: str) -> str:
-        """A liveliness key and all tokens below it: the lives and claims of its name."""
+        """A liveliness key and all tokens below it: sessions and claims of its name."""
         return f"{alive}/**"
 
     @staticmethod
     def life(alive: str, session: str) -> str:
-        """Token of the session that owns the name of a liveliness key: a new session is a new life."""
+        """Token of the session that owns the name of a liveliness key."""
         return f"{alive}/life/{session}"
 
     @staticmethod
@@ -53,13 +53,13 @@ class Keys:
 
     @staticmethod
     def rank_of(alive: str, token: str) -> str | None:
-        """The `rank` in the token of a claim; None of any other token."""
+        """The `rank` in the token of a claim; None for any other token."""
         begin = Keys.claim(alive, "")
         return token.removeprefix(begin) if token.startswith(begin) else None
 
     @staticmethod
     def life_of(token: str) -> str | None:
-        """The session in the token of a life; None of any other token."""
+        """The session in the token of an owner; None for any other token."""
         before, _, session = token.rpartition("/")
         return session if before.endswith("/life") else None
 
@@ -68,7 +68,7 @@ class Keys:
         return f"{self.realm}/{robot}/position"
 
     def goal(self, robot: str) -> str:
-        """Where whoever decides for this robot wants it to go: the centre, or somebody outside."""
+        """Goal from the central controller, or from outside."""
         return f"{self.realm}/{robot}/goal"
 
     def setpoint(self, robot: str) -> str:
@@ -76,16 +76,16 @@ class Keys:
         return f"{self.realm}/{robot}/setpoint"
 
     def ranges(self, robot: str) -> str:
-        """Readings of its range sensors."""
+        """Readings of the range sensors."""
         return f"{self.realm}/{robot}/ranges"
 
     def truth(self, robot: str) -> str:
-        """Where a protocol twin really is: for recorder and simulated motion capture, never for robots."""
+        """True pose of a protocol twin: for recorder and simulated motion capture, never for robots."""
         return f"{self.realm}/{robot}/truth"
 
     @property
     def world(self) -> str:
-        """What the world says of itself: pace, pauses, contacts. Not `state`: only robots have one."""
+        """Report of the world: pace, pauses, contacts. Not `state`, which only robots have."""
         return f"{self.realm}/world/report"
 
     @property
@@ -100,27 +100,27 @@ class Keys:
 
     @property
     def world_alive(self) -> str:
-        """Liveliness token of the world. Not `alive`: whoever counts robots asks for that of everybody."""
+        """Liveliness token of the world. Not `alive`, which is counted as a robot."""
         return f"{self.realm}/world/here"
 
     @property
     def centre(self) -> str:
-        """What the centre says of itself: whom it guides, load, what it heard. Not `state`: only robots have one."""
+        """Report of the central controller: guided robots, load, counters. Not `state`, which only robots have."""
         return f"{self.realm}/centre/report"
 
     @property
     def centre_alive(self) -> str:
-        """Liveliness token of the centre. Not `alive`, as that of the world."""
+        """Liveliness token of the central controller. Not `alive`, as that of the world."""
         return f"{self.realm}/centre/here"
 
     @property
     def estop(self) -> str:
-        """Emergency stop for everyone."""
+        """Emergency stop for all robots."""
         return f"{self.realm}/estop"
 
     @property
     def event(self) -> str:
-        """What the conductor says of the run: phases, losses, orders."""
+        """Events of the run: phases, losses, orders."""
         return f"{self.realm}/run/event"
 
     @property
@@ -140,7 +140,7 @@ class Keys:
 
     @property
     def clock(self) -> str:
-        """How the clocks of other machines lie to the conductor's."""
+        """Clock offsets of other machines from the conductor's."""
         return f"{self.realm}/run/clock"
 
     @property
@@ -149,7 +149,7 @@ class Keys:
         return f"{self.realm}/run/recorder"
 
     def below(self, name: str) -> str:
-        """Everything of a robot, or of a part of the system that has a name: `world`, `run`, `centre`."""
+        """All keys of a robot, or of `world`, `run` or `centre`."""
         return f"{self.realm}/{name}/**"
 
     @property
@@ -170,7 +170,7 @@ class Keys:
         return robot
 
     def whose(self, key: str) -> str | None:
-        """The robot that a key belongs to; None of any other, as when somebody puts on many keys at once (`**`)."""
+        """The robot that a key belongs to; None if there is none, as for a PUT on many keys at once (`**`)."""
         try:
             return self.robot(key)
         except ValueError:

@@ -1,11 +1,11 @@
-"""A laboratory's identities: who has a certificate, where its files are, and how an endpoint asks for one.
+"""Identities of a laboratory: certificates, their files, and endpoints that ask for them.
 
-A lab is a folder. `lab.json`, the register, says who is who; `ca.pem` is what everybody trusts; `CF01.pem` and
+A lab is a folder. `lab.json` is the register of identities; `ca.pem` the authority that all trust; `CF01.pem` and
 `CF01.key` are an identity. A robot's computer needs `ca.pem` and its own two files, a router the register as well.
-`ca.key`, which makes new identities, belongs on the computer of whoever runs the lab and nowhere else.
+`ca.key`, which makes new identities, belongs on the computer of the operator of the lab and nowhere else.
 
-Within the project an endpoint carries its lab behind it, `tls/127.0.0.1:7447#lab=/home/ana/lab`: whoever is told where
-a router is, is told by that how to be let in.
+Within the project an endpoint carries its lab behind it, `tls/127.0.0.1:7447#lab=/home/ana/lab`: the address of a
+router tells how to be let in.
 """
 
 from __future__ import annotations
@@ -34,26 +34,19 @@ class LabError(ValueError):
 
 
 class Identity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Somebody with a certificate.
+    """Holder of a certificate."""
 
-    Attributes:
-        role: What it may do.
-        common_name: What its present certificate is made out to: its name, or `CF01.2` when it is the second that
-            counts. A certificate on an earlier name is still the lab's, and gives no right.
-        serial: Of that certificate, in hexadecimal.
-        until: When it ends, UTC, ISO 8601.
-        hosts: At which names and addresses it may listen.
-    """
-
-    role: Role
+    role: Role  # decides its rights
+    # of its present certificate: its name, or `CF01.2` for the second one. A certificate with an earlier common name is
+    # still the lab's, and gives no right.
     common_name: str
-    serial: str
-    until: str
-    hosts: list[str] = []
+    serial: str  # of that certificate, in hexadecimal
+    until: str  # end of its validity, UTC, ISO 8601
+    hosts: list[str] = []  # names and addresses at which it may listen
 
 
 class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Who is who in a lab, by name."""
+    """Identities of a lab, by name."""
 
     identities: dict[str, Identity]
 
@@ -86,7 +79,7 @@ def register(folder: Path) -> Register:
 
 
 def files(folder: Path, name: str) -> Files:
-    """The files of an identity, which are there and whose key nobody else can read.
+    """The files of an identity, checked: all exist, and only the user can read the key.
 
     Raises:
         LabError: If not.
@@ -113,7 +106,7 @@ def require(folder: Path, names: Sequence[str]) -> None:
     """Checks identities before anything is started.
 
     Raises:
-        LabError: If some cannot be used here: the first, and which others are missing altogether.
+        LabError: If some cannot be used here: the first, or all that are missing.
     """
     gone = [name for name in names if not (folder / f"{name}.pem").exists()]
     if len(gone) > 1:
@@ -152,7 +145,7 @@ def bare(endpoints: Sequence[str]) -> list[str]:
 
 
 def options(endpoint: str) -> str:
-    """What to write on a command line to reach an endpoint."""
+    """Command-line options that reach an endpoint."""
     plain, mark, folder = endpoint.partition(MARK)
     return f"--connect {plain}" + (f" --lab {folder}" if mark else "")
 
@@ -174,7 +167,7 @@ def of(endpoints: Sequence[str]) -> Path | None:
 
 
 def settings(folder: Path, name: str, *, listens: bool) -> dict[str, object]:
-    """Zenoh's settings by which an identity shows its certificate and asks for that of the other end.
+    """Zenoh settings with which an identity shows its certificate and asks for that of the other end.
 
     Raises:
         LabError: If its files are not there.

@@ -1,9 +1,9 @@
-"""What goes over the network: the structs, their two encodings, and the check of what arrives.
+"""Messages on the network: their structs, their two encodings, and the decoding of payloads.
 
 JSON is the default (every Zenoh tool prints it), MessagePack a setting for thin links: a sample is MessagePack if its
-encoding says so, and JSON otherwise, since many tools set no encoding, or another one. What arrives is checked before
-it is believed: `decode` raises `Malformed` for anything that is not the struct, `agents.network.validation` for one
-that cannot be true. Unknown numbers are left out of messages: JSON has no NaN.
+encoding says so, and JSON otherwise, since many tools set no encoding, or another one. `decode` raises `Malformed` for
+a payload that is not the struct, `agents.network.validation` for impossible values. Unknown numbers are left out of
+messages: JSON has no NaN.
 """
 
 from __future__ import annotations
@@ -33,40 +33,38 @@ STILL: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 class Malformed(ValueError):
-    """A payload that is not what its key promises."""
+    """A payload that is no valid message of its kind."""
 
 
 class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Pose of a robot for its neighbours: position [m], UTC `stamp` [s], running `seq`, and if known velocity [m/s] and
-    yaw [rad]."""
+    """Pose of a robot for its neighbours."""
 
     robot: str
-    seq: int
-    stamp: float
-    position: Vector
-    velocity: Vector | None = None
-    yaw: float | None = None
+    seq: int  # grows by one with each pose
+    stamp: float  # [s] UTC of the measurement
+    position: Vector  # [m]
+    velocity: Vector | None = None  # [m/s]
+    yaw: float | None = None  # [rad]
 
 
 class Heard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A pose that reached its listener: whose, which one, when it was taken and when it was heard (UTC [s])."""
+    """A neighbour's pose as a robot received it."""
 
-    speaker: str
+    speaker: str  # the neighbour
     seq: int
-    stamp: float
-    arrived: float
-    position: Vector
-    velocity: Vector
+    stamp: float  # [s] UTC of the measurement
+    arrived: float  # [s] UTC of the reception
+    position: Vector  # [m]
+    velocity: Vector  # [m/s]
 
 
 class GoalReceipt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A goal that reached its robot: when it was sent, when the pose was taken on which it rests, and when it was acted
-    on (UTC [s])."""
+    """A goal as its robot received it."""
 
     seq: int
-    stamp: float
-    pose: float
-    acted: float
+    stamp: float  # [s] UTC of sending
+    pose: float  # [s] UTC of the measurement of the pose from which it was computed
+    acted: float  # [s] UTC from which it was used
 
 
 class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -74,34 +72,31 @@ class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
     Several states of one `seq` are one sample: `payloads` splits those whose `heard` or `followed` is too long for one
     payload.
-    `setpoint` is x, y, z, yaw [m, rad] for a body that takes positions, v_x, v_y, v_z [m/s], yaw rate [rad/s] for
-    velocities, and v [m/s], ω [rad/s], 0, 0 for twists; goal and setpoint are None while a robot has none. `error` [m]
-    is Σ|d − distance| over the robot's links as the robot itself sees it. `true_position` and `true_yaw` are known of
-    twins only, `attitude` (quaternion w, x, y, z) of bodies that know more than yaw, the shadow's pose of robots that
-    have a twin beside them.
     """
 
     robot: str
     seq: int
-    stamp: float
+    stamp: float  # [s] UTC
     phase: str
-    position: Vector | None = None
-    velocity: Vector | None = None
-    yaw: float | None = None
-    goal: Vector | None = None
+    position: Vector | None = None  # [m]
+    velocity: Vector | None = None  # [m/s]
+    yaw: float | None = None  # [rad]
+    goal: Vector | None = None  # [m]
+    # x, y, z, yaw [m, rad] for a body that takes positions; v_x, v_y, v_z [m/s], yaw rate [rad/s] for velocities;
+    # v [m/s], ω [rad/s], 0, 0 for twists
     setpoint: Setpoint | None = None
-    error: float | None = None
-    true_position: Vector | None = None
-    true_yaw: float | None = None
-    heard: list[Heard] = []
-    attitude: Setpoint | None = None
-    shadow_position: Vector | None = None
-    shadow_yaw: float | None = None
-    followed: list[GoalReceipt] = []
+    error: float | None = None  # [m] Σ|d − distance| over the links of the robot, by its own knowledge
+    true_position: Vector | None = None  # [m] of a twin
+    true_yaw: float | None = None  # [rad] of a twin
+    heard: list[Heard] = []  # poses of neighbours since the last state
+    attitude: Setpoint | None = None  # quaternion w, x, y, z, of bodies that measure more than yaw
+    shadow_position: Vector | None = None  # [m] of the twin beside a real robot
+    shadow_yaw: float | None = None  # [rad]
+    followed: list[GoalReceipt] = []  # goals since the last state
 
 
 class Incident(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Something was found wrong with a robot, has become worse, or is over; numbered since its process began."""
+    """Begin, worsening or end of a hazard of a robot; numbered since the start of its process."""
 
     seq: int
     stamp: float
@@ -109,93 +104,77 @@ class Incident(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a robot is: lifecycle phase, what holds it, what its body says, its counters since the process began.
-
-    `missing` names neighbours that were never heard or are gone; `lost` counts, per neighbour, samples that the
-    sequence numbers prove were sent and never came, `dropped` those that came and that the modelled network dropped
-    (`agents.network.channel_model`), and `stale` those that came and were left out, because a newer one was known or
-    the process that sent them is gone (names without any are left out of both). `late_s` is the largest lateness of a
-    tick since the last status. `started` is the UTC time at which the robot began to run the experiment (0 before).
-    From there `ticks` count, and `decisions`, at which it computed its goal (or was told one). `interventions` are
-    ticks on which safety changed what had been decided, `avoided` those of them, and of changed goals, that kept clear
-    of something. `origin` is where it, or its plan, began: x, y, z [m] and yaw [rad]. `hazard` is the worst of what is
-    wrong with it now and what is done about that, such as "hold: minimum separation: 0.18 m from CF03 (limit 0.25 m)";
-    `incidents` are the last few beginnings and ends of such, again in every status, so that none is lost with one.
-    """
+    """Condition of a robot, and its counters since the start of its process."""
 
     robot: str
-    stamp: float
-    phase: str
-    reason: str
-    body: str
-    battery: float | None
-    sent: int
-    heard: int
-    lost: dict[str, int]
-    dropped: dict[str, int]
-    malformed: int
-    refused: int
-    ticks: int
-    missed: int
-    decisions: int
-    interventions: int
-    avoided: int
-    late_s: float
-    started: float
-    missing: list[str]
+    stamp: float  # [s] UTC
+    phase: str  # of the lifecycle
+    reason: str  # for the phase
+    body: str  # report of the body
+    battery: float | None  # charge, 0 to 1
+    sent: int  # poses
+    heard: int  # poses of neighbours
+    lost: dict[str, int]  # by neighbour: samples that never arrived, by their sequence numbers
+    dropped: dict[str, int]  # by neighbour, if any: samples that the modelled channel dropped
+    malformed: int  # refused payloads
+    refused: int  # orders
+    ticks: int  # since the common start
+    missed: int  # ticks that were skipped
+    decisions: int  # ticks with a goal that was computed or received
+    interventions: int  # ticks on which safety changed the decision
+    avoided: int  # ticks on which avoidance changed goal or setpoint
+    late_s: float  # [s] largest lateness of a tick since the last status
+    started: float  # [s] UTC of the start of the experiment; 0 before
+    missing: list[str]  # neighbours that were never received, or are gone
     pid: int
     cpu_s: float
     rss_mb: float
-    origin: Setpoint | None = None
-    hazard: str = ""
-    incidents: list[Incident] = []
-    stale: dict[str, int] = {}
+    origin: Setpoint | None = None  # start of the robot, or of its plan: x, y, z [m], yaw [rad]
+    hazard: str = (
+        ""  # worst present hazard and its outcome: "hold: minimum separation: 0.18 m from CF03 (limit 0.25 m)"
+    )
+    incidents: list[Incident] = []  # the last ones, repeated in each status so that a lost status loses none
+    stale: dict[str, int] = {}  # by neighbour, if any: samples older than a known one, or of a former process
 
 
 class Position(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Where a robot is, as something outside of it measured or knows: position [m], yaw [rad] if known, UTC [s]."""
+    """Pose of a robot, measured or known from outside of it."""
 
     robot: str
-    stamp: float
-    position: Vector
-    yaw: float | None = None
+    stamp: float  # [s] UTC
+    position: Vector  # [m]
+    yaw: float | None = None  # [rad]
 
 
 class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where a guided robot must go: position [m], yaw [rad] if one is wanted, when it was decided (UTC `stamp` [s]).
-
-    `pose` is when that robot's own pose was taken on which the goal rests (UTC [s]). The running `seq` grows for ever:
-    whoever decides begins at a number that nobody before him had reached, such as the time in milliseconds.
-    """
+    """Goal for a robot that does not decide for itself."""
 
     robot: str
+    # grows for ever: a new sender begins at a number that no former one has reached, such as the time in milliseconds
     seq: int
-    stamp: float
-    position: Vector
-    yaw: float | None
-    pose: float
+    stamp: float  # [s] UTC of the decision
+    position: Vector  # [m]
+    yaw: float | None  # [rad]
+    pose: float  # [s] UTC of the measurement of the robot's pose from which the goal was computed
 
 
 class CentreState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the centre says of itself, at 1 Hz.
+    """Report of the central controller, at 1 Hz; counters since the start of its process.
 
-    `robots` are guided; `missing` are those that it needs and never heard, or that are gone. `load` is the share of a
-    core that it took in the last second, `late_s` the largest lateness of a decision in it. The others count since its
-    process began: `decisions`, and `missed` ones that were too late to be made, and `goals` sent. Of poses only those
-    count that were taken in the run, per robot: `heard`, `lost` by their numbers, `dropped` by the modelled network.
+    Poses count that were measured in the run, by robot.
     """
 
-    stamp: float
-    robots: list[str]
-    missing: list[str]
-    load: float
-    late_s: float
+    stamp: float  # [s] UTC
+    robots: list[str]  # guided
+    missing: list[str]  # needed, but never received, or gone
+    load: float  # share of a core in the last second
+    late_s: float  # [s] largest lateness of a decision in the last second
     decisions: int
-    missed: int
-    goals: int
-    heard: dict[str, int]
-    lost: dict[str, int]
-    dropped: dict[str, int]
+    missed: int  # decisions that were skipped because they were late
+    goals: int  # sent
+    heard: dict[str, int]  # poses
+    lost: dict[str, int]  # by their sequence numbers
+    dropped: dict[str, int]  # by the modelled channel
     malformed: int
     pid: int
     cpu_s: float
@@ -203,61 +182,54 @@ class CentreState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a body in another process must do.
-
-    `setpoint` (see `State`) belongs to `drive`, `height` [m] to `takeoff`.
-    """
+    """Command to a body in another process."""
 
     robot: str
     seq: int
-    stamp: float
+    stamp: float  # [s] UTC
     action: Literal["drive", "takeoff", "land", "stop"]
-    setpoint: Setpoint | None = None
-    height: float | None = None
+    setpoint: Setpoint | None = None  # of `drive`, see `State`
+    height: float | None = None  # [m] of `takeoff`
 
 
 class Ranges(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One sweep of a robot's range sensors: bearing and elevation [rad] from its nose, distance [m], None: nothing."""
+    """One sweep of the range sensors of a robot."""
 
     robot: str
-    stamp: float
-    bearing: list[float]
-    elevation: list[float]
-    distance: list[float | None]
+    stamp: float  # [s] UTC
+    bearing: list[float]  # [rad] from the robot's nose
+    elevation: list[float]  # [rad]
+    distance: list[float | None]  # [m]; None: nothing in reach
 
 
 class Contact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The beginning of a contact in the world: robots or obstacles by name ("wall" is the arena's), [N s], [m]."""
+    """Begin of a contact in the world."""
 
-    stamp: float
-    first: str
-    second: str
-    impulse: float
-    overlap: float
+    stamp: float  # [s] UTC
+    first: str  # robot
+    second: str  # robot, obstacle, or "wall" of the arena
+    impulse: float  # [N s]
+    overlap: float  # [m]
 
 
 class ObstaclePose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An obstacle by name, with x, y [m] and yaw [rad]."""
+    """Pose of an obstacle."""
 
     name: str
-    pose: Vector
+    pose: Vector  # x, y [m], yaw [rad]
 
 
 class WorldState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a world says of itself, at 1 Hz and on every change.
+    """Report of the world, at 1 Hz and on every change."""
 
-    `factor` is simulated over real time of the last second, `load` the share of it that the work took; `time` is
-    simulated since it began [s]. `robots` are carried, `mirrored` are elsewhere and seen here.
-    """
-
-    stamp: float
+    stamp: float  # [s] UTC
     engine: str
-    time: float
-    factor: float
-    load: float
+    time: float  # [s] simulated since the start
+    factor: float  # simulated over real time in the last second
+    load: float  # share of the last second that was worked
     paused: bool
-    robots: list[str]
-    mirrored: list[str]
+    robots: list[str]  # simulated here
+    mirrored: list[str]  # robots of other processes that are seen here
     obstacles: list[ObstaclePose]
     contacts: int
     refused: int
@@ -266,23 +238,19 @@ class WorldState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WorldOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What an operator asks of a world.
-
-    `steps` belongs to step (ticks, then it is paused again); `name` to spawn and remove, and to reset (left out: all);
-    `kind`, `at` (x, y [m]) and `yaw` to spawn of a robot, `obstacle` (as in the experiment file) to one of an obstacle.
-    """
+    """Order of an operator to a world."""
 
     order: Literal["pause", "resume", "step", "reset", "spawn", "remove"]
-    steps: int = 1
-    name: str | None = None
-    kind: str | None = None
-    at: tuple[float, float] | None = None
-    yaw: float = 0.0
-    obstacle: dict[str, object] | None = None
+    steps: int = 1  # of step: ticks until the next pause
+    name: str | None = None  # of spawn, remove and reset (left out: all)
+    kind: str | None = None  # of a robot to spawn
+    at: tuple[float, float] | None = None  # [m] x, y of a robot to spawn
+    yaw: float = 0.0  # [rad] of a robot to spawn
+    obstacle: dict[str, object] | None = None  # to spawn, as in the experiment file
 
 
 class WorldReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A world's answer to an order."""
+    """Reply of a world to an order."""
 
     ok: bool
     paused: bool
@@ -291,23 +259,22 @@ class WorldReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What an operator asks of a robot: `at` is a UTC start time [s]; `name` and `value` belong to get and set.
+    """Order of an operator to a robot.
 
-    `origin` belongs to the start of a robot that comes back: x, y, z [m] and yaw [rad] of the `Status.origin` that its
-    name had. Its plan goes on from there.
-
-    A robot that is told to leave lands and takes its token back; its process ends with the last of its robots.
+    "leave" lands a robot and undeclares its token; its process ends with the last of its robots.
     """
 
     order: OrderKind
-    at: float | None = None
-    name: str | None = None
-    value: float | None = None
-    origin: Setpoint | None = None
+    at: float | None = None  # [s] UTC of a start
+    name: str | None = None  # of the parameter to get or set
+    value: float | None = None  # of the parameter to set
+    origin: Setpoint | None = (
+        None  # of a start: `Status.origin` of the robot's former process; its plan goes on from there
+    )
 
 
 class Reply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A robot's answer to an order."""
+    """Reply of a robot to an order."""
 
     robot: str
     ok: bool
@@ -317,63 +284,56 @@ class Reply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RunOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What an operator asks of the conductor of a run under way; `who` is what the operator goes by.
-
-    The others belong to replace: the `spare` of the experiment file that takes over, or the address of a `body`; `at`
-    is where it starts, x, y [m], with `yaw` [rad].
-    """
+    """Order of an operator to the conductor of a run."""
 
     order: ChangeKind
     robots: list[str]
-    who: str = ""
-    spare: str | None = None
-    body: str | None = None
-    at: tuple[float, float] | None = None
-    yaw: float = 0.0
+    who: str = ""  # name of the operator
+    spare: str | None = None  # of replace: robot of the experiment file that takes over
+    body: str | None = None  # of replace: address of the new body
+    at: tuple[float, float] | None = None  # [m] x, y of its start
+    yaw: float = 0.0  # [rad] of its start
 
 
 class RunReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A conductor's answer, when all is done: by robot what was done, and why not; `reason` refuses the whole order."""
+    """Reply of a conductor when all is done."""
 
-    done: dict[str, str] = {}
-    refused: dict[str, str] = {}
-    reason: str = ""
+    done: dict[str, str] = {}  # by robot
+    refused: dict[str, str] = {}  # by robot, with the reason
+    reason: str = ""  # for which the whole order is refused
 
 
 class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Emergency stop for everyone, with who asks and why; see `read_stop`."""
+    """Emergency stop for all robots; see `read_stop`."""
 
-    who: str
+    who: str  # sender
     reason: str
 
     @property
     def words(self) -> str:
-        """The stop as robots and runs give it for their reason."""
+        """Reason that robots and runs report."""
         return f"{EMERGENCY} by {self.who}" + (f": {self.reason}" if self.reason else "")
 
 
 class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Something that happened in a run: `kind` is a word (`phase`, `start`, `lost`, ...), `source` who or what."""
+    """Event of a run."""
 
-    stamp: float
-    kind: str
-    source: str
+    stamp: float  # [s] UTC
+    kind: str  # phase, start, lost, ...
+    source: str  # robot or process
     text: str
 
 
 class HostClock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a host's clock lies to the conductor's at `stamp` (the conductor's, UTC [s]).
-
-    `offset` is the host's reading less the conductor's [s], within `uncertainty` [s]. `robots` run there; from then on
-    they take `applied` [s] off what they stamp, going there by `agents.clock.SLEW` from what they took off before.
-    None: the offset of the first such message of a run.
-    """
+    """Offset of the clock of a host from that of the conductor."""
 
     host: str
-    stamp: float
-    offset: float
-    uncertainty: float
-    robots: list[str]
+    stamp: float  # [s] UTC of the conductor
+    offset: float  # [s] reading of the host less that of the conductor
+    uncertainty: float  # [s]
+    robots: list[str]  # on the host
+    # [s] correction that the robots subtract from their stamps from now on, reached at the rate `agents.clock.SLEW`;
+    # None: the offset of the first such message of a run
     applied: float | None = None
 
 
@@ -406,18 +366,18 @@ _decoders: dict[tuple[type, bool], msgspec.json.Decoder[object] | msgspec.msgpac
 
 
 def number(value: float) -> float | None:
-    """A number as messages have it: None if it is not known."""
+    """A number for a message: None if it is not finite."""
     return value if -inf < value < inf else None
 
 
 def vector(values: Sequence[float]) -> Vector | None:
-    """Three numbers as messages have them: None if one of them is not known."""
+    """Three numbers for a message: None if one of them is not finite."""
     x, y, z = values
     return (x, y, z) if isfinite(x) and isfinite(y) and isfinite(z) else None
 
 
 def heading(yaw: float) -> float | None:
-    """A yaw as messages have it, within ±π [rad]: bodies count on over full turns, messages do not."""
+    """A yaw for a message, within ±π [rad]; None if it is not finite."""
     return remainder(yaw, tau) if isfinite(yaw) else None
 
 
@@ -445,7 +405,7 @@ def position(robot: str, stamp: float, place: Sequence[float], yaw: float) -> Po
 
 
 def payloads(state: State, encoding: Encoding) -> Iterator[bytes]:
-    """The payloads of telemetry: one, unless what was heard is too long for it; each then has a part of that."""
+    """The payloads of telemetry: several if the received poses are too long for one; each then has a part of them."""
     payload = encode(state, encoding)
     heard, followed = len(state.heard), len(state.followed)
     if len(payload) <= MAX_PAYLOAD or heard + followed < 2:

@@ -3,8 +3,8 @@
 A process claims a name with a token that carries the time of its start. Of several claims the earliest wins; a name
 that is owned already stays with its owner, whatever clocks say. Tokens end with their session, so a name is free again
 as soon as its owner is dead, or cut off, or stands still for longer than its lease. In the latter cases its tokens come
-back, maybe after another process has taken the name: a process that was cut off or stood still must ask (`Doubt`), and
-gives way to any other owner.
+back, maybe after another process has taken the name: a process that was cut off or stood still must ask
+(`OwnershipCheck`), and gives way to any other owner.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _rival(alive: str, token: str, mine: str, rank: str, owners: bool) -> bool:
 
 
 def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -> None:
-    """Returns when it is known that names that were owned once still are, because no other process has taken them.
+    """Returns when it is certain that no other process has taken the names since they were owned.
 
     One answer is not enough: a link that is lost ends its questions as an answer does, and a process that takes the
     name may be between its two rounds. No other owner must be seen for `SETTLE_S`. One that is seen may still give way
@@ -150,11 +150,11 @@ def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -
     raise network.Unreachable("told to end before it was known whether the name has another owner")
 
 
-class Doubt:
-    """Whether a process still owns its names, asked in a thread of its own: the control loop polls the answer."""
+class OwnershipCheck:
+    """Check whether a process still owns its names, in a thread of its own: the control loop polls the result."""
 
     def __init__(self, alive: Sequence[str]) -> None:
-        """There is none yet. `alive` has the liveliness key of each name."""
+        """`alive` has the liveliness key of each name."""
         self._alive = alive
         self._taken = ""
         self._asking: threading.Thread | None = None
@@ -162,14 +162,14 @@ class Doubt:
         self._over = threading.Event()
 
     def begin(self, session: zenoh.Session) -> None:
-        """Asks from now on; what is being asked already is asked anew afterwards."""
+        """Starts a check; a running one is repeated afterwards."""
         self._session, self._anew = session, self._asking is not None
         if self._asking is None:
             self._asking = threading.Thread(target=self._ask, name="owner of the name", daemon=True)
             self._asking.start()
 
     def over(self) -> bool:
-        """Whether there is none, or none any more; costs 0.1 µs when there is none.
+        """Whether no check runs; costs 0.1 µs then.
 
         Raises:
             NameTaken: If another process owns one of the names, each time.
@@ -183,7 +183,7 @@ class Doubt:
         return self._asking is None
 
     def end(self) -> None:
-        """Asks no longer."""
+        """Ends the check."""
         self._over.set()
 
     def _ask(self) -> None:
@@ -192,4 +192,4 @@ class Doubt:
         except NameTaken as taken:
             self._taken = str(taken)
         except network.Unreachable:
-            pass  # nobody asks any more
+            pass  # `end` was called

@@ -1,4 +1,4 @@
-"""Sessions on the Zenoh network, and what a robot declares on them.
+"""Sessions on the Zenoh network: opening, connection state, and detection of a silent router.
 
 Everything that is received waits to be polled from the control loop: frequent samples in a ring channel, which keeps
 the newest ones and never blocks; rare ones in a queue (`agents.network.pubsub`). A callback of the usual kind would
@@ -37,7 +37,7 @@ _INET: Final = (socket.AF_INET, socket.AF_INET6)
 
 
 def hang_up(session: zenoh.Session) -> int:
-    """Ends the connections of this process, those of its other sessions too, to where a session is linked.
+    """Ends the TCP connections of this process, those of its other sessions too, to the peers of a session.
 
     Blocks nothing: the network is not waited for. Only TCP and TLS have connections that can be ended so; other links
     stay.
@@ -81,7 +81,7 @@ def _connections() -> Iterator[socket.socket]:
 
 
 def _address(connection: socket.socket) -> str:
-    """The near end, as Zenoh writes it."""
+    """The local address, as Zenoh writes it."""
     host, port = connection.getsockname()[:2]
     return f"[{host}]:{port}" if connection.family == socket.AF_INET6 else f"{host}:{port}"
 
@@ -92,7 +92,7 @@ _CALL: Final = {"x86_64": 314, "aarch64": 274}  # sched_setattr, which glibc has
 
 @contextmanager
 def prompt_threads() -> Iterator[None]:
-    """Threads that are started inside, and by them, ask for short slices; the caller gets its own back."""
+    """Inside, new threads ask Linux (≥ 6.12) for short scheduler slices, to cut latency; the caller keeps its own."""
     asked = _ask(SLICE_NS)
     try:
         yield
@@ -102,7 +102,7 @@ def prompt_threads() -> Iterator[None]:
 
 
 def _ask(slice_ns: int) -> bool:
-    """Asks for slices of a length for the calling thread, 0 for the usual; whether that was possible."""
+    """Sets the slice of the calling thread, 0 for the default; returns whether that was possible."""
     number = _CALL.get(platform.machine())
     if sys.platform != "linux" or number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return False
@@ -117,20 +117,20 @@ T_co = TypeVar("T_co", covariant=True)
 RETRY_S: Final = 0.1  # between attempts to open; an open client keeps to the `connect/retry` of its configuration
 GATHER_S: Final = 1.0
 LINK_S: Final = 0.01
-ENDPOINT_FREE_S: Final = 3.0  # so long may an endpoint of a mesh stay taken by a robot that is started again
-ROBOT_LEASE_S: Final = 1.2  # of robots: neighbours of one that hangs must know within 1.5 s
-ASK_EVERY_S: Final = 0.4  # between two questions whether the router still answers
-ANSWER_S: Final = 0.3  # a question without an answer for so long begins a silence
-ASKED: Final = 8  # questions that are waited for at once
-LOOK_S: Final = 0.1  # between two looks for an answer no more than this is held against the router
+ENDPOINT_FREE_S: Final = 3.0  # limit for the endpoint of a robot of a mesh that is restarted to become free
+ROBOT_LEASE_S: Final = 1.2  # of robots: the neighbours of a robot that hangs must detect it within 1.5 s
+ASK_EVERY_S: Final = 0.4  # between two queries to the router
+ANSWER_S: Final = 0.3  # without a reply for so long the router is silent
+ASKED: Final = 8  # pending queries
+LOOK_S: Final = 0.1  # most time between two polls that counts as silence of the router
 
 
 class Unreachable(ConnectionError):
-    """No router answers at the endpoints that were tried."""
+    """No router answers at the endpoints."""
 
 
 class Polled(Protocol[T_co]):
-    """Anything that hands out what arrived, one by one, and None when nothing waits."""
+    """A queue that returns one received item a call, and None when it is empty."""
 
     def try_recv(self) -> T_co | None: ...
 
@@ -146,24 +146,24 @@ def open_session(
     rights: access_control.Rights | None = None,
     gather_s: float = GATHER_S,
 ) -> zenoh.Session:
-    """A session on the network that some endpoints make; use it in a `with`.
+    """A session on the network of some endpoints; use it in a `with`.
 
-    It is a client of the first router that answers. In a mesh (`agents.network.endpoints`) it is linked with all, some
-    of whom may come later.
+    It is a client of the first router that answers. In a mesh (`agents.network.endpoints`) it is linked with all
+    members, also with later ones.
 
     Args:
         endpoints: Routers, best first; or members of a mesh.
-        name: Who this is, as `zenpark keys` shows it.
+        name: As `zenpark keys` shows it.
         wait_s: How long to try [s].
         stop: Ends the wait when it is set.
         lease_s: See `agents.network.zenoh_config`.
-        identity: Whose certificate is shown, where the endpoints are of a lab; `name` if left out.
-        gather_s: How long members of a mesh that do not answer are waited for when others do [s].
-        rights: Who may do what; a member of a mesh needs them in a lab, for nobody else enforces them.
+        identity: Name in the certificate, if the endpoints belong to a lab; `name` if left out.
+        gather_s: Limit for further members of a mesh to answer when one has [s].
+        rights: Of all identities; a member of a mesh needs them in a lab, since no router enforces them.
 
     Raises:
         EndpointError: If an endpoint is malformed, or its lab has no such identity, or it cannot listen there.
-        Unreachable: If nobody answered in time, or `stop` was set before anybody did.
+        Unreachable: If there was no answer in time, or `stop` was set before.
     """
     ends = topology.ends(endpoints, name)
     chosen = config(
@@ -199,7 +199,7 @@ def open_session(
 
 
 def _gathered(session: zenoh.Session, members: int, gather_s: float, gone: threading.Event, deadline: float) -> bool:
-    """Waits until a visitor is linked with all members of a mesh, or after a while with those that are there."""
+    """Waits until a visitor is linked with all members of a mesh, or, after a while, with some."""
     begun = time.monotonic()
     while (linked := len(session.info.transports())) < members:
         now = time.monotonic()
@@ -223,7 +223,7 @@ def _silence(endpoints: Sequence[str], identity: str) -> str:
     elif folder is None:
         remedy += "; in a lab it needs --lab"
     return (
-        f"{'nobody' if topology.is_mesh(endpoints) else 'no router'} answers at "
+        f"{'no member' if topology.is_mesh(endpoints) else 'no router'} answers at "
         f"{', '.join(topology.bare(endpoints)) or 'no endpoint'}{refused}: {remedy}"
     )
 
@@ -234,12 +234,12 @@ def connected(session: zenoh.Session) -> bool:
 
 
 class RouterWatch:
-    """Detection of a router that is silent, by questions of our own.
+    """Detection of a silent router by liveliness queries.
 
     Zenoh closes a link after the lease that the *other* end announces: 2 s with our router, 10 s with a plain zenohd,
     60 s with rmw_zenohd. Until then a frozen router, or a pulled cable, looks like a quiet one. A router answers a
-    liveliness query from its own tables, so the end of its answer is a sign of life. Nothing waits for it: an answer
-    is polled. A member of a mesh is not asked, for its lease is ours.
+    liveliness query from its own tables, so the end of its reply is a sign of life. Replies are polled, never waited
+    for. Members of a mesh are not asked, since their lease is ours.
 
     Where there are several routers, one that is silent for `LEASE_S` is left for the next one, as one of ours would be
     by its lease (`agents.network.session`).
@@ -250,12 +250,12 @@ class RouterWatch:
 
         Args:
             session: Whose router is watched.
-            key: What is asked for; in a lab, a liveliness key that this session may watch.
+            key: Of the query; in a lab, a liveliness key that this session may watch.
             endpoints: Of the session.
         """
         self._session, self._key, self._others = session, key, len(endpoints) > 1
         self._waiting: deque[tuple[float, Polled[zenoh.Reply]]] = deque(maxlen=ASKED)
-        # Times of a clock that stands while nobody looks: a process that gets no processor cannot blame the router.
+        # Times of a clock that stands between polls: a process that gets no processor cannot blame the router.
         self._now, self._asked, self._unanswered = 0.0, -inf, inf  # the latter: when the oldest question was asked
         self._looked = inf
         self._silent_since = inf
@@ -264,11 +264,11 @@ class RouterWatch:
         self._answers = 0  # since the silence began
 
     def silent_since(self, t: float, arrived: int = 0) -> float:
-        """When the silence of the router began, or when the last link was lost; infinity while it answers.
+        """Begin of the silence of the router, or of the loss of the last link; infinity while it answers.
 
         Args:
             t: Now, on any clock that does not go back [s]. Call it in each round of a loop, at 10 Hz or more.
-            arrived: Samples that came by the router, ever. While more come it need not be asked.
+            arrived: Samples received by the router, ever. While they grow no query is needed.
         """
         self._now += max(0.0, min(t - self._looked, LOOK_S))
         self._looked = t
@@ -304,7 +304,7 @@ class RouterWatch:
         return self._silent_since
 
     def _answered(self) -> bool:
-        """Whether an answer has come since the last look."""
+        """Whether a reply has arrived since the last call."""
         for number in reversed(range(len(self._waiting))):
             _, handler = self._waiting[number]
             try:
@@ -319,17 +319,17 @@ class RouterWatch:
 
 
 def links(session: zenoh.Session) -> int:
-    """With how many others it is linked."""
+    """Number of links of a session."""
     return len(session.info.transports())
 
 
 def deserted(session: zenoh.Session) -> bool:
-    """Whether nobody but other routers is connected to a router."""
+    """Whether only other routers are connected to a router."""
     return all(transport.whatami == zenoh.WhatAmI.ROUTER for transport in session.info.transports())
 
 
 def here(session: zenoh.Session, keyexpr: str, wait_s: float = ASK_S) -> set[str] | None:
-    """Liveliness tokens that match; None if the question was not answered within `wait_s`."""
+    """Keys of the liveliness tokens that match; None without a reply within `wait_s`."""
     found = set()
     for reply in session.liveliness().get(keyexpr, timeout=wait_s):
         if reply.ok is None:
@@ -339,6 +339,6 @@ def here(session: zenoh.Session, keyexpr: str, wait_s: float = ASK_S) -> set[str
 
 
 def received(handler: Polled[T_co]) -> Iterable[T_co]:
-    """Items that wait in a handler, oldest first, without blocking. Nearly always there are none."""
+    """Queued items, oldest first, without blocking. Nearly always there are none."""
     first = handler.try_recv()
     return () if first is None else chain((first,), iter(handler.try_recv, None))

@@ -1,7 +1,7 @@
-"""Leaves the network without waiting for a router that does not answer.
+"""Leaving the network without waiting for a router that does not answer; support processes outlive the robots.
 
-Zenoh says good-bye to everybody and waits for it to be taken: about 9 s when the network is cut, and half as long again
-when what was declared is let go of.
+Closing a Zenoh session waits for acknowledgements: about 9 s when the network is cut, and half as long again when
+declared entities are dropped.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ LEAVING: Final = "leaving the network"
 
 
 def leave(session: zenoh.Session, *declared: object, limit_s: float = LEAVE_S) -> bool:
-    """Closes a session; whether that was over in time. If not it goes on in the background.
+    """Closes a session; returns whether that ended in time. If not it goes on in the background.
 
     Args:
         session: To close.
-        declared: Who holds what was declared on it: kept until it is closed, because to let go of it waits as well.
-        limit_s: How long to wait [s].
+        declared: Owners of entities of the session: kept until it is closed, because dropping an entity waits as well.
+        limit_s: Longest wait [s].
     """
     closing = threading.Thread(target=_close, args=(session, declared), name=LEAVING, daemon=True)
     closing.start()
@@ -43,7 +43,7 @@ def _close(session: zenoh.Session, _declared: tuple[object, ...]) -> None:
 
 @contextmanager
 def held(session: zenoh.Session, limit_s: float = LEAVE_S) -> Iterator[tuple[zenoh.Session, list[object]]]:
-    """Inside, a session is open; at the end it is left. What is put into the list counts as `declared`."""
+    """Inside, a session is open; at the end it is left. The items of the list count as `declared`."""
     declared: list[object] = []
     try:
         yield session, declared
@@ -52,7 +52,7 @@ def held(session: zenoh.Session, limit_s: float = LEAVE_S) -> Iterator[tuple[zen
 
 
 def end(code: int) -> NoReturn:
-    """Ends the process, at once if it is still leaving the network: all that is left to do is to wait for nobody."""
+    """Ends the process, at once if it is still leaving the network."""
     if any(thread.name == LEAVING for thread in threading.enumerate()):
         sys.stdout.flush()
         sys.stderr.flush()
@@ -60,24 +60,24 @@ def end(code: int) -> NoReturn:
     sys.exit(code)
 
 
-FAREWELL_S: Final = 15.0  # so long robots whose launcher is gone are flown down, and once more so long landed by force
-STOPPED_S: Final = 5.0  # a body that does not say that its motors stand is told so long, and then left
-AFTER_S: Final = 2.0 * FAREWELL_S + STOPPED_S + 5.0  # how long all of that may take, and the end of a process
-SETTLE_S: Final = 0.5  # the news of a robot that has just come may still be on its way
+FAREWELL_S: Final = 15.0  # limit for robots without a launcher to land; the same again to land by force
+STOPPED_S: Final = 5.0  # limit for a body to confirm that its motors are off
+AFTER_S: Final = 2.0 * FAREWELL_S + STOPPED_S + 5.0  # limit for all of that and the end of the process
+SETTLE_S: Final = 0.5  # the token of a robot that has just started may still be on its way
 
 
 class Farewell:
-    """Robots that have to land first still need what this process does for them."""
+    """Support processes stay until all their robots have landed, at most `AFTER_S` after the launcher died."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str], lost: threading.Event) -> None:
-        """`lost` is that of the lifeline."""
+        """`lost` is set when the lifeline is lost."""
         self._watches = [pubsub.AliveWatch(session, keys.alive(robot)) for robot in robots]
         self._alive = [False] * len(self._watches)
         self._lost = lost
         self._last = float("inf")
 
     def over(self) -> bool:
-        """Whether the starter is gone, and then the robots, or their time is up; costs microseconds."""
+        """Whether the launcher is gone, and the robots as well or their time is over; costs microseconds."""
         for row, watch in enumerate(self._watches):
             for _, alive in watch.changes():
                 self._alive[row] = alive

@@ -1,7 +1,7 @@
-"""The checks of what arrived and is well formed: numbers that no robot, clock or sensor can have are refused.
+"""Validation of received messages: numbers that no robot, clock or sensor can have are refused.
 
-`agents.network.messages` decodes; what it lets through may still be NaN, of another robot, or from the future. NaN
-fails each comparison here, because they all ask whether a number lies inside.
+Decoded values may still be NaN, or from the future. NaN fails each comparison here, because all of them ask whether a
+number lies inside.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import numpy as np
 from agents.arrays import Array
 from agents.network.messages import Command, Goal, Malformed, Pose, Position, Ranges, State, Vector
 
-FUTURE_S: Final = 5.0  # a stamp further ahead is a broken clock or a forgery, and would silence honest samples
+FUTURE_S: Final = 5.0  # a stamp further ahead comes from a wrong clock or a forgery, and would suppress correct samples
 MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
 ABSURD: Final = 1e6  # [m, m/s, rad, rad/s] no setpoint is that large
 MAX_RAYS: Final = 720  # of one sweep; the finest scanner here has 360
 MAX_RANGE: Final = 100.0  # [m]; no range sensor here sees farther
-REACH_M: Final = 1.0  # a neighbour said to be farther outside the arena than this is not believed
+REACH_M: Final = 1.0  # a position farther outside the arena is refused
 MAX_YAW: Final = 1e3  # [rad]; ours is within ±π, other programs may count on over full turns
 
 
 def reach_of(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Vector:
-    """Largest |x|, |y|, |z| [m] that a robot may say it has, and that anybody may tell it to go to.
+    """Largest |x|, |y|, |z| [m] of a valid position or goal.
 
     Args:
         low: Smallest x, y, z of the arena [m].
@@ -36,18 +36,18 @@ def reach_of(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Vec
 
 
 def taken(stamp: float, now: float) -> float:
-    """When something was measured, by its `stamp` [s]: not after `now` [s], at which it has arrived.
+    """Time of a measurement by its `stamp` [s], at most that of its arrival, `now` [s].
 
-    A clock that is ahead must not make anything look fresh for longer than it is.
+    A clock that is ahead must not make a measurement look fresher than it is.
     """
     return min(stamp, now)
 
 
 def check_pose(pose: Pose, *, now: float, reach: Vector) -> None:
-    """Refuses a pose that cannot be true.
+    """Refuses an impossible pose.
 
     Args:
-        pose: What arrived.
+        pose: Received.
         now: UTC time of arrival [s].
         reach: Largest |x|, |y|, |z| [m] that a robot of this experiment can have.
 
@@ -62,7 +62,7 @@ def check_pose(pose: Pose, *, now: float, reach: Vector) -> None:
 
 
 def check_state(state: State, *, now: float, reach: Vector) -> None:
-    """Refuses telemetry whose pose cannot be true; it may have none.
+    """Refuses telemetry with an impossible pose; a pose may be missing.
 
     Raises:
         Malformed: As `check_pose`.
@@ -74,7 +74,7 @@ def check_state(state: State, *, now: float, reach: Vector) -> None:
 
 
 def check_position(measured: Position, *, now: float, reach: Vector) -> None:
-    """Refuses a measured position that cannot be true.
+    """Refuses an impossible measured position.
 
     Raises:
         Malformed: As `check_pose`.
@@ -86,13 +86,13 @@ def check_position(measured: Position, *, now: float, reach: Vector) -> None:
 
 
 def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> None:
-    """Refuses a goal that no robot can follow, or that is too old to be followed.
+    """Refuses a goal that is impossible or too old.
 
     Args:
-        goal: What arrived.
+        goal: Received.
         now: UTC time of arrival [s].
         reach: See `check_pose`.
-        oldest_s: A goal that was decided longer ago is none [s].
+        oldest_s: Largest age [s].
 
     Raises:
         Malformed: If a number is not finite, the stamp is old or lies in the future, the pose is
@@ -108,7 +108,7 @@ def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> Non
 
 
 def check_ranges(ranges: Ranges, *, now: float) -> None:
-    """Refuses a sweep of range sensors that cannot be true.
+    """Refuses an impossible sweep of range sensors.
 
     Raises:
         Malformed: If the stamp is not finite or lies in the future, there is no ray or too many,
@@ -143,20 +143,20 @@ def check_command(command: Command) -> None:
 
 
 def missed(last: int, seq: int, since: float, rate: float) -> int:
-    """Poses of a robot that never came between two that did, by their running numbers.
+    """Number of lost poses between two received ones, by their sequence numbers.
 
     Args:
-        last: Number of the former. One that does not grow is of a process that began anew at 1.
-        seq: Number of the latter.
+        last: Number of the first. A smaller `seq` is that of a new process, which began at 1.
+        seq: Number of the second.
         since: Time between their stamps [s].
-        rate: Poses that a robot says in a second at most [1/s]. A gap counts only as far as that allows: one forged
-            number must not become a hundred million lost poses.
+        rate: Largest rate of poses [1/s]. It limits the result: one forged number must not become a hundred million
+            lost poses.
     """
     return min(seq - last - 1 if seq > last else seq - 1, said_within(since, rate))
 
 
 def said_within(since: float, rate: float) -> int:
-    """Poses that a robot can have said in `since` [s] at `rate` [1/s]; UTC stamps are exact to a microsecond."""
+    """Largest number of poses in `since` [s] at `rate` [1/s]; UTC stamps are exact to a microsecond."""
     return math.ceil(since * rate - 1e-3)
 
 

@@ -1,4 +1,4 @@
-"""Every setting of a Zenoh session, in one place: what is on, what is off, who is shown which certificate."""
+"""Settings of Zenoh sessions."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from agents.network import access_control, lab
 from agents.network import endpoints as topology
 from agents.network.endpoints import DEFAULT_ENDPOINT, UNIX, EndpointError, Mode, refusal
 
-LEASE_S: Final = 2.0  # whoever is silent for so long is held for dead
-ASK_S: Final = 2.0  # whoever asks waits no longer for an answer
-OPEN_S: Final = 3.0  # a handshake that takes longer has failed,
-NEXT_S: Final = 1.0  # or longer than this where there is another router to go to
+LEASE_S: Final = 2.0  # a peer silent for this long is considered dead
+ASK_S: Final = 2.0  # limit for a reply to a query
+OPEN_S: Final = 3.0  # limit of a handshake,
+NEXT_S: Final = 1.0  # and where there is another router
 MOST_BYTES: Final = 4 * 1024 * 1024  # of a message that a router of a lab puts together; the largest is an experiment
 
 # 4 threads instead of 7 in each client and a sixth less CPU at 50 Hz. Zenoh reads it once, at the first open.
@@ -28,10 +28,10 @@ _RUNTIME: Final = (
 
 
 def config(settings: Mapping[str, object]) -> zenoh.Config:
-    """The configuration of a session that has these settings.
+    """The configuration of a session with these settings.
 
     Raises:
-        EndpointError: If Zenoh understands an endpoint in another way or not at all.
+        EndpointError: If Zenoh does not accept an endpoint.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     made = zenoh.Config()
@@ -54,7 +54,7 @@ def settings(
     identity: str | None = None,
     rights: access_control.Rights | None = None,
 ) -> dict[str, object]:
-    """What every session sets of Zenoh: no multicast, no gossip, no shared memory, listening on loopback only.
+    """Settings of every session: no multicast, no gossip, no shared memory, listening on loopback only.
 
     With a lab (`agents.network.lab`) both ends show certificates, and listening beyond loopback is allowed.
 
@@ -64,9 +64,9 @@ def settings(
             router is linked with every one.
         listen: Loopback endpoints to listen on; a client needs none.
         name: Shown by `zenpark keys`.
-        lease_s: After this silence [s] the others hold this session for dead. A killed process is noticed at once.
-        identity: Whose certificate is shown, in a lab; `name` if left out.
-        rights: Who may do what; a router of a lab needs them.
+        lease_s: Silence after which the others consider this session dead [s]. A killed process is noticed at once.
+        identity: Name in the certificate, in a lab; `name` if left out.
+        rights: Of all identities; a router of a lab needs them.
 
     Raises:
         EndpointError: If an endpoint is malformed, or one to listen on can be reached from outside this machine
@@ -83,12 +83,12 @@ def settings(
         for endpoint in listen:
             check_loopback(endpoint)
     elif listen and rights is None:
-        raise EndpointError(f"who listens in the lab {folder} must know who may do what: name the experiment")
+        raise EndpointError(f"listening in the lab {folder} needs its access rights: name the experiment")
     made: dict[str, object] = {
         "mode": mode,
         "connect/endpoints": list(connect),
-        # A client's open that waits inside Zenoh does not hear Ctrl-C: fail at once and try again in Python. Others
-        # open without waiting, and seek whom they miss for as long as they live.
+        # Ctrl-C does not end a wait inside Zenoh: a client fails at once and tries again in Python. Others open without
+        # waiting, and try to connect as long as they live.
         "connect/timeout_ms": 0 if mode == "client" else -1,
         "connect/exit_on_failure": mode == "client",
         "open/return_conditions/connect_scouted": mode == "client",
@@ -97,12 +97,12 @@ def settings(
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": round(lease_s * 1000),
-        # A client that has lost its router seeks them in the order of the list: one that is frozen holds it up so long.
+        # A client that has lost its router tries them in the order of the list: a frozen one delays it so long.
         "transport/unicast/open_timeout": round((NEXT_S if mode == "client" and len(connect) > 1 else OPEN_S) * 1000),
         "transport/unicast/accept_timeout": round(OPEN_S * 1000),
         "transport/shared_memory/enabled": False,
         "queries_default_timeout": round(ASK_S * 1000),
-        "adminspace/enabled": True,  # read-only; how `zenpark keys` learns who is there
+        "adminspace/enabled": True,  # read-only; the source of `zenpark keys`
     }
     if name is not None:
         made["metadata"] = {"name": name}
@@ -112,7 +112,7 @@ def settings(
 def _of_lab(
     endpoints: Sequence[str], identity: str, listens: bool, rights: access_control.Rights | None
 ) -> tuple[dict[str, object], Path | None]:
-    """What the lab of some endpoints adds to a configuration, and its folder; nothing and None without one.
+    """Settings of the lab of some endpoints, and its folder; empty and None without one.
 
     Raises:
         LabError: If the lab has no such identity, or its register does not go with the rights.
@@ -125,8 +125,8 @@ def _of_lab(
         known = lab.register(folder)
         if identity in known.identities and not known.identities[identity].hosts:
             raise lab.LabError(
-                f"{identity} has a certificate with which one cannot listen, as in a mesh all do: `zenpark keys init` "
-                f"with the file of the mesh gives such, or `zenpark keys issue {folder} NAME --host ADDRESS`"
+                f"{identity} has a certificate for clients only, but in a mesh all listen: `zenpark keys init` "
+                f"with the file of the mesh makes such, or `zenpark keys issue {folder} NAME --host ADDRESS`"
             )
         settings["access_control"] = access_control.rules(rights, known)
         settings["low_pass_filter"] = access_control.sizes(rights)
@@ -143,7 +143,7 @@ def _check_form(endpoint: str) -> None:
 
 
 def check_loopback(endpoint: str) -> None:
-    """Refuses to listen where others could connect: without a lab there is no authentication.
+    """Refuses to listen beyond loopback: without a lab there is no authentication.
 
     Raises:
         EndpointError: If the endpoint is not of this machine alone.
@@ -158,12 +158,12 @@ def check_loopback(endpoint: str) -> None:
         loopback = False
     if not loopback:
         raise EndpointError(
-            f"will not listen on {endpoint}: whoever reaches it could command the robots. Make certificates with "
+            f"will not listen on {endpoint}: any program there could command the robots. Make certificates with "
             "`zenpark keys init LAB FILE`, then listen on tls/... with --lab LAB; or listen on "
             f"{DEFAULT_ENDPOINT} and let other machines in through an SSH tunnel (ssh -R 7447:127.0.0.1:7447 HOST)"
         )
 
 
 def reason(error: zenoh.ZError) -> str:
-    """The innermost reason in a message of Zenoh, without the place in its source."""
+    """The innermost reason in an error message of Zenoh, without the place in its source."""
     return str(error).partition(" at /")[0].rpartition(": ")[2]

@@ -29,77 +29,49 @@ class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class Lighthouse(Part, frozen=True, tag_field="system", tag="lighthouse"):
-    """Lighthouse deck and base stations.
+    """Lighthouse deck and base stations."""
 
-    Attributes:
-        file: Geometry and calibration as the Crazyflie client saves them; None: what is stored on board.
-        base_stations: How many the firmware knows.
-    """
-
+    # geometry and calibration as the Crazyflie client saves them; None: what is stored on board
     file: str | None = None
-    base_stations: Annotated[int, Meta(ge=1, le=16)] = 4
+    base_stations: Annotated[int, Meta(ge=1, le=16)] = 4  # how many the firmware knows
 
 
 class Loco(Part, frozen=True, tag_field="system", tag="loco"):
-    """Loco deck and anchors.
+    """Loco deck and anchors."""
 
-    Attributes:
-        mode: How ranges are measured.
-        anchors: Positions [m] of anchors 0, 1, ...; empty: what they were told before.
-    """
-
-    mode: Literal["auto", "twr", "tdoa2", "tdoa3"] = "auto"
+    mode: Literal["auto", "twr", "tdoa2", "tdoa3"] = "auto"  # how ranges are measured
+    # positions [m] of anchors 0, 1, ...; empty: what they were told before
     anchors: list[tuple[float, float, float]] = []
 
 
 class Outside(Part, frozen=True, tag_field="system", tag="external"):
-    """Positions from outside (motion capture), passed on to the Crazyflie's own estimator.
+    """Positions from outside (motion capture), passed on to the Crazyflie's own estimator."""
 
-    Attributes:
-        rate_hz: At most so many are passed on per second.
-        position_sigma: Their standard deviation [m].
-        attitude: Pass the yaw on as well; a marker set that is seen in two ways upsets the estimator.
-        attitude_sigma: Standard deviation of the attitude [rad].
-    """
-
-    rate_hz: Rate = 50.0
-    position_sigma: Positive = 0.01
-    attitude: bool = False
-    attitude_sigma: Positive = 0.05
+    rate_hz: Rate = 50.0  # at most so many are passed on per second
+    position_sigma: Positive = 0.01  # their standard deviation [m]
+    attitude: bool = False  # pass the yaw on as well; a marker set that is seen in two ways upsets the estimator
+    attitude_sigma: Positive = 0.05  # standard deviation of the attitude [rad]
 
 
 class Settings(Part, frozen=True):
-    """How one Crazyflie is driven.
+    """How one Crazyflie is driven."""
 
-    Attributes:
-        control: `position` and `velocity` stream setpoints, `high-level` sends the planner on board to each new goal.
-        stream_hz: Rate of streamed setpoints.
-        log_hz: Rate of the pose; a log period is a multiple of 10 ms.
-        status_hz: Rate of battery and supervisor.
-        multiranger: It carries a Multi-ranger deck.
-        ranges_hz: Rate of its ranges.
-        positioning: Which system tells it where it is; None: what it carries is set up already.
-        estimator: On board; None: Kalman if a positioning system is named, else as it is.
-        parameters: Firmware parameters to set on connecting.
-        arm: Arm it before taking off, where the platform asks for that.
-        platform: For the twin only: a `brushless` one must be armed.
-        connect_s: It must be connected after this [s].
-        converge_s: Its position estimate must have settled after this [s].
-    """
-
+    # `position` and `velocity` stream setpoints, `high-level` sends the planner on board to each new goal
     control: Literal["position", "velocity", "high-level"] = "position"
-    stream_hz: Rate = 20.0
-    log_hz: Rate = 50.0
-    status_hz: Rate = 10.0
-    multiranger: bool = False
-    ranges_hz: Rate = 10.0
+    stream_hz: Rate = 20.0  # rate of streamed setpoints
+    log_hz: Rate = 50.0  # rate of the pose; a log period is a multiple of 10 ms
+    status_hz: Rate = 10.0  # rate of battery and supervisor
+    multiranger: bool = False  # it carries a Multi-ranger deck
+    ranges_hz: Rate = 10.0  # rate of its ranges
+    # which system tells it where it is; None: what it carries is set up already
     positioning: Lighthouse | Loco | Outside | None = None
+    # on board; None: Kalman if a positioning system is named, else as it is
     estimator: Literal["auto", "complementary", "kalman", "ukf"] | None = None
-    parameters: dict[str, float] = {}
-    arm: bool = True
-    platform: Literal["crazyflie", "brushless"] = "crazyflie"
-    connect_s: Wait = 15.0
-    converge_s: Wait = 10.0
+    parameters: dict[str, float] = {}  # firmware parameters to set on connecting
+    arm: bool = True  # arm it before taking off, where the platform asks for that
+    platform: Literal["crazyflie", "brushless"] = "crazyflie"  # for the twin only: a `brushless` one must be armed
+    connect_s: Wait = 15.0  # it must be connected after this [s]
+    converge_s: Wait = 10.0  # its position estimate must have settled after this [s]
 
     @property
     def packets_hz(self) -> float:

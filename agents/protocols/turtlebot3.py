@@ -37,28 +37,21 @@ _NAMESPACE: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The `device` table of a TurtleBot3. Robot and twin read the same one, so that a switch changes nothing else.
+    """The `device` table of a TurtleBot3. Robot and twin read the same one, so that a switch changes nothing else."""
 
-    Attributes:
-        distro: ROS 2 distribution of the robot; what its address says counts more.
-        domain: ROS_DOMAIN_ID, for style "rmw"; likewise.
-        stamped: Whether cmd_vel is a TwistStamped (`enable_stamped_cmd_vel`); by distribution when left out.
-        command_topic: Where it takes commands: cmd_vel, or what a watchdog in front of it listens to.
-        endpoint: Zenoh router by which the robot is reached, where it is not that of the experiment.
-        origin: What stands at the robot's start pose: the robot when its body is opened, or the origin of its
-            odometry, which is where its node was started.
-        style: Of the twin.
-        watchdog_s: The twin stops when it hears no command for so long [s]. A TurtleBot3 as it is sold has no such
-            watchdog, hence None.
-    """
-
-    distro: Distro = "jazzy"
-    domain: Annotated[int, Meta(ge=0, le=ros2.MAX_DOMAIN)] = 0
+    distro: Distro = "jazzy"  # ROS 2 distribution of the robot; what its address says counts more
+    domain: Annotated[int, Meta(ge=0, le=ros2.MAX_DOMAIN)] = 0  # ROS_DOMAIN_ID, for style "rmw"; likewise
+    # whether cmd_vel is a TwistStamped (`enable_stamped_cmd_vel`); by distribution when left out
     stamped: bool | None = None
+    # where it takes commands: cmd_vel, or what a watchdog in front of it listens to
     command_topic: Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = COMMAND
-    endpoint: str | None = None
+    endpoint: str | None = None  # Zenoh router by which the robot is reached, where it is not that of the experiment
+    # what stands at the robot's start pose: the robot when its body is opened, or the origin of its odometry, which is
+    # where its node was started
     origin: Literal["open", "boot"] = "open"
-    style: Style = "ros2dds"
+    style: Style = "ros2dds"  # of the twin
+    # the twin stops when it hears no command for so long [s]. A TurtleBot3 as it is sold has no such watchdog, hence
+    # None.
     watchdog_s: Annotated[float, Meta(gt=0)] | None = None
 
 

@@ -28,7 +28,7 @@ from agents.decision.lifecycle import Phase
 from agents.decision.transmission import Transmission
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
-from agents.network.name_ownership import ANSWER_S, Doubt, NameTaken, claim
+from agents.network.name_ownership import ANSWER_S, NameTaken, OwnershipCheck, claim
 from agents.network.shutdown import FAREWELL_S, STOPPED_S, leave
 from agents.network.zenoh_config import ASK_S
 from agents.runtime.command_line import told_to_end
@@ -67,7 +67,7 @@ class Runtime:
         self._joined = False
         self._utc = self._now = self._next = 0.0
         self._looked = np.inf  # when the process ran last, on `_CLOCK` [s]
-        self._doubt = Doubt([setup.keys.alive(name) for name in assignment.names])
+        self._ownership = OwnershipCheck([setup.keys.alive(name) for name in assignment.names])
         self._hands_off = False  # another process may drive the bodies, or does
         self._told: Callable[[], str | None] = lambda: None
         self._reach = validation.reach_of(assignment.limits.low, assignment.limits.high)
@@ -106,7 +106,7 @@ class Runtime:
             )
             out.callback(leave, session, self)
             self._take_names(session, asked)
-            out.callback(self._doubt.end)
+            out.callback(self._ownership.end)
             self._body.open()
             out.callback(self._let_go)
             out.callback(self._watchdog.end)
@@ -202,7 +202,7 @@ class Runtime:
             NameTaken: If another process has taken one of them.
         """
         try:
-            return self._doubt.over()
+            return self._ownership.over()
         except NameTaken as taken:
             self._hands_off = True
             raise NameTaken(
@@ -222,7 +222,7 @@ class Runtime:
         if self._looked - last < STOOD_S or self._watchdog.tripped:  # one that is watched over does not stand still
             return False
         woke, self._hands_off = self._looked, True
-        self._doubt.begin(self._session)
+        self._ownership.begin(self._session)
         while not self._mine():
             if self._looked - woke > ANSWER_S and self._told() is not None:
                 names = ", ".join(self._names)
@@ -330,7 +330,7 @@ class Runtime:
             self._router_due = t + ROUTER_S
             before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
             if before < np.inf and self._silent_since == np.inf:
-                self._doubt.begin(self._session)  # it was cut off
+                self._ownership.begin(self._session)  # it was cut off
             self._mine()
         return self._silent_since
 

@@ -31,22 +31,15 @@ class Coming(Enum):
 
 
 class ReceivedPose(NamedTuple):
-    """A pose that is news.
+    """A pose that is news."""
 
-    Attributes:
-        pose: Checked.
-        size: Of its payload [bytes].
-        missed: Poses before it that never came.
-        measured: When the pose was measured (UTC [s]), as far as its stamp can be true: not after its arrival; of a
-            clock that is behind, not earlier before it than a network delays poses.
-        anew: Whether it is the first of a new life: what was known of the robot is of the past.
-    """
-
-    pose: messages.Pose
-    size: int
-    missed: int
+    pose: messages.Pose  # checked
+    size: int  # of its payload [bytes]
+    missed: int  # poses before it that never came
+    # when the pose was measured (UTC [s]), as far as its stamp can be true: not after its arrival; of a clock that is
+    # behind, not earlier before it than a network delays poses
     measured: float
-    anew: bool
+    anew: bool  # whether it is the first of a new life: what was known of the robot is of the past
 
 
 class NeighbourSubscription:

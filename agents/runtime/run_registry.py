@@ -28,31 +28,18 @@ KNOCK_S: Final = 0.3  # a router on this machine takes a connection sooner
 
 
 class Run(msgspec.Struct, frozen=True):
-    """A run, or a router that was started by hand.
+    """A run, or a router that was started by hand."""
 
-    Attributes:
-        what: Which of both.
-        pid: Its process.
-        born: When that process was started, as the operating system counts it; empty where that is not known.
-        since: The same, UTC [s].
-        title: Of the experiment.
-        folder: Of the results, absolute.
-        endpoints: Routers, or members of a mesh, each with its lab.
-        realm: First chunk of the keys.
-        identity: Whose certificate stops it, in a lab.
-        robots: Name and address of hardware of each robot; the address is empty for a twin.
-    """
-
-    what: Literal["run", "router"]
-    pid: int
-    born: str
-    since: float
-    title: str
-    folder: str
-    endpoints: list[str]
-    realm: str = "park"
-    identity: str = "operator"
-    robots: dict[str, str] = {}
+    what: Literal["run", "router"]  # which of both
+    pid: int  # its process
+    born: str  # when that process was started, as the operating system counts it; empty where that is not known
+    since: float  # the same, UTC [s]
+    title: str  # of the experiment
+    folder: str  # of the results, absolute
+    endpoints: list[str]  # routers, or members of a mesh, each with its lab
+    realm: str = "park"  # first chunk of the keys
+    identity: str = "operator"  # whose certificate stops it, in a lab
+    robots: dict[str, str] = {}  # name and address of hardware of each robot; the address is empty for a twin
 
     @property
     def alive(self) -> bool:

@@ -35,25 +35,15 @@ UNDER_WAY: Final = ("airborne", "running")
 
 @dataclass
 class Counts:
-    """What is counted in a process of n rows; ticks and interventions from the common start.
+    """What is counted in a process of n rows; ticks and interventions from the common start."""
 
-    Attributes:
-        sent: (n) poses said.
-        interventions: (n,) ticks on which safety changed what had been decided.
-        avoided: (n,) ticks on which avoidance did.
-        refused: Orders that were.
-        ticks: Since the start, and `missed` ones.
-        missed: See `ticks`.
-        late_s: Largest lateness of a tick since the last status.
-    """
-
-    sent: list[int]
-    interventions: Index
-    avoided: Index
-    refused: int = 0
-    ticks: int = 0
-    missed: int = 0
-    late_s: float = 0.0
+    sent: list[int]  # (n) poses said
+    interventions: Index  # (n,) ticks on which safety changed what had been decided
+    avoided: Index  # (n,) ticks on which avoidance did
+    refused: int = 0  # orders that were
+    ticks: int = 0  # since the start, and `missed` ones
+    missed: int = 0  # see `ticks`
+    late_s: float = 0.0  # largest lateness of a tick since the last status
 
     @classmethod
     def nothing(cls, rows: int) -> Counts:

@@ -56,13 +56,13 @@ def test_whoever_listens_in_a_lab_must_know_the_rights(tmp_path):
 
     folder = tmp_path / "lab"
     authority.create(folder, {"A": "robot"}, hosts=["127.0.0.1"])
-    with pytest.raises(EndpointError, match="must know who may do what"):
+    with pytest.raises(EndpointError, match="needs its access rights"):
         config(settings("peer", listen=[f"tls/127.0.0.1:1#lab={folder}"], name="A"))
 
 
 def test_nobody_in_a_mesh_is_said_so():
     endpoint = endpoints.owned(free_endpoint(0), "A")
-    with pytest.raises(Unreachable, match="nobody answers at"):
+    with pytest.raises(Unreachable, match="no member answers at"):
         open_session([endpoint], name="visitor", wait_s=0.05)
 
 
