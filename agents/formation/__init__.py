@@ -1,1 +1,1 @@
-"""Who listens to whom, and what theory says of it: links, rigidity, anchors, changes of shape. Imports arrays only."""
+"""Formation graph and its theory: links, rigidity, anchors, changes of shape. Imports arrays only."""

@@ -1,4 +1,4 @@
-"""Anchors: distances that robots keep to a point, a line or a plane that stands still."""
+"""Anchors: distances that robots keep to a fixed point, line or plane."""
 
 from __future__ import annotations
 
@@ -11,44 +11,35 @@ from agents.arrays import Array, Index, norm
 
 @dataclass(frozen=True)
 class Anchors:
-    """Distances to what stands still (A): a point, a line through it along `axis`, or a plane through it across `axis`.
+    """Distances (A) to a fixed point, to a line along `axis` through it, or to a plane across `axis` through it."""
 
-    Attributes:
-        row: (A,) which robot.
-        point: (A, 3) [m].
-        axis: (A, 3) unit vectors; of no meaning for points.
-        whole: (A,) 1 for points and lines, 0 for planes: the share of p − point that counts.
-        along: (A,) 0 for points, −1 for lines, 1 for planes: the share of its part along `axis` that is added.
-        distance: (A,) wanted [m]; 0: on it.
-        gain: (A,) [1/(m² decision)], or [1/decision] where the distance is 0.
-    """
-
-    row: Index
-    point: Array
-    axis: Array
-    whole: Array
-    along: Array
-    distance: Array
-    gain: Array
+    row: Index  # (A,) robot
+    point: Array  # (A, 3) [m]
+    axis: Array  # (A, 3) unit vectors; unused for points
+    whole: Array  # (A,) share of p − point that counts: 1 for points and lines, 0 for planes
+    along: Array  # (A,) share of its part along `axis` that is added: 0 for points, −1 for lines, 1 for planes
+    distance: Array  # (A,) wanted [m]; 0: on it
+    gain: Array  # (A,) [1/(m² decision)], or [1/decision] where the distance is 0
 
     def __len__(self) -> int:
         return len(self.row)
 
     def of_rows(self, rows: Index) -> Anchors:
-        """Those of these rows, which are renumbered from 0."""
+        """Anchors of these rows, renumbered from 0."""
         mine = np.flatnonzero(np.isin(self.row, rows))
         order = np.argsort(rows)
         return self._take(mine, order[np.searchsorted(rows, self.row[mine], sorter=order)])
 
     def repeated(self, times: int, rows: int) -> Anchors:
-        """The same in `times` copies of an experiment of `rows` robots, one copy behind the other."""
+        """Anchors of `times` copies of an experiment of `rows` robots, one copy behind the other."""
         shift = np.repeat(np.arange(times) * rows, len(self))
         return self._take(np.tile(np.arange(len(self)), times), np.tile(self.row, times) + shift)
 
     def offset(self, position: Array) -> Array:
         """u (N, 3) [m] of all rows: ½ g (d² − ‖x‖²) x, with x from the nearest point to p; −g x where d = 0.
 
-        For points as the authors' controllers pull to the origin; −g x because the cube of a small x never gets there.
+        For points this is the pull to the origin of the authors' controllers; −g x because the cube of a small x never
+        gets there.
         """
         away = self.displacement(position)
         square = np.vecdot(away, away)
@@ -62,7 +53,7 @@ class Anchors:
         return np.abs(self.distance - norm(self.displacement(position)))
 
     def displacement(self, position: Array) -> Array:
-        """x (A, 3): from the nearest point of each point, line or plane to its robot [m]."""
+        """x (A, 3) from the nearest point of each point, line or plane to its robot [m]."""
         apart = position[self.row] - self.point
         part = np.vecdot(apart, self.axis) * self.along
         return np.asarray(self.whole[:, None] * apart + part[:, None] * self.axis)

@@ -1,7 +1,7 @@
-"""Formations that change: targets that go smoothly from one shape to another, and links that come and go.
+"""Formations that change: targets that move smoothly from one shape to another, and links that come and go.
 
-A robot subscribes to everybody who may become its neighbour; here it is decided who is one now, from its own clock and
-from what it has heard, so that all of a robot's decisions stay its own.
+A robot subscribes to every possible neighbour; these functions decide which are neighbours now, from the robot's own
+clock and the poses that it received, so that its decisions need nobody else.
 """
 
 from __future__ import annotations
@@ -19,30 +19,18 @@ ROUNDING_S = 1e-6  # decisions are multiples of a period that binary fractions m
 
 @dataclass(frozen=True)
 class Change:
-    """From `at` on, within `over` seconds, links go to other targets; then the whole is scaled and turned.
+    """Transition of links (E) to other targets, then scaling and turning of the whole shape."""
 
-    Attributes:
-        at: Since the common start [s].
-        over: How long it takes [s]; 0: at once.
-        distance: (E,) new [m], NaN where it stays.
-        relative: (E, 3) new [m], NaN where it stays.
-        bearing: (E, 3) new, NaN where it stays.
-        scale: Of the shape seen from above; heights are held.
-        turn: About the vertical, to the left [rad].
-        rise: (E,) height of the listener above the speaker [m], which no scale changes.
-    """
-
-    at: float
-    over: float
-    distance: Array
-    relative: Array
-    bearing: Array
-    scale: float
-    turn: float
-    rise: Array
+    at: float  # begin since the common start [s]
+    over: float  # duration [s]; 0: at once
+    distance: Array  # (E,) new [m], NaN where unchanged
+    relative: Array  # (E, 3) new [m], NaN where unchanged
+    bearing: Array  # (E, 3) new, NaN where unchanged
+    scale: float  # of the shape seen from above; heights are kept
+    turn: float  # about the vertical, to the left [rad]
+    rise: Array  # (E,) height of the receiver above the sender [m], which no scale changes
 
     def select(self, which: Index) -> Change:
-        """Of some links."""
         return replace(
             self,
             distance=self.distance[which],
@@ -52,7 +40,7 @@ class Change:
         )
 
     def padded(self, more: int) -> Change:
-        """For links behind these, which stay."""
+        """Change for `more` links behind these, which keep their targets."""
         blank = np.full((more, 3), np.nan)
         return replace(
             self,
@@ -64,7 +52,7 @@ class Change:
 
 
 def progress(elapsed: Array, at: float, over: float) -> Array:
-    """How far a change has come, 0 to 1: the polynomial of minimum jerk 10τ³ − 15τ⁴ + 6τ⁵."""
+    """Progress of a change, 0 to 1: the polynomial of minimum jerk 10τ³ − 15τ⁴ + 6τ⁵."""
     if over <= 0.0:
         return np.asarray((elapsed >= at - ROUNDING_S).astype(float))
     share = np.minimum(np.maximum((elapsed - at) / over, 0.0), 1.0)
@@ -72,7 +60,7 @@ def progress(elapsed: Array, at: float, over: float) -> Array:
 
 
 def changed_targets(links: Links, changes: Sequence[Change], elapsed: Array) -> Links:
-    """The links with the targets of now, `elapsed` (E,) seconds after the common start."""
+    """Links with their targets `elapsed` (E,) [s] after the common start."""
     distance, relative, bearing = links.distance, links.relative, links.bearing
     for change in changes:
         share = progress(elapsed, change.at, change.over)
@@ -97,7 +85,7 @@ def _toward(old: Array, new: Array, share: Array) -> Array:
 
 
 def _toward_unit(old: Array, new: Array, share: Array) -> Array:
-    """Between two directions at an even rate, and over the vertical plane between them if they are opposite."""
+    """Directions at an even rate between old and new; opposite ones turn through the vertical plane between them."""
     changed = np.isfinite(new[:, 0])
     if not changed.any():
         return old
@@ -117,7 +105,7 @@ def _turned(vectors: Array, angle: Array) -> Array:
 
 
 def _scaled(distance: Array, grown: Array, rise: Array) -> Array:
-    """Lengths of links whose part in the plane grows and whose heights are held."""
+    """Lengths of links whose part in the plane is scaled and whose height difference is kept."""
     if (grown == 1.0).all():
         return distance
     return np.where(grown == 1.0, distance, np.sqrt(np.maximum(grown**2 * (distance**2 - rise**2), 0.0) + rise**2))
@@ -125,45 +113,37 @@ def _scaled(distance: Array, grown: Array, rise: Array) -> Array:
 
 @dataclass(frozen=True)
 class Presence:
-    """When and how near two robots must be to be neighbours: links (E) that come and go.
+    """Times and distances at which links (E) exist."""
 
-    Attributes:
-        since: (E,) from when on, since the common start [s].
-        until: (E,) when no more [s]; infinity: to the end.
-        reach: (E,) nearer than this they become neighbours [m]; infinity: however far.
-        release: (E,) farther than this they are no more [m]; the gap to `reach` keeps a link from flickering.
-    """
-
-    since: Array
-    until: Array
-    reach: Array
-    release: Array
+    since: Array  # (E,) begin since the common start [s]
+    until: Array  # (E,) end [s]; infinity: never
+    reach: Array  # (E,) distance below which a link begins [m]; infinity: any
+    release: Array  # (E,) distance above which it ends [m]; the gap to `reach` prevents flicker
 
     def select(self, which: Index) -> Presence:
-        """Of some links."""
         return Presence(self.since[which], self.until[which], self.reach[which], self.release[which])
 
     def padded(self, more: int) -> Presence:
-        """For links behind these, which are always there."""
+        """Presence with `more` links behind these, which always exist."""
         ever = np.full(more, np.inf)
         columns = ((self.since, -ever), (self.until, ever), (self.reach, ever), (self.release, ever))
         return Presence(*(np.concatenate(both) for both in columns))
 
     def present_at_start(self) -> Mask:
-        """Which links are there before anybody knows how far the others are."""
+        """Links (E,) that exist before any distance is known."""
         return self.planned_at(0.0)
 
     def planned_at(self, elapsed: float) -> Mask:
-        """Which links are there at a time [s], however far apart the robots are."""
+        """Links (E,) that exist at a time [s] whatever the distance of the robots."""
         return (self.since <= elapsed + ROUNDING_S) & (self.until > elapsed + ROUNDING_S) & np.isinf(self.reach)
 
     def present_now(self, elapsed: Array, apart: Array, were: Mask) -> Mask:
-        """Which links are there (E,), `elapsed` (E,) [s] after the start, between robots that are `apart` (E,) [m].
+        """Links (E,) that exist now.
 
         Args:
-            elapsed: On each listener's clock.
-            apart: NaN where unknown.
-            were: Which were there at the last decision.
+            elapsed: (E,) time since the start on each receiver's clock [s].
+            apart: (E,) distance of the two robots [m], NaN where unknown.
+            were: (E,) links that existed at the last decision.
         """
         planned = (elapsed >= self.since - ROUNDING_S) & (elapsed < self.until - ROUNDING_S)
         near = np.isinf(self.reach) | (apart <= np.where(were, self.release, self.reach))
@@ -171,19 +151,19 @@ class Presence:
 
 
 class Reshaping:
-    """What a formation that changes asks of its links now."""
+    """Current links and targets of a formation that changes."""
 
     def __init__(self, links: Links, changes: Sequence[Change], presence: Presence | None) -> None:
-        """`links` (E) with the targets of the beginning."""
+        """Start from `links` (E) with the targets of the beginning."""
         self._given, self._changes, self._presence = links, tuple(changes), presence
         self.links = links
         self.present: Mask = np.ones(len(links), dtype=bool) if presence is None else presence.present_at_start()
 
-    def advance(self, since_start: Array, position: Array, heard: Array) -> None:
-        """On to now: `since_start` (N,) [s] of the rows, their `position` (N, 3), and what they `heard` (E, 3)."""
+    def advance(self, since_start: Array, position: Array, sender_position: Array) -> None:
+        """Advance to now: `since_start` (N,) [s], `position` (N, 3) of the rows and of the senders (E, 3) [m]."""
         elapsed = np.maximum(since_start[self._given.receiver], 0.0)
         if self._changes:
             self.links = changed_targets(self._given, self._changes, elapsed)
         if self._presence is not None:
-            apart = norm(position[self._given.receiver] - heard)
+            apart = norm(position[self._given.receiver] - sender_position)
             self.present = self._presence.present_now(elapsed, apart, self.present)

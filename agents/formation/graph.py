@@ -1,4 +1,4 @@
-"""Who listens to whom, as arrays, and what the theory of graphs and of rigid frameworks says of it."""
+"""Links as arrays, and graph theory on them."""
 
 from __future__ import annotations
 
@@ -10,42 +10,33 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask
 
-BY_DISTANCE, BY_RELATIVE, BY_BEARING = range(3)  # what a link wants
+BY_DISTANCE, BY_RELATIVE, BY_BEARING = range(3)  # kinds of link targets
 
 
 @dataclass(frozen=True)
 class Links:
-    """Directed links sorted by listener: `listener`, `speaker` (E,) rows, target `distance` [m] and `gain` (E,).
+    """Directed links (E), sorted by receiver.
 
-    What a link wants is a distance, a relative position or a direction; it is told in each way that follows from it.
-    In a robot's own process the listeners are its rows, renumbered from 0; the speakers keep the numbers that they
-    have in the experiment.
-
-    Attributes:
-        receiver: (E,) rows i.
-        sender: (E,) rows j.
-        distance: (E,) d_ij [m]; NaN where only a direction is wanted.
-        gain: (E,) of the law.
-        relative: (E, 3) wanted p_i − p_j [m], NaN where only a distance or a direction is; None: nowhere any.
-        bearing: (E, 3) unit vector along the wanted p_i − p_j, NaN where none is; its z alone is NaN where the
-            direction is one seen from above. None: nowhere any.
-        wants: (E,) BY_DISTANCE, BY_RELATIVE or BY_BEARING, as the file has it; None, as both before: all by distance.
+    A link wants a distance, a relative position or a direction; it is stored in each form that follows from it. In a
+    robot's own process receivers are its rows, renumbered from 0; senders keep their numbers in the experiment.
     """
 
-    receiver: Index
-    sender: Index
-    distance: Array
-    gain: Array
+    receiver: Index  # (E,) rows i
+    sender: Index  # (E,) rows j
+    distance: Array  # (E,) d_ij [m]; NaN where only a direction is wanted
+    gain: Array  # (E,) of the law
+    # (E, 3) wanted p_i − p_j [m], NaN for distances and directions; None: no link wants one
     relative: Array | None = None
+    # (E, 3) unit vector along the wanted p_i − p_j, NaN where none; z alone NaN: seen from above
     bearing: Array | None = None
-    wants: Index | None = None
+    wants: Index | None = None  # (E,) BY_DISTANCE, BY_RELATIVE or BY_BEARING; None: all by distance
 
     def __len__(self) -> int:
         return len(self.receiver)
 
     @cached_property
     def _starts(self) -> Index:
-        """Where each listener that has links begins; the links are sorted by listener."""
+        """Index of the first link of each receiver; the links are sorted by receiver."""
         return np.flatnonzero(np.diff(self.receiver, prepend=-1))
 
     @cached_property
@@ -53,7 +44,7 @@ class Links:
         return self.receiver[self._starts]
 
     def sum_by_receiver(self, per_link: Array, rows: int) -> Array:
-        """Sum of a quantity (E, ...) over each listener's links -> (rows, ...)."""
+        """Sum of a quantity (E, ...) over the links of each receiver -> (rows, ...)."""
         if len(self._heads) == rows > 0:
             return np.asarray(np.add.reduceat(per_link, self._starts, axis=0))
         total = np.zeros((rows, *per_link.shape[1:]))
@@ -62,28 +53,28 @@ class Links:
         return total
 
     def select(self, which: Index | Mask) -> Links:
-        """Some of them, or the same in another order."""
+        """Subset of the links, or another order of them."""
         return Links(*(None if column is None else column[which] for column in self._columns()))  # type: ignore[arg-type]
 
     def max_by_receiver(self, per_link: Array, rows: int) -> Array:
-        """Largest of a quantity (E,) over each listener's links -> (rows,), 0 without links."""
+        """Largest value of a quantity (E,) per receiver -> (rows,), 0 without links."""
         most = np.zeros(rows)
         if len(self):
             most[self._heads] = np.maximum.reduceat(per_link, self._starts)
         return most
 
     def to_receivers(self, rows: Index) -> Links:
-        """The links on which these rows listen; listeners renumbered 0..len(rows)-1, speakers keep their numbers."""
-        at, listener = self.indices_to_receivers(rows)
-        return replace(self.select(at), receiver=listener)
+        """Links to these rows; receivers are renumbered 0..len(rows)-1, senders keep their numbers."""
+        at, receiver = self.indices_to_receivers(rows)
+        return replace(self.select(at), receiver=receiver)
 
     def indices_to_receivers(self, rows: Index) -> tuple[Index, Index]:
-        """Which links these rows listen on, in the order of `of`, and the new number of each one's listener."""
+        """Indices of the links to these rows, in the order of `to_receivers`, and new receiver numbers."""
         mine = np.flatnonzero(np.isin(self.receiver, rows))
         order = np.argsort(rows)
-        listener = order[np.searchsorted(rows, self.receiver[mine], sorter=order)]
-        by_listener = np.argsort(listener, kind="stable")
-        return mine[by_listener], listener[by_listener]
+        receiver = order[np.searchsorted(rows, self.receiver[mine], sorter=order)]
+        by_receiver = np.argsort(receiver, kind="stable")
+        return mine[by_receiver], receiver[by_receiver]
 
     def repeated(self, times: int, rows: int) -> Links:
         """The same links in `times` copies of an experiment of `rows` robots, one copy behind the other."""
@@ -92,16 +83,16 @@ class Links:
         return replace(many, receiver=many.receiver + shift, sender=many.sender + shift)
 
     def append(self, others: Links) -> Links:
-        """These and others behind them: no longer sorted, so only a sorted part of it may be summed."""
+        """These links followed by others: no longer sorted, so only a sorted part of the result may be summed."""
         if others.wants is None and self.wants is None:
             ours, theirs = self, others
         else:
-            ours, theirs = self._told_in_full(), others._told_in_full()
+            ours, theirs = self._with_all_columns(), others._with_all_columns()
         both = zip(ours._columns(), theirs._columns(), strict=True)
         return Links(*(None if a is None or b is None else np.concatenate([a, b]) for a, b in both))  # type: ignore[arg-type]
 
-    def _told_in_full(self) -> Links:
-        """With every column."""
+    def _with_all_columns(self) -> Links:
+        """Links with every column."""
         if self.wants is not None:
             return self
         blank = np.full((len(self), 3), np.nan)
@@ -114,9 +105,9 @@ class Links:
 def links(
     pairs: Sequence[tuple[int, int]], distance: Sequence[float] | float = np.nan, gain: Sequence[float] | float = 1.0
 ) -> Links:
-    """Links by distance from (listener, speaker) pairs in any order; one number is for all of them.
+    """Links by distance from (receiver, sender) pairs in any order; one number is for all of them.
 
-    For a graph of which only the matrices are wanted the pairs are enough: `laplacian(links(pairs), rows)`.
+    Pairs are enough where only the matrices are wanted: `laplacian(links(pairs), rows)`.
     """
     both = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     order = np.lexsort((both[:, 1], both[:, 0]))
@@ -125,14 +116,14 @@ def links(
 
 
 def adjacency(net: Links, rows: int) -> Array:
-    """A (N, N): a_ij = 1 if i listens to j (paper, eq. (11))."""
+    """A (N, N): a_ij = 1 if i receives from j (paper, eq. (11))."""
     matrix = np.zeros((rows, rows))
     matrix[net.receiver, net.sender] = 1.0
     return matrix
 
 
 def degree(net: Links, rows: int) -> Array:
-    """D (N, N): how many neighbours each robot listens to, on the diagonal."""
+    """D (N, N): number of neighbours that each robot receives from, on the diagonal."""
     return np.diag(adjacency(net, rows).sum(axis=1))
 
 
@@ -148,12 +139,12 @@ def edges(net: Links) -> Index:
 
 
 def reachable(net: Links, rows: int, sources: Index) -> Mask:
-    """Which rows (N,) hear of the sources, directly or through others."""
-    hears = adjacency(net, rows) > 0
+    """Rows (N,) that receive from the sources, directly or through others."""
+    receives = adjacency(net, rows) > 0
     known = np.zeros(rows, dtype=bool)
     known[sources] = True
     for _ in range(rows):
-        wider = known | (hears @ known)
+        wider = known | (receives @ known)
         if (wider == known).all():
             break
         known = wider
@@ -161,7 +152,7 @@ def reachable(net: Links, rows: int, sources: Index) -> Mask:
 
 
 def components(net: Links, rows: int) -> int:
-    """How many parts the network has when directions are ignored."""
+    """Number of connected parts when directions are ignored."""
     label = np.arange(rows)
     for i, j in edges(net):
         label[label == label[j]] = label[i]

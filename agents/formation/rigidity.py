@@ -1,4 +1,4 @@
-"""What a rigid formation can lose and stay rigid: single links, single robots."""
+"""Rigidity of a framework, and which links and robots it can lose without losing it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def rigidity_matrix(position: Array, pairs: Index, moves: Mask | None = None) ->
     Args:
         position: (N, 3) [m].
         pairs: (M, 2) undirected edges.
-        moves: (N, 3) which coordinates are free to move; columns of held ones (a hover height, the floor) are left
-            out, which gives the rigidity in the motions that the robots really have.
+        moves: (N, 3) free coordinates; columns of held ones (a hover height, the floor) are left out, which gives the
+            rigidity in the motions that the robots really have.
     """
     rows = len(position)
     i, j = pairs[:, 0], pairs[:, 1]
@@ -94,29 +94,19 @@ CERTAIN: Final = 1e-12  # a link that bears all but this share of its own load a
 
 @dataclass(frozen=True)
 class Redundancy:
-    """Of a framework of N robots and M pairs.
+    """Links (M) and robots (N) without which a framework stays rigid."""
 
-    Attributes:
-        pairs: (M,) whether it stays rigid without this pair.
-        robots: (N,) whether it stays rigid without this robot.
-    """
-
-    pairs: Mask
-    robots: Mask
+    pairs: Mask  # (M,) rigid without this pair
+    robots: Mask  # (N,) rigid without this robot
 
 
 def redundancy(position: Array, pairs: Index, moves: Mask | None = None) -> Redundancy:
-    """What can be left out of an infinitesimally rigid framework; nothing, if it is not rigid.
+    """Redundant links and robots of an infinitesimally rigid framework; none, if it is not rigid.
 
     With P the projector onto the columns of the rigidity matrix R, the rank of R without the rows of a set S is smaller
     by the multiplicity of the eigenvalue 1 of P_SS: as many independent velocities stretch links of S only. For one
     link that eigenvalue is P_ee itself, and it is 1 where no self-stress passes through the link. So one
-    decomposition of R tells it for every link and every robot.
-
-    Args:
-        position: (N, 3) [m].
-        pairs: (M, 2) undirected edges.
-        moves: (N, 3) which coordinates are free to move; None: all.
+    decomposition of R answers for every link and every robot. For the arguments see `rigidity_matrix`.
     """
     rows = len(position)
     free = np.ones_like(position, dtype=bool) if moves is None else moves

@@ -1,3 +1,4 @@
-"""Everything an experiment file chooses by name: laws, triggers, predictors, planners, avoidances, and their registry.
-Imports formation, arrays.
+"""Everything that an experiment file chooses by name: laws, triggers, predictors, planners, avoidances; their registry.
+
+Imports formation and arrays.
 """

@@ -1,8 +1,8 @@
-"""Avoidance: how robots keep clear of what their range sensors see and of whom they hear.
+"""Avoidance: keeping clear of obstacles seen by range sensors and of robots whose poses are received.
 
 An avoidance is a frozen struct of its parameters, found by the entry-point group `zenpark.avoidances`. It may act at
-two levels: `deviate` shifts a goal (individual level; the potential of the paper), `restrain` has a say in the last
-word before the body (safety level; the barrier).
+two levels: `deviate` shifts a goal (individual level; the potential of the paper), `restrain` limits the setpoint
+after all other limits (safety level; the barrier).
 """
 
 from __future__ import annotations
@@ -20,44 +20,32 @@ Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 
 COINCIDENT = 1e-6  # [m] axes nearer than this have no direction
-TOUCHING = 1e-3  # [m] no gap counts as smaller: forces stay finite
+TOUCHING = 1e-3  # [m] smallest gap in a force: forces stay finite
 
 
 @dataclass(frozen=True)
 class Nearby:
-    """What rows know of the things around them, one entry per thing and row that knows it (K).
+    """Things near rows, one entry per thing and row that knows it (K).
 
-    Things are upright cylinders: a robot that was heard, or the point (radius 0) where a ray of a range sensor ended.
-
-    Attributes:
-        row: (K,) who knows it.
-        position: (K, 2) where it is believed to be now [m].
-        velocity: (K, 2) as believed [m/s]; 0 for what a ray saw.
-        radius: (K,) [m]
-        low: (K,) lower end [m].
-        high: (K,) upper end [m].
-        is_robot: (K,) a robot of this experiment that was heard, which may avoid as well; else what a ray saw.
-        lag: (K,) time constant with which its velocity follows its commands [s]; 0 for what a ray saw.
+    Things are upright cylinders: a robot whose pose was received, or the point (radius 0) where a range reading ended.
     """
 
-    row: Index
-    position: Array
-    velocity: Array
-    radius: Array
-    low: Array
-    high: Array
-    is_robot: Mask
-    lag: Array
+    row: Index  # (K,) row that knows the thing
+    position: Array  # (K, 2) believed now [m]
+    velocity: Array  # (K, 2) believed [m/s]; 0 for range readings
+    radius: Array  # (K,) [m]
+    low: Array  # (K,) lower end [m]
+    high: Array  # (K,) upper end [m]
+    is_robot: Mask  # (K,) robot of this experiment, which may avoid as well; else a range reading
+    lag: Array  # (K,) time constant of its velocity [s]; 0 for range readings
 
     def __len__(self) -> int:
         return len(self.row)
 
     def select(self, which: Mask) -> Nearby:
-        """Some of the things (K,)."""
         return Nearby(*(getattr(self, field.name)[which] for field in fields(Nearby)))
 
     def append(self, others: Nearby) -> Nearby:
-        """These things and others."""
         if not len(others):
             return self
         if not len(self):
@@ -66,9 +54,9 @@ class Nearby:
         return Nearby(*both)
 
     def bearing(self, own: OwnState) -> tuple[Array, Array]:
-        """Unit vectors (K, 2) from each thing to who knows it, and the distances (K,) of their axes [m].
+        """Unit vectors (K, 2) from each thing to the row that knows it, and the distances (K,) of their axes [m].
 
-        Two axes in one place, which only wrong measurements can give, are told apart along x.
+        Two axes in one place, which only wrong measurements can give, are separated along x.
         """
         away = own.position[self.row, :2] - self.position
         distance = norm(away)
@@ -80,64 +68,49 @@ class Nearby:
 
 @dataclass(frozen=True)
 class OwnState:
-    """What rows know of themselves (N).
+    """State and properties of rows (N)."""
 
-    Attributes:
-        position: (N, 3) measured [m].
-        velocity: (N, 3) measured or estimated, 0 where unknown [m/s].
-        yaw: (N,) measured [rad].
-        radius: (N,) [m]
-        height: (N,) vertical size, from the position up [m].
-        speed: (N,) limit [m/s].
-        turn_rate: (N,) limit [rad/s].
-        response: (N,) rate at which a body that takes positions closes a position error [1/s].
-        lag: (N,) time constant with which the velocity follows what is commanded [s].
-        takes: (N,) "position", "velocity" or "twist".
-        by_position: (N,) takes a position.
-        by_twist: (N,) takes a twist.
-        flies: (N,)
-    """
-
-    position: Array
-    velocity: Array
-    yaw: Array
-    radius: Array
-    height: Array
-    speed: Array
-    turn_rate: Array
-    response: Array
-    lag: Array
-    takes: tuple[str, ...]
-    by_position: Mask
-    by_twist: Mask
-    flies: Mask
+    position: Array  # (N, 3) measured [m]
+    velocity: Array  # (N, 3) measured or estimated, 0 where unknown [m/s]
+    yaw: Array  # (N,) measured [rad]
+    radius: Array  # (N,) [m]
+    height: Array  # (N,) vertical size, from the position up [m]
+    speed: Array  # (N,) limit [m/s]
+    turn_rate: Array  # (N,) limit [rad/s]
+    response: Array  # (N,) rate at which a body that takes positions closes a position error [1/s]
+    lag: Array  # (N,) time constant from commanded to true velocity [s]
+    takes: tuple[str, ...]  # (N,) "position", "velocity" or "twist"
+    by_position: Mask  # (N,) takes a position
+    by_twist: Mask  # (N,) takes a twist
+    flies: Mask  # (N,)
 
 
 class Avoidance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Parameters that every avoidance has."""
+    """Base of all avoidances, with the parameters that every one has."""
 
     hears: Annotated[
-        Literal["neighbours", "all"], Meta(description="whom it hears: the neighbours of the formation, or every robot")
+        Literal["neighbours", "all"],
+        Meta(description="robots whose poses are received for it: neighbours of the formation, or all"),
     ] = "neighbours"
     clearance: Annotated[
         NotNegative,
-        Meta(description="things farther above or below than this are in nobody's way [m]; more against downwash"),
+        Meta(description="things farther above or below than this are ignored [m]; more against downwash"),
     ] = 0.1
 
     def deviate(self, goal: Array, own: OwnState, near: Nearby, period: float) -> Array:
-        """The goals (N, 3) [m] that are pursued in place of `goal` (N, 3); asked every `period` [s]."""
+        """Goals (N, 3) [m] to pursue in place of `goal` (N, 3); called every `period` [s]."""
         return goal
 
     def restrain(self, setpoint: Array, own: OwnState, near: Nearby) -> Array:
-        """The setpoints (N, 4) that may be sent in place of `setpoint` (N, 4), in the meaning of each row's kind.
+        """Setpoints (N, 4) to send in place of `setpoint` (N, 4), in the meaning of each row's kind.
 
-        What is changed is held to the limits of speed and arena; rows that do not know where they are keep theirs.
+        Changes are held to the limits of speed and arena; rows without a valid pose keep theirs.
         """
         return setpoint
 
 
 class Potential(Avoidance, frozen=True):
-    """The repulsive potential of the paper, eqs. (2) to (4): a shift of the goal away from what is near.
+    """The repulsive potential of the paper, eqs. (2) to (4): a shift of the goal away from near things.
 
     Each thing k within d0 pushes with F_k = η (1/d_k − 1/d0) / d_k² along the horizontal unit vector from it to the
     robot, and the goal is shifted by u = h v F/‖F‖, F = Σ F_k. The paper leaves open:
@@ -146,12 +119,12 @@ class Potential(Avoidance, frozen=True):
       is counted from its edge as well). F points away from the thing's axis.
     - h, "the period of the controller", is the time in which the body closes an error of position, 1/response: that is
       the shift that makes the body move at v along F. (A shift of a tick of 10 ms times v would be millimetres.)
-    - v is the robot's own limit of speed unless given, and the goal is first brought as near as that limit lets the
-      robot go anyway: so no goal, however far behind the thing it lies, pulls harder than the thing pushes.
-    - η has no influence after the normalisation of (4); it is kept for whoever compares forces.
+    - v is the robot's own speed limit unless given, and the goal is first brought as near as that limit lets the robot
+      go anyway: so no goal, however far behind the thing it lies, pulls harder than the thing pushes.
+    - η has no influence after the normalisation of (4); it is kept to compare forces.
 
-    There is no guarantee: a robot can be caught between two pushes, and what is behind it may be nearer than what it is
-    pushed from. It halts where pull and push are opposite (no way around is sought).
+    There is no guarantee: a robot can be caught between two pushes, and things behind it may be nearer than those that
+    push it. It halts where pull and push are opposite (no way around is sought).
     """
 
     reach: Annotated[Positive, Meta(description="d0, from surface to surface [m]")] = 0.30
@@ -160,7 +133,7 @@ class Potential(Avoidance, frozen=True):
     period_s: Annotated[Positive | None, Meta(description="h [s]; left out: 1/response of the robot's kind")] = None
 
     def force(self, own: OwnState, near: Nearby) -> Array:
-        """F (N, 2) of eq. (3), summed over what is near; zero where nothing is."""
+        """F (N, 2) of eq. (3), summed over near things; zero where there are none."""
         away, distance = near.bearing(own)
         gap = np.maximum(distance - own.radius[near.row] - near.radius, TOUCHING)
         push = self.strength * np.maximum(1.0 / gap - 1.0 / self.reach, 0.0) / gap**2
@@ -169,7 +142,7 @@ class Potential(Avoidance, frozen=True):
         return total
 
     def deviate(self, goal: Array, own: OwnState, near: Nearby, period: float) -> Array:
-        """See `Avoidance.deviate`; eq. (4)."""
+        """Shift goals by eq. (4)."""
         if not len(near):
             return goal
         force = self.force(own, near)

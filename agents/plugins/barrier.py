@@ -21,40 +21,40 @@ class Barrier(Avoidance, frozen=True):
     """A control barrier function, kept by a quadratic program in closed form.
 
     For each thing near a robot let n be the horizontal unit vector from it to the robot, h the gap between their
-    surfaces less `margin`, and s = h − τ_i [−n·v_i]₊ − τ_j [n·v_j]₊ what would be left of h if both stopped now: a body
-    whose velocity follows its commands with time constant τ goes on for τ v. The commanded velocity u of the robot must
+    surfaces less `margin`, and s = h − τ_i [−n·v_i]₊ − τ_j [n·v_j]₊ the part of h that would remain if both stopped
+    now: a body whose velocity follows its commands with time constant τ goes on for τ v. The commanded velocity u must
     obey
 
-        −n·u ≤ α s / 2                  its half; the other one keeps the other half
-        −n·u ≤ α s − [n·v_j]₊           whatever the other one was heard to do
+        −n·u ≤ α s / 2                  its half; the other robot keeps the other half
+        −n·u ≤ α s − [n·v_j]₊           for the received velocity of the other robot
         −n·u ≤ α s                      in place of the first, where s < 0: back off
 
-    and is the one nearest to what is wanted (‖u − w‖² least, a quadratic program in two variables). At the last, the
-    speed of robots on wheels along their heading is limited by the same inequalities, of which none forbids turning on
-    the spot; before that their goal is shifted to where u points, so that they drive around things rather than stop,
-    and by a smaller α (`steering`), so that they have turned when it matters. Where not all inequalities can be kept,
-    the largest violation is made as small as it can be.
+    and is the one nearest to the wanted velocity w (‖u − w‖² least, a quadratic program in two variables). At the last,
+    the speed of robots on wheels along their heading is limited by the same inequalities, of which none forbids turning
+    on the spot; before that their goal is shifted to where u points, so that they drive around things rather than stop,
+    and by a smaller α (`steering`), so that they have turned in time. Where not all inequalities can be kept, the
+    largest violation is made as small as it can be.
 
-    What is guaranteed. For u that obeys, s' ≥ −α s: s stays positive once it is, and h ≥ s. So no two robots touch if
+    Guarantee: for u that obeys, s' ≥ −α s: s stays positive once it is, and h ≥ s. So no two robots touch if
 
-    - they begin apart, and both keep their half: by hearing or by seeing, which is why a thing that only a ray saw, and
-      that may be a robot which sees this one, gets half as well; or the other one stands still; or it moves as it was
-      heard to, and this one is quick enough to get out of its way (on wheels, it must turn first);
-    - `margin` covers what is not modelled: the other one's motion while a pose or a scan ages (with half each at most
+    - they begin apart, and both keep their half, by received poses or by range readings (a thing known from readings
+      only may be a robot that sees this one, and gets half as well); or the other one stands still; or it moves with
+      the received velocity, and this one is quick enough to get out of its way (on wheels, it must turn first);
+    - `margin` covers the unmodelled: the other one's motion while a pose or a scan ages (with half each at most
       α/2·age of the gap, so nothing at the end of an approach; of a robot that does not avoid, its speed times the
-      age), what a trigger leaves unsaid (1 cm for a δ of 1 cm), errors of measured positions, the wobble of both (4
-      standard deviations are 5.7 cm for two drones of 1 cm each), what the heading of a robot on wheels sweeps while
-      its wheels slow down (4 mm), and the arc by which a drone that turns cuts a corner: the vectors n turn;
+      age), the deviation that a trigger allows (1 cm for a δ of 1 cm), errors of measured positions, the wobble of both
+      (4 standard deviations are 5.7 cm for two drones of 1 cm each), the sweep of the heading of a robot on wheels
+      while its wheels slow down (4 mm), and the arc by which a drone that turns cuts a corner: the vectors n turn;
     - heights do not change so that something gets beside the robot from above or below within the margin, and no wall
       of the arena is in the way of backing off.
 
-    What is not heard and moves (an obstacle on a path, a person) is only backed away from, α s fast: that is enough for
-    drones up to a speed of about α·margin, and for nothing on wheels.
+    Moving things without received poses (an obstacle on a path, a person) are only backed away from, α s fast: enough
+    for drones up to a speed of about α·margin, and for nothing on wheels.
 
-    What is not guaranteed is arrival. Against deadlocks of robots that meet head-on, what is taken from the wanted
-    velocity is given back to the right in the share `right`: all pass each other on the same side. A robot that comes
-    faster than this one can flee is dodged to the side of its way on which this one is. A trap, such as a corner of
-    walls or a knot of robots that all want to get past one another, is not planned around.
+    Arrival is not guaranteed. Against deadlocks of robots that meet head-on, the share `right` of the barred velocity
+    is given back to the right: all pass each other on the same side. A robot that comes faster than this one can flee
+    is dodged to the side of its way on which this one is. A trap, such as a corner of walls or a knot of robots that
+    all want to get past one another, is not planned around.
 
     Barrier functions: Ames et al., European Control Conference 2019; shared between robots: Wang, Ames and Egerstedt,
     IEEE Transactions on Robotics 33(3), 2017.
@@ -63,9 +63,14 @@ class Barrier(Avoidance, frozen=True):
     margin: Annotated[NotNegative, Meta(description="gap between surfaces that is kept [m]")] = 0.05
     alpha: Annotated[Positive, Meta(description="α: how fast a gap may be used up, per metre of it [1/s]")] = 3.0
     steering: Annotated[
-        Positive, Meta(description="robots on wheels are steered by this share of α around those that they hear", le=1)
+        Positive,
+        Meta(
+            description="robots on wheels are steered by this share of α around robots whose poses they receive", le=1
+        ),
     ] = 0.2
-    right: Annotated[NotNegative, Meta(description="share of what is barred that is driven to the right instead")] = 1.0
+    right: Annotated[
+        NotNegative, Meta(description="share of the barred velocity that is driven to the right instead")
+    ] = 1.0
 
     def bounds(self, own: OwnState, near: Nearby, share: Array | float = 1.0) -> tuple[Array, Array]:
         """The half-planes a·u ≤ b that the commanded velocities must obey: unit vectors a (K, 2), b (K,) [m/s].
@@ -81,7 +86,7 @@ class Barrier(Avoidance, frozen=True):
         return -away, np.minimum(np.where(left > 0.0, 0.5 * used, used), used - coming)
 
     def deviate(self, goal: Array, own: OwnState, near: Nearby, period: float) -> Array:
-        """See `Avoidance.deviate`: steers robots that cannot move sideways."""
+        """Steer robots that cannot move sideways."""
         if not len(near):
             return goal
         mine = own.by_twist[near.row]
@@ -100,7 +105,6 @@ class Barrier(Avoidance, frozen=True):
         return steered
 
     def restrain(self, setpoint: Array, own: OwnState, near: Nearby) -> Array:
-        """See `Avoidance.restrain`."""
         if not len(near):
             return setpoint
         twist = own.by_twist[near.row]

@@ -1,8 +1,8 @@
-"""Coordination, the middle level (paper, figure 10): from what was heard of the neighbours to a goal position.
+"""Formation laws, the middle level (paper, figure 10): from the positions of neighbours to a goal position.
 
 A law is a frozen struct of its parameters with `offset` and `error`, found by the entry-point group `zenpark.laws`.
-It may say what it needs of every link (`NEEDS`), and by which gain of the file links without one of their own pull
-(`PULLS_BY`): `check` and the defaults go by that, and a law that says neither takes distances as `distance` does.
+`NEEDS` names the target that it needs of every link, `PULLS_BY` the gain of the file for links without their own:
+`check` and the defaults go by both, and a law without them takes distances as `distance` does.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Gain = Literal["gain", "stiffness", "by link"]
 class Law(Protocol):
     """A formation law."""
 
-    def offset(self, position: Array, heard: Array, links: Links) -> Array:
-        """Offset u^s (N, 3) [m] from `position` (N, 3) and what was `heard` on each link (E, 3)."""
+    def offset(self, position: Array, sender_position: Array, links: Links) -> Array:
+        """Offset u^s (N, 3) [m] from `position` (N, 3) and the position of each link's sender (E, 3) [m]."""
         ...
 
-    def error(self, position: Array, heard: Array, links: Links) -> Array:
+    def error(self, position: Array, sender_position: Array, links: Links) -> Array:
         """Error of each link (E,) [m], not negative."""
         ...
 
@@ -36,25 +36,25 @@ class Law(Protocol):
 class Distance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Formation by distances: the negative gradient of Σ μ/8 (d² − ‖p_i − p_j‖²)² (paper, eq. (6)).
 
-    With a `dead_zone` b a link that is off by s pulls as if it were off by s less b, and not at all below. Two robots
-    that disagree about the length of their link by less than 2b, whether they were given different distances or hold
-    positions of each other that are older than their own, then both find a length at which they rest. Without it they
-    push and pull for ever, which turns the whole formation (Mou, Belabbas, Morse, Sun, Anderson, IEEE TAC 2016).
+    With a `dead_zone` b a link with error s pulls as if its error were s less b, and not at all below. Two robots that
+    disagree about the length of their link by less than 2b, because of different distances or outdated positions of
+    each other, then both find a length at which they rest. Without it they push and pull for ever, which turns the
+    whole formation (Mou, Belabbas, Morse, Sun, Anderson, IEEE TAC 2016).
     """
 
     NEEDS: ClassVar[Need] = "distance"
     PULLS_BY: ClassVar[Gain] = "gain"
 
-    dead_zone: Annotated[NotNegative, Meta(description="errors that are left alone [m]")] = 0.0
+    dead_zone: Annotated[NotNegative, Meta(description="errors up to this are ignored [m]")] = 0.0
 
-    def offset(self, position: Array, heard: Array, links: Links) -> Array:
-        """u_i = ½ Σ_j μ_ij (d_ij² − ‖p_i − p_j‖²)(p_i − p_j), see `Law.offset`."""
-        pull = _by_distance(position[links.receiver] - heard, links, self.dead_zone)
+    def offset(self, position: Array, sender_position: Array, links: Links) -> Array:
+        """u_i = ½ Σ_j μ_ij (d_ij² − ‖p_i − p_j‖²)(p_i − p_j)."""
+        pull = _by_distance(position[links.receiver] - sender_position, links, self.dead_zone)
         return links.sum_by_receiver(pull, len(position))
 
-    def error(self, position: Array, heard: Array, links: Links) -> Array:
-        """|d_ij − ‖p_i − p_j‖|, see `Law.error`."""
-        return np.abs(links.distance - norm(position[links.receiver] - heard))
+    def error(self, position: Array, sender_position: Array, links: Links) -> Array:
+        """|d_ij − ‖p_i − p_j‖|."""
+        return np.abs(links.distance - norm(position[links.receiver] - sender_position))
 
 
 class Displacement(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -67,14 +67,14 @@ class Displacement(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     NEEDS: ClassVar[Need] = "relative"
     PULLS_BY: ClassVar[Gain] = "stiffness"
 
-    def offset(self, position: Array, heard: Array, links: Links) -> Array:
-        """u_i = −Σ_j k_ij (p_i − p_j − d_ij), see `Law.offset`."""
-        pull = _by_relative(position[links.receiver] - heard, links)
+    def offset(self, position: Array, sender_position: Array, links: Links) -> Array:
+        """u_i = −Σ_j k_ij (p_i − p_j − d_ij)."""
+        pull = _by_relative(position[links.receiver] - sender_position, links)
         return links.sum_by_receiver(pull, len(position))
 
-    def error(self, position: Array, heard: Array, links: Links) -> Array:
-        """‖p_i − p_j − d_ij‖, see `Law.error`."""
-        return norm(np.asarray(position[links.receiver] - heard - _given(links.relative, links)))
+    def error(self, position: Array, sender_position: Array, links: Links) -> Array:
+        """‖p_i − p_j − d_ij‖."""
+        return norm(np.asarray(position[links.receiver] - sender_position - _given(links.relative, links)))
 
 
 class Bearing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -88,31 +88,31 @@ class Bearing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     NEEDS: ClassVar[Need] = "bearing"
     PULLS_BY: ClassVar[Gain] = "stiffness"
 
-    def offset(self, position: Array, heard: Array, links: Links) -> Array:
-        """u_i = −Σ_j k_ij (x − max(gᵀx, 0) g) with x = p_i − p_j, see `Law.offset`."""
-        pull = _by_bearing(position[links.receiver] - heard, links)
+    def offset(self, position: Array, sender_position: Array, links: Links) -> Array:
+        """u_i = −Σ_j k_ij (x − max(gᵀx, 0) g) with x = p_i − p_j."""
+        pull = _by_bearing(position[links.receiver] - sender_position, links)
         return links.sum_by_receiver(pull, len(position))
 
-    def error(self, position: Array, heard: Array, links: Links) -> Array:
-        """‖x − max(gᵀx, 0) g‖, see `Law.error`."""
-        return norm(_beside(position[links.receiver] - heard, links))
+    def error(self, position: Array, sender_position: Array, links: Links) -> Array:
+        """‖x − max(gᵀx, 0) g‖."""
+        return norm(_beside(position[links.receiver] - sender_position, links))
 
 
 class Mixed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Each link by what it asks for: a distance, a relative position or a direction.
+    """Each link by its own target: a distance, a relative position or a direction.
 
-    One link with a relative position among distances tells the formation which way to face, and takes away the
-    rotation that distances leave free.
+    One link with a relative position among distances fixes the orientation of the formation, which distances leave
+    free.
     """
 
     NEEDS: ClassVar[Need] = "any"
     PULLS_BY: ClassVar[Gain] = "by link"
 
-    dead_zone: Annotated[NotNegative, Meta(description="errors of distances that are left alone [m]")] = 0.0
+    dead_zone: Annotated[NotNegative, Meta(description="errors of distances up to this are ignored [m]")] = 0.0
 
-    def offset(self, position: Array, heard: Array, links: Links) -> Array:
-        """The sum of what each link's own law has to say, see `Law.offset`."""
-        offset = position[links.receiver] - heard
+    def offset(self, position: Array, sender_position: Array, links: Links) -> Array:
+        """Sum of the laws of each link."""
+        offset = position[links.receiver] - sender_position
         pull = _by_distance(offset, links, self.dead_zone)
         if links.wants is not None:
             other = np.where(
@@ -121,9 +121,9 @@ class Mixed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             pull = np.where((links.wants == BY_DISTANCE)[:, None], pull, other)
         return links.sum_by_receiver(pull, len(position))
 
-    def error(self, position: Array, heard: Array, links: Links) -> Array:
-        """As each link's own law measures it, see `Law.error`."""
-        offset = position[links.receiver] - heard
+    def error(self, position: Array, sender_position: Array, links: Links) -> Array:
+        """Error of each link by its own law."""
+        offset = position[links.receiver] - sender_position
         error = np.abs(links.distance - norm(offset))
         if links.wants is None:
             return error

@@ -1,7 +1,7 @@
-"""Planning, the upper level (paper, figure 10): where a robot should be, as a function of time.
+"""Planners, the upper level (paper, figure 10): target of a robot as a function of time.
 
 A planner is a frozen struct of its parameters with two methods, found by the entry-point group `zenpark.planners`.
-It starts where the robot is (its anchor and heading when the leg begins), so one file serves any start.
+It starts at the robot's place (its anchor and heading when the leg begins), so one file serves any start.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Offset = Annotated[list[float], Meta(min_length=2, max_length=3)]
 
 
 class Planner(Protocol):
-    """Where to be."""
+    """Target as a function of time."""
 
     def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
         """Target position and yaw of rows that began this leg `elapsed` seconds ago.
@@ -38,7 +38,7 @@ class Planner(Protocol):
         ...
 
     def speed(self) -> float:
-        """The largest speed that it asks for [m/s]."""
+        """Largest speed of the target [m/s]."""
         ...
 
 
@@ -56,32 +56,29 @@ def _spatial(values: Sequence[float]) -> Array:
 
 
 class Hold(Parameters, frozen=True):
-    """Stay where the robot is, or stand at `at`, and turn to `yaw` if given."""
+    """Stay in place, or stand at `at`; turn to `yaw` if given."""
 
     at: Annotated[Offset | None, Meta(description="x, y (, z) [m]")] = None
     yaw: Annotated[float | None, Meta(description="[rad]")] = None
 
     def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        """See `Planner.target`."""
         position = anchor.copy()
         if self.at is not None:
             position[:, : len(self.at)] = self.at
         return position, np.full(len(elapsed), np.nan if self.yaw is None else self.yaw)
 
     def speed(self) -> float:
-        """See `Planner.speed`."""
         return 0.0
 
 
 class Line(Parameters, frozen=True):
-    """A straight line from where the robot is, at constant speed, then stay."""
+    """Straight line from the robot's place, at constant speed; then stay."""
 
     move_by: Annotated[Offset, Meta(description="x, y (, z) [m]")]
     speed_: Annotated[Positive, Meta(description="[m/s]")] = msgspec.field(name="speed")
     yaw: Annotated[float | None, Meta(description="at the end [rad]")] = None
 
     def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        """See `Planner.target`."""
         way = _spatial(self.move_by)
         length = math.sqrt(float(way @ way))
         share = np.minimum(elapsed * self.speed_ / length, 1.0) if length else np.ones_like(elapsed)
@@ -91,7 +88,6 @@ class Line(Parameters, frozen=True):
         return anchor + share[:, None] * way, yaw
 
     def speed(self) -> float:
-        """See `Planner.speed`."""
         return self.speed_
 
 
@@ -103,7 +99,6 @@ class Waypoints(Parameters, frozen=True):
     loop: Annotated[bool, Meta(description="from the last point to the first, and again")] = False
 
     def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        """See `Planner.target`."""
         points = np.repeat(anchor[:, None, :], len(self.points), axis=1)  # (R, P, 3): heights left out stay
         for k, point in enumerate(self.points):
             points[:, k, : len(point)] = point
@@ -118,7 +113,6 @@ class Waypoints(Parameters, frozen=True):
         return np.where(on_ring[:, None], _along(ring, rest), _along(route, way)), _any_yaw(len(elapsed))
 
     def speed(self) -> float:
-        """See `Planner.speed`."""
         return self.speed_
 
 
@@ -138,7 +132,7 @@ def _along(route: Array, way: Array) -> Array:
 
 
 class Circle(Parameters, frozen=True):
-    """A circle that starts where the robot is, along its heading, to the left (to the right with a negative radius)."""
+    """Circle from the robot's place, along its heading, to the left (to the right with a negative radius)."""
 
     radius: Annotated[float, Meta(description="[m]")]
     period_s: Annotated[Positive, Meta(description="one turn [s]")]
@@ -149,7 +143,6 @@ class Circle(Parameters, frozen=True):
             raise ValueError("`radius` must be a number other than 0")
 
     def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        """See `Planner.target`."""
         turned = elapsed / self.period_s
         if self.turns is not None:
             turned = np.minimum(turned, self.turns)
@@ -160,18 +153,16 @@ class Circle(Parameters, frozen=True):
         return position, _any_yaw(len(elapsed))
 
     def speed(self) -> float:
-        """See `Planner.speed`."""
         return 2.0 * math.pi * abs(self.radius) / self.period_s
 
 
 class Lemniscate(Parameters, frozen=True):
-    """A figure of eight (Gerono's lemniscate) through where the robot is, leaving along its heading."""
+    """Figure of eight (Gerono's lemniscate) through the robot's place, leaving along its heading."""
 
     size: Annotated[Positive, Meta(description="half its length [m]")]
     period_s: Annotated[Positive, Meta(description="one figure [s]")]
 
     def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        """See `Planner.target`."""
         angle = 2.0 * math.pi * elapsed / self.period_s
         along, across = self.size * np.sin(angle), self.size * np.sin(angle) * np.cos(angle)
         turn = heading - math.pi / 4.0  # the curve leaves its centre at 45 degrees
@@ -181,7 +172,6 @@ class Lemniscate(Parameters, frozen=True):
         return position, _any_yaw(len(elapsed))
 
     def speed(self) -> float:
-        """See `Planner.speed`."""
         return 2.0 * math.pi / self.period_s * self.size * math.sqrt(2.0)
 
 
@@ -194,15 +184,12 @@ class Leg:
 
 
 class Itinerary:
-    """The legs that some rows follow one after the other, and where each began."""
+    """Legs that some rows follow one after the other, and where each began."""
 
     def __init__(self, rows: Index, legs: Sequence[Leg], *, holds_before: bool) -> None:
-        """Rows `rows` (R,) follow `legs` in order of time.
+        """Rows `rows` (R,) follow `legs`, given in order of time; the first may begin later than 0.
 
-        Args:
-            rows: Rows that share these legs.
-            legs: In order of time; the first may begin later than 0.
-            holds_before: Whether the rows stay where they start until the first leg; else they have no target then.
+        With `holds_before` the rows stay at their start until the first leg; else they have no target then.
         """
         self.rows = rows
         first = Leg(0.0, Hold()) if holds_before else None
@@ -240,7 +227,7 @@ class Itinerary:
         return x, y, z, yaw
 
     def _begin(self, number: int, rows: Mask, position: Array, yaw: Array) -> None:
-        """Anchors a leg at the end of the one before, so that tracking errors don't add up, or at the robot."""
+        """Anchor a leg at the end of the one before, so that tracking errors do not add up, or at the robot."""
         anchor, heading = position[rows], yaw[rows].copy()
         if number:
             before = self.legs[number - 1]

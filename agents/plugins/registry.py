@@ -1,7 +1,7 @@
-"""Plug-ins by name: bodies, triggers, laws, planners, avoidances and engines, found through entry points.
+"""Registry of plug-ins: bodies, triggers, laws, planners, avoidances and engines, found through entry points.
 
 A trigger, law, planner, avoidance or engine is a frozen `msgspec.Struct` of its parameters; a body is a function, a
-`agents.body.interface.BodyFactory`. Anybody's distribution may add one, for example under
+`agents.body.interface.BodyFactory`. Any distribution may add one, for example under
 `[project.entry-points."zenpark.triggers"]` in its pyproject.toml.
 """
 
@@ -21,18 +21,18 @@ LAWS: Final = "zenpark.laws"
 PREDICTORS: Final = "zenpark.predictors"
 PLANNERS: Final = "zenpark.planners"
 AVOIDANCES: Final = "zenpark.avoidances"
-ENGINES: Final = "zenpark.engines"  # what moves the twins of a world
-DEVICES: Final = "zenpark.devices"  # protocol twins: what stands in for hardware at the far end of a body's wire
+ENGINES: Final = "zenpark.engines"  # physics of the twins of a world
+DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
 
 
 class _Groups(Protocol):
-    """What `entry_points()` gives, which Python 3.12 has changed."""
+    """Result of `entry_points()`, whose type Python 3.12 changed."""
 
     def select(self, *, group: str) -> EntryPoints: ...
 
 
 class PluginError(ValueError):
-    """A plug-in that is registered but cannot be used."""
+    """A registered plug-in cannot be used."""
 
 
 class UnknownPlugin(PluginError):
@@ -120,7 +120,7 @@ def split(choice: str | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
 
 
 def body_name(address: str) -> str:
-    """The body that an address asks for: `"radio"` of `"radio://0/80/2M"`, `"twin"` of `"twin"`."""
+    """Name of the body in an address: `"radio"` of `"radio://0/80/2M"`, `"twin"` of `"twin"`."""
     return address.partition("://")[0]
 
 
@@ -140,9 +140,9 @@ def _origin(entry: EntryPoint) -> str:
     return f"plug-in {entry.name!r} ({entry.value}) of {distribution}"
 
 
-# What a mistake in a plug-in raises.
+# Exceptions from mistakes in a plug-in.
 FAILURES: Final = (AttributeError, TypeError, ValueError, NameError, LookupError, ArithmeticError)
-# What a stranger's module may raise while it is imported.
+# Exceptions from the import of a foreign module.
 _IMPORT_FAILURES: Final = (
     ImportError, AttributeError, SyntaxError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError
 )  # fmt: skip

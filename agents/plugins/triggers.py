@@ -1,10 +1,9 @@
-"""Triggers: for which rows it is time, to speak (communication) or to compute the law anew (control).
+"""Triggers: decide when a robot transmits (communication) or computes its law anew (control).
 
 A trigger is a frozen struct of its parameters, found by the entry-point group `zenpark.triggers`. It has no state:
-what it must remember stands in rows outside of it, so that one serves a robot, a swarm, or a sweep of swarms. It judges
-a value that somebody holds: for communication the position that the neighbours believe, for control the input that
-the law was last computed from. Here are the seam and the two basic ones; the others are in
-`agents.plugins.trigger_families`.
+its memory stands in rows outside of it, so that one serves a robot, a swarm, or a sweep of swarms. It judges a held
+value: for communication the position that the neighbours believe, for control the input of the last computation of
+the law. This module has the interface and the two basic ones; the others are in `agents.plugins.trigger_families`.
 """
 
 from __future__ import annotations
@@ -29,33 +28,26 @@ ROUNDING_S = 1e-6  # ticks are multiples of a period that binary fractions miss 
 
 @dataclass
 class LastEvent:
-    """What was so at the last event of each row: when it last spoke, or the law was last computed.
+    """State at the last event of each row (N): its last transmission, or the last computation of its law.
 
     Rows without an event have an infinite position and a time of minus infinity.
-
-    Attributes:
-        position: (N, 3) said [m].
-        velocity: (N, 3) said [m/s].
-        time: (N,) of the event [s].
-        offset: (N, 3) of the law [m].
-        energy: (N,) of the formation error [m²].
     """
 
-    position: Array
-    velocity: Array
-    time: Array
-    offset: Array
-    energy: Array
+    position: Array  # (N, 3) transmitted [m]
+    velocity: Array  # (N, 3) transmitted [m/s]
+    time: Array  # (N,) of the event [s]
+    offset: Array  # (N, 3) of the law [m]
+    energy: Array  # (N,) of the formation error [m²]
 
     @classmethod
     def none(cls, rows: int) -> LastEvent:
-        """Before any event."""
+        """State before any event."""
         zeros = np.zeros((rows, 3))
         return cls(np.full((rows, 3), np.inf), zeros, np.full(rows, -np.inf), zeros.copy(), np.zeros(rows))
 
     def record(self, rows: Index, view: View) -> None:
-        """An event of `rows`: remembers what they see."""
-        if len(rows) == len(self.time):  # all of them, as always in a process of one: a copy, without an index
+        """Record an event of `rows` with the values of `view`."""
+        if len(rows) == len(self.time):  # all, as always in a process of one robot: a copy, without an index
             self.position[:], self.velocity[:], self.time[:] = view.position, view.velocity, view.t
             self.offset[:], self.energy[:] = view.offset, view.energy
             return
@@ -64,18 +56,16 @@ class LastEvent:
 
 
 class View:
-    """What a trigger may look at, in rows; what costs something is computed when it is looked at.
+    """Quantities that a trigger may use, in rows (N); the costly ones are computed on first use."""
 
-    Attributes:
-        t: Now [s].
-        position: (N, 3) own [m]; for communication what would be said, smoothed if that is asked for.
-        velocity: (N, 3) own [m/s].
-        last_event: The last event of each row.
-        error: (N,) Σ|e| of its links, as the row itself sees them [m].
-        energy: (N,) edge potential Σ ½e² of its links [m²].
-        start: (N,) when each row began, or will [s].
-        predictor: How neighbours carry on what they were told.
-    """
+    t: float  # now [s]
+    position: Array  # (N, 3) own [m]; for communication the pose to transmit, smoothed if asked for
+    velocity: Array  # (N, 3) own [m/s]
+    last_event: LastEvent  # of each row
+    error: Array  # (N,) Σ|e| of its links, as the row itself knows them [m]
+    energy: Array  # (N,) edge potential Σ ½e² of its links [m²]
+    start: Array  # (N,) start of each row in the experiment [s]
+    predictor: Predictor  # of the neighbours
 
     def __init__(
         self,
@@ -106,12 +96,12 @@ class View:
 
     @property
     def offset(self) -> Array:
-        """(N, 3) u of the law [m]: as it was last decided, for control as it would be now."""
+        """(N, 3) u of the law [m]: of the last decision; for control, as it would be now."""
         return self._offset
 
     @cached_property
     def believed(self) -> Array:
-        """(N, 3) where the neighbours believe each row to be [m]; infinite before it first spoke."""
+        """(N, 3) position that the neighbours believe [m]; infinite before the first transmission."""
         if self.predictor is HOLD:
             return self.last_event.position
         age = np.where(np.isinf(self.last_event.time), 0.0, self.since_event)
@@ -119,53 +109,55 @@ class View:
 
     @cached_property
     def deviation(self) -> Array:
-        """(N,) ‖ε‖: how far what is held is from what is [m]."""
+        """(N,) ‖ε‖: distance of the held value from the true one [m]."""
         return norm(self.position - self.believed)
 
     @property
     def drift(self) -> Array:
-        """(N,) how fast ε began to grow after the last event, as was known then [m/s]."""
-        told = self.last_event.velocity
-        return norm(told - self.predictor.velocity(told, np.zeros(len(told))))
+        """(N,) rate at which ε began to grow after the last event, as known then [m/s]."""
+        velocity = self.last_event.velocity
+        return norm(velocity - self.predictor.velocity(velocity, np.zeros(len(velocity))))
 
     @property
     def reach_s(self) -> float:
-        """For how long after an event `drift` stays what it was [s], if nobody changes speed."""
+        """Time after an event for which `drift` holds at constant speed [s]."""
         return self.predictor.reach_s
 
 
 class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Parameters that every trigger has, and the question that each answers in its own way.
+    """Base of all triggers, with the parameters that every one has.
 
-    Class attributes of a kind of trigger: `places` where it makes sense, the `prediction` that it needs (an experiment
-    that names none gets it), and whether it `judges_errors` of the formation, which a robot that is guided by a centre
-    does not know: for it they are 0.
+    Class attributes of a kind of trigger: `places` where it makes sense, the `prediction` that it needs (the default of
+    an experiment that names none), and `judges_errors`: it uses errors of the formation, which are 0 for robots that
+    the central controller guides.
     """
 
     places: ClassVar[tuple[Place, ...]] = ("communication", "control")
     prediction: ClassVar[str] = "hold"
     judges_errors: ClassVar[bool] = False
 
-    minimum_interval_s: Annotated[NotNegative, Meta(description="never sooner after the last event [s]")] = 0.0
-    maximum_silence_s: Annotated[Positive | None, Meta(description="at the latest so long after it [s]")] = None
+    minimum_interval_s: Annotated[NotNegative, Meta(description="shortest time between two events [s]")] = 0.0
+    maximum_silence_s: Annotated[
+        Positive | None, Meta(description="longest time between two events [s]; left out: unlimited")
+    ] = None
     evaluate_every_s: Annotated[
         Positive | None,
-        Meta(description="its condition is looked at this often [s]; left out: as often as it is asked"),
+        Meta(description="period of the condition's evaluation [s]; left out: at every question"),
     ] = None
     smoothing_s: Annotated[
-        NotNegative, Meta(description="time constant of the low-pass on what is said and judged [s]; 0: none")
+        NotNegative, Meta(description="time constant of the low-pass on transmitted and judged poses [s]; 0: none")
     ] = 0.0
 
     def memory(self, rows: int) -> Array:
-        """What it remembers of each row, at the beginning: (N, k)."""
+        """Initial memory of each row (N, k)."""
         return np.zeros((rows, 0))
 
     def fires(self, view: View, memory: Array) -> Mask:
-        """For which rows (N,) its condition holds; `memory` (N, k) is updated in place."""
-        raise TypeError(f"{type(self).__name__} must say when it fires")
+        """Rows (N,) whose condition holds; `memory` (N, k) is updated in place."""
+        raise TypeError(f"{type(self).__name__} must define `fires`")
 
     def state(self, rows: int) -> Array:
-        """What must be kept from one question to the next (N, 1 + k): when it was last evaluated, and its memory."""
+        """Initial state from one question to the next (N, 1 + k): time of the last evaluation, and memory."""
         return np.concatenate([np.full((rows, 1), -np.inf), self.memory(rows)], axis=1)
 
     def due(self, view: View, state: Array) -> Index:
@@ -198,7 +190,7 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         before = state.copy()
         fired = self.fires(view, state[:, 1:])
         state[:, 0] = view.t
-        state[~ripe] = before[~ripe]  # rows that nobody looked at remember what they did
+        state[~ripe] = before[~ripe]  # rows that were not evaluated keep their memory
         return fired & ripe
 
 
@@ -208,12 +200,11 @@ class Periodic(Trigger, frozen=True):
     period_s: Annotated[Positive, Meta(description="T [s]")] = 0.02
 
     def fires(self, view: View, memory: Array) -> Mask:
-        """See `Trigger.fires`."""
         return view.since_event >= self.period_s - ROUNDING_S
 
 
 class SendOnDelta(Trigger, frozen=True):
-    """‖ε‖ > δ: what is held is off by more than a threshold.
+    """‖ε‖ > δ: the held value is off by more than a threshold.
 
     M. Miskowicz, "Send-On-Delta Concept: An Event-Based Data Reporting Strategy", Sensors 6(1), 2006, 49–63; here on
     the distance of positions. Case 2 of the paper's experiment, with δ = 1 cm.
@@ -222,5 +213,4 @@ class SendOnDelta(Trigger, frozen=True):
     threshold: Annotated[Positive, Meta(description="δ [m]")] = 0.01
 
     def fires(self, view: View, memory: Array) -> Mask:
-        """See `Trigger.fires`."""
         return view.deviation > self.threshold

@@ -34,7 +34,7 @@ def test_the_pull_is_a_gradient(seed):
     position, anchors = some(seed)
 
     def potential(place):
-        square = (anchors.away(place) ** 2).sum(axis=1)
+        square = (anchors.displacement(place) ** 2).sum(axis=1)
         ring = anchors.gain / 8.0 * (anchors.distance**2 - square) ** 2
         return np.where(anchors.distance > 0.0, ring, anchors.gain / 2.0 * square).sum()
 
@@ -48,7 +48,7 @@ def test_a_row_gets_what_it_gets_alone_and_in_every_copy(seed):
     whole = anchors.offset(position)
     for row in range(len(position)):
         rows = np.array([row])
-        np.testing.assert_array_equal(anchors.of(rows).offset(position[rows])[0], whole[row])
+        np.testing.assert_array_equal(anchors.of_rows(rows).offset(position[rows])[0], whole[row])
     twice = anchors.repeated(2, len(position)).offset(np.tile(position, (2, 1)))
     np.testing.assert_array_equal(twice, np.tile(whole, (2, 1)))
 

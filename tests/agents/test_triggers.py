@@ -166,7 +166,7 @@ def test_periodic_counts_are_exact_however_long_it_runs(period, hz, begin_s, len
 
 
 def test_a_trigger_must_say_when_it_fires():
-    with pytest.raises(TypeError, match="Trigger must say when it fires"):
+    with pytest.raises(TypeError, match="Trigger must define `fires`"):
         Trigger().due(view([[0.0] * 3], LastEvent.none(1)), Trigger().state(1))
 
 

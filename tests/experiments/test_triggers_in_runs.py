@@ -135,7 +135,7 @@ def test_belief_error_is_that_of_the_prediction(flown):
     found = signals.beliefs(trace, net)
     listener, speaker, heard, ends = net.receiver, net.sender, trace.received, trace.plan.heard_links
     for link in np.flatnonzero(speaker > 0)[::5]:  # the leader stands, and says nothing after the start
-        asked = (ends.listener == listener[link]) & (ends.speaker == speaker[link])
+        asked = (ends.receiver == listener[link]) & (ends.sender == speaker[link])
         mine = np.flatnonzero(asked[heard.link])
         for k in (150, 300, 399):
             last = mine[heard.arrival[mine] <= trace.time[k]][-1]
