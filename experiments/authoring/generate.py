@@ -39,23 +39,14 @@ WOBBLE: Final = "# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s
 
 @dataclass(frozen=True)
 class Wanted:
-    """What may be chosen of a generated experiment.
+    """What may be chosen of a generated experiment."""
 
-    Attributes:
-        kind: Of all robots.
-        spacing: Between neighbours [m].
-        scatter: Of the starts [m]; None for as much as keeps neighbours apart.
-        seed: Of the file, and of what is drawn while the formation is built.
-        duration_s: [s].
-        law: distance, or displacement, which finds the shape from any starts.
-    """
-
-    kind: str = "crazyflie"
-    spacing: float = 0.6
-    scatter: float | None = None
-    seed: int = 1
-    duration_s: float = 60.0
-    law: str = "distance"
+    kind: str = "crazyflie"  # of all robots
+    spacing: float = 0.6  # between neighbours [m]
+    scatter: float | None = None  # of the starts [m]; None for as much as keeps neighbours apart
+    seed: int = 1  # of the file, and of what is drawn while the formation is built
+    duration_s: float = 60.0  # [s]
+    law: str = "distance"  # distance, or displacement, which finds the shape from any starts
 
 
 def layout(what: str, size: str, wanted: Wanted, jumps: Sequence[int] = (1, 2)) -> Layout:

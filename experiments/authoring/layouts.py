@@ -27,17 +27,11 @@ class LayoutError(ValueError):
 
 @dataclass(frozen=True)
 class Layout:
-    """A shape and its links.
+    """A shape and its links."""
 
-    Attributes:
-        title: What it is, for people.
-        position: (N, 3) [m], centred on the origin; z is the height that a flying robot holds, 0 where any will do.
-        pairs: (M, 2) who hears whom, both ways, smaller row first.
-    """
-
-    title: str
-    position: Array
-    pairs: Index
+    title: str  # what it is, for people
+    position: Array  # (N, 3) [m], centred on the origin; z is the height that a flying robot holds, 0 where any will do
+    pairs: Index  # (M, 2) who hears whom, both ways, smaller row first
 
     def __len__(self) -> int:
         return len(self.position)

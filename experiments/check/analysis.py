@@ -46,48 +46,29 @@ GUESSES: Final = 400  # random places of robots from which a shape is sought: ea
 
 @dataclass(frozen=True)
 class Analysis:
-    """The numbers of one case.
+    """The numbers of one case."""
 
-    Attributes:
-        plan: The case, compiled.
-        assignment: Of all its robots; without avoidance, and without the links that only avoidance needs.
-        silent: Rows that hear nobody.
-        start: (N, 3) on the floor [m].
-        parts: Of the network.
-        fiedler: Algebraic connectivity.
-        asked: The links of the beginning, with what the law takes them to ask for.
-        standing: (E,) those that are there at the beginning, however far the robots are from each other.
-        shapes: Places that were tried for the last stage of the formation, the best of which is to be its end.
-        shape: The best for the beginning; None if no link stands then.
-        later: The best after each change.
-        planar: Rigidity with heights held.
-        spatial: Rigidity in full space.
-        spare: What the formation can lose and stay rigid, of the pairs `edges(...)` of the links that stand at the
-            beginning; None if it is not rigid, if its links ask for more than distances, or if it has too many robots.
-        modes: Of the sampled loop at the shape.
-        prediction: The motion.
-        error: (T, E) of each link along it [m]; 0 while it is not there.
-        scene: What stands in the arena.
-    """
-
-    plan: Plan
-    assignment: Assignment
-    silent: Index
-    start: Array
-    parts: int
-    fiedler: float
-    asked: Links
-    standing: Mask
+    plan: Plan  # the case, compiled
+    assignment: Assignment  # of all its robots; without avoidance, and without the links that only avoidance needs
+    silent: Index  # rows that hear nobody
+    start: Array  # (N, 3) on the floor [m]
+    parts: int  # of the network
+    fiedler: float  # algebraic connectivity
+    asked: Links  # the links of the beginning, with what the law takes them to ask for
+    standing: Mask  # (E,) those that are there at the beginning, however far the robots are from each other
+    # places that were tried for the last stage of the formation, the best of which is to be its end
     shapes: tuple[Shape, ...]
-    shape: Shape | None
-    later: tuple[Shape, ...]
-    planar: Rigidity | None
-    spatial: Rigidity | None
+    shape: Shape | None  # the best for the beginning; None if no link stands then
+    later: tuple[Shape, ...]  # the best after each change
+    planar: Rigidity | None  # rigidity with heights held
+    spatial: Rigidity | None  # rigidity in full space
+    # what the formation can lose and stay rigid, of the pairs `edges(...)` of the links that stand at the beginning;
+    # None if it is not rigid, if its links ask for more than distances, or if it has too many robots
     spare: Redundancy | None
-    modes: Modes | None
-    prediction: Prediction
-    error: Array
-    scene: Scene
+    modes: Modes | None  # of the sampled loop at the shape
+    prediction: Prediction  # the motion
+    error: Array  # (T, E) of each link along it [m]; 0 while it is not there
+    scene: Scene  # what stands in the arena
 
     @property
     def experiment(self) -> Experiment:

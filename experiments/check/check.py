@@ -36,22 +36,15 @@ ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """What is to be said of an experiment.
+    """What is to be said of an experiment."""
 
-    Attributes:
-        severity: Of an error, the experiment cannot work; of a warning, it may not do what was meant; a note is good
-            news, or explains.
-        code: One word for programs.
-        message: What it is, with numbers.
-        remedy: What to change; empty for notes.
-        where: file:line:column, or the `--set` at fault; empty where it concerns the whole.
-    """
-
+    # of an error, the experiment cannot work; of a warning, it may not do what was meant; a note is good news, or
+    # explains
     severity: Severity
-    code: str
-    message: str
-    remedy: str
-    where: str
+    code: str  # one word for programs
+    message: str  # what it is, with numbers
+    remedy: str  # what to change; empty for notes
+    where: str  # file:line:column, or the `--set` at fault; empty where it concerns the whole
 
     def __str__(self) -> str:
         """As a line for people."""
@@ -95,71 +88,38 @@ SUBJECTS: Final = (
 
 
 class Figures(msgspec.Struct, frozen=True, kw_only=True):
-    """The numbers of one case; None where they have no meaning, as those of a formation without links.
+    """The numbers of one case; None where they have no meaning, as those of a formation without links."""
 
-    Attributes:
-        robots: How many.
-        arena: Its size, x, y, z [m].
-        obstacles: What each is, by name.
-        links: Directed ones.
-        edges: Pairs that are linked, directions ignored.
-        parts: Of the network.
-        leaders: Names.
-        algebraic_connectivity: Of the network without directions.
-        rank: Of the rigidity matrix when heights are held, `rank_needed` for a rigid formation.
-        rank_needed: See `rank`.
-        rank_space: The same in full space.
-        rank_space_needed: See `rank_space`.
-        smallest_singular: Of the rigidity matrix when heights are held, rigid motions left out [m].
-        smallest_eigenvalue: Its square [m²].
-        spare_links: Pairs without any one of which the formation stays rigid; None where that has no meaning.
-        vital_links: The other pairs.
-        spare_robots: Robots without any one of which it stays rigid.
-        vital_robots: The other robots.
-        residual_mm: Worst link of the best shape.
-        loop_gain: h·μ·λ_max; 2 is where the formation hunts.
-        slowest_mode_s: Time constant of the slowest mode that moves.
-        free_modes: Modes that are slower than the run: nothing brings them back in time.
-        speed_needed: Of the fastest plan [m/s].
-        speed_available: Of the slowest follower [m/s].
-        acquired_s: When the formation keeps within the tolerance, before any plan begins.
-        end_error_mm: Worst link at the end.
-        end: Where each robot is expected to end [m].
-        end_inside: Whether all of them are inside the arena then.
-        messages_hz: Poses that all robots send in a second, estimated.
-        predicted_s: How much of the run was predicted.
-    """
-
-    robots: int
-    arena: tuple[float, float, float]
-    obstacles: dict[str, str]
-    links: int
-    edges: int
-    parts: int
-    leaders: tuple[str, ...]
-    algebraic_connectivity: float
-    rank: int | None
-    rank_needed: int | None
-    rank_space: int | None
-    rank_space_needed: int | None
-    smallest_singular: float | None
-    smallest_eigenvalue: float | None
-    spare_links: int | None
-    vital_links: tuple[str, ...]
-    spare_robots: int | None
-    vital_robots: tuple[str, ...]
-    residual_mm: float | None
-    loop_gain: float | None
-    slowest_mode_s: float | None
-    free_modes: int
-    speed_needed: float | None
-    speed_available: float | None
-    acquired_s: float | None
-    end_error_mm: float | None
-    end: dict[str, tuple[float, float, float]]
-    end_inside: bool
-    messages_hz: float
-    predicted_s: float
+    robots: int  # how many
+    arena: tuple[float, float, float]  # its size, x, y, z [m]
+    obstacles: dict[str, str]  # what each is, by name
+    links: int  # directed ones
+    edges: int  # pairs that are linked, directions ignored
+    parts: int  # of the network
+    leaders: tuple[str, ...]  # names
+    algebraic_connectivity: float  # of the network without directions
+    rank: int | None  # of the rigidity matrix when heights are held, `rank_needed` for a rigid formation
+    rank_needed: int | None  # see `rank`
+    rank_space: int | None  # the same in full space
+    rank_space_needed: int | None  # see `rank_space`
+    smallest_singular: float | None  # of the rigidity matrix when heights are held, rigid motions left out [m]
+    smallest_eigenvalue: float | None  # its square [m²]
+    spare_links: int | None  # pairs without any one of which the formation stays rigid; None where that has no meaning
+    vital_links: tuple[str, ...]  # the other pairs
+    spare_robots: int | None  # robots without any one of which it stays rigid
+    vital_robots: tuple[str, ...]  # the other robots
+    residual_mm: float | None  # worst link of the best shape
+    loop_gain: float | None  # h·μ·λ_max; 2 is where the formation hunts
+    slowest_mode_s: float | None  # time constant of the slowest mode that moves
+    free_modes: int  # modes that are slower than the run: nothing brings them back in time
+    speed_needed: float | None  # of the fastest plan [m/s]
+    speed_available: float | None  # of the slowest follower [m/s]
+    acquired_s: float | None  # when the formation keeps within the tolerance, before any plan begins
+    end_error_mm: float | None  # worst link at the end
+    end: dict[str, tuple[float, float, float]]  # where each robot is expected to end [m]
+    end_inside: bool  # whether all of them are inside the arena then
+    messages_hz: float  # poses that all robots send in a second, estimated
+    predicted_s: float  # how much of the run was predicted
 
 
 def check(given: Document, settings: Sequence[str] = ()) -> list[Finding]:

@@ -40,19 +40,12 @@ PAIRS: Final = 1_000_000  # distances that are held in memory at once
 
 @dataclass(frozen=True)
 class Prediction:
-    """Where the robots are at each decision.
+    """Where the robots are at each decision."""
 
-    Attributes:
-        time: (T,) [s] after the common start.
-        position: (T, N, 3) [m].
-        incidents: What is wrong with robots on the way.
-        stuck: Why they do not get under way at all; empty if they do. They stay at their starts then.
-    """
-
-    time: Array
-    position: Array
-    incidents: tuple[Incident, ...] = ()
-    stuck: str = ""
+    time: Array  # (T,) [s] after the common start
+    position: Array  # (T, N, 3) [m]
+    incidents: tuple[Incident, ...] = ()  # what is wrong with robots on the way
+    stuck: str = ""  # why they do not get under way at all; empty if they do. They stay at their starts then.
 
 
 def closed(kinds: Sequence[Kind], hz: float) -> Array:

@@ -21,19 +21,12 @@ TINY: Final = 1e-18  # [m²] no length is zero
 
 @dataclass(frozen=True)
 class Residuals:
-    """Equations (M) of links and anchors.
+    """Equations (M) of links and anchors."""
 
-    Attributes:
-        value: (M,) how far each is off [m].
-        tail: (M,) row i.
-        head: (M,) row j, −1 for anchors.
-        slope: (M, 2) derivative of the value by x and y of row i; that by row j is its negative.
-    """
-
-    value: Array
-    tail: Index
-    head: Index
-    slope: Array
+    value: Array  # (M,) how far each is off [m]
+    tail: Index  # (M,) row i
+    head: Index  # (M,) row j, −1 for anchors
+    slope: Array  # (M, 2) derivative of the value by x and y of row i; that by row j is its negative
 
     def jacobian(self, rows: Index, count: int) -> Array:
         """Derivatives (M, 2 R) of all values by x and y of `rows` (R,), of `count` robots."""
@@ -141,17 +134,11 @@ POINT = 1e-6  # [m] robots that are nearer than this to each other stand in one 
 
 @dataclass(frozen=True)
 class Shape:
-    """A place for every robot that meets the distances as well as they can be met.
+    """A place for every robot that meets the distances as well as they can be met."""
 
-    Attributes:
-        position: (N, 3) [m].
-        error: (E,) of each link as its law measures it, |‖p_i − p_j‖ − d_ij| for distances [m].
-        anchored: (A,) of each anchor [m].
-    """
-
-    position: Array
-    error: Array
-    anchored: Array = field(default_factory=lambda: np.zeros(0))
+    position: Array  # (N, 3) [m]
+    error: Array  # (E,) of each link as its law measures it, |‖p_i − p_j‖ − d_ij| for distances [m]
+    anchored: Array = field(default_factory=lambda: np.zeros(0))  # (A,) of each anchor [m]
 
     @property
     def worst(self) -> float:
@@ -234,17 +221,12 @@ def _fitted(links: Links, anchors: Anchors | None, guess: Array, rows: Index) ->
 
 @dataclass(frozen=True)
 class Conflict:
-    """Distances that contradict one another whatever the rest of the formation does.
+    """Distances that contradict one another whatever the rest of the formation does."""
 
-    Attributes:
-        rows: Two robots whose heights alone are farther apart than they should be, or the three of a triangle.
-        ceiling: Height of the higher ones at which they would just be met [m]; NaN where no height would do.
-        high: The rows of the higher ones.
-    """
-
+    # two robots whose heights alone are farther apart than they should be, or the three of a triangle
     rows: tuple[int, ...]
-    ceiling: float
-    high: tuple[int, ...]
+    ceiling: float  # height of the higher ones at which they would just be met [m]; NaN where no height would do
+    high: tuple[int, ...]  # the rows of the higher ones
 
 
 def conflicts(links: Links, height: Array) -> list[Conflict]:
@@ -287,17 +269,11 @@ def _of_triangle(triangle: tuple[int, ...], wanted: Array, height: Array) -> Con
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Relative positions that do not add up: around `rows`, each linked to the next and the last to the first.
+    """Relative positions that do not add up: around `rows`, each linked to the next and the last to the first."""
 
-    Attributes:
-        rows: Two robots of which each asks for something else, or more around a ring.
-        link: The one that closes the ring.
-        gap: How far its ends miss each other [m].
-    """
-
-    rows: tuple[int, ...]
-    link: int
-    gap: float
+    rows: tuple[int, ...]  # two robots of which each asks for something else, or more around a ring
+    link: int  # the one that closes the ring
+    gap: float  # how far its ends miss each other [m]
 
 
 def contradictions(links: Links) -> list[Contradiction]:

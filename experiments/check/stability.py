@@ -21,18 +21,12 @@ EVEN: Final = 1e-9  # of the fastest: a loop that is symmetric but for this has 
 
 @dataclass(frozen=True)
 class Modes:
-    """The sampled loop near its target.
+    """The sampled loop near its target."""
 
-    Attributes:
-        gain: Largest real part of the eigenvalues of H M, what a decision takes from a mode; 2 is where it hunts.
-        radius: Largest |1 − λ|: above 1 something grows.
-        slowest_s: Time constant of the slowest mode that moves [s]; infinity where none does.
-        free: Modes that decay more slowly than was asked for, or not at all: in that time nothing brings them back.
-    """
-
-    gain: float
-    radius: float
-    slowest_s: float
+    gain: float  # largest real part of the eigenvalues of H M, what a decision takes from a mode; 2 is where it hunts
+    radius: float  # largest |1 − λ|: above 1 something grows
+    slowest_s: float  # time constant of the slowest mode that moves [s]; infinity where none does
+    # modes that decay more slowly than was asked for, or not at all: in that time nothing brings them back
     free: int = 0
 
 

@@ -23,17 +23,11 @@ AT_ONCE: Final = 200_000  # errors of links that are held in memory at once
 
 @dataclass(frozen=True)
 class FormationArrays:
-    """The links that there may be, with their targets of the beginning; what becomes of them, and when they are there.
+    """Every possible link with its first target, the changes of the targets, and the times of presence."""
 
-    Attributes:
-        links: (E), sorted by listener, then speaker.
-        changes: Of their targets, in order of time.
-        presence: When they are there; None if always.
-    """
-
-    links: Links
-    changes: tuple[Change, ...]
-    presence: Presence | None
+    links: Links  # (E), sorted by listener, then speaker
+    changes: tuple[Change, ...]  # of their targets, in order of time
+    presence: Presence | None  # when they are there; None if always
 
     @classmethod
     def compiled(cls, experiment: Experiment, there: Sequence[OneWay]) -> FormationArrays:

@@ -30,29 +30,17 @@ class LinkTarget:
 
 @dataclass(frozen=True)
 class OneWay:
-    """A one-way link: who listens to whom, for what, with which gain, and when.
+    """A one-way link: who listens to whom, for what, with which gain, and when."""
 
-    Attributes:
-        listener: Name.
-        speaker: Name.
-        wanted: What it asks for.
-        gain: Of the law.
-        since: From when on [s].
-        until: Until when [s], infinity to the end.
-        reach: Nearer than this it is there [m], infinity always.
-        release: Farther than this it is there no more [m].
-        text: As the file writes it; empty for links by proximity only.
-    """
-
-    listener: str
-    speaker: str
-    wanted: LinkTarget
-    gain: float
-    since: float = 0.0
-    until: float = math.inf
-    reach: float = math.inf
-    release: float = math.inf
-    text: str = ""
+    listener: str  # name
+    speaker: str  # name
+    wanted: LinkTarget  # what it asks for
+    gain: float  # of the law
+    since: float = 0.0  # from when on [s]
+    until: float = math.inf  # until when [s], infinity to the end
+    reach: float = math.inf  # nearer than this it is there [m], infinity always
+    release: float = math.inf  # farther than this it is there no more [m]
+    text: str = ""  # as the file writes it; empty for links by proximity only
 
 
 def pairs(text: str) -> tuple[tuple[str, str], ...]:

@@ -38,19 +38,12 @@ class _Whole(Part, frozen=True):
 
 @dataclass(frozen=True)
 class ArenaFile:
-    """An arena file that holds no error.
+    """An arena file that holds no error."""
 
-    Attributes:
-        name: As the experiment names it.
-        label: As its errors name it.
-        text: As it stands there.
-        table: Its [arena].
-    """
-
-    name: str
-    label: str
-    text: str
-    table: dict[str, Any]
+    name: str  # as the experiment names it
+    label: str  # as its errors name it
+    text: str  # as it stands there
+    table: dict[str, Any]  # its [arena]
 
     @cached_property
     def places(self) -> dict[Keys, Place]:

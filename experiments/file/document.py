@@ -34,20 +34,14 @@ _ABOVE: Final = (("arena",), ("arena", "file"))  # changes after which the arena
 
 @dataclass(frozen=True)
 class Document:
-    """An experiment file that holds no error.
+    """An experiment file that holds no error."""
 
-    Attributes:
-        path: The file that was read.
-        text: As it stands there.
-        experiment: What it says, before any case changes it; `--set` is in it. Its arena is complete, whatever file it
-            begins with.
-        arenas: The arena file of each case that has one; of the file without cases under the empty name.
-    """
-
-    path: Path
-    text: str
+    path: Path  # the file that was read
+    text: str  # as it stands there
+    # what it says, before any case changes it; `--set` is in it. Its arena is complete, whatever file it begins with.
     experiment: Experiment
     resolved: Mapping[str, Experiment]
+    # the arena file of each case that has one; of the file without cases under the empty name
     arenas: Mapping[str, ArenaFile] = field(default_factory=dict)
 
     def cases(self) -> dict[str, Experiment]:

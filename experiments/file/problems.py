@@ -160,40 +160,24 @@ MOST = 20  # problems that are told at once
 
 @dataclass(frozen=True)
 class Fault:
-    """Something wrong at a path of the document, not yet located in the text.
+    """Something wrong at a path of the document, not yet located in the text."""
 
-    Attributes:
-        path: Keys and list indices from the top of the document.
-        message: What is wrong.
-        hint: What to do.
-        on_key: The key itself is wrong, not its value.
-    """
-
-    path: Path
-    message: str
-    hint: str = ""
-    on_key: bool = False
+    path: Path  # keys and list indices from the top of the document
+    message: str  # what is wrong
+    hint: str = ""  # what to do
+    on_key: bool = False  # the key itself is wrong, not its value
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Something wrong at a place. Line and column are 1-based, 0 where there is no text to point into.
+    """Something wrong at a place. Line and column are 1-based, 0 where there is no text to point into."""
 
-    Attributes:
-        file: As the user named it; or the command-line flag that is at fault.
-        line: Line number.
-        column: In characters.
-        message: What is wrong.
-        hint: What to do.
-        source: The line of text.
-    """
-
-    file: str
-    line: int
-    column: int
-    message: str
-    hint: str = ""
-    source: str = ""
+    file: str  # as the user named it; or the command-line flag that is at fault
+    line: int  # line number
+    column: int  # in characters
+    message: str  # what is wrong
+    hint: str = ""  # what to do
+    source: str = ""  # the line of text
 
     def __str__(self) -> str:
         place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
