@@ -14,7 +14,7 @@ import numpy as np
 
 from agents.plugins import registry
 from experiments.definition.experiment import Experiment, Formation, Link, Robot, Start
-from experiments.definition.formation import errors
+from experiments.definition.formation import errors_over_time
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.metrics.signals import net_rotation
@@ -58,7 +58,7 @@ def measured(name: str, experiment: Experiment) -> Row:
     for copy in range(len(SEEDS)):
         position = log.true_position[late, copy * rows : (copy + 1) * rows]
         rate.append(1e3 * (net_rotation(position[:, follow], time) or 0.0))
-        error.append(1e3 * float(errors(law, pattern, time, position).mean()))
+        error.append(1e3 * float(errors_over_time(law, pattern, time, position).mean()))
     return Row(name, rate, float(np.mean(error)), len(log.sent[0]) / len(SEEDS))
 
 

@@ -134,7 +134,7 @@ def simulate_seeds(
     _refuse_too_much(read.experiment, len(seeds))
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     for name, experiment in chosen(read, cases).items():
-        experiment = standby.taking_part(experiment)  # noqa: PLW2901
+        experiment = standby.without_standby(experiment)  # noqa: PLW2901
         log = simulation.simulate(experiment, seeds, tell=partial(_pass_on, tell, name, experiment.duration_s))
         _pass_on(tell, name, experiment.duration_s, math.inf)
         for copy in range(len(seeds)):

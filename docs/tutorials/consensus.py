@@ -18,7 +18,7 @@ from agents.arrays import Array
 from agents.body.kinds import CRAZYFLIE
 from agents.formation.graph import components, laplacian, links
 from experiments.check.check import check, figures
-from experiments.check.ideal_run import closed
+from experiments.check.ideal_run import closed_shares
 from experiments.check.realisation import algebraic_connectivity
 from experiments.file.document import Document, loads
 from experiments.recording.trace import Trace
@@ -244,7 +244,7 @@ assert np.all(np.abs(off) < 0.10)
 # %%
 HZ = 10.0  # decisions in a second
 BODY_HZ = 100.0  # steps of the position controller
-h = float(closed([CRAZYFLIE], HZ)[0])
+h = float(closed_shares([CRAZYFLIE], HZ)[0])
 
 
 def sampled_rate(taken: float) -> float:

@@ -18,7 +18,7 @@ from agents.arrays import Array, Mask, norm
 from agents.body.kinds import CRAZYFLIE
 from agents.formation.rigidity import rigid_motions, rigidity, rigidity_matrix
 from experiments.check.check import check, figures
-from experiments.check.ideal_run import closed
+from experiments.check.ideal_run import closed_shares
 from experiments.file.document import Document, load, loads
 from experiments.report.style import CASES, MAGENTA, WIDTH, styled
 from experiments.run import folder, show, simulate
@@ -325,7 +325,7 @@ for rise in SLACK:
 
 assert eigenvalue == sorted(eigenvalue, reverse=True)
 HZ = 10.0  # decisions in a second
-h = float(closed([CRAZYFLIE], HZ)[0])
+h = float(closed_shares([CRAZYFLIE], HZ)[0])
 assert np.allclose(slowest[2:], 1.0 / (HZ * h * GAIN * np.array(eigenvalue[2:])), rtol=0.05)
 faster = 1.0 - np.array(constant) / np.array(slowest)
 assert np.all(faster > 0.0)

@@ -19,7 +19,7 @@ from agents.formation.rigidity import Redundancy, Rigidity
 from agents.plugins.laws import Law
 from agents.plugins.planners import Planner
 from experiments.check.findings import FORGIVEN
-from experiments.check.ideal_run import Prediction, closed
+from experiments.check.ideal_run import Prediction, closed_shares
 from experiments.check.realisation import (
     Shape,
     algebraic_connectivity,
@@ -32,8 +32,8 @@ from experiments.check.realisation import (
 from experiments.check.stability import Modes, modes
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
-from experiments.definition.formation import FormationArrays, errors
-from experiments.definition.links import pairs
+from experiments.definition.formation import FormationArrays, errors_over_time
+from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
 from experiments.file.problems import Path
 from experiments.metrics.measure import WINDOW_S
@@ -97,7 +97,7 @@ class Analysis:
     def pull(self) -> Array:
         """(N,) the speed at which each robot follows a goal that is a full clamp away [m/s]."""
         hz = self.experiment.rates.coordination_hz
-        return np.minimum(self.speed, closed(self.assignment.kinds, hz) * self.assignment.clamp * hz)
+        return np.minimum(self.speed, closed_shares(self.assignment.kinds, hz) * self.assignment.clamp * hz)
 
     @property
     def legs(self) -> list[tuple[int, str, Planner]]:
@@ -173,9 +173,9 @@ class Analysis:
     def link_path(self, number: int) -> Path:
         """Where a link stands in the file."""
         wanted = self.assignment.links.receiver[number], self.assignment.links.sender[number]
-        wanted_names = tuple(self.names[row] for row in wanted)
+        ends = tuple(self.names[row] for row in wanted)
         return next(
-            (("formation", "links", text) for text in self.experiment.formation.links if wanted_names in pairs(text)),
+            (("formation", "links", text) for text in self.experiment.formation.links if ends in link_pairs(text)),
             ("formation", "links"),
         )
 
@@ -187,7 +187,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     bare = Plan(msgspec.structs.replace(experiment, avoidance=None, architecture="distributed"))
     assignment, pattern = bare.assignment(), plan.formation
     links, rows, hz = assignment.links, len(names), experiment.rates.coordination_hz
-    start, _ = bodies.start(experiment, names)
+    start, _ = bodies.start_poses(experiment, names)
     aloft = start.copy()
     aloft[:, 2] = np.nan_to_num(assignment.hover)
     anchored = np.zeros(0, dtype=np.intp) if assignment.anchors is None else assignment.anchors.row
@@ -206,7 +206,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
         planar, spatial = stiffness(shape.position, here, silent, assignment.anchors)
         if planar.rigid and spatial is not None and rows <= MANY:
             spare = expendable(shape.position, here, silent)
-        share = closed(assignment.kinds, hz)
+        share = closed_shares(assignment.kinds, hz)
         within = experiment.duration_s
         loop = modes(assignment.law, here, shape.position, share, hz, anchors=assignment.anchors, within_s=within)
     return Analysis(
@@ -233,7 +233,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
 
 def link_errors(law: Law, pattern: FormationArrays, prediction: Prediction) -> Array:
     """Error of each link (T, E) along the motion [m]; 0 while it is not there."""
-    return np.nan_to_num(errors(law, pattern, prediction.time, prediction.position))
+    return np.nan_to_num(errors_over_time(law, pattern, prediction.time, prediction.position))
 
 
 def _best(shapes: Sequence[Shape]) -> Shape:

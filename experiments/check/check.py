@@ -17,7 +17,7 @@ from agents.network.messages import MAX_PAYLOAD
 from experiments.check import motion, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse, link_errors
-from experiments.check.findings import FORGIVEN, Claim, Severity, few
+from experiments.check.findings import FORGIVEN, Claim, Severity, first_of_each_code
 from experiments.check.ideal_run import Prediction, message_rate, predict, undisturbed
 from experiments.definition import bodies, standby
 from experiments.definition.experiment import Channel, Experiment, Network
@@ -157,7 +157,7 @@ def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
     known: dict[bytes, Analysis] = {}
     found = {}
     for name, case in cases.items():
-        case = standby.taking_part(case)  # noqa: PLW2901
+        case = standby.without_standby(case)  # noqa: PLW2901
         quiet = undisturbed(case)
         flight = msgspec.json.encode(quiet)
         if flight not in flights:
@@ -195,7 +195,7 @@ def _findings(given: Document, settings: Sequence[str], analyses: Mapping[str, A
     holders: dict[Claim, list[str]] = {}
     for name, analysis in analyses.items():
         for subject in SUBJECTS:
-            for claim in few(subject(analysis)):
+            for claim in first_of_each_code(subject(analysis)):
                 holders.setdefault(claim, []).append(name)
     index = _Index(given, settings)
     found = []

@@ -31,7 +31,7 @@ def listed(words: Sequence[str], most: int = 4) -> str:
     return ", ".join(words) if more <= 0 else f"{', '.join(words[:most])} and {more} more"
 
 
-def few(claims: Iterable[Claim]) -> list[Claim]:
+def first_of_each_code(claims: Iterable[Claim]) -> list[Claim]:
     """The first claims of each code; the last that is kept tells how many more there are."""
     by_code: dict[str, list[Claim]] = {}
     for claim in claims:

@@ -48,7 +48,7 @@ class Prediction:
     stuck: str = ""  # why they do not get under way at all; empty if they do. They stay at their starts then.
 
 
-def closed(kinds: Sequence[Kind], hz: float) -> Array:
+def closed_shares(kinds: Sequence[Kind], hz: float) -> Array:
     """h (N,): the share of a position error that each robot closes between two decisions."""
     return 1.0 - np.exp(-np.array([kind.response for kind in kinds]) / hz)
 
@@ -86,7 +86,7 @@ def isolated(experiment: Experiment) -> Experiment:
 
 def predict(bare: Experiment) -> Prediction:
     """Flight of what `undisturbed` or `isolated` made of an experiment, from the common start to the end."""
-    return repeat(bare, 1)[0]
+    return fly_repeatedly(bare, 1)[0]
 
 
 def repetitions(bare: Experiment) -> int:
@@ -94,14 +94,14 @@ def repetitions(bare: Experiment) -> int:
     return max(1, min(REPETITIONS, int(TICK_COST) // len(bare.robots)))
 
 
-def repeat(bare: Experiment, count: int) -> list[Prediction]:
+def fly_repeatedly(bare: Experiment, count: int) -> list[Prediction]:
     """`count` flights, the first with the seed of the experiment, each other one with the next seed; see `predict`."""
     names = tuple(bare.robots)
     try:
         log = simulation.simulate(bare, [bare.seed + k for k in range(count)], lean=True, landing=False)
     except conductor.Stuck as stuck:
-        position, _ = bodies.start(bare, names)
-        position[:, 2] = np.nan_to_num(bodies.hover(bare, names))
+        position, _ = bodies.start_poses(bare, names)
+        position[:, 2] = np.nan_to_num(bodies.hover_heights(bare, names))
         return [Prediction(np.zeros(1), position[None], stuck=str(stuck))] * count
     run = log.time >= -ROUNDING_S
     begun = [each for each in log.incidents if each.outcome > Outcome.NONE and 0.0 <= each.time < bare.duration_s]

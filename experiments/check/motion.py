@@ -15,7 +15,7 @@ from agents.formation.graph import BY_DISTANCE
 from agents.plugins.planners import Planner
 from experiments.check.analysis import Analysis, link_errors
 from experiments.check.findings import FORGIVEN, Claim
-from experiments.check.ideal_run import approaches, isolated, repeat, repetitions, undisturbed
+from experiments.check.ideal_run import approaches, fly_repeatedly, isolated, repetitions, undisturbed
 from experiments.check.theory import FAR_OFF, OFF
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
@@ -141,7 +141,7 @@ def softness(analysis: Analysis) -> Iterator[Claim]:
         spans.append((formed, until))
     count = repetitions(bare)
     lost, worst, said = 0, experiment.tolerance + FORGIVEN, ""
-    for flight in repeat(bare, count):
+    for flight in fly_repeatedly(bare, count):
         if flight.stuck:
             continue
         error, time = link_errors(analysis.assignment.law, analysis.pattern, flight), flight.time

@@ -50,7 +50,7 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
         tuple(sorted(pair)): distance
         for *pair, distance in zip(links.receiver.tolist(), links.sender.tolist(), links.distance.tolist(), strict=True)
     }
-    start, _ = bodies.start(analysis.experiment, names)
+    start, _ = bodies.start_poses(analysis.experiment, names)
     quiet = True
     for first, second in pairs:
         who = f"{names[first]} and {names[second]}"

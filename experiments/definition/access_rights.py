@@ -35,7 +35,7 @@ def rights(cases: Iterable[Experiment]) -> Rights:
     return reduce(Rights.joined, map(_rights, cases))
 
 
-def needed(experiment: Experiment, operator: str = "operator") -> list[str]:
+def needed_identities(experiment: Experiment, operator: str = "operator") -> list[str]:
     """The identities whose certificates a run of this experiment needs on the machine that starts it."""
     robots = experiment.robots.values()
     abroad = {robot for host in experiment.hosts.values() for robot in host.robots}
@@ -53,9 +53,9 @@ def needed(experiment: Experiment, operator: str = "operator") -> list[str]:
 
 def _rights(experiment: Experiment) -> Rights:
     keys = Keys(experiment.network.realm)
-    hears, steered = heard(experiment), Plan(experiment).guided
+    hears, steered = senders_by_receiver(experiment), Plan(experiment).guided
     robots: dict[str, Grant] = {}
-    for group in processes(experiment):
+    for group in process_groups(experiment):
         others = sorted({speaker for name in group for speaker in hears[name]})
         if len(others) >= MANY and {*others, *group} == set(experiment.robots):
             others = ["*"]
@@ -140,7 +140,7 @@ def _each(names: Iterable[str], *of: Callable[[str], str]) -> list[str]:
     return [key(name) for name in names for key in of]
 
 
-def processes(experiment: Experiment) -> list[list[str]]:
+def process_groups(experiment: Experiment) -> list[list[str]]:
     """The robots of each process."""
     groups: dict[str, list[str]] = {}
     for name, robot in experiment.robots.items():
@@ -148,7 +148,7 @@ def processes(experiment: Experiment) -> list[list[str]]:
     return list(groups.values())
 
 
-def heard(experiment: Experiment) -> dict[str, set[str]]:
+def senders_by_receiver(experiment: Experiment) -> dict[str, set[str]]:
     """Whom each robot listens to: what its process subscribes to, and no one else."""
     plan = Plan(experiment)
     links = plan.heard_links

@@ -35,19 +35,19 @@ def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
     return tuple(KINDS[experiment.robots[name].kind] for name in names)
 
 
-def start(experiment: Experiment, names: Sequence[str]) -> tuple[Array, Array]:
+def start_poses(experiment: Experiment, names: Sequence[str]) -> tuple[Array, Array]:
     """Where robots start: position (n, 3) [m] on the floor and yaw (n,) [rad]."""
     given = [(*experiment.robots[name].start, 0.0)[:3] for name in names]
     pose = np.array(given, dtype=float).reshape(-1, 3)
     return np.concatenate([pose[:, :2], np.zeros((len(pose), 1))], axis=1), pose[:, 2]
 
 
-def scattered(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[Array, Array]:
-    """As `start`, scattered by the seed as the file asks; who is scattered overlaps no other robot and no obstacle.
+def scattered_poses(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[Array, Array]:
+    """As `start_poses`, scattered by the seed as the file asks, clear of other robots and of obstacles.
 
     A place is drawn for each robot of the experiment, in the order of the file, whoever asks: all processes agree.
     """
-    position, yaw = start(experiment, tuple(experiment.robots))
+    position, yaw = start_poses(experiment, tuple(experiment.robots))
     begin = experiment.start
     if begin.scatter > 0.0 or begin.scatter_yaw > 0.0:
         rng = np.random.default_rng([seed, 0x73746172])
@@ -79,7 +79,9 @@ def _free(stands: Scene, place: Array, kind: Kind) -> bool:
     )
 
 
-def world(experiment: Experiment, names: Sequence[str], copies: int = 1, *, sensing: bool | None = None) -> World:
+def shared_world(
+    experiment: Experiment, names: Sequence[str], copies: int = 1, *, sensing: bool | None = None
+) -> World:
     """The place that `names` share, in `copies`; with range sensors if somebody uses them, or as `sensing` says."""
     used = experiment.avoidance is not None if sensing is None else sensing
     carried = []
@@ -108,7 +110,7 @@ def scene(experiment: Experiment) -> Scene:
     return Scene.furnished(arena.size, arena.obstacles, plans, walled=arena.walls)
 
 
-def shadows(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Array:
+def shadow_periods(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Array:
     """How often the twin beside each robot is put onto it (n,) [s]: infinite for once, NaN for robots without one."""
     period = []
     for name in names:
@@ -117,7 +119,7 @@ def shadows(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Ar
     return np.tile(np.array(period), copies)
 
 
-def hover(experiment: Experiment, names: Sequence[str]) -> Array:
+def hover_heights(experiment: Experiment, names: Sequence[str]) -> Array:
     """Heights that robots hold (n,) [m], NaN for ground robots."""
     return np.array([experiment.robots[name].hover or np.nan for name in names])
 
@@ -132,15 +134,15 @@ def disturbance(experiment: Experiment, name: str) -> Disturbance:
     return Disturbance(**merged)  # type: ignore[arg-type]
 
 
-def request(
+def body_request(
     experiment: Experiment, names: Sequence[str], seeds: Sequence[int], endpoints: Sequence[str] = ()
 ) -> BodyRequest:
     """What the bodies of `names` are opened with, one repetition for each seed; `endpoints` are the routers.
 
-    Twins start where `scattered` puts them; hardware is where it is.
+    Twins start where `scattered_poses` puts them; hardware is where it is.
     """
     copies = len(seeds)
-    placed = [scattered(experiment, names, seed) for seed in seeds]
+    placed = [scattered_poses(experiment, names, seed) for seed in seeds]
     return BodyRequest(
         names=tuple(names) * copies,
         kinds=kinds(experiment, names) * copies,

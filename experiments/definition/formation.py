@@ -16,7 +16,7 @@ from agents.formation.graph import BY_DISTANCE, Links
 from agents.plugins.laws import Distance, Law
 from experiments.definition.experiment import Anchor, Experiment
 from experiments.definition.experiment import Change as Described
-from experiments.definition.links import UNKNOWN, OneWay, height, pairs, target
+from experiments.definition.links import UNKNOWN, OneWay, held_height, link_pairs, link_target
 
 AT_ONCE: Final = 200_000  # errors of links that are held in memory at once
 
@@ -36,8 +36,8 @@ class FormationArrays:
         wants = np.array([link.wanted.wants for link in there], dtype=np.intp)
         plain = bool((wants == BY_DISTANCE).all())
         links = Links(
-            np.array([row[link.listener] for link in there], dtype=np.intp),
-            np.array([row[link.speaker] for link in there], dtype=np.intp),
+            np.array([row[link.receiver] for link in there], dtype=np.intp),
+            np.array([row[link.sender] for link in there], dtype=np.intp),
             np.array([link.wanted.distance for link in there], dtype=float),
             np.array([link.gain for link in there], dtype=float),
             None if plain else _vectors([link.wanted.relative for link in there]),
@@ -92,7 +92,7 @@ class FormationArrays:
         return there
 
 
-def errors(law: Law, pattern: FormationArrays, time: Array, position: Array) -> Array:
+def errors_over_time(law: Law, pattern: FormationArrays, time: Array, position: Array) -> Array:
     """Error of each link (T, E) as the law measures it; NaN where the link is not there or an end is unknown.
 
     Args:
@@ -124,7 +124,7 @@ def _errors(law: Law, pattern: FormationArrays, time: Array, position: Array) ->
     return law.error(flat, flat[many.sender], many).reshape(count, len(links))
 
 
-def anchors_of(experiment: Experiment, names: Sequence[str], only: Sequence[str] | None = None) -> Anchors | None:
+def compile_anchors(experiment: Experiment, names: Sequence[str], only: Sequence[str] | None = None) -> Anchors | None:
     """The anchors of these robots, or of some `only`, each once; None if there are none."""
     formation = experiment.formation
     anchored = formation.anchors if only is None else [name for name in formation.anchors if name in only]
@@ -153,18 +153,18 @@ def _presence_of(one_way: Sequence[OneWay]) -> Presence | None:
 
 
 def _changes_of(experiment: Experiment, one_way: Sequence[OneWay]) -> tuple[Change, ...]:
-    rise = np.array([height(experiment, link.listener) - height(experiment, link.speaker) for link in one_way])
+    rise = np.array([held_height(experiment, link.receiver) - held_height(experiment, link.sender) for link in one_way])
     in_order = sorted(experiment.formation.changes, key=lambda each: each.at_s)
     return tuple(_change(experiment, each, one_way, rise) for each in in_order)
 
 
 def _change(experiment: Experiment, described: Described, one_way: Sequence[OneWay], rise: Array) -> Change:
     new = {
-        pair: target(experiment, text, given, pair[0])
+        pair: link_target(experiment, text, given, pair[0])
         for text, given in described.links.items()
-        for pair in pairs(text)
+        for pair in link_pairs(text)
     }
-    then = [new.get((link.listener, link.speaker)) for link in one_way]
+    then = [new.get((link.receiver, link.sender)) for link in one_way]
     return Change(
         at=described.at_s,
         over=described.over_s,

@@ -15,19 +15,19 @@ from agents.formation.graph import Links, links
 from agents.network import channel_model
 from agents.network.channel_model import Conditions, LinkEffects, Outage
 from experiments.definition.experiment import Channel, Experiment, LinkChannel
-from experiments.definition.links import pairs
+from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
 
 OWN_S: Final = Channel().delay_s  # any real network takes as long: to wait for it would cost a tick in ten milliseconds
 TO_CENTRE, FROM_CENTRE = "to centre", "from centre"  # streams
 
 
-def modelled(experiment: Experiment) -> bool:
+def models_network(experiment: Experiment) -> bool:
     """Whether the file asks for any network effect."""
     return experiment.channel != Channel()
 
 
-def of_link(channel: Channel, own: LinkChannel | None = None) -> LinkEffects:
+def link_effects(channel: Channel, own: LinkChannel | None = None) -> LinkEffects:
     """Effects on a link: its `own` settings, and the channel's where it has none."""
     effects = {name: getattr(channel, name) for name in LinkEffects.__struct_fields__}
     if own is not None:
@@ -35,7 +35,7 @@ def of_link(channel: Channel, own: LinkChannel | None = None) -> LinkEffects:
     return LinkEffects(**effects)
 
 
-def virtual(experiment: Experiment, over: Links, seeds: Sequence[int], *, stream: str = "") -> Conditions:
+def virtual_conditions(experiment: Experiment, over: Links, seeds: Sequence[int], *, stream: str = "") -> Conditions:
     """Of all links `over` of all repetitions, those of the first seed first; rows are the robots as in the file.
 
     What else goes between the same robots has another `stream`, and its own luck.
@@ -44,7 +44,9 @@ def virtual(experiment: Experiment, over: Links, seeds: Sequence[int], *, stream
     return Conditions.side_by_side(_seeded(_of(experiment.channel, ends, experiment.duration_s), ends, seeds, stream))
 
 
-def at_listeners(experiment: Experiment, over: Links, listeners: Sequence[str], *, stream: str = "") -> Conditions:
+def receiver_conditions(
+    experiment: Experiment, over: Links, listeners: Sequence[str], *, stream: str = ""
+) -> Conditions:
     """Of the links on which robots of one process listen, on a real network, which has a delay of its own.
 
     `over.listener` counts in `listeners`, `over.speaker` in the robots of the file.
@@ -55,18 +57,18 @@ def at_listeners(experiment: Experiment, over: Links, listeners: Sequence[str], 
     return _seeded(bare, ends, [experiment.seed], stream)[0]
 
 
-def to_centre(experiment: Experiment, speakers: Index) -> Conditions:
+def conditions_to_centre(experiment: Experiment, speakers: Index) -> Conditions:
     """Of poses that the centre hears from robots `speakers` (K,), rows of the file, on a real network."""
     names = tuple(experiment.robots)
-    pairs = [(row, row) for row in speakers.tolist()]
-    return at_listeners(experiment, links(pairs), names, stream=TO_CENTRE)
+    link_pairs = [(row, row) for row in speakers.tolist()]
+    return receiver_conditions(experiment, links(link_pairs), names, stream=TO_CENTRE)
 
 
-def from_centre(experiment: Experiment, listeners: Sequence[str]) -> Conditions:
+def conditions_from_centre(experiment: Experiment, listeners: Sequence[str]) -> Conditions:
     """Of goals that those of the robots `listeners` hear which are guided, in their order, on a real network."""
     names, told = tuple(experiment.robots), Plan(experiment).guided
-    pairs = [(row, names.index(name)) for row, name in enumerate(listeners) if name in told]
-    return at_listeners(experiment, links(pairs), listeners, stream=FROM_CENTRE)
+    link_pairs = [(row, names.index(name)) for row, name in enumerate(listeners) if name in told]
+    return receiver_conditions(experiment, links(link_pairs), listeners, stream=FROM_CENTRE)
 
 
 @dataclass(frozen=True)
@@ -83,14 +85,14 @@ class _Ends:
     def named(self, text: str) -> Mask:
         """Which links (E,) a text such as "A > B" or "A - B" means."""
         found = np.zeros(len(self.listener), dtype=bool)
-        for listener, speaker in pairs(text):
+        for listener, speaker in link_pairs(text):
             found |= (self.listener == listener) & (self.speaker == speaker)
         return found
 
 
 def _of(channel: Channel, ends: _Ends, duration: float) -> Conditions:
     """Without keys."""
-    effects = [of_link(channel), *(of_link(channel, own) for own in channel.links.values())]
+    effects = [link_effects(channel), *(link_effects(channel, own) for own in channel.links.values())]
     count = len(ends.listener)
     which = np.zeros(count, dtype=np.intp)
     for number, text in enumerate(channel.links, start=1):

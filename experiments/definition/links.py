@@ -32,8 +32,8 @@ class LinkTarget:
 class OneWay:
     """A one-way link: who listens to whom, for what, with which gain, and when."""
 
-    listener: str  # name
-    speaker: str  # name
+    receiver: str  # name
+    sender: str  # name
     wanted: LinkTarget  # what it asks for
     gain: float  # of the law
     since: float = 0.0  # from when on [s]
@@ -43,7 +43,7 @@ class OneWay:
     text: str = ""  # as the file writes it; empty for links by proximity only
 
 
-def pairs(text: str) -> tuple[tuple[str, str], ...]:
+def link_pairs(text: str) -> tuple[tuple[str, str], ...]:
     """The (listener, speaker) pairs that a link stands for, one or two.
 
     Raises:
@@ -69,13 +69,13 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
     found = []
     for text, link in formation.links.items():
         given = link if isinstance(link, Link) else Link(distance=link)
-        for listener, speaker in pairs(text):
-            wanted = target(experiment, text, given, listener)
+        for listener, speaker in link_pairs(text):
+            wanted = link_target(experiment, text, given, listener)
             gain = _gain(experiment, law, wanted.wants) if given.gain is None else given.gain
             until = math.inf if given.until_s is None else given.until_s
             found.append(OneWay(listener, speaker, wanted, gain, given.from_s, until, reach, release, text))
     if near is not None and near.distance is not None:
-        there = {(link.listener, link.speaker) for link in found}
+        there = {(link.receiver, link.sender) for link in found}
         wanted = LinkTarget(BY_DISTANCE, near.distance)
         gain = _gain(experiment, law, BY_DISTANCE)
         found += [
@@ -85,10 +85,10 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
             if a != b and (a, b) not in there
         ]
     row = {name: number for number, name in enumerate(experiment.robots)}
-    return sorted(found, key=lambda link: (row[link.listener], row[link.speaker]))
+    return sorted(found, key=lambda link: (row[link.receiver], row[link.sender]))
 
 
-def target(experiment: Experiment, text: str, given: Target | float, listener: str) -> LinkTarget:
+def link_target(experiment: Experiment, text: str, given: Target | float, listener: str) -> LinkTarget:
     """What a link asks of one of its ends, each way that it can be told.
 
     Args:
@@ -100,21 +100,21 @@ def target(experiment: Experiment, text: str, given: Target | float, listener: s
     given = given if isinstance(given, Target) else Target(distance=given)
     if given.distance is not None:
         return LinkTarget(BY_DISTANCE, given.distance)
-    second, first = pairs(text)[0]
+    second, first = link_pairs(text)[0]
     sign = 1.0 if listener == second else -1.0
     if given.bearing is not None:
         length = math.hypot(*given.bearing)
         toward = [sign * value / length for value in given.bearing]
         return LinkTarget(BY_BEARING, math.nan, UNKNOWN, (*toward, math.nan)[:3])  # type: ignore[arg-type]
     offset = list(given.offset or ())
-    rise = height(experiment, second) - height(experiment, first)
+    rise = held_height(experiment, second) - held_height(experiment, first)
     x, y, z = (sign * value for value in (offset if len(offset) == 3 else [*offset, rise]))
     length = math.hypot(x, y, z)
     bearing = (x / length, y / length, z / length) if length > 0.0 else UNKNOWN
     return LinkTarget(BY_RELATIVE, length, (x, y, z), bearing)
 
 
-def height(experiment: Experiment, name: str) -> float:
+def held_height(experiment: Experiment, name: str) -> float:
     """The height that a robot holds [m]."""
     return experiment.robots[name].hover or 0.0
 

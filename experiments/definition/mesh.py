@@ -17,7 +17,7 @@ from experiments.definition.plan import Plan
 ENDPOINTS: Final = "network.txt"  # what to say behind --connect to look at a run: @FOLDER/network.txt
 
 
-def members(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
+def member_endpoints(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
     """The endpoints of all members of a mesh, each with its owner: robots, then whoever serves them.
 
     All cases of a file have the same: a robot is at one place in all of them.
@@ -29,7 +29,7 @@ def members(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
     found: dict[str, str] = {}
     services: dict[str, None] = {"recorder": None}
     for case in cases:
-        for group in access_rights.processes(case):
+        for group in access_rights.process_groups(case):
             given = next((case.network.addresses[name] for name in group if name in case.network.addresses), "")
             found.setdefault(topology.TOGETHER.join(group), given)
         if any(bodies.WORLD in (robot.body, robot.ranges) for robot in case.robots.values()):
@@ -49,7 +49,7 @@ def members(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
     return [topology.owned(endpoint, name) for name, endpoint in found.items()]
 
 
-def listeners(experiment: Experiment) -> dict[str, list[str]]:
+def listening_hosts(experiment: Experiment) -> dict[str, list[str]]:
     """At which names of machines the identities of a lab listen in a mesh; nobody where there are routers."""
     if experiment.network.topology != "mesh":
         return {}
@@ -59,14 +59,14 @@ def listeners(experiment: Experiment) -> dict[str, list[str]]:
     return {**dict.fromkeys(("recorder", "world", "centre", "twin", "operator"), here), **robots}
 
 
-def near(experiment: Experiment, names: Sequence[str], endpoints: Sequence[str]) -> list[str]:
-    """What of the endpoints concerns robots that share a process: see `topology.near`."""
+def neighbour_endpoints(experiment: Experiment, names: Sequence[str], endpoints: Sequence[str]) -> list[str]:
+    """What of the endpoints concerns robots that share a process: see `topology.neighbour_endpoints`."""
     if not topology.is_mesh(endpoints):
         return list(endpoints)
-    return topology.near(endpoints, access_rights.heard(experiment), names)
+    return topology.near(endpoints, access_rights.senders_by_receiver(experiment), names)
 
 
-def rights(experiment: Experiment, endpoints: Sequence[str]) -> Rights | None:
+def member_rights(experiment: Experiment, endpoints: Sequence[str]) -> Rights | None:
     """Who may do what, for a member of a mesh, which enforces it itself; None where routers do, or nobody."""
     if not topology.is_mesh(endpoints) or lab.of(endpoints) is None:
         return None

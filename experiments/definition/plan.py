@@ -20,9 +20,9 @@ from agents.plugins.laws import Law
 from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
-from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, hover, kinds
+from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, hover_heights, kinds
 from experiments.definition.experiment import Experiment, Hybrid
-from experiments.definition.formation import FormationArrays, anchors_of
+from experiments.definition.formation import FormationArrays, compile_anchors
 from experiments.definition.links import OneWay, one_way_links
 
 
@@ -80,7 +80,7 @@ class Plan:
         return None if chosen is None else registry.build(registry.AVOIDANCES, chosen)
 
     @cached_property
-    def legs(self) -> dict[str, tuple[Leg, ...]]:
+    def legs_by_robot(self) -> dict[str, tuple[Leg, ...]]:
         """The timeline of each robot that has one."""
         found: dict[str, tuple[Leg, ...]] = {}
         for leg in self.experiment.timeline:
@@ -89,14 +89,14 @@ class Plan:
         return found
 
     @cached_property
-    def one_way(self) -> tuple[OneWay, ...]:
+    def one_way_links(self) -> tuple[OneWay, ...]:
         """Every link of the formation, by listener, then speaker."""
         return tuple(one_way_links(self.experiment, self.law))
 
     @cached_property
     def formation(self) -> FormationArrays:
         """The same as arrays, with changes and presence."""
-        return FormationArrays.compiled(self.experiment, self.one_way)
+        return FormationArrays.compiled(self.experiment, self.one_way_links)
 
     @property
     def links(self) -> Links:
@@ -112,7 +112,7 @@ class Plan:
         avoidance, nobody, centrally = self.avoidance, links([], [], []), set(self.guided)
         if avoidance is None or not (avoidance.hears == "all" or centrally):
             return nobody
-        linked = {(link.listener, link.speaker) for link in self.one_way}
+        linked = {(link.receiver, link.sender) for link in self.one_way_links}
         there = {(listener, speaker) for listener, speaker in linked if listener not in centrally}
         robots = list(enumerate(self.names))
         listening = [(i, a) for i, a in robots if self.experiment.robots[a].avoids]
@@ -143,7 +143,7 @@ class Plan:
         formation = self.experiment.formation
         if formation.leader is not None:
             return (formation.leader,)
-        held = {link.listener for link in self.one_way} | set(formation.anchors)
+        held = {link.receiver for link in self.one_way_links} | set(formation.anchors)
         free = tuple(name for name in self.names if name not in held)
         return free if len(free) < len(self.names) else ()
 
@@ -217,9 +217,13 @@ class Plan:
         mine = [name for name in names if name not in others]
         formation = self.formation.without_listeners(self.rows(others)).heard_by(rows)
         watched = links([], [], []) if centrally else self.watched_links.to_receivers(rows)
-        anchors = anchors_of(experiment, names, only=mine)
+        anchors = compile_anchors(experiment, names, only=mine)
         only_watched = np.repeat([False, True], [len(formation.links), len(watched)])
-        planned = [(row, self.legs[name]) for row, name in enumerate(names) if name in mine and name in self.legs]
+        planned = [
+            (row, self.legs_by_robot[name])
+            for row, name in enumerate(names)
+            if name in mine and name in self.legs_by_robot
+        ]
         first_rows = np.arange(copies) * len(names)
         if len(watched):
             formation = formation.and_then(watched)
@@ -230,7 +234,7 @@ class Plan:
         return Assignment(
             names=tuple(names) * copies,
             kinds=kinds(experiment, names) * copies,
-            hover=np.tile(hover(experiment, names), copies),
+            hover=np.tile(hover_heights(experiment, names), copies),
             robots=everyone * copies,
             links=formation.links,
             changes=formation.changes,
@@ -242,7 +246,7 @@ class Plan:
             update=self.update,
             clamp=experiment.formation.clamp,
             tracking_gain=experiment.formation.tracking_gain,
-            legs=tuple((row + first_rows, legs) for row, legs in planned),
+            legs=tuple((row + first_rows, own) for row, own in planned),
             limits=self.limits(names, copies),
             avoidance=None if centrally else self.avoidance,
             robot_kinds=self.kinds * copies,

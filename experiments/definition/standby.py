@@ -8,12 +8,12 @@ from typing import TypeVar
 import msgspec
 
 from experiments.definition.experiment import Experiment, Hybrid
-from experiments.definition.links import pairs
+from experiments.definition.links import link_pairs
 
 T = TypeVar("T")
 
 
-def taking_part(experiment: Experiment) -> Experiment:
+def without_standby(experiment: Experiment) -> Experiment:
     """The experiment without its robots on standby, as it runs while nobody adds them: in virtual time nobody can."""
     robots = {name: robot for name, robot in experiment.robots.items() if not robot.standby}
     if len(robots) == len(experiment.robots):
@@ -61,9 +61,9 @@ def taking_part(experiment: Experiment) -> Experiment:
 
 def _between(links: Mapping[str, T], robots: Collection[str]) -> dict[str, T]:
     """Those of the links whose ends are both among `robots`."""
-    return {text: to for text, to in links.items() if {*pairs(text)[0]} <= {*robots}}
+    return {text: to for text, to in links.items() if {*link_pairs(text)[0]} <= {*robots}}
 
 
-def absent(experiment: Experiment) -> dict[str, str]:
+def robots_without_address(experiment: Experiment) -> dict[str, str]:
     """Robots that nobody starts from here, for their hosts have no address; by robot its host."""
     return {robot: name for name, host in experiment.hosts.items() if host.address is None for robot in host.robots}

@@ -19,7 +19,7 @@ from experiments.catalogue import index
 from experiments.definition.experiment import Arena, Part
 from experiments.file import structure
 from experiments.file import text as syntax
-from experiments.file.consistency import of_arena
+from experiments.file.consistency import arena_faults
 from experiments.file.overrides import merged
 from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places, refusal
 from experiments.file.problems import Path as Keys
@@ -65,14 +65,14 @@ class Misnamed(ValueError):
         self.fault = fault
 
 
-def named(document: Mapping[str, Any]) -> str | None:
+def arena_file_name(document: Mapping[str, Any]) -> str | None:
     """The arena file that a document names, if it names one as it should."""
     arena = document.get("arena")
     name = arena.get("file") if isinstance(arena, dict) else None
     return name if isinstance(name, str) else None
 
 
-def furnished(document: Mapping[str, Any], file: ArenaFile | None) -> dict[str, Any]:
+def with_arena_file(document: Mapping[str, Any], file: ArenaFile | None) -> dict[str, Any]:
     """A document with what its arena file holds in its own [arena], which names no file any more."""
     if file is None:
         return dict(document)
@@ -108,8 +108,8 @@ def load(name: str, folder: Path) -> ArenaFile:
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
     read = ArenaFile(name, label, text, content.get("arena", {}))
-    _refuse(read, [*structure.storable(content), *_misshapen(content)])
-    _refuse(read, list(of_arena(msgspec.convert(content, _Whole).arena)))
+    _refuse(read, [*structure.number_faults(content), *_misshapen(content)])
+    _refuse(read, list(arena_faults(msgspec.convert(content, _Whole).arena)))
     return read
 
 

@@ -30,7 +30,7 @@ def path(name: str) -> Path:
     return _entry(name)
 
 
-def copy(name: str, target: Path) -> Path:
+def copy_entry(name: str, target: Path) -> Path:
     """Copies a catalogue entry; beside it its arena file, and the schema that its first line shows to editors.
 
     Args:
@@ -85,7 +85,7 @@ def _arena_beside(text: str, folder: Path) -> ArenaFile | None:
     Raises:
         DocumentError: If another one of that name is there.
     """
-    name = arena_file.named(tomllib.loads(text))
+    name = arena_file.arena_file_name(tomllib.loads(text))
     if name is None:
         return None
     wanted, there = arena_file.load(name, index.FOLDER), folder / name
@@ -105,7 +105,7 @@ def no_entry(name: str) -> Problem:
     return Problem(name, 0, 0, "neither a file nor an experiment of the catalogue", f"{hint} (zenpark new copies one)")
 
 
-def found(name: str | Path) -> Path:
+def find_file(name: str | Path) -> Path:
     """The file of that name, or that of the catalogue entry; a folder of the same name does not hide an entry."""
     file = Path(name)
     known = str(name) in index.names()

@@ -63,7 +63,7 @@ _WALL: Final = "wall"  # the border of the arena, where contacts are told
 def faults(experiment: Experiment) -> Iterator[Fault]:
     """Everything that contradicts something else, with its path in the file."""
     yield from _rates(experiment)
-    yield from of_arena(experiment.arena)
+    yield from arena_faults(experiment.arena)
     for name, robot in experiment.robots.items():
         yield from _robot(experiment, ("robots", name), robot)
     for name, robot in experiment.spares.items():
@@ -83,7 +83,7 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
             yield Fault(("disturbance", name), message, did_you_mean(name, known), on_key=True)
 
 
-def of_arena(arena: Arena) -> Iterator[Fault]:
+def arena_faults(arena: Arena) -> Iterator[Fault]:
     """What is wrong with an arena by itself; paths begin at the top of a document."""
     scene = Scene.furnished(arena.size, arena.obstacles, {}, walled=arena.walls)
     x, y, z = arena.size

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Change, Experiment, Link, Target
-from experiments.definition.links import FORM, height, pairs
+from experiments.definition.links import FORM, held_height, link_pairs
 from experiments.file.problems import Fault, Path
 
 ROUNDED = 1e-3  # [m] heights written with three decimals
@@ -47,7 +47,7 @@ def _links(experiment: Experiment) -> Iterator[Fault]:
     for text in experiment.formation.links:
         path = ("formation", "links", text)
         try:
-            both = pairs(text)
+            both = link_pairs(text)
         except ValueError as error:
             hint = str(error)
             yield Fault(path, f"{text!r} is no link", hint if hint == FORM else f"{hint}; {FORM}", on_key=True)
@@ -86,8 +86,8 @@ def _asked(experiment: Experiment, text: str, given: Target | float, path: Path)
         return
     if not isinstance(given, Target):
         return
-    second, first = pairs(text)[0]
-    rise = height(experiment, second) - height(experiment, first)
+    second, first = link_pairs(text)[0]
+    rise = held_height(experiment, second) - held_height(experiment, first)
     if given.offset is not None:
         if needs == "bearing" and not any(given.offset) and rise == 0.0:
             yield Fault((*path, "offset"), "an offset of zeros has no direction", "give x, y other than 0")
@@ -105,12 +105,12 @@ def _change(experiment: Experiment, number: int, change: Change) -> Iterator[Fau
     if change.at_s >= experiment.duration_s:
         message = f"this change begins at {change.at_s:g} s, when the run of {experiment.duration_s:g} s is over"
         yield Fault((*path, "at_s"), message, "begin earlier, or give a longer duration_s")
-    before = {pair: given for text, given in experiment.formation.links.items() for pair in pairs(text)}
+    before = {pair: given for text, given in experiment.formation.links.items() for pair in link_pairs(text)}
     kinds = {kind_of(given) for given in before.values()}
     for text, given in change.links.items():
         where = (*path, "links", text)
         try:
-            both = pairs(text)
+            both = link_pairs(text)
         except ValueError as error:
             yield Fault(where, f"{text!r} is no link", str(error), on_key=True)
             continue

@@ -11,8 +11,8 @@ from agents.network.endpoints import Endpoint
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment, LinkChannel
-from experiments.definition.link_conditions import of_link
-from experiments.definition.links import pairs
+from experiments.definition.link_conditions import link_effects
+from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
 from experiments.file.problems import Fault, Path, shown
 
@@ -140,7 +140,7 @@ def channel_faults(experiment: Experiment) -> Iterator[Fault]:
     for text, own in channel.links.items():
         path = (*AT, text)
         yield from _link(experiment, there, text, path, on_key=True)
-        yield from _bursts(of_link(channel, own), path, own)
+        yield from _bursts(link_effects(channel, own), path, own)
         for pair in _pairs(text):
             if pair in said:
                 message = f"what {pair[1]} says to {pair[0]} has its settings by '{said[pair]}' already"
@@ -161,9 +161,9 @@ def channel_faults(experiment: Experiment) -> Iterator[Fault]:
 
 
 def _pairs(text: str) -> tuple[tuple[str, str], ...]:
-    """As `links.pairs`; nothing where that is reported elsewhere."""
+    """As `links.link_pairs`; nothing where that is reported elsewhere."""
     try:
-        return pairs(text)
+        return link_pairs(text)
     except ValueError:
         return ()
 

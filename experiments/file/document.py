@@ -20,7 +20,7 @@ from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.file import arena_file, catalogue, consistency, structure
 from experiments.file.arena_file import ArenaFile
-from experiments.file.overrides import Override, assign, merged, parse, used
+from experiments.file.overrides import Override, assign, chosen_parameters, merged, parse
 from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places, refusal
 from experiments.file.problems import Path as Keys
 from experiments.file.text import content, decoded, parsed
@@ -71,7 +71,7 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
     Raises:
         DocumentError: With everything that is wrong and where, whatever is in the file.
     """
-    file = catalogue.found(path)
+    file = catalogue.find_file(path)
     label = str(path) if file == Path(path) else str(file)
     try:
         text = content(file, label)
@@ -130,7 +130,7 @@ class _Reading:
     def document(self) -> Document:
         """See `read`."""
         overrides = self._overrides()
-        self._refuse(structure.storable(self.content), overrides)
+        self._refuse(structure.number_faults(self.content), overrides)
         base, tables, cases, files = self._changed(overrides)
         nested = [
             Fault(("cases", name, "cases"), "a case cannot hold cases", "leave them out", on_key=True)
@@ -190,7 +190,7 @@ class _Reading:
         self, document: _Table, case: str, overrides: Sequence[Override], files: dict[str, ArenaFile]
     ) -> _Table:
         """The document with what its arena file holds; that file is added to `files`."""
-        name = arena_file.named(document)
+        name = arena_file.arena_file_name(document)
         if name is None:
             return document
         try:
@@ -199,7 +199,7 @@ class _Reading:
         except arena_file.Misnamed as error:
             path = ("cases", case, *error.fault.path) if case else error.fault.path
             self._refuse([replace(error.fault, path=path)], overrides)
-        return deepcopy(arena_file.furnished(document, files[case]))
+        return deepcopy(arena_file.with_arena_file(document, files[case]))
 
     def _overrides(self) -> list[Override]:
         overrides, problems = [], []
@@ -210,7 +210,7 @@ class _Reading:
                 problems += error.problems
                 continue
             overrides.append(override)
-            for fault in structure.storable(override.value, override.path):
+            for fault in structure.number_faults(override.value, override.path):
                 problems += override.refused(fault.message, fault.hint).problems
         if problems:
             raise DocumentError(problems)
@@ -252,7 +252,7 @@ class _Reading:
 def _unused(override: Override, documents: Sequence[Mapping[str, Any]]) -> Problem:
     """A parameter that no trigger, law or plan of the experiment has."""
     end = next(end for end in range(1, len(override.path)) if structure.group_of(override.path[:end]))
-    known = dict.fromkeys(name for document in documents for name in used(document, override.path[:end]))
+    known = dict.fromkeys(name for document in documents for name in chosen_parameters(document, override.path[:end]))
     parameter = str(override.path[end])
     message = f"no {override.path[end - 1]} of this experiment has a parameter '{parameter}'"
     return override.refused(message, did_you_mean(parameter, known)).problems[0]

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
-from experiments.definition.links import pairs
+from experiments.definition.links import link_pairs
 from experiments.file.problems import DocumentError, Path, refusal
 from experiments.file.structure import group_of, parameters
 
@@ -128,7 +128,7 @@ def merged(document: Mapping[str, Any], changes: Mapping[str, Any], path: Path =
     return result
 
 
-def used(document: Mapping[str, Any], path: Path) -> Iterable[str]:
+def chosen_parameters(document: Mapping[str, Any], path: Path) -> Iterable[str]:
     """The parameters of the plug-in that a document chooses at `path`."""
     at: Any = document
     for step in path[:-1]:
@@ -182,7 +182,7 @@ def _same_link(text: str, links: Mapping[str, Any]) -> str:
 def _ends(link: str) -> set[tuple[str, str]]:
     """Its pairs; none if it cannot be read, which is reported where links are checked."""
     try:
-        return set(pairs(link))
+        return set(link_pairs(link))
     except ValueError:
         return set()
 

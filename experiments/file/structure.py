@@ -37,14 +37,14 @@ _WORDS: Final = {
 _FIELDS: Final = frozenset(Experiment.__struct_fields__)
 
 
-def storable(value: object, path: Path = ()) -> Iterator[Fault]:
+def number_faults(value: object, path: Path = ()) -> Iterator[Fault]:
     """Numbers that no experiment can hold, though TOML can write them."""
     if isinstance(value, dict):
         for key, each in value.items():
-            yield from storable(each, (*path, key))
+            yield from number_faults(each, (*path, key))
     elif isinstance(value, list):
         for number, each in enumerate(value):
-            yield from storable(each, (*path, number))
+            yield from number_faults(each, (*path, number))
     elif isinstance(value, float) and not math.isfinite(value):
         yield Fault(path, f"'{_name(path)}' is {value}, which is no quantity", "give a finite number")
     elif isinstance(value, float) and abs(value) > LARGEST:
@@ -286,7 +286,7 @@ def _in(path: Path) -> str:
 OBJECT: Final = "write an object, '{\"name\": value}'"
 
 
-def table(flag: str, text: str, struct: type[msgspec.Struct] | None = None, path: Path = ()) -> dict[str, Any]:
+def parse_object(flag: str, text: str, struct: type[msgspec.Struct] | None = None, path: Path = ()) -> dict[str, Any]:
     """The object that stands behind a flag.
 
     Args:

@@ -124,7 +124,7 @@ def measure(trace: Trace) -> CaseMetrics:
         lost=int(trace.lost.sum()),
         dropped=sum(each.dropped for each in passed),
         passages=passed,
-        modelled=link_conditions.modelled(trace.experiment),
+        modelled=link_conditions.models_network(trace.experiment),
         missed_deadlines=int(trace.missed_deadlines.sum()),
         missed_share=_share(trace.missed_deadlines.sum(), ticks),
         collisions=touched,

@@ -15,7 +15,7 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
 from agents.formation.graph import Links
-from experiments.definition.formation import errors
+from experiments.definition.formation import errors_over_time
 from experiments.metrics.results import Passage
 from experiments.recording.losses import unrecorded
 from experiments.recording.trace import Trace
@@ -69,7 +69,7 @@ class LinkErrors:
         """The errors of a whole trace."""
         pattern = trace.plan.formation
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
-        error = errors(trace.plan.law, pattern, trace.time, trace.true_position)
+        error = errors_over_time(trace.plan.law, pattern, trace.time, trace.true_position)
         own, (_, away) = own_links(pattern.links, len(trace.robots)), network_away(alive, trace.time)
         return cls(trace.time, pattern.links, own, error, alive, away)
 

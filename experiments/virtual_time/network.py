@@ -31,7 +31,9 @@ class Channel:
 
     def __init__(self, experiment: Experiment, links: Links, seeds: Sequence[int], *, stream: str = "") -> None:
         """`links` of all repetitions, those of the first seed first; each `stream` has its own luck."""
-        self._channel = channel_model.Channel(link_conditions.virtual(experiment, links, seeds, stream=stream))
+        self._channel = channel_model.Channel(
+            link_conditions.virtual_conditions(experiment, links, seeds, stream=stream)
+        )
         self.instant = self._channel.instant
         self._speaker = links.sender
         self._names = tuple(experiment.robots)

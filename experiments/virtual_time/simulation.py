@@ -104,10 +104,10 @@ def simulate(
     names = tuple(experiment.robots)
     assignment = Plan(experiment).assignment(names, copies=len(seeds))
     agent = Agent(assignment)
-    request = bodies.request(experiment, names, seeds)
+    request = bodies.body_request(experiment, names, seeds)
     request = replace(request, external=(False,) * len(request.names))  # nobody measures in virtual time
-    twin = TwinBody(request, bodies.world(experiment, names, len(seeds)))
-    body = shadowed(twin, request, bodies.shadows(experiment, names, len(seeds)))
+    twin = TwinBody(request, bodies.shared_world(experiment, names, len(seeds)))
+    body = shadowed(twin, request, bodies.shadow_periods(experiment, names, len(seeds)))
     network = VirtualNetwork(experiment, agent, seeds, lean=lean)
     rows = len(assignment.names)
     dt = 1.0 / assignment.body_hz

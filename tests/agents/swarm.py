@@ -28,7 +28,7 @@ class Group:
         self.names = tuple(names)
         self.assignment = Plan(experiment).assignment(self.names)
         self.agent = Agent(self.assignment)
-        self.body = TwinBody(bodies.request(experiment, self.names, [experiment.seed]))
+        self.body = TwinBody(bodies.body_request(experiment, self.names, [experiment.seed]))
         self.agent.mark_alive(np.arange(len(self.assignment.links)))
         self.by_speaker = links_by_sender(self.assignment.links, self.assignment.robots)
         self.state: BodyState

@@ -117,7 +117,7 @@ def request(*addresses):
         f"R{k}": Robot(kind="crazyflie" if k == 1 else "khepera4", start=[0.5 * k, 0.0], body=address, hover=0.5)
         for k, address in enumerate(addresses)
     }
-    return bodies.request(Experiment(title="Bodies", robots=robots, duration_s=1.0), tuple(robots), [7])
+    return bodies.body_request(Experiment(title="Bodies", robots=robots, duration_s=1.0), tuple(robots), [7])
 
 
 def test_addresses_choose_the_bodies(monkeypatch):

@@ -60,7 +60,7 @@ def flown(ahead: Callable[[float], float | None], seconds: float) -> tuple[Runti
     said: list[tuple[float, str]] = []
     net = Net()
     with net.worn():
-        body = assemble(bodies.request(few, ("T",), [1]))
+        body = assemble(bodies.body_request(few, ("T",), [1]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True])
         runtime = Runtime(Plan(few).assignment(("T",)), body, setup)
         body.open()

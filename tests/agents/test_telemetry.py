@@ -43,7 +43,7 @@ class Robot:
             monkeypatch.setattr(pubsub, name, lambda *_: Taken())
         experiment = pair()
         self.agent = Agent(Plan(experiment).assignment(("A",)))
-        self.body = TwinBody(bodies.request(experiment, ("A",), [1]))
+        self.body = TwinBody(bodies.body_request(experiment, ("A",), [1]))
         self.body.open()
         nowhere = None
         self.neighbours = Neighbours(nowhere, Keys(), self.agent, reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]

@@ -294,7 +294,7 @@ def test_sizes_bound_what_robots_say_and_not_the_experiment():
 
 def test_needed_identities():
     reference = load("robotic-park").cases()["event"]
-    assert set(access_rights.needed(reference)) == {"router", "operator", "recorder", *reference.robots}
-    assert {"world"} < set(access_rights.needed(choose_bodies(reference, "world")))
-    assert {"centre"} < set(access_rights.needed(load("architectures").cases()["hybrid"]))
-    assert {"twin", "positioning"} < set(access_rights.needed(choose_bodies(reference, "protocol")))
+    assert set(access_rights.needed_identities(reference)) == {"router", "operator", "recorder", *reference.robots}
+    assert {"world"} < set(access_rights.needed_identities(choose_bodies(reference, "world")))
+    assert {"centre"} < set(access_rights.needed_identities(load("architectures").cases()["hybrid"]))
+    assert {"twin", "positioning"} < set(access_rights.needed_identities(choose_bodies(reference, "protocol")))

@@ -187,14 +187,14 @@ def test_the_catalogue_has_arena_files_that_are_no_experiments(tmp_path):
     assert index.arenas() == ["gate.arena.toml"]
     assert "obstacle-course" in index.names()
     assert not any("arena" in name for name in index.names())
-    made = entries.copy("obstacle-course", tmp_path)
+    made = entries.copy_entry("obstacle-course", tmp_path)
     assert read(made).experiment == read("obstacle-course").experiment
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(
         [made.name, "gate.arena.toml", index.SCHEMA]
     )  # fmt: skip
     (tmp_path / "gate.arena.toml").write_text("[arena]\n")
     with pytest.raises(DocumentError, match="is another arena"):
-        entries.copy("obstacle-course", tmp_path / "again.toml")
+        entries.copy_entry("obstacle-course", tmp_path / "again.toml")
     assert not (tmp_path / "again.toml").exists()
 
 

@@ -89,7 +89,7 @@ def test_repetitions_stand_side_by_side(park):
 
 
 def test_bodies_of_repetitions_differ_in_their_seeds_only(park):
-    made = bodies.request(park, NAMES, [5, 6])
+    made = bodies.body_request(park, NAMES, [5, 6])
     assert made.names == NAMES * 2
     assert made.seeds == (5,) * 7 + (6,) * 7
     assert made.addresses == ("twin",) * 14
@@ -109,7 +109,7 @@ def experiment(**parts):
 
 
 def test_starts_are_on_the_floor_with_a_yaw():
-    position, yaw = bodies.start(experiment(), ("B", "A"))
+    position, yaw = bodies.start_poses(experiment(), ("B", "A"))
     np.testing.assert_array_equal(position, [[0.0, 0.25, 0.0], [0.5, -0.5, 0.0]])
     np.testing.assert_array_equal(yaw, [0.0, 1.5])
 
@@ -175,7 +175,7 @@ def test_robots_are_not_scattered_into_obstacles():
     given = Experiment(
         title="t", duration_s=1.0, robots=robots, arena=Arena(obstacles={"post": post}), start=Start(scatter=0.6)
     )
-    place = np.array([bodies.scattered(given, ("A", "B"), seed)[0][:, :2] for seed in range(100)])
+    place = np.array([bodies.scattered_poses(given, ("A", "B"), seed)[0][:, :2] for seed in range(100)])
     gap = np.hypot(place[..., 0], place[..., 1]) - 0.3 - 0.07
     assert gap.min() > bodies.CLEAR
     assert gap.min() < 0.1  # it is near enough to be in the way

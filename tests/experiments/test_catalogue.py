@@ -74,17 +74,17 @@ def test_the_leader_of_the_convoy_stays_inside_and_below_its_top_speed():
 
 
 def test_copy_gives_an_experiment_that_reads_and_never_overwrites(tmp_path):
-    target = entries.copy("triangle", tmp_path / "mine.toml")
+    target = entries.copy_entry("triangle", tmp_path / "mine.toml")
     assert read(target).experiment == read("triangle").experiment
     assert json.loads((tmp_path / index.SCHEMA).read_bytes()) == json_schema.schema()
     with pytest.raises(DocumentError, match="exists already"):
-        entries.copy("convoy", target)
+        entries.copy_entry("convoy", target)
     assert read(target).experiment == read("triangle").experiment
-    assert entries.copy("convoy", tmp_path) == tmp_path / "convoy.toml"
+    assert entries.copy_entry("convoy", tmp_path) == tmp_path / "convoy.toml"
     with pytest.raises(DocumentError, match="cannot be written: No such file"):
-        entries.copy("convoy", tmp_path / "nowhere" / "x.toml")
+        entries.copy_entry("convoy", tmp_path / "nowhere" / "x.toml")
     with pytest.raises(DocumentError, match="neither a file nor"):
-        entries.copy("convoi", tmp_path)
+        entries.copy_entry("convoi", tmp_path)
 
 
 # The schema

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from agents.body.interface import Disturbance, Jitter
 from agents.decision.position_control import REACHED
 from experiments.check.check import Figures, check, figures
-from experiments.check.ideal_run import REPETITIONS, isolated, predict, repeat, repetitions, undisturbed
+from experiments.check.ideal_run import REPETITIONS, fly_repeatedly, isolated, predict, repetitions, undisturbed
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.file import catalogue, document
 from experiments.file.document import Document
@@ -198,8 +198,8 @@ def test_formations_that_settle_well_within_the_run_are_not_flown_with_noise(mon
 def test_flights_with_noise_are_those_of_their_seeds():
     bare = isolated(msgspec.structs.replace(flat_strip(0.3), duration_s=5.0, seed=7))
     assert repetitions(bare) == REPETITIONS
-    first, second = repeat(bare, 2)
-    (alone,) = repeat(msgspec.structs.replace(bare, seed=8), 1)
+    first, second = fly_repeatedly(bare, 2)
+    (alone,) = fly_repeatedly(msgspec.structs.replace(bare, seed=8), 1)
     np.testing.assert_array_equal(second.position, alone.position)
     assert np.abs(first.position - second.position).max() > 1e-3
     assert repetitions(msgspec.structs.replace(bare, robots={f"R{k}": bare.robots["CF0"] for k in range(1000)})) == 1

@@ -27,20 +27,20 @@ def experiment(channel=None, **parts):
 
 def virtual(channel, seeds=(1,)):
     chosen = experiment(channel)
-    return link_conditions.virtual(chosen, Plan(chosen).assignment(NAMES, copies=len(seeds)).links, seeds)
+    return link_conditions.virtual_conditions(chosen, Plan(chosen).assignment(NAMES, copies=len(seeds)).links, seeds)
 
 
 def at(channel, *names):
     chosen = experiment(channel)
-    return link_conditions.at_listeners(chosen, Plan(chosen).assignment(names).links, names)
+    return link_conditions.receiver_conditions(chosen, Plan(chosen).assignment(names).links, names)
 
 
 def test_the_default_is_a_millisecond_and_nothing_at_a_real_listener():
     assert virtual(Channel()).delay.tolist() == [0.001] * 4
     assert at(Channel(), "A").delay.tolist() == [0.0]
     assert at(Channel(delay_s=0.02), "A").delay.tolist() == [0.02]
-    assert not link_conditions.modelled(experiment())
-    assert link_conditions.modelled(experiment(Channel(loss=0.1)))
+    assert not link_conditions.models_network(experiment())
+    assert link_conditions.models_network(experiment(Channel(loss=0.1)))
 
 
 def test_links_have_their_own():
@@ -91,7 +91,7 @@ def test_another_robot_does_not_change_the_luck_of_the_others():
     bigger = experiment(channel)
     robots = {"Z": Robot(kind="khepera4", start=[0.0, 1.0]), **bigger.robots}
     bigger = msgspec.structs.replace(bigger, robots=robots)
-    made = link_conditions.virtual(bigger, Plan(bigger).assignment(tuple(robots)).links, [1])
+    made = link_conditions.virtual_conditions(bigger, Plan(bigger).assignment(tuple(robots)).links, [1])
     assert made.key.tolist() == virtual(channel).key.tolist()
 
 
@@ -158,6 +158,6 @@ def test_links_that_only_avoidance_hears_are_links():
     assert wrong(channel, avoidance=everybody) == []
     chosen = experiment(channel, avoidance=everybody)
     links = Plan(chosen).assignment(NAMES).links
-    made = link_conditions.virtual(chosen, links, [1])
+    made = link_conditions.virtual_conditions(chosen, links, [1])
     ((k),) = np.flatnonzero(made.loss)
     assert (NAMES[links.receiver[k]], NAMES[links.sender[k]]) == ("A", "C")

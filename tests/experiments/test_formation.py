@@ -9,7 +9,7 @@ from agents.plugins import registry
 from experiments.check import check
 from experiments.check.realisation import contradictions
 from experiments.definition.experiment import Start
-from experiments.definition.formation import anchors_of, errors
+from experiments.definition.formation import compile_anchors, errors_over_time
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.metrics.signals import net_rotation
@@ -89,7 +89,7 @@ def flown(experiment, seeds=(1,)):
     running = (log.time >= 0.0) & (log.time < experiment.duration_s)
     time, position = log.time[running], log.true_position[running][:, : len(log.names)]
     law = registry.build(registry.LAWS, experiment.formation.law)
-    return time, position, errors(law, Plan(experiment).formation, time, position)
+    return time, position, errors_over_time(law, Plan(experiment).formation, time, position)
 
 
 def codes(given):
@@ -101,17 +101,17 @@ def codes(given):
 
 def test_both_ends_of_a_link_are_asked_for_the_same(written):
     experiment = written(SQUARE).experiment
-    asked = {(link.listener, link.speaker): link.wanted for link in Plan(experiment).one_way}
+    asked = {(link.receiver, link.sender): link.wanted for link in Plan(experiment).one_way_links}
     assert asked["B", "A"].relative == (0.6, 0.0, 0.0)  # B stands 0.6 m along x from A
     assert asked["A", "B"].relative == (-0.6, -0.0, -0.0)
     assert asked["C", "B"].relative == (0.0, 0.6, 0.6)  # the heights that they hold
     assert asked["B", "C"].distance == pytest.approx(np.hypot(0.6, 0.6))
-    assert {link.gain for link in Plan(experiment).one_way} == {0.5}  # the stiffness, not the gain of distances
+    assert {link.gain for link in Plan(experiment).one_way_links} == {0.5}  # the stiffness, not the gain of distances
 
 
 def test_each_link_has_the_gain_of_what_it_asks_for(written):
-    links = Plan(written(MIXED).experiment).one_way
-    assert {(link.listener, link.speaker): link.gain for link in links} == {
+    links = Plan(written(MIXED).experiment).one_way_links
+    assert {(link.receiver, link.sender): link.gain for link in links} == {
         ("B", "A"): 0.5, ("B", "C"): 3.0, ("C", "B"): 3.0, ("C", "A"): 3.0, ("C", "D"): 3.0, ("D", "C"): 3.0,
         ("D", "A"): 0.5,
     }  # fmt: skip
@@ -125,7 +125,7 @@ def test_a_law_of_distances_takes_offsets_for_distances(written):
 
 
 def test_anchors_from_the_file(written):
-    anchors = anchors_of(
+    anchors = compile_anchors(
         written(
             "[formation.anchors]\nA = 1.0\nB = { along = [0.0, 2.0], to = [0.5, 0.0] }\nC = { across = [0, 0, 1], "
             'distance = 0.6 }\nD = { distance = 0.7, gain = 9.0 }\n[formation.links]\n"A - B" = 0.5'

@@ -3,7 +3,7 @@
 import pytest
 
 from experiments.file.problems import DocumentError
-from experiments.file.structure import OBJECT, table
+from experiments.file.structure import OBJECT, parse_object
 from twins.devices.device import Faults
 from twins.scene import Obstacle
 
@@ -11,9 +11,9 @@ PLACE = ("arena", "obstacles", "box")
 
 
 def test_an_object_is_read():
-    assert table("--device", '{"rc_hz": 20.0}') == {"rc_hz": 20.0}
-    assert table("--faults", '{"loss": 0.05}', Faults) == {"loss": 0.05}
-    assert table("--faults", "{}", Faults) == {}
+    assert parse_object("--device", '{"rc_hz": 20.0}') == {"rc_hz": 20.0}
+    assert parse_object("--faults", '{"loss": 0.05}', Faults) == {"loss": 0.05}
+    assert parse_object("--faults", "{}", Faults) == {}
 
 
 @pytest.mark.parametrize(
@@ -32,14 +32,14 @@ def test_an_object_is_read():
 )
 def test_what_is_wrong_is_said_with_the_remedy(text, why):
     with pytest.raises(DocumentError) as refused:
-        table("--obstacle", text, Obstacle, PLACE)
+        parse_object("--obstacle", text, Obstacle, PLACE)
     assert str(refused.value).endswith(f": {why}")
     assert str(refused.value).startswith("--obstacle ")
 
 
 def test_everything_that_is_wrong_is_said():
     with pytest.raises(DocumentError) as refused:
-        table("--faults", '{"los": 1, "battery": "full"}', Faults)
+        parse_object("--faults", '{"los": 1, "battery": "full"}', Faults)
     assert [problem.message for problem in refused.value.problems] == [
         "unknown key 'los'",
         "'battery' must be a number, not 'full'",

@@ -76,7 +76,7 @@ def test_without_those_on_standby_nothing_names_them() -> None:
             outages=[Outage(from_s=1.0, links=["A - C"]), Outage(from_s=2.0, robots=["B", "C"]), Outage(from_s=3.0)],
         ),
     )
-    made = reserves.taking_part(whole)
+    made = reserves.without_standby(whole)
     assert list(made.robots) == ["A", "B"]
     assert made.formation.links == {"A - B": 0.5}
     assert not made.timeline
@@ -84,7 +84,7 @@ def test_without_those_on_standby_nothing_names_them() -> None:
     assert [(outage.from_s, outage.robots) for outage in made.channel.outages] == [(2.0, ["B"]), (3.0, [])]
     assert made.architecture == Hybrid("hybrid", ["A"])
     assert not list(consistency.faults(made))
-    assert reserves.taking_part(made) is made
+    assert reserves.without_standby(made) is made
 
 
 def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ TIMED = ("position", "yaw", "true_position", "goal", "setpoint")
 
 def parse_links(experiment):
     """Every directed link: listener, speaker, distance [m], gain."""
-    return [(link.listener, link.speaker, link.wanted.distance, link.gain) for link in Plan(experiment).one_way]
+    return [(link.receiver, link.sender, link.wanted.distance, link.gain) for link in Plan(experiment).one_way_links]
 
 
 def experiment(

@@ -345,7 +345,7 @@ def words() -> Iterator[Target]:
     from bridges.crazyflie.positioning import stations  # noqa: PLC0415
     from bridges.khepera4.link import Address  # noqa: PLC0415
     from bridges.vicon.publisher import parse_server  # noqa: PLC0415
-    from experiments.definition.links import pairs  # noqa: PLC0415
+    from experiments.definition.links import link_pairs  # noqa: PLC0415
     from tools.commands.network import KeyExpressionError, key_expression  # noqa: PLC0415
     from twins.devices import vicon  # noqa: PLC0415
 
@@ -375,7 +375,7 @@ def words() -> Iterator[Target]:
             "device": device,
             "key": key_expression,
             "plugin": lambda text: registry.struct(registry.TRIGGERS, text),
-            "link": pairs,
+            "link": link_pairs,
             "park": lambda text: khepera4.scanned(text) + khepera4.numbers(text),
             "stations": lighthouse,
         }

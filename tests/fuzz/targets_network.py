@@ -61,7 +61,7 @@ def robot() -> Iterator[Target]:
 
     def make():
         net.forget()
-        body = assemble(bodies.request(experiment, ["KH01"], [1], ["tcp/127.0.0.1:1"]))
+        body = assemble(bodies.body_request(experiment, ["KH01"], [1], ["tcp/127.0.0.1:1"]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True], ranging=["world"])
         runtime = Runtime(Plan(experiment).assignment(["KH01"]), body, setup)
         body.open()

@@ -47,7 +47,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
     children = flight.children()
     assert "router" not in children
 
-    hears = access_rights.heard(load("robotic-park").experiment)
+    hears = access_rights.senders_by_receiver(load("robotic-park").experiment)
     robots = list(hears)
     linked: dict[str, set[str]] = {name: set() for name in robots}
     for name in robots:
@@ -147,7 +147,7 @@ def test_members_of_a_lab_let_nobody_do_what_is_not_his(tmp_path: Path) -> None:
     file = tmp_path / "mesh.toml"
     file.write_text(load("triangle").path.read_text() + '\n[network]\ntopology = "mesh"\nlab = "lab"\n')
     case = load(file).experiment
-    listening = mesh.listeners(case)
+    listening = mesh.listening_hosts(case)
     identities: dict[str, Role] = {role: role for role in authority.SERVICES}
     authority.create(
         tmp_path / "lab", {**identities, **dict.fromkeys((*case.robots, "KH09"), "robot")}, listening=listening

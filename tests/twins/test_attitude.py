@@ -339,7 +339,7 @@ def twin(robots, nature=None):
     experiment = Experiment(
         title="Drones", robots=robots, duration_s=1.0, disturbance=nature or {}, world=World(engine="mujoco")
     )
-    return TwinBody(bodies.request(experiment, names, (3,)), bodies.world(experiment, names))
+    return TwinBody(bodies.body_request(experiment, names, (3,)), bodies.shared_world(experiment, names))
 
 
 @pytest.mark.slow
@@ -364,7 +364,7 @@ def test_ground_robots_drive_as_in_the_point_mass_engine():
         {"K": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.5)}
     )
     experiment = Experiment(title="K", robots={"K": Robot(kind="khepera4", start=[0.0, 0.0])}, duration_s=1.0)
-    plain = TwinBody(bodies.request(experiment, ("K",), (3,)))
+    plain = TwinBody(bodies.body_request(experiment, ("K",), (3,)))
     for tick in range(100):
         state, other = body.read(tick * DT), plain.read(tick * DT)
         body.command(np.array([[0.2, 0.5, 0.0, 0.0], [np.nan] * 4]))

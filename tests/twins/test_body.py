@@ -37,7 +37,7 @@ def request(robots, nature=None, seeds=(3,), hz=100.0):
     experiment = Experiment(
         title="Bodies", robots=robots, duration_s=1.0, disturbance=nature or {}, rates=Rates(body_hz=hz)
     )
-    return bodies.request(experiment, tuple(robots), seeds)
+    return bodies.body_request(experiment, tuple(robots), seeds)
 
 
 def body(kind, **parts):

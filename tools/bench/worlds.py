@@ -88,8 +88,8 @@ def _stepping() -> Iterator[Figure]:
     def stepped(experiment: Experiment, *, sensing: bool) -> float:
         """CPU time [s] of TICKS ticks of the bodies, robots under way."""
         names = tuple(experiment.robots)
-        request = bodies.request(experiment, names, [1])
-        body = TwinBody(request, bodies.world(experiment, names, sensing=sensing))
+        request = bodies.body_request(experiment, names, [1])
+        body = TwinBody(request, bodies.shared_world(experiment, names, sensing=sensing))
         setpoint, everyone = _setpoints(experiment), np.arange(len(names))
         body.takeoff(everyone, np.full(len(names), 0.5))
         tick = 0

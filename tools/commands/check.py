@@ -159,7 +159,7 @@ def new(
     if not formations:
         if name is None:
             raise typer.BadParameter("give a NAME (`zenpark list`), or a formation such as --hemisphere 40")
-        path = catalogue.copy(name, Path(target) if target else Path(f"{name}.toml"))
+        path = catalogue.copy_entry(name, Path(target) if target else Path(f"{name}.toml"))
         print(f"{path}: a copy of {name}; change it, then `zenpark check {path}` and `zenpark run {path}`")
         return
     if len(formations) > 1 or target is not None:

@@ -152,7 +152,7 @@ def _listening(who: list[str]) -> dict[str, list[str]]:
     """Where identities of experiments listen that are meshes."""
     from experiments.definition import mesh
 
-    return {name: at for each in who for case in _cases(each) or () for name, at in mesh.listeners(case).items()}
+    return {name: at for each in who for case in _cases(each) or () for name, at in mesh.listening_hosts(case).items()}
 
 
 def _robots(who: list[str], taken: set[str]) -> dict[str, Role]:

@@ -120,7 +120,7 @@ def world_order(
         raise WorldOrderError(f"no order '{what}' to a world; {did_you_mean(what, WORLD_ORDERS)}")
     given = None
     if obstacle is not None:
-        given = structure.table("--obstacle", obstacle, Obstacle, ("arena", "obstacles", name or "it"))
+        given = structure.parse_object("--obstacle", obstacle, Obstacle, ("arena", "obstacles", name or "it"))
         if at is not None:
             given["at"] = at
         if what == "spawn" and not given.keys() & {"at", "wall"}:

@@ -138,8 +138,8 @@ class Flight:
         self._well: float | None = None  # since when all is well, before a fault
         self._formed_since: float | None = None
         self._hears: dict[str, set[str]] = {name: set() for name in setting.experiment.robots}
-        for link in Plan(setting.experiment).one_way:
-            self._hears[link.listener].add(link.speaker)
+        for link in Plan(setting.experiment).one_way_links:
+            self._hears[link.receiver].add(link.sender)
 
     def fly(self) -> Ended:
         """Runs the round to its end; leaves no process behind."""

@@ -52,10 +52,10 @@ class Invariants:
         self._low = np.array([-0.5 * x - OUT_M, -0.5 * y - OUT_M, -BELOW_M])
         self._high = np.array([0.5 * x + OUT_M, 0.5 * y + OUT_M, z + OUT_M])
         self.position: Array = np.full((len(row), 3), np.nan)
-        links = [link for link in Plan(experiment).one_way if np.isinf(link.reach)]
+        links = [link for link in Plan(experiment).one_way_links if np.isinf(link.reach)]
         self._links = links
-        self._listener = np.array([row[link.listener] for link in links], dtype=np.intp)
-        self._speaker = np.array([row[link.speaker] for link in links], dtype=np.intp)
+        self._listener = np.array([row[link.receiver] for link in links], dtype=np.intp)
+        self._speaker = np.array([row[link.sender] for link in links], dtype=np.intp)
         self._distance = np.array([link.wanted.distance for link in links])
         self._relative = np.array([link.wanted.relative for link in links]).reshape(-1, 3)
         self._bearing = np.array([link.wanted.bearing for link in links]).reshape(-1, 3)

@@ -112,7 +112,7 @@ def conduct(
             check_loopback(endpoint)
     endpoints = list(map(from_here, listening)) if own_router else listening
     if meshed:
-        endpoints = secured(mesh.members(embodied.values(), secure=secure), of_lab)
+        endpoints = secured(mesh.member_endpoints(embodied.values(), secure=secure), of_lab)
     rights = enforced(embodied.values(), endpoints, folder, staging.identity)
     (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
     me = run_registry.mine(
@@ -222,7 +222,7 @@ def enforced(
     if of is None:
         return None
     known = register(of)
-    require(of, list(dict.fromkeys(name for case in cases for name in access_rights.needed(case, operator))))
+    require(of, list(dict.fromkeys(name for case in cases for name in access_rights.needed_identities(case, operator))))
     role = known.identities[operator].role
     if role != "operator":
         raise LabError(f"{operator} is {role} in the lab, and gives no orders: choose an operator with --as")

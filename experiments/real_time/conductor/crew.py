@@ -60,7 +60,7 @@ class CaseProcesses:
         self._centre: tuple[str, ...] = ()
         self._servants = Servants(context)
         self.adopted: set[str] = set()
-        self.away = standby.absent(context.experiment)
+        self.away = standby.robots_without_address(context.experiment)
         self._addressed, self._reached = context.file, context.experiment
         self._joining = context.folder / f"{context.case}-joining.json"
         self._abroad: dict[str, Process] = {}  # by host and group
@@ -138,7 +138,7 @@ class CaseProcesses:
     def place(self, name: str, robot: Robot | None = None) -> Array:
         """Where a robot is put (2,) [m], or where `robot` would be under its name."""
         robots = self._reached.robots if robot is None else {**self._reached.robots, name: robot}
-        position, _ = bodies.scattered(
+        position, _ = bodies.scattered_poses(
             msgspec.structs.replace(self._reached, robots=robots), [name], self._context.experiment.seed
         )
         return np.asarray(position[0, :2])

@@ -181,7 +181,7 @@ class Overview:
             name="conductor",
             wait_s=ROUTER_S,
             identity=identity,
-            rights=mesh.rights(experiment, endpoints),
+            rights=mesh.member_rights(experiment, endpoints),
         )
         self._session, declared = stack.enter_context(held(opened))
         declared.append(self)

@@ -71,7 +71,7 @@ class CentreProcess:
             for link, row in enumerate(rows)
         ]
         self._heard: Index = np.zeros(len(rows), dtype=np.intp)
-        self._channel = Channel(link_conditions.to_centre(experiment, centre.needed))
+        self._channel = Channel(link_conditions.conditions_to_centre(experiment, centre.needed))
         self._guided = [row for row in rows if centre.guided[row]]
         self._statuses = {
             row: pubsub.Inbox(pubsub.pose_subscriber(session, keys.status(names[row])), messages.Status, keys=keys)

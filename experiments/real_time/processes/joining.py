@@ -97,7 +97,9 @@ def joined(
     if lost is not None:
         Lifeline(lost).start()
     with told_to_end(on_signal):
-        session = network.open_session(endpoints, name=name, stop=stop, rights=mesh.rights(experiment, endpoints))
+        session = network.open_session(
+            endpoints, name=name, stop=stop, rights=mesh.member_rights(experiment, endpoints)
+        )
         with held(session) as (session, declared):
             if token:
                 try:

@@ -123,7 +123,9 @@ def stand_in(launch: TwinLaunch) -> int:
     if len(words) != 1 or not words <= set(known):
         hint = f"their `body` must be one of {', '.join(known)}"
         raise DocumentError([Problem(launch.file, 0, 0, f"{', '.join(names)} cannot share a protocol twin", hint)])
-    request = DeviceRequest(bodies.request(experiment, names, [experiment.seed], endpoints), _faults(launch.faults))
+    request = DeviceRequest(
+        bodies.body_request(experiment, names, [experiment.seed], endpoints), _faults(launch.faults)
+    )
     keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
     return _serve(words.pop(), request, keys=keys, rate_hz=rate, connect=endpoints, lifeline=launch.lifeline)
 
@@ -162,7 +164,7 @@ def by_hand(
     }
     experiment = Experiment(title=word, robots=robots, duration_s=1.0)
     endpoints = list(connect) or [DEFAULT_ENDPOINT]
-    request = DeviceRequest(bodies.request(experiment, list(robots), [experiment.seed], endpoints), faults)
+    request = DeviceRequest(bodies.body_request(experiment, list(robots), [experiment.seed], endpoints), faults)
     keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
     return _serve(word, request, keys=keys, rate_hz=rate, connect=connect, lifeline=False, identity=identity)
 
@@ -199,12 +201,12 @@ def _serve(
 
 def command(kind: str, count: int, *, faults: str, device: str, connect: Sequence[str], identity: str = "twin") -> int:
     """`zenpark twin`: as `by_hand`, with faults and settings as JSON."""
-    settings = structure.table("--device", device)
+    settings = structure.parse_object("--device", device)
     return by_hand(kind, count, faults=_faults(faults), device=settings, connect=connect, identity=identity)
 
 
 def _faults(text: str) -> Faults:
-    return msgspec.convert(structure.table("--faults", text, Faults), Faults)
+    return msgspec.convert(structure.parse_object("--faults", text, Faults), Faults)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

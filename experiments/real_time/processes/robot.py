@@ -103,9 +103,9 @@ def fly(launch: RobotLaunch) -> int:
 def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
     """Runs robots of a case until they end."""
     names, clock = launch.names, Clock(launch.clock_correction)
-    endpoints = mesh.near(experiment, names, endpoints)
-    request = replace(bodies.request(experiment, names, [experiment.seed], endpoints), clock=clock)
-    body = shadowed(assemble(request), request, bodies.shadows(experiment, names))
+    endpoints = mesh.neighbour_endpoints(experiment, names, endpoints)
+    request = replace(bodies.body_request(experiment, names, [experiment.seed], endpoints), clock=clock)
+    body = shadowed(assemble(request), request, bodies.shadow_periods(experiment, names))
     assignment = Plan(experiment).assignment(names)
     setup = Setup(
         keys=Keys(experiment.network.realm),
@@ -115,11 +115,11 @@ def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) 
         lifeline=launch.lifeline,
         located=[experiment.robots[name].position == "external" for name in names],
         ranging=[_ranging(experiment.robots[name]) for name in names],
-        conditions=link_conditions.at_listeners(experiment, assignment.links, names),
-        goal_conditions=link_conditions.from_centre(experiment, names),
+        conditions=link_conditions.receiver_conditions(experiment, assignment.links, names),
+        goal_conditions=link_conditions.conditions_from_centre(experiment, names),
         clock=clock,
         once=launch.once,
-        rights=mesh.rights(experiment, endpoints),
+        rights=mesh.member_rights(experiment, endpoints),
         loop_silence_s=experiment.safety.loop_silence_s,
     )
     return Runtime(assignment, body, setup).run()

@@ -67,7 +67,7 @@ class Population:
         self._experiment = experiment
         self._obstacles = dict(experiment.arena.obstacles)  # as they were given
         everyone = tuple(experiment.robots)
-        position, yaw = bodies.scattered(experiment, everyone, experiment.seed)
+        position, yaw = bodies.scattered_poses(experiment, everyone, experiment.seed)
         self._home = {name: (position[row], float(yaw[row])) for row, name in enumerate(everyone)}
         self._under_way: dict[str, float | None] = {}  # climbs with their height, landings with None
         self._dt = 1.0 / experiment.rates.body_hz
@@ -258,12 +258,12 @@ class Population:
         self.seen: Mask = self.carried | np.array([robot.ranges == "world" for robot in robots])
         home = [self._home[name] for name in self.names]
         request = replace(
-            bodies.request(experiment, self.names, [experiment.seed]),
+            bodies.body_request(experiment, self.names, [experiment.seed]),
             start=np.array([position for position, _ in home]),
             yaw=np.array([yaw for _, yaw in home]),
             external=(False,) * len(self.names),  # what is published is what is measured from outside
         )
-        world = bodies.world(experiment, self.names, sensing=True)
+        world = bodies.shared_world(experiment, self.names, sensing=True)
         sensors = tuple(own if seen else () for own, seen in zip(world.sensors, self.seen.tolist(), strict=True))
         self._scene = world.scene
         self.body = TwinBody(request, replace(world, mirrored=~self.carried, sensors=sensors))
