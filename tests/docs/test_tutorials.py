@@ -48,11 +48,16 @@ def test_a_lesson_is_a_notebook(lesson):
     assert len(re.findall(r"^# [1-9]\. ", words[-1], re.MULTILINE)) in (2, 3)
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("lesson", FIGURES)
+def test_what_a_lesson_imports_is_there(lesson):
+    tree = ast.parse("".join(body for is_text, body in cells(lesson) if not is_text))
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    exec(compile(ast.Module(imports, []), lesson, "exec"), {})
+
+
+@pytest.mark.nightly
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize(
-    "lesson", ["consensus", *(pytest.param(lesson, marks=pytest.mark.nightly) for lesson in ("rigidity", "events"))]
-)
+@pytest.mark.parametrize("lesson", FIGURES)
 def test_what_a_lesson_claims_is_true(lesson, tmp_path):
     done = subprocess.run(
         [sys.executable, "-W", "error", FOLDER / f"{lesson}.py", tmp_path / "figures"],

@@ -88,7 +88,13 @@ def test_four_of_all_kinds_change_sides():
     assert outcome.arrived.mean() >= 0.95
 
 
-@pytest.mark.parametrize(("kind", "sensors"), [("turtlebot3", ["lds01"]), ("khepera4", ["infrared", "ultrasonic"])])
+@pytest.mark.parametrize(
+    ("kind", "sensors"),
+    [
+        pytest.param("turtlebot3", ["lds01"], marks=pytest.mark.nightly),
+        ("khepera4", ["infrared", "ultrasonic"]),
+    ],
+)
 def test_two_that_only_see_each_other_keep_clear(kind, sensors):
     outcome = met((kind, kind), {"kind": "barrier"}, 4, sensors=sensors)
     assert outcome.collided.sum() == 0
