@@ -1,4 +1,4 @@
-"""The levels of one tick, pure and row-wise: what is told and heard, goals, position control, when to transmit.
+"""Levels of one tick, pure and row-wise: neighbours, goals, position control, transmission.
 
 Imports body, plugins, formation.
 """

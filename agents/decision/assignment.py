@@ -1,4 +1,4 @@
-"""What the experiment tells some of its robots."""
+"""Assignment: the experiment as some of its robots need it."""
 
 from __future__ import annotations
 
@@ -21,68 +21,39 @@ from agents.plugins.triggers import Trigger
 
 @dataclass(frozen=True)
 class Assignment:
-    """What the experiment tells some of its robots.
+    """Settings of the experiment for its rows (N), with their links (E)."""
 
-    Attributes:
-        names: Of the rows (N).
-        kinds: Of the rows (N).
-        hover: (N,) height that a flying row holds [m]; NaN for ground robots.
-        robots: Names of all robots of the experiment; `links.speaker` points here.
-        links: On which the rows listen.
-        law: Formation law.
-        trigger: Who speaks when.
-        predictor: Where a neighbour is believed to be between two messages.
-        update: When the law is computed anew; None: at every decision.
-        clamp: Largest step of a goal per axis and decision [m].
-        tracking_gain: k of (7) [1/(m² decision)].
-        legs: Plans: rows, and the legs that they follow.
-        limits: For `agents.safety.setpoint_filter`.
-        avoidance: How the rows keep clear of what they see and hear; None: they do not.
-        robot_kinds: Kinds of all robots of the experiment.
-        avoidance_only: (E,) links that are only for avoidance: the law knows nothing of them; None: there are none.
-        avoids: (N,) rows that keep clear at all; None: all.
-        anchors: Distances that the rows keep to what stands still; None: none.
-        changes: What becomes of the links' targets, over all links.
-        presence: When the links are there, over all links; None: always.
-        guided: (N,) rows for which a centre decides; None: none. Links of the law, anchors and legs are those of the
-            other rows; in the assignment of a centre, of these.
-        body_hz: Rate of ticks.
-        pose_every: The trigger is asked on every so many ticks.
-        decide_every: A goal is decided on every so many ticks.
-        duration: Of the experiment [s].
-        patience_s: A row that misses a neighbour for this long is ready without it; None: never.
-        awaited: (E,) links without which a row is not ready; None: all.
-    """
-
-    names: tuple[str, ...]
-    kinds: tuple[Kind, ...]
-    hover: Array
-    robots: tuple[str, ...]
-    links: Links
+    names: tuple[str, ...]  # of the rows (N)
+    kinds: tuple[Kind, ...]  # of the rows (N)
+    hover: Array  # (N,) height that a flying row holds [m]; NaN for ground robots
+    robots: tuple[str, ...]  # names of all robots of the experiment; `links.sender` points here
+    links: Links  # on which the rows receive
     law: laws.Law
-    trigger: Trigger
-    clamp: float
-    tracking_gain: float
-    legs: tuple[tuple[Index, tuple[Leg, ...]], ...]
+    trigger: Trigger  # of transmissions
+    clamp: float  # largest step of a goal per axis and decision [m]
+    tracking_gain: float  # k of (7) [1/(m² decision)]
+    legs: tuple[tuple[Index, tuple[Leg, ...]], ...]  # plans: rows, and the legs that they follow
     limits: Limits
-    body_hz: float
-    pose_every: int
-    decide_every: int
-    duration: float
-    patience_s: float | None = None
-    awaited: Mask | None = None
-    predictor: Predictor = HOLD
-    update: Trigger | None = None
-    avoidance: Avoidance | None = None
-    robot_kinds: tuple[Kind, ...] = ()
-    avoidance_only: Mask | None = None
-    avoids: Mask | None = None
-    anchors: Anchors | None = None
-    changes: tuple[Change, ...] = ()
-    presence: Presence | None = None
+    body_hz: float  # rate of ticks
+    pose_every: int  # ticks from one question to the trigger to the next
+    decide_every: int  # ticks from one goal to the next
+    duration: float  # of the experiment [s]
+    patience_s: float | None = None  # wait for a missing neighbour [s]; None: without limit
+    awaited: Mask | None = None  # (E,) links without which a row is not ready; None: all
+    predictor: Predictor = HOLD  # of neighbours between two messages
+    update: Trigger | None = None  # of the law; None: at every decision
+    avoidance: Avoidance | None = None  # None: no collision avoidance
+    robot_kinds: tuple[Kind, ...] = ()  # of all robots of the experiment
+    avoidance_only: Mask | None = None  # (E,) links that never enter the law; None: none
+    avoids: Mask | None = None  # (N,) rows that avoid; None: all
+    anchors: Anchors | None = None  # distances to fixed points, lines, planes
+    changes: tuple[Change, ...] = ()  # of the targets of all links
+    presence: Presence | None = None  # times of all links; None: always
+    # (N,) rows that the central controller guides; links of the law, anchors and legs are those of the other rows, and
+    # in the assignment of a central controller those of these rows
     guided: Mask | None = None
 
     def unreceived(self, stamp: Array) -> Mask:
-        """Links (E,) that are waited for and on which nothing was heard yet: the last `stamp` (E,) is not finite."""
-        unheard: Mask = ~np.isfinite(stamp)
-        return unheard if self.awaited is None else unheard & self.awaited
+        """Awaited links (E,) without a pose so far: the last `stamp` (E,) is not finite."""
+        missing: Mask = ~np.isfinite(stamp)
+        return missing if self.awaited is None else missing & self.awaited

@@ -1,7 +1,7 @@
-"""Where rows should go next: the law, plans and links of a formation, from where they are and what was heard.
+"""Goals of rows: law, plans and links of a formation, from own positions and received poses.
 
-Pure and row-wise. A robot asks it for itself, from where it is measured; the centre of a centralised experiment asks
-it for all that it guides, from where they last said that they are.
+Pure and row-wise. A robot computes its own goal from its measured position; the central controller computes the goals
+of all robots that it guides from their last received poses.
 """
 
 from __future__ import annotations
@@ -20,33 +20,24 @@ from agents.plugins.registry import FAILURES, PluginError
 
 
 class GoalDecision(msgspec.Struct, frozen=True):
-    """What a decision says of all rows; of those that are not `due` it means nothing.
+    """Result of a decision for all rows (N); meaningless for rows that are not `due`."""
 
-    Attributes:
-        due: (N,) rows that have a new goal.
-        goal: (N, 3) [m].
-        offset: (N, 3) of the law, before it was clamped [m].
-        yaw: (N,) yaw wanted at the goal [rad], NaN for any.
-    """
-
-    due: Mask
-    goal: Array
-    offset: Array
-    yaw: Array
+    due: Mask  # (N,) rows with a new goal
+    goal: Array  # (N, 3) [m]
+    offset: Array  # (N, 3) of the law, before it was clamped [m]
+    yaw: Array  # (N,) wanted at the goal [rad], NaN for any
 
 
 class GoalComputer:
-    """Goals of some of N rows.
+    """Goals of some of N rows."""
 
-    Attributes:
-        neighbours: What was heard on each link, and who takes part in the law.
-        clamp: Largest step of a goal per axis and decision [m].
-        tracking_gain: k of (7) [1/(m² decision)].
-        ground: (N,) heights that rows hold [m]; 0 for ground robots.
-    """
+    neighbours: NeighbourStates
+    clamp: float  # largest step of a goal per axis and decision [m]
+    tracking_gain: float  # k of (7) [1/(m² decision)]
+    ground: Array  # (N,) heights that rows hold [m]; 0 for ground robots
 
     def __init__(self, assignment: Assignment, mine: Mask) -> None:
-        """Of the rows `mine` (N,); links, anchors and plans of the others are none of its business."""
+        """Compute goals of the rows `mine` (N,); links, anchors and plans of the others are not used."""
         rows = len(assignment.names)
         self._assignment, links = assignment, assignment.links
         self.neighbours = NeighbourStates(links, assignment.avoidance_only, assignment.limits.link_silence_s)
@@ -57,9 +48,9 @@ class GoalComputer:
         self._anchored = np.zeros(rows, dtype=bool)
         if assignment.anchors is not None:
             self._anchored[assignment.anchors.row] = True
-        self._listens = self._anchored.copy()
-        watched = assignment.avoidance_only
-        self._listens[links.receiver if watched is None else links.receiver[~watched]] = True
+        self._uses_law = self._anchored.copy()
+        avoidance_only = assignment.avoidance_only
+        self._uses_law[links.receiver if avoidance_only is None else links.receiver[~avoidance_only]] = True
         changing = bool(assignment.changes) or assignment.presence is not None
         self._reshaping = Reshaping(links, assignment.changes, assignment.presence) if changing else None
         if self._reshaping is not None:
@@ -68,36 +59,36 @@ class GoalComputer:
         itineraries = []
         for group, legs in assignment.legs:
             planned[group] = True
-            for listens in (True, False):
-                part = group[self._listens[group] == listens]
+            for lawful in (True, False):
+                part = group[self._uses_law[group] == lawful]
                 if len(part):
-                    itineraries.append(Itinerary(part, legs, holds_before=not listens))
-        rest = np.flatnonzero(mine & ~planned & ~self._listens)
-        if len(rest):  # nobody tells it anything: it stays where it is
+                    itineraries.append(Itinerary(part, legs, holds_before=not lawful))
+        rest = np.flatnonzero(mine & ~planned & ~self._uses_law)
+        if len(rest):  # neither law nor plan: stay in place
             itineraries.append(Itinerary(rest, (), holds_before=True))
         self._itineraries = tuple(itineraries)
-        self._gated = self._listens & ~planned  # a plan moves its target while nobody looks
+        self._gated = self._uses_law & ~planned  # a plan moves its target at every decision
 
     def update_links(self, t: float) -> None:
-        """Takes in who is there and who is gone at `t` [s]."""
+        """Update the active links at `t` [s] for neighbours that appeared or were lost."""
         if self.neighbours.incomplete:
             self._links_changed(self.neighbours.update_active(t))
 
     def without_neighbours(self) -> Mask:
-        """Rows (N,) that the law has no answer for: all their neighbours are gone."""
-        hearing = self.neighbours
-        if len(hearing.active) == len(self._assignment.links):
-            return np.zeros(len(self._listens), dtype=bool)
-        hears = self._anchored.copy()
-        hears[hearing.links.receiver] = True
-        return self._listens & ~hears
+        """Rows (N,) for which the law has no input: all their neighbours are lost."""
+        neighbours = self.neighbours
+        if len(neighbours.active) == len(self._assignment.links):
+            return np.zeros(len(self._uses_law), dtype=bool)
+        has_input = self._anchored.copy()
+        has_input[neighbours.links.receiver] = True
+        return self._uses_law & ~has_input
 
     def begin_plans(self, rows: Index, place: Array, yaw: Array, elapsed_s: float = 0.0) -> None:
-        """Plans of `rows` (K,) that have not begun do so where these were when they did: (K, 3) [m] and (K,) [rad].
+        """Begin the plans of `rows` (K,) at `place` (K, 3) [m] and `yaw` (K,) [rad], if they have not begun.
 
         Legs that are due `elapsed_s` after the common start follow from there [s].
         """
-        count = len(self._listens)
+        count = len(self._uses_law)
         elapsed, position, heading = np.full(count, -np.inf), np.full((count, 3), np.nan), np.zeros(count)
         elapsed[rows], position[rows], heading[rows] = elapsed_s, place, yaw
         position[:, 2] = self.ground
@@ -106,28 +97,28 @@ class GoalComputer:
             itinerary.target(elapsed[mine], position[mine], heading[mine])
 
     def origin(self, row: int) -> tuple[float, float, float, float] | None:
-        """x, y, z [m] and yaw [rad] where the plan of a row began; None if it has none, or it has not begun."""
+        """x, y, z [m] and yaw [rad] at which the plan of a row began; None without plan, or before."""
         return next(filter(None, (itinerary.origin(row) for itinerary in self._itineraries)), None)
 
     def require_update(self, rows: Index) -> None:
-        """Rows whose goals are old compute the law at the next decision, whatever a trigger says."""
+        """Rows with old goals compute the law at the next decision, whatever a trigger decides."""
         if self._updating is not None:
             self._updating.require_update(rows)
 
     def decide(
         self, t: float, position: Array, velocity: Array, yaw: Array, *, start: Array, running: Mask
     ) -> GoalDecision:
-        """New goals of rows that are under way.
+        """New goals of running rows.
 
         Args:
             t: Now [s].
-            position: (N, 3) where rows are, or are believed to be [m].
+            position: (N, 3) measured or believed [m].
             velocity: (N, 3) [m/s].
             yaw: (N,) [rad].
-            start: (N,) when each row began [s].
+            start: (N,) start of each row [s].
             running: (N,) rows that want a goal.
         """
-        follows, due, view = self._listens, running, None
+        follows, due, view = self._uses_law, running, None
         if self._reshaping is not None:
             everywhere = self.neighbours.extrapolate_all(self._assignment.predictor, t)
             self._reshaping.advance(t - start, position, everywhere)
@@ -140,12 +131,12 @@ class GoalComputer:
         else:
             offset = view.offset if some(due & follows) else np.zeros_like(position)
         goal = position.copy()
-        toward = np.full(len(position), np.nan)
+        goal_yaw = np.full(len(position), np.nan)
         place = position.copy()
-        place[:, 2] = self.ground  # a plan begins at the height that is held, not where the climb was called done
+        place[:, 2] = self.ground  # a plan begins at the held height, not where the climb ended
         for itinerary in self._itineraries:
             rows = itinerary.rows
-            target, toward[rows] = itinerary.target(t - start[rows], place[rows], yaw[rows])
+            target, goal_yaw[rows] = itinerary.target(t - start[rows], place[rows], yaw[rows])
             leads = ~follows[rows]
             if leads.all():
                 goal[rows] = target
@@ -153,79 +144,76 @@ class GoalComputer:
                 offset[rows] += laws.tracking_offset(position[rows], target, self.tracking_gain)
         goal = np.where(follows[:, None], laws.goal_position(position, offset, self.clamp), goal)
         goal[:, 2] = np.where(follows | ~self._flies, self.ground, goal[:, 2])
-        return GoalDecision(due, goal, offset, toward)
+        return GoalDecision(due, goal, offset, goal_yaw)
 
     def law_offset(self, t: float, position: Array) -> Array:
-        """The offset of all rows (N, 3) [m]; a law that fails is named, for it may be somebody's first."""
-        law, hearing, anchors = self._assignment.law, self.neighbours, self._assignment.anchors
-        believed = hearing.poses.extrapolate_position(self._assignment.predictor, t, hearing.active)
+        """Offset of all rows (N, 3) [m].
+
+        Raises:
+            PluginError: If the law fails; the error names it.
+        """
+        law, neighbours, anchors = self._assignment.law, self.neighbours, self._assignment.anchors
+        believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
         try:
-            offset = law.offset(position, believed, hearing.links)
+            offset = law.offset(position, believed, neighbours.links)
         except FAILURES as error:
             raise PluginError(f"the law {type(law).__name__} failed: {type(error).__name__}: {error}") from error
         return offset if anchors is None else offset + anchors.offset(position)
 
     def errors(self, t: float, position: Array) -> tuple[Array, Array]:
-        """Σ|e| [m] and Σ ½e² [m²] of each row's links, as it sees them."""
-        hearing = self.neighbours
-        believed = hearing.poses.extrapolate_position(self._assignment.predictor, t, hearing.active)
-        error = self._assignment.law.error(position, believed, hearing.links)
-        both = hearing.links.sum_by_receiver(_error_and_energy(error), len(position))
+        """Σ|e| [m] and Σ ½e² [m²] of the links of each row, as it knows them."""
+        neighbours = self.neighbours
+        believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
+        error = self._assignment.law.error(position, believed, neighbours.links)
+        both = neighbours.links.sum_by_receiver(_error_and_energy(error), len(position))
         anchors = self._assignment.anchors
         if anchors is not None:
             np.add.at(both, anchors.row, _error_and_energy(anchors.error(position)))
         return both[:, 0], both[:, 1]
 
     def control_view(self, t: float, position: Array, velocity: Array, start: Array) -> ControlView:
-        """What the trigger of the control place sees; see `decide`."""
+        """View of the control trigger; see `decide`."""
         assert self._updating is not None
-        hearing, predictor = self.neighbours, self._assignment.predictor
-        listener = hearing.links.receiver
-        believed = hearing.poses.extrapolate_position(predictor, t, hearing.active)
-        moves = hearing.poses.extrapolate_velocity(predictor, t, hearing.active)
-        return self._updating.view(
-            t, position, velocity,
-            start=start,
-            live=hearing.active,
-            links=hearing.links,
-            anchored=self._anchored,
-            apart=position[listener] - believed,
-            rate=velocity[listener] - moves,
+        neighbours, predictor, active = self.neighbours, self._assignment.predictor, self.neighbours.active
+        receiver = neighbours.links.receiver
+        apart = position[receiver] - neighbours.poses.extrapolate_position(predictor, t, active)
+        rate = velocity[receiver] - neighbours.poses.extrapolate_velocity(predictor, t, active)
+        return ControlView(
+            t, position, velocity, self._updating.last_event, start, neighbours.links,
+            self._updating.inputs(active), (apart, rate), self._anchored,
             law=lambda: self.law_offset(t, position),
             errors=lambda: self.errors(t, position),
         )  # fmt: skip
 
     def _links_changed(self, rows: Index) -> None:
-        """Rows that got or lost a link, or whose links ask for something else, compute the law at once."""
+        """Rows whose links or targets changed compute the law at once."""
         if len(rows):
             self.require_update(rows)
 
 
 class StationKeeping:
-    """Rows that stay where they were when that began.
+    """Rows (N) that stay at the place where their hold began."""
 
-    Attributes:
-        held: (N,) which.
-    """
+    held: Mask  # (N,) rows that stay
 
     def __init__(self, ground: Array) -> None:
-        """Rows that hold their heights, `ground` (N,) [m]."""
+        """Hold at the heights `ground` (N,) [m]."""
         self._ground, self._at = ground, np.full((len(ground), 3), np.nan)
         self.held: Mask = np.zeros(len(ground), dtype=bool)
 
-    def hold_position(self, held: Mask, position: Array, goal: Array, toward: Array) -> tuple[Array, Array]:
-        """Goals (N, 3) [m] and yaws (N,) [rad] when rows `held` (N,) must stay and the others have those given."""
+    def hold_position(self, held: Mask, position: Array, goal: Array, yaw: Array) -> tuple[Array, Array]:
+        """Goals (N, 3) [m] and yaws (N,) [rad]: the held place for rows `held` (N,), else the given ones."""
         before, self.held = self.held, held
         if not some(held):
-            return goal, toward
+            return goal, yaw
         entered = held & ~before
         if some(entered):
             self._at[entered] = np.nan
-        nowhere = held & np.isnan(self._at[:, 0])  # who does not know where it is stays where it finds itself
+        nowhere = held & np.isnan(self._at[:, 0])  # rows without a position stay at the first known one
         if some(nowhere):
             self._at[nowhere] = position[nowhere]
             self._at[nowhere, 2] = self._ground[nowhere]
-        return np.where(held[:, None], self._at, goal), np.where(held, np.nan, toward)
+        return np.where(held[:, None], self._at, goal), np.where(held, np.nan, yaw)
 
 
 def _error_and_energy(error: Array) -> Array:

@@ -1,6 +1,6 @@
-"""The life of a robot in an experiment: idle, ready, airborne, running, landing, done. Pure and row-wise.
+"""Life of a robot in an experiment: idle, ready, airborne, running, landing, done. Pure and row-wise.
 
-Orders and facts go in, phases come out; what a body must do because of a change is collected in `BodyCommands`.
+Orders and facts go in, phases come out; resulting commands to the body are collected in `BodyCommands`.
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ from agents.arrays import Array, Index, Mask
 
 
 class Phase(IntEnum):
-    """Where in its life a robot is; the numbers grow with time."""
+    """Phase in the life of a robot; the numbers grow with time."""
 
     IDLE = 0  # process alive, something missing: position or a neighbour
-    READY = (
-        1  # body open, own position fresh, every neighbour heard, and whatever else `agents.safety.preflight` asks for
-    )
+    READY = 1  # body open, own position fresh, all neighbours received, `agents.safety.preflight` passed
     AIRBORNE = 2  # at its hover height (a ground robot: at once), waiting for the common start
     RUNNING = 3  # the experiment
     LANDING = 4  # going down, or rolling out
@@ -27,20 +25,20 @@ class Phase(IntEnum):
 
     @property
     def word(self) -> str:
-        """As it stands on the wire."""
+        """Name on the network."""
         return self.name.lower()
 
 
 # the members of an enumeration are slow to look up, and every tick asks for them
 IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
 
-AT_HEIGHT = 0.05  # [m] nearer than this to the hover height a robot has arrived there
-SETTLED = 0.1  # [m/s] slower than this it has stopped climbing, or rolling
+AT_HEIGHT = 0.05  # [m] from the hover height: arrived
+SETTLED = 0.1  # [m/s] slower: climbing or rolling has ended
 
 
 @dataclass(frozen=True)
 class BodyCommands:
-    """What the body must do now: rows that take off, land, and cut their motors."""
+    """Commands to the body: rows that take off, land, and stop their motors."""
 
     takeoff: Index
     land: Index
@@ -48,10 +46,12 @@ class BodyCommands:
 
 
 class Lifecycle:
-    """Phases of N rows; `moved` says whether any changed on the last tick, or by an order since the one before."""
+    """Phases of N rows."""
+
+    moved: bool  # whether a phase changed on the last tick, or by an order since the one before
 
     def __init__(self, flies: Mask, hover: Array, duration: float) -> None:
-        """Rows that fly (N,), the heights that they hold (N,) [m], and how long the experiment is [s]."""
+        """Rows that fly (N,), their hover heights (N,) [m], and the duration of the experiment [s]."""
         rows = len(flies)
         self.phase = np.full(rows, IDLE)
         self.start_at = np.full(rows, np.inf)
@@ -61,13 +61,13 @@ class Lifecycle:
         self._flies, self._hover, self._duration = flies, hover, duration
         self._climbing = np.zeros(rows, dtype=bool)
         self._due: dict[str, list[int]] = {"takeoff": [], "land": [], "stop": []}
-        self._settled_until = -np.inf  # until then nothing changes by itself
+        self._settled_until = -np.inf  # no change by itself before this time
 
     def takeoff(self, row: int) -> str:
-        """Order to climb; an empty answer means yes, else why not."""
+        """Order to climb; returns the reason of a refusal, empty when accepted."""
         phase = Phase(self.phase[row])
         if self._climbing[row] or phase in (AIRBORNE, RUNNING):
-            return ""  # done already: an order may be repeated when its reply was lost
+            return ""  # an order may be repeated when its reply was lost
         if phase != READY:
             return f"cannot take off while {phase.word}" + (f": {self.reason[row]}" if self.reason[row] else "")
         self._climbing[row] = True
@@ -75,7 +75,7 @@ class Lifecycle:
         return ""
 
     def start(self, row: int, at: float) -> str:
-        """Order to begin the experiment at `at` on the process's clock [s]."""
+        """Order to begin the experiment at `at` on the process's clock [s]; returns as `takeoff`."""
         phase = Phase(self.phase[row])
         if phase == RUNNING:
             return ""
@@ -85,7 +85,7 @@ class Lifecycle:
         return ""
 
     def land(self, row: int, reason: str) -> None:
-        """Go down, or roll out, whatever it was doing."""
+        """Land, or roll out, in any phase."""
         if self.phase[row] < LANDING:
             self.phase[row], self._climbing[row], self.reason[row] = LANDING, False, reason
             self._forget("takeoff", row)
@@ -100,12 +100,12 @@ class Lifecycle:
         self._settled_until = -np.inf
 
     def _forget(self, what: str, row: int) -> None:
-        """A duty that the body has not been told yet and must not be told any more."""
+        """Drop a command that the body has not received yet."""
         if row in self._due[what]:
             self._due[what].remove(row)
 
     def set_missing(self, row: int, reason: str) -> None:
-        """Says why an idle row is not ready, or why a ready one will not be any more on this tick."""
+        """Store why an idle row is not ready, or why a ready one will not be any more on this tick."""
         self._waits[row] = reason
         if self.phase[row] == IDLE:
             self.reason[row] = reason
@@ -126,11 +126,11 @@ class Lifecycle:
         return self._settled_until > -np.inf or bool((self.phase == RUNNING).all())
 
     def advance(self, t: float, ready: Mask, position: Array, velocity: Array, flying: Mask) -> BodyCommands | None:
-        """Moves every row on as far as the facts allow.
+        """Advance the phase of every row as far as the facts allow.
 
         Args:
             t: Now, on the process's clock [s].
-            ready: (N,) nothing is missing; who was ready and is not is idle again, unless it climbs already.
+            ready: (N,) nothing is missing; a ready row that loses this is idle again, unless it climbs already.
             position: (N, 3) [m].
             velocity: (N, 3) [m/s].
             flying: (N,) motors on.
@@ -159,20 +159,20 @@ class Lifecycle:
             for row in np.flatnonzero(over) if over.any() else ():
                 self.land(int(row), "finished")
         if highest >= LANDING:
-            slow = ~((velocity * velocity).sum(axis=1) >= SETTLED**2)  # what is not known cannot be waited for
+            slow = ~((velocity * velocity).sum(axis=1) >= SETTLED**2)  # an unknown velocity counts as slow
             down = (phase == LANDING) & np.where(self._flies, ~flying, slow)
-            down[self._due["land"]] = False  # the body has not been told yet
+            down[self._due["land"]] = False  # the body has not received the command yet
             phase[down] = DONE
         now = phase.tobytes()
         self.moved, self._before = now != self._before, now  # orders between ticks count as well
         if (phase == RUNNING).all():
             self._settled_until = float(self.start_at.min()) + self._duration - 1e-6
-        return self._duties()
+        return self._commands()
 
-    def _duties(self) -> BodyCommands | None:
+    def _commands(self) -> BodyCommands | None:
         if not any(self._due.values()):
             return None
-        duties = BodyCommands(*(np.array(self._due[what], dtype=np.intp) for what in ("takeoff", "land", "stop")))
+        commands = BodyCommands(*(np.array(self._due[what], dtype=np.intp) for what in ("takeoff", "land", "stop")))
         for rows in self._due.values():
             rows.clear()
-        return duties
+        return commands

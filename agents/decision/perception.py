@@ -1,4 +1,4 @@
-"""What rows know of the things around them: from their own range readings, and from whom they hear."""
+"""Perception: things near rows, from their own range readings and from received poses."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from agents.plugins.avoidance import Nearby, OwnState
 if TYPE_CHECKING:
     from agents.decision.neighbours import NeighbourPoses
 
-REACH: Final = 3.0  # [m] between axes; what is farther away is nobody's concern yet
-AHEAD_S: Final = 0.1  # heard positions are carried on for so long: who is silent for longer may as well have stopped
-BELIEVED_S: Final = 0.5  # and so long a heard velocity is believed
-SCAN_S: Final = 1.0  # readings older than this are none
-DESCENT: Final = 0.1  # [m/s] who sinks faster than this may be coming down,
-DESCENT_S: Final = 2.0  # and is in the way wherever it can be within so long
-OUTLINE: Final = 0.05  # [m] a ray that ends this near to a robot that was heard has seen that robot,
+REACH: Final = 3.0  # [m] between axes; farther things are ignored
+AHEAD_S: Final = 0.1  # received positions are extrapolated for this long: a silent robot may have stopped
+BELIEVED_S: Final = 0.5  # and received velocities are used for this long
+SCAN_S: Final = 1.0  # readings older than this are dropped
+DESCENT: Final = 0.1  # [m/s] a robot that sinks faster may be landing,
+DESCENT_S: Final = 2.0  # and is in the way wherever it can be within this time
+OUTLINE: Final = 0.05  # [m] a reading that ends this near to a received robot has hit that robot,
 OUTLINE_SHARE: Final = 0.05  # and this share of its length, as long ones are measured worse
 STEEP: Final = 0.5  # cosine of the elevation above which a ray looks up or down, not around
 
 
 class Perception:
-    """Puts together what `Avoidance` decides on."""
+    """Collects the inputs of `Avoidance`."""
 
     def __init__(  # noqa: PLR0917
         self,
         kinds: Sequence[Kind],
-        speaker_kinds: Sequence[Kind],
+        robot_kinds: Sequence[Kind],
         links: Links,
         limits: Limits,
         clearance: float,
         avoids: Mask | None = None,
     ) -> None:
-        """Of rows of `kinds` that listen on `links`.
+        """Perceive for rows of `kinds` that receive on `links`.
 
         Args:
             kinds: Of the rows (N).
-            speaker_kinds: Of all robots of the experiment; `links.speaker` points here.
-            links: On which the rows hear, for the formation or only for this (E).
-            limits: Of safety: speed, and how long silence is borne.
-            clearance: What is farther above or below than this is not seen [m].
-            avoids: (N,) rows that keep clear at all; None: all.
+            robot_kinds: Of all robots of the experiment; `links.sender` points here.
+            links: On which the rows receive, for the formation or only for this (E).
+            limits: Of safety.
+            clearance: Things farther above or below than this are ignored [m].
+            avoids: (N,) rows that avoid; None: all.
         """
         self._limits, self._clearance, self._avoids = limits, clearance, avoids
         self._takes = tuple(kind.takes for kind in kinds)
@@ -61,21 +61,21 @@ class Perception:
         self._turn_rate, self._response = _column(kinds, "turn_rate"), _column(kinds, "response")
         self._lag = _column(kinds, "lag")
         self._flies = np.array([kind.flies for kind in kinds], dtype=bool)
-        self._listener = links.receiver
-        speaks = [speaker_kinds[speaker] for speaker in links.sender.tolist()]
+        self._receiver = links.receiver
+        speaks = [robot_kinds[sender] for sender in links.sender.tolist()]
         self._their_radius, self._their_lag = _column(speaks, "radius"), _column(speaks, "lag")
         self._their_height = _column(speaks, "height")
         self._rays: Rays | None = None
         self._points = _Points.nothing()
 
-    def sense(self, t: float, state: BodyState, heard: NeighbourPoses) -> tuple[OwnState, Nearby]:
-        """What rows know of themselves and of what is near at `t` [s].
+    def sense(self, t: float, state: BodyState, poses: NeighbourPoses) -> tuple[OwnState, Nearby]:
+        """Own state and near things of the rows at `t` [s].
 
-        Rows whose own position is missing or old know of nothing. A robot that was heard is where it was then, carried
-        on with its velocity; a ray that ended on one that was heard is not counted a second time.
+        Rows whose own position is missing or old get no things. A received robot is extrapolated with its velocity; a
+        range reading on a received robot is not counted a second time.
         """
         velocity = state.velocity
-        if not every(known := np.abs(velocity) <= MAX_SPEED):  # of an estimator that diverged, or not a number
+        if not every(known := np.abs(velocity) <= MAX_SPEED):  # diverged estimator, or NaN
             velocity = np.where(known, velocity, 0.0)
         own = OwnState(
             state.position, velocity, state.yaw, self._radius, self._height, self._speed, self._turn_rate,
@@ -84,25 +84,25 @@ class Perception:
         aware = np.isfinite(state.yaw) & (t - state.time <= self._limits.own_silence_s)
         if self._avoids is not None:
             aware &= self._avoids
-        near = self._others(t, state, heard, aware)
+        near = self._others(t, state, poses, aware)
         if state.rays is not self._rays:
-            self._look(state, heard)
+            self._update_points(state, poses)
         if state.rays is not None:
-            near = near.append(self._seen(t, state, aware))
+            near = near.append(self._near_points(t, state, aware))
         return own, near
 
-    def _others(self, t: float, state: BodyState, heard: NeighbourPoses, aware: Mask) -> Nearby:
-        """The robots that were heard, where they are near; those that are gone stay where they were heard last."""
-        row = self._listener
-        age = np.maximum(t - heard.stamp, 0.0)
-        position = heard.position + heard.velocity * np.minimum(age, AHEAD_S)[:, None]
+    def _others(self, t: float, state: BodyState, poses: NeighbourPoses, aware: Mask) -> Nearby:
+        """Received robots that are near; lost ones stay at their last received place."""
+        row = self._receiver
+        age = np.maximum(t - poses.stamp, 0.0)
+        position = poses.position + poses.velocity * np.minimum(age, AHEAD_S)[:, None]
         apart = state.position[row] - position
         near = (np.vecdot(apart[:, :2], apart[:, :2]) <= REACH**2) & aware[row]
-        # who is gone hangs there still, has come down, or falls: it is in the way from the floor up
-        lost = t - heard.lost_since > self._limits.link_silence_s
-        sinking = np.where((heard.velocity[:, 2] < -DESCENT) & (age <= BELIEVED_S), heard.velocity[:, 2], 0.0)
+        # a lost drone still hovers, has landed, or falls: it is in the way from the floor up
+        lost = t - poses.lost_since > self._limits.link_silence_s
+        sinking = np.where((poses.velocity[:, 2] < -DESCENT) & (age <= BELIEVED_S), poses.velocity[:, 2], 0.0)
         low = position[:, 2] + DESCENT_S * sinking
-        # their lower end under my upper one, and the other way round; `apart` is how much higher I am
+        # their lower end under the own upper one, and the other way round; `apart` is the own height above them
         near &= (state.position[row, 2] + self._height[row] + self._clearance > low) | lost
         near &= apart[:, 2] - self._their_height - self._clearance < 0.0
         which = np.flatnonzero(near)
@@ -110,7 +110,7 @@ class Perception:
         return Nearby(
             row[which],
             position[which, :2],
-            np.where(believed[:, None], heard.velocity[which, :2], 0.0),
+            np.where(believed[:, None], poses.velocity[which, :2], 0.0),
             self._their_radius[which],
             np.where(lost[which], np.minimum(z, 0.0), low[which]),
             z + self._their_height[which],
@@ -118,8 +118,8 @@ class Perception:
             self._their_lag[which],
         )
 
-    def _look(self, state: BodyState, heard: NeighbourPoses) -> None:
-        """Where in the room the rays ended that are new: by the pose that the robot had when they were measured."""
+    def _update_points(self, state: BodyState, poses: NeighbourPoses) -> None:
+        """Update the end points of new range readings, by the pose of the robot at their measurement."""
         before, rays = self._rays, state.rays
         self._rays = rays
         if rays is None:
@@ -131,12 +131,12 @@ class Perception:
             if not some(fresh):
                 return
         found = self._ends(rays, fresh, state)
-        found = found.of(~self._known(found, heard, state.position))
+        found = found.of(~self._known(found, poses, state.position))
         self._points = found if every(fresh) else self._points.of(~fresh[self._points.ray]).and_then(found)
 
     def _ends(self, rays: Rays, fresh: Mask, state: BodyState) -> _Points:
-        """The ends of the fresh rays that hit something near."""
-        hit = fresh & (rays.distance <= REACH)  # not a number: nothing was hit
+        """End points of the fresh readings that hit something near."""
+        hit = fresh & (rays.distance <= REACH)  # NaN: nothing was hit
         flat = np.cos(rays.elevation)
         ray = np.flatnonzero(hit & (flat > STEEP))
         row, distance, time = rays.row[ray], rays.distance[ray], rays.time[ray]
@@ -149,20 +149,20 @@ class Perception:
         height = eye[:, 2] + 0.5 * self._height[row] + distance * np.sin(rays.elevation[ray])
         return _Points(ray, row, time, distance, place, height)
 
-    def _known(self, found: _Points, heard: NeighbourPoses, position: Array) -> Mask:
-        """Which points (P,) lie on a robot that was heard, for rows at `position` (N, 3)."""
+    def _known(self, found: _Points, poses: NeighbourPoses, position: Array) -> Mask:
+        """Points (P,) that lie on a received robot, for rows at `position` (N, 3)."""
         known = np.zeros(len(found.ray), dtype=bool)
-        if not len(found.ray) or not len(self._listener):
+        if not len(found.ray) or not len(self._receiver):
             return known
         order = np.argsort(found.row, kind="stable")
-        begin = np.searchsorted(found.row, self._listener, side="left", sorter=order)
-        count = np.searchsorted(found.row, self._listener, side="right", sorter=order) - begin
-        apart = heard.position[:, :2] - position[self._listener, :2]
-        count[~(np.vecdot(apart, apart) <= (REACH + 1.0) ** 2)] = 0  # never heard: not a number
+        begin = np.searchsorted(found.row, self._receiver, side="left", sorter=order)
+        count = np.searchsorted(found.row, self._receiver, side="right", sorter=order) - begin
+        apart = poses.position[:, :2] - position[self._receiver, :2]
+        count[~(np.vecdot(apart, apart) <= (REACH + 1.0) ** 2)] = 0  # never received: NaN
         link = np.repeat(np.arange(len(count)), count)
         point = order[np.arange(len(link)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(begin, count)]
-        late = clamp(found.time[point] - heard.stamp[link], 0.0, AHEAD_S)[:, None]
-        place = heard.position[link] + heard.velocity[link] * late
+        late = clamp(found.time[point] - poses.stamp[link], 0.0, AHEAD_S)[:, None]
+        place = poses.position[link] + poses.velocity[link] * late
         apart = found.place[point] - place[:, :2]
         outline = self._their_radius[link] + OUTLINE + OUTLINE_SHARE * found.distance[point]
         up = found.height[point] - place[:, 2]
@@ -170,8 +170,8 @@ class Perception:
         known[point[(np.vecdot(apart, apart) <= outline**2) & beside]] = True
         return known
 
-    def _seen(self, t: float, state: BodyState, aware: Mask) -> Nearby:
-        """What the rays ended on, where it is near."""
+    def _near_points(self, t: float, state: BodyState, aware: Mask) -> Nearby:
+        """End points of readings that are near."""
         points = self._points
         row = points.row
         up = points.height - state.position[row, 2]
@@ -189,14 +189,14 @@ class Perception:
 
 @dataclass(frozen=True)
 class _Points:
-    """Ends of rays in the room (P): number of the ray, row, time [s], length [m], place (P, 2) and height [m]."""
+    """End points of range readings in the room (P)."""
 
-    ray: Index
-    row: Index
-    time: Array
-    distance: Array
-    place: Array
-    height: Array
+    ray: Index  # (P,) number of the reading
+    row: Index  # (P,)
+    time: Array  # (P,) [s]
+    distance: Array  # (P,) [m]
+    place: Array  # (P, 2) [m]
+    height: Array  # (P,) [m]
 
     @classmethod
     def nothing(cls) -> _Points:
@@ -207,7 +207,7 @@ class _Points:
         return _Points(*(getattr(self, field.name)[which] for field in fields(_Points)))
 
     def and_then(self, others: _Points) -> _Points:
-        """These and others, sorted as the rays are."""
+        """These points and others, sorted by reading."""
         pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in fields(_Points))
         both = _Points(*(np.concatenate(pair) for pair in pairs))
         return both.of(np.argsort(both.ray))

@@ -1,4 +1,4 @@
-"""The individual level (paper, figure 10): from a goal to the setpoint that the robot's body takes."""
+"""Position control, the individual level (paper, figure 10): from a goal to the setpoint of the robot's body."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from agents.arrays import Array, clamp, every, norm, some, span
 from agents.body.kinds import Kind
 
-REACHED = 0.005  # [m] nearer than this a ground robot stands; half of what a 1 cm trigger lets its neighbours know
-TURNED = math.radians(2.0)  # [rad] nearer than this to the yaw wanted it stands
+REACHED = 0.005  # [m] a ground robot stops nearer than this to its goal; half the threshold of a 1 cm trigger
+TURNED = math.radians(2.0)  # [rad] and nearer than this to the wanted yaw
 
-BROADSIDE = 0.02  # cosine of α below which a goal is abeam; there wheels turn first, and drive as much as it is not
+BROADSIDE = 0.02  # cosine of α below which a goal is abeam: wheels turn first, and drive in proportion
 
 
 def wrap(angle: Array) -> Array:
@@ -38,12 +38,12 @@ class PositionController:
             for name in ("response", "turn_response", "speed", "turn_rate")
         }
 
-    def setpoint(self, goal: Array, toward: Array, position: Array, yaw: Array) -> Array:
+    def setpoint(self, goal: Array, goal_yaw: Array, position: Array, yaw: Array) -> Array:
         """Setpoints (N, 4), in the meaning of each row's kind (see `agents.network.messages.State`).
 
         Args:
             goal: (N, 3) [m].
-            toward: (N,) yaw wanted at the goal [rad], NaN for any.
+            goal_yaw: (N,) wanted at the goal [rad], NaN for any.
             position: (N, 3) measured [m].
             yaw: (N,) measured [rad].
         """
@@ -51,25 +51,25 @@ class PositionController:
         if self._any_position:
             rows = self._position
             setpoint[rows, :3] = goal[rows]
-            unasked = np.isnan(toward[rows])
-            setpoint[rows, 3] = 0.0 if every(unasked) else np.where(unasked, 0.0, toward[rows])
+            free = np.isnan(goal_yaw[rows])
+            setpoint[rows, 3] = 0.0 if every(free) else np.where(free, 0.0, goal_yaw[rows])
         if self._any_velocity:
             rows = self._velocity
             velocity = self._response[rows, None] * (goal[rows] - position[rows])
             setpoint[rows, :3] = clamp(velocity, -self._speed[rows, None], self._speed[rows, None])
-            turn = self._turn_response[rows] * wrap(toward[rows] - yaw[rows])
+            turn = self._turn_response[rows] * wrap(goal_yaw[rows] - yaw[rows])
             setpoint[rows, 3] = np.where(np.isnan(turn), 0.0, turn)
         if self._any_twist:
             rows = self._twist
-            way = goal[rows, :2] - position[rows, :2]
-            setpoint[rows, :2] = drive(way, yaw[rows], toward[rows], **self._drive)
+            offset = goal[rows, :2] - position[rows, :2]
+            setpoint[rows, :2] = drive(offset, yaw[rows], goal_yaw[rows], **self._drive)
         return setpoint
 
 
 def drive(
     way: Array,
     yaw: Array,
-    toward: Array,
+    goal_yaw: Array,
     *,
     response: Array,
     turn_response: Array,
@@ -87,7 +87,7 @@ def drive(
     Args:
         way: (n, 2) goal less position [m].
         yaw: (n,) [rad].
-        toward: (n,) yaw wanted at the goal [rad], NaN for any.
+        goal_yaw: (n,) wanted at the goal [rad], NaN for any.
         response: (n,) K [1/s].
         turn_response: (n,) K_α [1/s].
         speed: (n,) limit [m/s].
@@ -106,9 +106,9 @@ def drive(
     there = distance <= REACHED
     if some(there):
         twist[there] = 0.0
-        asked = there & ~np.isnan(toward)
+        asked = there & ~np.isnan(goal_yaw)
         if some(asked):
-            turn = wrap(toward[asked] - yaw[asked])
+            turn = wrap(goal_yaw[asked] - yaw[asked])
             twist[asked, 1] = np.where(np.abs(turn) > TURNED, turn_response[asked] * turn, 0.0)
     twist[:, 1] = clamp(twist[:, 1], -turn_rate, turn_rate)
     return twist

@@ -1,4 +1,4 @@
-"""What rows say of themselves: whose turn it is, and the pose that is said, smoothed if the trigger asks for it."""
+"""Transmission: which rows transmit their pose now, smoothed if the trigger asks for it."""
 
 from __future__ import annotations
 
@@ -17,20 +17,18 @@ from agents.plugins.triggers import LastEvent, Trigger, View
 
 
 class Transmission(msgspec.Struct, frozen=True):
-    """A moment of speaking: `rows` that speak, and of all rows the position and velocity (N, 3) to be said."""
+    """Poses to transmit."""
 
-    rows: Index
-    position: Array
-    velocity: Array
+    rows: Index  # (K,) that transmit
+    position: Array  # (N, 3) to transmit [m]
+    velocity: Array  # (N, 3) to transmit [m/s]
 
 
 class Transmitter:
-    """Of N rows.
+    """Transmissions of N rows."""
 
-    Attributes:
-        trigger: Who speaks when; may be replaced by one of the same kind.
-        last_event: What the neighbours were told.
-    """
+    trigger: Trigger  # may be replaced by one of the same kind
+    last_event: LastEvent  # last transmission of each row
 
     def __init__(
         self, trigger: Trigger, rows: int, predictor: Predictor = HOLD, *, kinds: Sequence[Kind] | None = None
@@ -53,19 +51,19 @@ class Transmitter:
         offset: Array,
         setpoint: Array | None = None,
     ) -> Transmission:
-        """Who speaks at `t` [s], and what; rows that do not know where they are stay silent. See `View`.
+        """Transmission at `t` [s]; rows without a known position do not transmit. For the arguments see `View`.
 
-        `setpoint` (N, 4) is what the bodies were commanded last, NaN for rows that their bodies drive by themselves; it
-        counts where the trigger smooths.
+        `setpoint` (N, 4) is the last command to the bodies, NaN for rows that their bodies drive by themselves; used
+        where the trigger smooths.
 
-        An unknown velocity is said as NaN, and counts as 0 for trigger and smoothing: what the neighbours assume then.
+        An unknown velocity is transmitted as NaN, and counts as 0 for trigger and smoothing, as the neighbours assume.
 
         Raises:
-            PluginError: If the trigger fails; it is named, for it may be somebody's first.
+            PluginError: If the trigger fails; the error names it.
         """
         trigger = self.trigger
         unknown: Index | None = None
-        if not every(known := np.abs(velocity) <= MAX_SPEED):  # as nobody would believe it, it is not known
+        if not every(known := np.abs(velocity) <= MAX_SPEED):  # implausible, hence unknown
             unknown = np.flatnonzero(~known.all(axis=1))
             velocity = velocity.copy()
             velocity[unknown] = 0.0
@@ -79,41 +77,40 @@ class Transmitter:
         )  # fmt: skip
         rows = due_rows(trigger, view, self._state)
         if len(rows):
-            seen = np.isfinite(position if len(rows) == len(position) else position[rows])
-            if not every(seen):
-                rows = rows[seen.all(axis=1)]
+            valid = np.isfinite(position if len(rows) == len(position) else position[rows])
+            if not every(valid):
+                rows = rows[valid.all(axis=1)]
             self.last_event.record(rows, view)
         if unknown is not None:
-            velocity = velocity.copy()  # what neighbours were told of stays with them
+            velocity = velocity.copy()  # the recorded event keeps its values
             velocity[unknown] = np.nan
         return Transmission(rows, position, velocity)
 
 
 def due_rows(trigger: Trigger, view: View, state: Array) -> Index:
-    """`Trigger.due`; a trigger that fails is named.
+    """`Trigger.due`, with an error that names the trigger.
 
     Raises:
-        PluginError: See above.
+        PluginError: If the trigger fails.
     """
     try:
         return trigger.due(view, state)
     except FAILURES as error:
-        what = f"{type(error).__name__}: {error}"
-        raise PluginError(f"the trigger {type(trigger).__name__} failed: {what}") from error
+        raise PluginError(f"the trigger {type(trigger).__name__} failed: {type(error).__name__}: {error}") from error
 
 
 class LowPass:
-    """Positions without their jitter: carried on by a velocity, and drawn to what is measured with a time constant.
+    """Positions without jitter: extrapolated by a velocity, and drawn to the measured ones with a time constant.
 
     A bare low-pass of the position would lag by τ·v behind a robot that drives, 0.1 m at 0.15 m/s and 0.7 s. This one
     does not: ṗ_f = v + (p − p_f)/τ and v̇_f = (v − v_f)/τ, with p − p_f and v as they are at the end of a step.
 
-    v is what a robot on wheels measures of its motion. A flying robot's measured velocity has the wobble in it, which
-    would be carried into the position that is said. Its horizontal v is therefore the one that its own setpoints make:
-    v̇ = (v_c − v)/T, with T the lag of its kind, v_c the velocity that it is commanded, or K (setpoint − p_f) within
-    its speed if it is commanded places. Such a model of a robot on both sides of a network is the idea of L. A.
-    Montestruque and P. J. Antsaklis, "On the model-based control of networked systems", Automatica 39(10), 2003. Where
-    the robot does something else than its model, by Δv, p_f is off by τ·Δv.
+    v of a robot on wheels is its measured velocity. A flying robot's measured velocity contains the wobble, which would
+    enter the transmitted position. Its horizontal v therefore follows from its own setpoints: v̇ = (v_c − v)/T, with T
+    the lag of its kind, v_c the commanded velocity, or K (setpoint − p_f) within its speed if positions are commanded.
+    Such a model of a robot on both sides of a network is the idea of L. A. Montestruque and P. J. Antsaklis, "On the
+    model-based control of networked systems", Automatica 39(10), 2003. Where the robot deviates from its model by Δv,
+    p_f is off by τ·Δv.
     """
 
     def __init__(self, rows: int, kinds: Sequence[Kind] | None = None) -> None:
@@ -131,9 +128,9 @@ class LowPass:
     def smooth(
         self, t: float, position: Array, velocity: Array, constant_s: float, setpoint: Array | None = None
     ) -> tuple[Array, Array]:
-        """Smoothed position [m] and velocity [m/s] (N, 3) at `t` [s], after these measured ones and this setpoint.
+        """Smoothed position [m] and velocity [m/s] (N, 3) at `t` [s], from the measured ones and the last setpoint.
 
-        Rows begin with what is measured, and begin anew once they did not know it.
+        Rows begin at their measured pose, and begin anew after it was unknown.
         """
         step = t - self._t if math.isfinite(self._t) else 0.0
         if setpoint is not None and len(self._flies):
@@ -150,7 +147,7 @@ class LowPass:
         return smoothed, slow
 
     def _drive(self, step: float, measured: Array, setpoint: Array) -> Array:
-        """Horizontal velocity (F, 2) that setpoints make of the rows that fly; without setpoints the measured one."""
+        """Horizontal velocity (F, 2) of the flying rows from their setpoints; without setpoints the measured one."""
         toward = self._response * (setpoint - self._position[self._flies, :2])
         due_rows = clamp(np.where(self._by_place, toward, setpoint), -self._speed, self._speed)
         driven = self._driven + step / (self._lag + step) * (due_rows - self._driven)
