@@ -39,7 +39,7 @@ WOBBLE: Final = "# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s
 
 @dataclass(frozen=True)
 class Wanted:
-    """What may be chosen of a generated experiment."""
+    """Options of a generated experiment."""
 
     kind: str = "crazyflie"  # of all robots
     spacing: float = 0.6  # between neighbours [m]

@@ -1,4 +1,4 @@
-"""Formations of any size: where the robots stand and who hears whom. Geometry only; `generate` makes files of them."""
+"""Layouts of any size: positions and links. Geometry only; `generate` makes files of them."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ KEPT: Final = 0.9  # share of the stiffness that a split must leave
 
 
 class LayoutError(ValueError):
-    """A formation that cannot be had; the message says what to ask for instead."""
+    """Layout that is impossible; the message names a possible one."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A shape and its links."""
+    """Shape and links of a formation."""
 
-    title: str  # what it is, for people
+    title: str  # for people
     position: Array  # (N, 3) [m], centred on the origin; z is the height that a flying robot holds, 0 where any will do
-    pairs: Index  # (M, 2) who hears whom, both ways, smaller row first
+    pairs: Index  # (M, 2) rows that receive from each other, smaller row first
 
     def __len__(self) -> int:
         return len(self.position)
 
 
 def polygon(count: int, spacing: float) -> Layout:
-    """A regular polygon of `count` robots `spacing` [m] apart; each hears its next two neighbours on either side.
+    """Regular polygon of `count` robots `spacing` [m] apart, linked to the next two neighbours on either side.
 
     The ring alone could fold; with the second neighbours it is rigid in the plane.
     """
@@ -48,7 +48,7 @@ def polygon(count: int, spacing: float) -> Layout:
 
 
 def circulant(count: int, jumps: Sequence[int], spacing: float) -> Layout:
-    """`count` robots on a circle, `spacing` [m] apart; i and i ± j hear each other for each jump j."""
+    """`count` robots on a circle, `spacing` [m] apart; i and i ± j are linked for each jump j."""
     _at_least(count, 3, "circulant")
     wrong = [jump for jump in jumps if not 0 < jump < count]
     if not jumps or wrong:
@@ -66,7 +66,7 @@ def circulant(count: int, jumps: Sequence[int], spacing: float) -> Layout:
 
 
 def grid(rows: int, columns: int, spacing: float) -> Layout:
-    """`rows` × `columns` robots on a square grid, `spacing` [m] apart; each hears the up to eight around it."""
+    """`rows` × `columns` robots on a square grid, `spacing` [m] apart, linked to the up to eight around."""
     if min(rows, columns) < 2:
         raise LayoutError(f"a grid of {rows}x{columns} is a line, which bends: give 2x2 or more")
     number = np.arange(rows * columns).reshape(rows, columns)

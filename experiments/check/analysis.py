@@ -1,4 +1,4 @@
-"""One case of an experiment in numbers: its network, the shape that it asks for, and the motion to be expected."""
+"""Analysis of one case: network, shape, rigidity, modes, and predicted motion."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ GUESSES: Final = 400  # random places of robots from which a shape is sought: ea
 
 @dataclass(frozen=True)
 class Analysis:
-    """The numbers of one case."""
+    """Figures of one case."""
 
     plan: Plan  # the case, compiled
     assignment: Assignment  # of all its robots; without avoidance, and without the links that only avoidance needs
-    silent: Index  # rows that hear nobody
+    silent: Index  # rows without neighbours
     start: Array  # (N, 3) on the floor [m]
     parts: int  # of the network
     fiedler: float  # algebraic connectivity
@@ -181,7 +181,7 @@ class Analysis:
 
 
 def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
-    """All the numbers of one case that goes like `prediction`."""
+    """Analysis of one case with this predicted motion."""
     names = tuple(experiment.robots)
     plan = Plan(experiment)
     bare = Plan(msgspec.structs.replace(experiment, avoidance=None, architecture="distributed"))
@@ -277,5 +277,5 @@ def _shapes(  # noqa: PLR0917 - one caller
 
 
 def _rest(guess: Array, end: Array, moves: Mask) -> Array:
-    """Leaders stay where their plans leave them."""
+    """The guess, with leaders where their plans leave them."""
     return np.where(moves[:, None], guess, end)

@@ -36,7 +36,7 @@ ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """What is to be said of an experiment."""
+    """Finding on an experiment: an error, a warning or a note, with remedy and place."""
 
     # of an error, the experiment cannot work; of a warning, it may not do what was meant; a note is good news, or
     # explains
@@ -47,12 +47,12 @@ class Finding:
     where: str  # file:line:column, or the `--set` at fault; empty where it concerns the whole
 
     def __str__(self) -> str:
-        """As a line for people."""
+        """Line for a terminal."""
         return f"{MARK[self.severity]} {self.message}" + (f"; {self.remedy}" if self.remedy else "")
 
 
 def chance(analysis: Analysis) -> Iterator[Claim]:
-    """Do seeds change anything."""
+    """Warn if no seed changes anything."""
     if not analysis.plan.uses_chance:
         message = "nothing in this file is random: runs of other seeds are the same"
         remedy = "add what nature adds, such as [disturbance.all] with position_sigma = 0.0005"
@@ -60,7 +60,7 @@ def chance(analysis: Analysis) -> Iterator[Claim]:
 
 
 def telemetry(analysis: Analysis) -> Iterator[Claim]:
-    """Does what a robot hears between two samples of telemetry fit into one message."""
+    """Warn if the poses received between two samples of telemetry do not fit into one message."""
     experiment, links = analysis.experiment, analysis.plan.heard_links
     if not len(links):
         return
@@ -88,7 +88,7 @@ SUBJECTS: Final = (
 
 
 class Figures(msgspec.Struct, frozen=True, kw_only=True):
-    """The numbers of one case; None where they have no meaning, as those of a formation without links."""
+    """Figures of one case; None where one has no meaning, as without links."""
 
     robots: int  # how many
     arena: tuple[float, float, float]  # its size, x, y, z [m]
@@ -123,7 +123,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def check(given: Document, settings: Sequence[str] = ()) -> list[Finding]:
-    """Everything there is to say of all cases: errors first, then warnings, then notes.
+    """Findings of all cases: errors first, then warnings, then notes.
 
     Args:
         given: As `document.read` returned it.
@@ -146,13 +146,13 @@ def unreadable(problem: Problem) -> Finding:
 
 
 def figures(experiment: Experiment) -> Figures:
-    """The numbers of one case."""
+    """Figures of one case."""
     return _figures(_analyses({"": experiment})[""])
 
 
 @QUIET
 def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
-    """Of each case; the geometry of those that differ only in trigger, channel and noise is computed once."""
+    """Analysis of each case; geometry is computed once for cases that differ only in trigger, channel and noise."""
     flights: dict[bytes, Prediction] = {}
     known: dict[bytes, Analysis] = {}
     found = {}
@@ -191,7 +191,7 @@ def _of_case(known: Analysis, case: Experiment, prediction: Prediction) -> Analy
 
 @QUIET
 def _findings(given: Document, settings: Sequence[str], analyses: Mapping[str, Analysis]) -> list[Finding]:
-    """What every case has is said once; what only some have, with their names."""
+    """Findings, each once; those of only some cases name these cases."""
     holders: dict[Claim, list[str]] = {}
     for name, analysis in analyses.items():
         for subject in SUBJECTS:
@@ -210,7 +210,7 @@ def _findings(given: Document, settings: Sequence[str], analyses: Mapping[str, A
 
 
 class _Index:
-    """Where the paths of a document stand, in its file or behind a `--set`."""
+    """Places of the paths of a document, in its file or in a `--set`."""
 
     def __init__(self, given: Document, settings: Sequence[str]) -> None:
         is_json = given.path.suffix.lower() == ".json"

@@ -1,4 +1,4 @@
-"""A claim about an experiment: what its numbers mean to the user, and what to do about it."""
+"""Claims of the checks: severity, code, message and remedy at a path of the file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FORGIVEN: Final = 1e-6  # of rounding
 
 @dataclass(frozen=True)
 class Claim:
-    """Something to say about a path of the experiment file."""
+    """Claim about a path of the experiment file."""
 
     severity: Severity
     code: str
@@ -26,7 +26,7 @@ class Claim:
 
 
 def listed(words: Sequence[str], most: int = 4) -> str:
-    """Words with commas; the last of many are counted."""
+    """Words joined by commas; the last of many are counted."""
     more = len(words) - most
     return ", ".join(words) if more <= 0 else f"{', '.join(words[:most])} and {more} more"
 

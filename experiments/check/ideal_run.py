@@ -1,4 +1,4 @@
-"""How an experiment goes undisturbed: one flight on the virtual clock, without noise, in an empty, endless room.
+"""Ideal run: one flight on the virtual clock, without noise, in an empty, endless room.
 
 Everything else is that of a run: bodies with their limits and their inertia, triggers, updates, the modelled network,
 the plans, and the 5 mm at which robots on wheels stop. Walls, obstacles and avoidance are left out, because what is
@@ -40,12 +40,12 @@ PAIRS: Final = 1_000_000  # distances that are held in memory at once
 
 @dataclass(frozen=True)
 class Prediction:
-    """Where the robots are at each decision."""
+    """Predicted motion: positions at each decision."""
 
     time: Array  # (T,) [s] after the common start
     position: Array  # (T, N, 3) [m]
     incidents: tuple[Incident, ...] = ()  # what is wrong with robots on the way
-    stuck: str = ""  # why they do not get under way at all; empty if they do. They stay at their starts then.
+    stuck: str = ""  # reason why the run does not begin; the robots stay at their starts then
 
 
 def closed_shares(kinds: Sequence[Kind], hz: float) -> Array:
@@ -115,7 +115,7 @@ def fly_repeatedly(bare: Experiment, count: int) -> list[Prediction]:
 
 @dataclass(frozen=True)
 class Approach:
-    """The nearest that two robots come to each other: `distance` [m] in the plane, at `time` [s]."""
+    """Closest approach of two robots: `distance` [m] in the plane, at `time` [s]."""
 
     first: int
     second: int
@@ -163,7 +163,7 @@ def message_rate(
     hz: float,
     rng: np.random.Generator,
 ) -> float:
-    """Poses that all robots together would send in a second.
+    """Estimated rate of transmissions of all robots together [1/s].
 
     Args:
         trigger: Asked along the predicted motion.

@@ -1,4 +1,4 @@
-"""What the expected motion says: does the formation come together, in time, inside the arena, without collisions."""
+"""Checks of the predicted motion: acquisition, arena, walls, collisions, speeds and rates."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SETTLED: Final = 1e-3  # [m] slower than this per decision, robots have come to 
 
 
 def starts(analysis: Analysis) -> Iterator[Claim]:
-    """Do the robots start inside the arena and clear of one another; flying ones too start on the floor."""
+    """Check that robots start inside the arena and clear of one another; flying ones too start on the floor."""
     names, limits, start = analysis.names, analysis.assignment.limits, analysis.start[:, :2]
     inside = np.minimum(start - limits.low[:2], limits.high[:2] - start).min(axis=1)
     problems = []
@@ -49,7 +49,7 @@ def starts(analysis: Analysis) -> Iterator[Claim]:
 
 
 def flight(analysis: Analysis) -> Iterator[Claim]:
-    """Does the undisturbed flight go through: does it begin, how much of it was flown, what was wrong on the way."""
+    """Report what stopped or disturbed the ideal run, and how much of it was flown."""
     experiment, prediction = analysis.experiment, analysis.prediction
     if prediction.stuck:
         message = f"the run does not begin, even undisturbed: {prediction.stuck}"
@@ -66,13 +66,13 @@ def flight(analysis: Analysis) -> Iterator[Claim]:
 
 
 def _cut(analysis: Analysis) -> bool:
-    """Whether only the beginning of the run was flown."""
+    """Whether only the first part of the run was flown."""
     experiment = analysis.experiment
     return bool(analysis.prediction.time[-1] < experiment.duration_s - 1.0 / experiment.rates.coordination_hz)
 
 
 def formation(analysis: Analysis) -> Iterator[Claim]:
-    """Does the formation come together, and is it there at the end."""
+    """Check that the formation is acquired, and kept at the end."""
     experiment, prediction, shape = analysis.experiment, analysis.prediction, analysis.shape
     last = analysis.error[-1]
     if (
@@ -121,7 +121,7 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
 
 
 def softness(analysis: Analysis) -> Iterator[Claim]:
-    """Does a soft formation that is acquired without noise stay so with the noise of its file."""
+    """Check that a soft formation that is acquired without noise is also acquired with the noise of its file."""
     experiment, loop, shape = analysis.experiment, analysis.modes, analysis.shape
     bare, end = isolated(experiment), float(analysis.prediction.time[-1])
     if (
@@ -168,7 +168,7 @@ def softness(analysis: Analysis) -> Iterator[Claim]:
 
 
 def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:
-    """That robots on wheels which stand at sample `at` keep the formation from being acquired."""
+    """Claim that wheeled robots which stand still at sample `at` prevent acquisition."""
     experiment, links = analysis.experiment, analysis.pattern.links
     off = np.flatnonzero(analysis.error[at] > experiment.tolerance)
     ends = np.union1d(links.receiver[off], links.sender[off])
@@ -187,7 +187,7 @@ def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:
 
 
 def walls(analysis: Analysis) -> Iterator[Claim]:
-    """Does anybody leave the arena, or come so near to a wall that it is held back."""
+    """Check that no robot leaves the arena, or is held back by the margin at a wall."""
     names, limits, track = analysis.names, analysis.assignment.limits, analysis.prediction.position
     beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
     outside = beyond.max(axis=2) > FORGIVEN
@@ -205,7 +205,7 @@ def walls(analysis: Analysis) -> Iterator[Claim]:
 
 
 def encounters(analysis: Analysis) -> Iterator[Claim]:
-    """Does anybody hit another robot, or land on one; those too near at the start are not told again."""
+    """Check that no robots collide or land on each other; pairs too near at the start are not repeated."""
     names, kinds, start = analysis.names, analysis.assignment.kinds, analysis.start
     radius = np.array([kind.radius for kind in kinds])
     near = [
@@ -243,7 +243,7 @@ def encounters(analysis: Analysis) -> Iterator[Claim]:
 
 
 def _first(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
-    """When a row is first there, and its place then in words."""
+    """Time at which a row is first there, and its place then in words."""
     at = int(where.argmax())
     x, y, _ = analysis.prediction.position[at, row]
     return float(analysis.prediction.time[at]), f"({x:.2f}, {y:.2f})"
@@ -262,7 +262,7 @@ def _left(analysis: Analysis, row: int, outside: Mask) -> Claim:
 
 
 def speeds(analysis: Analysis) -> Iterator[Claim]:
-    """Do plans ask for more speed than the robots have."""
+    """Check that plans ask for no more speed than the robots have."""
     names, timeline, problems = analysis.names, analysis.experiment.timeline, []
     for number, robot, plan in analysis.legs:
         row, asked, path = names.index(robot), plan.speed(), ("timeline", number, "plan")
@@ -293,7 +293,7 @@ def speeds(analysis: Analysis) -> Iterator[Claim]:
 
 
 def rates(analysis: Analysis) -> Iterator[Claim]:
-    """Can the trigger be asked as often as it wants, and do decisions see news."""
+    """Check the rates: trigger period against pose_hz, pose_hz against coordination_hz."""
     rates, trigger = analysis.experiment.rates, analysis.assignment.trigger
     asked = 1.0 / rates.pose_hz
     for field in ("period_s", "maximum_silence_s"):
@@ -315,7 +315,7 @@ def rates(analysis: Analysis) -> Iterator[Claim]:
 
 
 def ends(analysis: Analysis) -> Iterator[Claim]:
-    """Is the last leg of each robot over before the run is."""
+    """Check that the last leg of each robot ends before the run."""
     timeline, duration = analysis.experiment.timeline, analysis.experiment.duration_s
     last = {robot: (number, plan) for number, robot, plan in analysis.legs}
     for robot, (number, plan) in last.items():

@@ -1,4 +1,4 @@
-"""What stands in the arena: does it get in anybody's way, and can robots know of it, touch it and push it."""
+"""Checks of obstacles: collisions on the predicted paths, contacts, sensors, and worlds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AVOID: Final = 'or let robots avoid it: [avoidance] with kind = "barrier"'
 
 
 def described(obstacle: Obstacle) -> str:
-    """What an obstacle is, in a few words."""
+    """Description of an obstacle in a few words."""
     if obstacle.box is not None:
         what = f"box {obstacle.box[0]:g} × {obstacle.box[1]:g} m"
     else:
@@ -32,7 +32,7 @@ def described(obstacle: Obstacle) -> str:
 
 
 def obstacles(analysis: Analysis) -> Iterator[Claim]:
-    """Does anybody drive or fly into an obstacle, as far as avoidance does not prevent it."""
+    """Check that no predicted path meets an obstacle; with avoidance, note that it will act."""
     scene, prediction = analysis.scene, analysis.prediction
     if not scene.names:
         return
@@ -61,7 +61,7 @@ def obstacles(analysis: Analysis) -> Iterator[Claim]:
 
 
 def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: bool) -> Claim:
-    """That `rows` (K,) are where an obstacle is, at the times `near` (T, K); they `keep` clear of it or not."""
+    """Claim that `rows` (K,) meet an obstacle at the times `near` (T, K); `keeps`: avoidance is on."""
     scene, prediction, names = analysis.scene, analysis.prediction, analysis.names
     name, path = scene.names[number], ("arena", "obstacles", scene.names[number])
     which = int(near.argmax(axis=0).argmin())
@@ -80,7 +80,7 @@ def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: boo
 
 
 def contacts(analysis: Analysis) -> Iterator[Claim]:
-    """Does the engine know of the contacts that the arena is made for."""
+    """Check that the engine computes the contacts for which the arena is made."""
     experiment, scene = analysis.experiment, analysis.scene
     kind, _ = registry.split(experiment.world.engine)
     touching = getattr(registry.struct(registry.ENGINES, kind), "contacts", True)
@@ -100,7 +100,7 @@ def contacts(analysis: Analysis) -> Iterator[Claim]:
 
 
 def perception(analysis: Analysis) -> Iterator[Claim]:
-    """Can robots that shall avoid know of what is around them."""
+    """Check that robots with avoidance have sensors or neighbours to avoid by."""
     experiment, scene = analysis.experiment, analysis.scene
     avoidance = analysis.plan.avoidance
     if avoidance is None:
@@ -125,7 +125,7 @@ def perception(analysis: Analysis) -> Iterator[Claim]:
 
 
 def reality(analysis: Analysis) -> Iterator[Claim]:
-    """Do worlds, mirrors and shadows make sense for the bodies of the robots."""
+    """Check worlds, range sensors and shadows against the bodies of the robots."""
     experiment, robots = analysis.experiment, analysis.experiment.robots
     peopled = any(robot.body == WORLD for robot in robots.values())
     bare = not (peopled or experiment.arena.obstacles or experiment.arena.walls)
@@ -152,7 +152,7 @@ def reality(analysis: Analysis) -> Iterator[Claim]:
 
 
 def _avoids(analysis: Analysis) -> Mask:
-    """(N,) which rows keep clear of anything."""
+    """Mask (N,) of the rows with avoidance."""
     robots = analysis.experiment.robots.values()
     return np.array([robot.avoids for robot in robots]) & (analysis.experiment.avoidance is not None)
 

@@ -1,4 +1,4 @@
-"""Can a formation exist, and does it hold its shape: the numbers, without any motion."""
+"""Realisation and rigidity of a formation, without motion."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Residuals:
 
 
 def as_taken(law: Law, links: Links) -> Links:
-    """The links with what the law takes them to ask for: `distance` sees a distance in a relative position as well."""
+    """Links with the targets that the law reads: `distance` reads the distance of a relative position as well."""
     wants = TAKES.get(getattr(law, "NEEDS", "any"))
     if wants is None or links.wants is None:
         return links

@@ -1,4 +1,4 @@
-"""Do the settings of `[safety]` go together, and with the formation and the starts."""
+"""Checks of `[safety]` against itself, the formation and the starts; checks of the architecture."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SLOW_M_S: Final = 0.2  # no robot comes down more slowly
 
 
 def safety(analysis: Analysis) -> Iterator[Claim]:
-    """What `[safety]` makes impossible, or makes no sense."""
+    """Report settings of `[safety]` that contradict each other or the experiment."""
     chosen = analysis.experiment.safety
     if chosen.battery_min < chosen.battery_low:
         message = (
@@ -42,7 +42,7 @@ def safety(analysis: Analysis) -> Iterator[Claim]:
 
 
 def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
-    """Pairs that hear each other: at the start, as the formation wants them, and on their way."""
+    """Check the separation of linked pairs: at the start, at their target, and on their way."""
     names, path = tuple(analysis.experiment.robots), ("safety", "separation")
     links, heard = analysis.plan.links, analysis.plan.heard_links
     pairs = sorted({tuple(sorted(pair)) for pair in zip(heard.receiver.tolist(), heard.sender.tolist(), strict=True)})
@@ -78,7 +78,7 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
 
 
 def architecture(analysis: Analysis) -> Iterator[Claim]:
-    """Who decides for whom, what happens when the centre is gone, and whether the trigger suits that."""
+    """Describe the architecture; check the age of goals, and that the trigger suits guided robots."""
     experiment, path = analysis.experiment, ("architecture",)
     steered = analysis.plan.guided
     if not steered:

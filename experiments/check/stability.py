@@ -1,4 +1,4 @@
-"""The sampled loop near its target: does it settle, how fast, and what moves it not at all."""
+"""Stability of the sampled loop near its target: modes, their time constants, and free motions."""
 
 from __future__ import annotations
 

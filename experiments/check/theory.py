@@ -1,4 +1,4 @@
-"""What theory says of a formation: is it one, can it exist, does it hold its shape, does the sampled loop settle."""
+"""Checks by theory: connectivity, realisation, rigidity, redundancy and stability of a formation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RINGS: Final = 1.2  # beyond 1 an error changes its sign; what is left to 2 is f
 
 
 def network(analysis: Analysis) -> Iterator[Claim]:
-    """Does everybody hear of a leader, in one network."""
+    """Check that the network is connected, and that every robot is reached by a leader."""
     names, links, leaders = analysis.names, analysis.assignment.links, analysis.plan.leaders
     path = ("formation", "links")
     if not len(links):
@@ -70,7 +70,7 @@ def network(analysis: Analysis) -> Iterator[Claim]:
 
 
 def realisation(analysis: Analysis) -> Iterator[Claim]:
-    """Can everything that links and anchors ask for be met while heights are held, at the start and later."""
+    """Check that the targets of links and anchors can be met with held heights, at the start and after changes."""
     shape = analysis.shape
     if shape is None:
         return
@@ -88,7 +88,7 @@ def realisation(analysis: Analysis) -> Iterator[Claim]:
 
 
 def _asked(analysis: Analysis) -> str:
-    """What the links ask for, in a word."""
+    """Kinds of targets of the links, in words."""
     wants = analysis.asked.wants
     found = {BY_DISTANCE} if wants is None else set(wants[analysis.standing].tolist())
     words = {BY_DISTANCE: "distances", BY_RELATIVE: "offsets", BY_BEARING: "bearings"}
@@ -159,7 +159,7 @@ def _inside(analysis: Analysis, conflict: Conflict) -> Index:
 
 
 def _pair(analysis: Analysis, link: int | np.intp) -> str:
-    """The same words for both directions of a link."""
+    """Name of a link, the same for both directions."""
     links = analysis.assignment.links
     i, j = sorted((int(links.sender[link]), int(links.receiver[link])))
     return f"{analysis.names[i]} - {analysis.names[j]}"
@@ -181,7 +181,7 @@ def _too_high(analysis: Analysis, conflict: Conflict, off: str) -> Claim:
 
 
 def rigidity(analysis: Analysis) -> Iterator[Claim]:
-    """Do the distances leave only one shape nearby, in the motions that the robots have."""
+    """Check rigidity in the motions that the robots have."""
     planar, spatial = analysis.planar, analysis.spatial
     if planar is None or not analysis.standing.any() or analysis.parts > 1:
         return
@@ -202,7 +202,7 @@ def rigidity(analysis: Analysis) -> Iterator[Claim]:
 
 
 def presence(analysis: Analysis) -> Iterator[Claim]:
-    """Do links that come and go leave the network whole, as the motion is expected."""
+    """Check that the network stays connected along the predicted motion while links come and go."""
     pattern, prediction = analysis.pattern, analysis.prediction
     there = pattern.present(prediction.time, prediction.position)
     if there is None or analysis.parts > 1:
@@ -233,7 +233,7 @@ def _runs(there: Mask) -> Mask:
 
 
 def redundancy(analysis: Analysis) -> Iterator[Claim]:
-    """Which single links and robots the formation can lose and stay rigid."""
+    """Report the single links and robots that the formation can lose and stay rigid."""
     spare = analysis.spare
     if spare is None or analysis.parts > 1:
         return
@@ -243,7 +243,7 @@ def redundancy(analysis: Analysis) -> Iterator[Claim]:
 
 
 def _lost(what: str, spare: Mask, needed: list[str]) -> str:
-    """What can be lost, in words that stay short."""
+    """Sentence on what can be lost."""
     if not needed:
         return f"it stays rigid without any one {what}"
     if len(needed) == len(spare):
@@ -254,7 +254,7 @@ def _lost(what: str, spare: Mask, needed: list[str]) -> str:
 
 
 def stability(analysis: Analysis) -> Iterator[Claim]:
-    """Does the sampled loop settle, near the shape."""
+    """Check that the sampled loop is stable near the shape."""
     loop, shape, formation = analysis.modes, analysis.shape, analysis.experiment.formation
     if loop is None or shape is None or shape.worst > FAR_OFF:
         return

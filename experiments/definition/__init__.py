@@ -1,4 +1,4 @@
-"""What an experiment is: the structs of its file, and what follows from them for robots, bodies and network.
+"""Definition of an experiment: the structs of its file, and what follows for robots, bodies and network.
 
 Imports agents, twins.
 """

@@ -1,7 +1,7 @@
-"""Who may say and hear what in an experiment: the table from which a lab's router gets its access control.
+"""Access rights in an experiment: the table from which the routers of a lab get their access control.
 
-A robot says what lies below its own name and hears its neighbours' poses, those from which it keeps its distance
-included. Robots that share a process share one session, so that each of their certificates speaks for all of them.
+A robot publishes below its own name and receives the poses of its neighbours, those included that only avoidance needs.
+Robots that share a process share one session, so that each of their certificates holds for all of them.
 """
 
 from __future__ import annotations
@@ -21,13 +21,15 @@ from experiments.definition.experiment import Experiment, Robot
 from experiments.definition.plan import Plan
 
 FAR: Final = ("external", bodies.WORLD)  # bodies whose poses come from the process that carries them
-MANY: Final = 16  # who hears so many, and all there are, hears "*": a router reads N² keys for minutes
+MANY: Final = (
+    16  # from so many senders on, if they are all robots, the right is "*": a router reads N² keys for minutes
+)
 ROS: Final = ("ros2dds", "rmw")
 ROS_TWIN: Final = "turtlebot3-twin"
 
 
 def rights(cases: Iterable[Experiment]) -> Rights:
-    """The rights of everybody in the cases of an experiment, which share a router.
+    """Rights of all processes in the cases of an experiment, which share a router.
 
     Raises:
         LabError: If the cases are in different realms.
@@ -36,7 +38,7 @@ def rights(cases: Iterable[Experiment]) -> Rights:
 
 
 def needed_identities(experiment: Experiment, operator: str = "operator") -> list[str]:
-    """The identities whose certificates a run of this experiment needs on the machine that starts it."""
+    """Identities whose certificates a run needs on the machine that starts it."""
     robots = experiment.robots.values()
     abroad = {robot for host in experiment.hosts.values() for robot in host.robots}
     found = ["router", operator, "recorder", *(name for name in experiment.robots if name not in abroad)]
@@ -141,7 +143,7 @@ def _each(names: Iterable[str], *of: Callable[[str], str]) -> list[str]:
 
 
 def process_groups(experiment: Experiment) -> list[list[str]]:
-    """The robots of each process."""
+    """Robots by process."""
     groups: dict[str, list[str]] = {}
     for name, robot in experiment.robots.items():
         groups.setdefault(f"process {robot.process}" if robot.process else name, []).append(name)
@@ -149,7 +151,7 @@ def process_groups(experiment: Experiment) -> list[list[str]]:
 
 
 def senders_by_receiver(experiment: Experiment) -> dict[str, set[str]]:
-    """Whom each robot listens to: what its process subscribes to, and no one else."""
+    """Senders of each robot: the poses to which its process subscribes."""
     plan = Plan(experiment)
     links = plan.heard_links
     found: dict[str, set[str]] = {name: set() for name in plan.names}
@@ -159,7 +161,7 @@ def senders_by_receiver(experiment: Experiment) -> dict[str, set[str]]:
 
 
 def _ros(name: str, robot: Robot) -> turtlebot3.Address | None:
-    """Where a robot is in ROS 2 on the experiment's own routers; None if it is not there."""
+    """Address of a robot in ROS 2 on the experiment's own routers; None if it is not there."""
     body = registry.body_name(robot.body)
     if body not in (*ROS, ROS_TWIN):
         return None
@@ -170,7 +172,7 @@ def _ros(name: str, robot: Robot) -> turtlebot3.Address | None:
 
 
 def _foreign(name: str, robot: Robot) -> list[str]:
-    """Keys outside the realm on which a robot of ROS 2 speaks and is spoken to."""
+    """Keys outside the realm on which a robot of ROS 2 sends and receives."""
     where = _ros(name, robot)
     if where is None:
         return []

@@ -1,4 +1,4 @@
-"""The body of each robot: which one, its kind, start pose and disturbance, and the scene around it."""
+"""Bodies of the robots: kind, start pose, disturbance, body request, and the scene around them."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
 
 
 def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
-    """The kinds of these robots."""
+    """Kinds of these robots."""
     return tuple(KINDS[experiment.robots[name].kind] for name in names)
 
 
 def start_poses(experiment: Experiment, names: Sequence[str]) -> tuple[Array, Array]:
-    """Where robots start: position (n, 3) [m] on the floor and yaw (n,) [rad]."""
+    """Start poses of robots: position (n, 3) [m] on the floor and yaw (n,) [rad]."""
     given = [(*experiment.robots[name].start, 0.0)[:3] for name in names]
     pose = np.array(given, dtype=float).reshape(-1, 3)
     return np.concatenate([pose[:, :2], np.zeros((len(pose), 1))], axis=1), pose[:, 2]
@@ -45,7 +45,7 @@ def start_poses(experiment: Experiment, names: Sequence[str]) -> tuple[Array, Ar
 def scattered_poses(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[Array, Array]:
     """As `start_poses`, scattered by the seed as the file asks, clear of other robots and of obstacles.
 
-    A place is drawn for each robot of the experiment, in the order of the file, whoever asks: all processes agree.
+    Places are drawn for all robots of the experiment in the order of the file, so that all processes agree.
     """
     position, yaw = start_poses(experiment, tuple(experiment.robots))
     begin = experiment.start
@@ -82,7 +82,7 @@ def _free(stands: Scene, place: Array, kind: Kind) -> bool:
 def shared_world(
     experiment: Experiment, names: Sequence[str], copies: int = 1, *, sensing: bool | None = None
 ) -> World:
-    """The place that `names` share, in `copies`; with range sensors if somebody uses them, or as `sensing` says."""
+    """World that `names` share, in `copies`; with range sensors where avoidance uses them, or as `sensing` says."""
     used = experiment.avoidance is not None if sensing is None else sensing
     carried = []
     for name in names:
@@ -100,7 +100,7 @@ def shared_world(
 
 
 def scene(experiment: Experiment) -> Scene:
-    """What stands in the arena."""
+    """Obstacles and walls of the arena."""
     arena = experiment.arena
     plans = {
         name: registry.build(registry.PLANNERS, obstacle.plan)
@@ -111,7 +111,7 @@ def scene(experiment: Experiment) -> Scene:
 
 
 def shadow_periods(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Array:
-    """How often the twin beside each robot is put onto it (n,) [s]: infinite for once, NaN for robots without one."""
+    """Period (n,) [s] at which each shadow twin is reset to its robot: infinite for once, NaN without a shadow."""
     period = []
     for name in names:
         shadow = experiment.robots[name].shadow
@@ -120,12 +120,12 @@ def shadow_periods(experiment: Experiment, names: Sequence[str], copies: int = 1
 
 
 def hover_heights(experiment: Experiment, names: Sequence[str]) -> Array:
-    """Heights that robots hold (n,) [m], NaN for ground robots."""
+    """Heights that robots hold (n,) [m]; NaN for ground robots."""
     return np.array([experiment.robots[name].hover or np.nan for name in names])
 
 
 def disturbance(experiment: Experiment, name: str) -> Disturbance:
-    """What nature adds to a robot: `all`, overridden by its kind, overridden by its own name, field by field."""
+    """Disturbance of a robot: `all`, overridden by its kind, overridden by its own name, field by field."""
     merged: dict[str, object] = {}
     for scope in ("all", experiment.robots[name].kind, name):
         if (given := experiment.disturbance.get(scope)) is not None:
@@ -137,7 +137,7 @@ def disturbance(experiment: Experiment, name: str) -> Disturbance:
 def body_request(
     experiment: Experiment, names: Sequence[str], seeds: Sequence[int], endpoints: Sequence[str] = ()
 ) -> BodyRequest:
-    """What the bodies of `names` are opened with, one repetition for each seed; `endpoints` are the routers.
+    """Request for the bodies of `names`, one repetition for each seed; `endpoints` are the routers.
 
     Twins start where `scattered_poses` puts them; hardware is where it is.
     """
@@ -160,7 +160,7 @@ def body_request(
 
 
 # what `--bodies protocol` makes of each kind: its protocol twin, the process that its robots share (several Crazyflies
-# hang on one radio, all Tellos of a computer on one port), and who knows where it is
+# hang on one radio, all Tellos of a computer on one port), and the source of its position
 PROTOCOL: Final[dict[str, tuple[str, str | None, str]]] = {
     "crazyflie": ("crazyflie-twin", "radio0", "body"),
     "tello": ("tello-twin", "tellos", "external"),
@@ -173,7 +173,7 @@ BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
 
 
 def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
-    """The experiment with every robot in the body that `--bodies` names; as it is without.
+    """Replace the body of every robot by that of `--bodies`; without it, change nothing.
 
     Args:
         experiment: A case.
@@ -194,7 +194,7 @@ def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
 
 
 def behind_protocols(experiment: Experiment) -> Experiment:
-    """The experiment with every robot behind its real bridge and a protocol twin, and simulated motion capture."""
+    """Put every robot behind its real bridge and a protocol twin, with simulated motion capture."""
     robots = {}
     for name, robot in experiment.robots.items():
         body, process, position = PROTOCOL[robot.kind]

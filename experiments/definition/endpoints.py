@@ -1,4 +1,4 @@
-"""Where the routers of an experiment are, and which lab lets one in."""
+"""Endpoints of the routers of an experiment, and the lab whose certificates they ask for."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # numpy comes with it, and an emergency stop waits for nothin
 
 
 def folder(experiment: Experiment, file: Path, chosen: str | None = None) -> Path | None:
-    """The folder of the lab: that of the command line, or the one that the file names, which lies beside it."""
+    """Folder of the lab: that of the command line, or the one that the file names, beside the file."""
     if chosen is not None:
         return Path(chosen).absolute()
     own = experiment.network.lab
@@ -22,7 +22,7 @@ def folder(experiment: Experiment, file: Path, chosen: str | None = None) -> Pat
 
 
 def routers(experiment: Experiment, file: Path, connect: Sequence[str], chosen: str | None = None) -> list[str]:
-    """The routers of an experiment, each with its lab if there is one; empty where neither says which.
+    """Routers of an experiment, each with its lab if there is one; empty if neither file nor command names any.
 
     Args:
         experiment: Its `network.connect` holds if nothing else is said.

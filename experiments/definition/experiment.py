@@ -1,6 +1,6 @@
-"""An experiment: what its file says, as typed, frozen structs. SI units; the name says where a unit is another.
+"""Structs of the experiment file, typed and frozen. SI units; a name tells where a unit is another.
 
-`experiments.file.document` reads the file into these and says where it is wrong.
+`experiments.file.document` reads the file into these and reports each error with its place.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class StartBox(Part, frozen=True):
-    """A part of the floor where robots may start."""
+    """Part of the floor where robots may start."""
 
     at: Annotated[Planar, Meta(description="its middle, x, y [m]")]
     size: Annotated[tuple[Positive, Positive], Meta(description="x, y [m]")]
 
 
 class Shadow(Part, frozen=True):
-    """A twin that runs beside a robot and gets the same setpoints, to see how far they agree."""
+    """Shadow twin: runs beside a robot with the same setpoints, to measure how far they agree."""
 
     restart_s: Annotated[
         Positive | None,
@@ -46,7 +46,7 @@ class Shadow(Part, frozen=True):
 
 
 class Arena(Part, frozen=True):
-    """The box that the robots must not leave: centred on the origin, floor at z = 0."""
+    """Box that the robots must not leave: centred on the origin, floor at z = 0."""
 
     size: Annotated[Spatial, Meta(description="x, y, z [m]")] = (4.0, 4.0, 2.5)
     file: Annotated[
@@ -60,7 +60,7 @@ class Arena(Part, frozen=True):
 
 
 class Rates(Part, frozen=True):
-    """How often things happen; pose_hz, coordination_hz and state_hz divide body_hz."""
+    """Rates [Hz]; pose_hz, coordination_hz and state_hz divide body_hz."""
 
     body_hz: Annotated[Rate, Meta(description="position control and body")] = 100.0
     pose_hz: Annotated[Rate, Meta(description="how often the trigger is asked")] = 50.0
@@ -98,7 +98,7 @@ class Robot(Part, frozen=True):
 
 
 class Target(Part, frozen=True):
-    """What a link asks for, one of the three: how far apart, where from each other, or in which direction."""
+    """Target of a link, one of three: distance, offset or bearing."""
 
     distance: Annotated[Positive | None, Meta(description="[m]")] = None
     offset: Annotated[
@@ -120,7 +120,7 @@ class Target(Part, frozen=True):
 
 
 class Link(Target, frozen=True):
-    """A link that asks for something else than a distance, has a gain of its own, or is there for a time."""
+    """Link with a target other than a distance, a gain of its own, or a limited time."""
 
     gain: Annotated[Positive | None, Meta(description="the formation's if left out")] = None
     from_s: Annotated[NotNegative, Meta(description="the link is there from then on [s]")] = 0.0
@@ -133,7 +133,7 @@ class Link(Target, frozen=True):
 
 
 class Anchor(Part, frozen=True):
-    """A distance that a robot keeps to a point, to a line through it, or to a plane through it."""
+    """Distance of a robot to a point, to a line through it, or to a plane through it."""
 
     distance: Annotated[NotNegative, Meta(description="[m]; 0: on it")] = 0.0
     to: Annotated[Vector | None, Meta(description="the point, x, y (, z) [m]; left out: the origin")] = None
@@ -153,7 +153,7 @@ class Anchor(Part, frozen=True):
 
 
 class Change(Part, frozen=True):
-    """From `at_s` on, the formation goes smoothly to another shape."""
+    """Smooth transition of the formation to another shape, from `at_s` on."""
 
     at_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
     over_s: Annotated[NotNegative, Meta(description="how long it takes [s]; 0: at once")] = 5.0
@@ -166,7 +166,7 @@ class Change(Part, frozen=True):
 
 
 class Proximity(Part, frozen=True):
-    """Links that are there while two robots are near each other."""
+    """Links that exist while two robots are near each other."""
 
     range: Annotated[Positive, Meta(description="nearer than this they become neighbours [m]")]
     release: Annotated[Positive | None, Meta(description="farther than this no more [m]; left out: 1.1 range")] = None
@@ -181,7 +181,7 @@ class Proximity(Part, frozen=True):
 
 
 class Formation(Part, frozen=True):
-    """Which shape, by which law."""
+    """Formation: links with their targets, anchors, and the law."""
 
     law: Annotated[Choice, Meta(description="a registered law")] = "distance"
     update: Annotated[
@@ -208,7 +208,7 @@ class Formation(Part, frozen=True):
 
 
 class Leg(Part, frozen=True):
-    """From `at_s` on, a robot follows a plan."""
+    """Plan that a robot follows from `at_s` on."""
 
     at_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
     robot: Name
@@ -227,7 +227,7 @@ class LinkChannel(Part, frozen=True):
 
 
 class Outage(Part, frozen=True):
-    """A time in which nothing passes on some links."""
+    """Time in which nothing passes on some links."""
 
     from_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
     until_s: Annotated[Positive | None, Meta(description="[s] after it; left out: to the end")] = None
@@ -251,7 +251,7 @@ class Channel(LinkEffects, Part, frozen=True):
 
 
 class Network(Part, frozen=True):
-    """The network of a run in real time."""
+    """Network of a run in real time."""
 
     realm: Annotated[Name, Meta(description="first chunk of every key")] = "park"
     connect: Annotated[
@@ -292,7 +292,7 @@ class Network(Part, frozen=True):
 
 
 class Host(Part, frozen=True):
-    """Another machine, whose robots are started there."""
+    """Other machine, which runs some of the robots."""
 
     address: Annotated[
         str | None,
@@ -312,7 +312,7 @@ class Host(Part, frozen=True):
 
 
 class World(Part, frozen=True):
-    """The place that all twins share in virtual time, and those with `body = "world"` in real time."""
+    """World that all twins share in virtual time, and those with `body = "world"` in real time."""
 
     engine: Annotated[Choice, Meta(description="a registered engine")] = "point-mass"
     sensor_noise: Annotated[NotNegative, Meta(description="of range sensors, as a multiple of the real ones'")] = 1.0
@@ -322,7 +322,7 @@ class World(Part, frozen=True):
 
 
 class Start(Part, frozen=True):
-    """How a run begins."""
+    """Beginning of a run."""
 
     deadline_s: Annotated[Positive, Meta(description="how long to wait for all robots to be ready [s]")] = 20.0
     missing: Annotated[Literal["abort", "go-on"], Meta(description="when one is not ready by then")] = "abort"
@@ -333,7 +333,7 @@ class Start(Part, frozen=True):
 
 
 class Hybrid(Part, frozen=True):
-    """Some robots are guided by the centre, the others decide for themselves."""
+    """Hybrid architecture: some robots are guided by the central controller, the others decide for themselves."""
 
     kind: Annotated[Literal["hybrid"], Meta(description='"hybrid"')]
     robots: Annotated[list[Name], Meta(min_length=1, description="those that the centre guides")]
@@ -361,7 +361,9 @@ class Experiment(Part, frozen=True):
     timeline: list[Leg] = []
     architecture: Annotated[
         Literal["distributed", "centralised"] | Hybrid,
-        Meta(description="who decides: every robot for itself, or one process for all or some of them"),
+        Meta(
+            description="distributed: each robot decides for itself; centralised: one process for all; hybrid: for some"
+        ),
     ] = "distributed"
     trigger: Annotated[Choice, Meta(description="a registered trigger: when a robot speaks")] = "periodic"
     prediction: Annotated[

@@ -1,4 +1,4 @@
-"""From the formation of a file to arrays: links and what they ask for, anchors, changes, and the errors of a motion."""
+"""Formation as arrays: links with their targets, anchors, changes, and the link errors of a motion."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class FormationArrays:
 
     @classmethod
     def compiled(cls, experiment: Experiment, there: Sequence[OneWay]) -> FormationArrays:
-        """Of these links; rows are the robots of the file."""
+        """Arrays of these links; rows are the robots of the file."""
         row = {name: number for number, name in enumerate(experiment.robots)}
         wants = np.array([link.wanted.wants for link in there], dtype=np.intp)
         plain = bool((wants == BY_DISTANCE).all())
@@ -54,17 +54,17 @@ class FormationArrays:
         )
 
     def heard_by(self, rows: Index) -> FormationArrays:
-        """The links on which these rows listen, as `Links.of` gives them."""
+        """Links on which these rows receive, as `Links.of` gives them."""
         at, listener = self.links.indices_to_receivers(rows)
         mine = self.take(at)
         return replace(mine, links=replace(mine.links, receiver=listener))
 
     def without_listeners(self, rows: Index) -> FormationArrays:
-        """The links on which others than these rows listen."""
+        """Links on which other rows than these receive."""
         return self.take(np.flatnonzero(~np.isin(self.links.receiver, rows))) if len(rows) else self
 
     def and_then(self, others: Links) -> FormationArrays:
-        """With other links behind them, which do not change and are always there."""
+        """Append links that do not change and are always present."""
         changes = tuple(change.padded(len(others)) for change in self.changes)
         presence = None if self.presence is None else self.presence.padded(len(others))
         return FormationArrays(self.links.append(others), changes, presence)
@@ -81,7 +81,7 @@ class FormationArrays:
         return [self.links, *later]
 
     def present(self, time: Array, position: Array) -> Mask | None:
-        """Which links are there (T, E), on true positions (T, N, 3) at times (T,); None if all always are."""
+        """Presence of links (T, E) along true positions (T, N, 3) at times (T,); None if all are always present."""
         if self.presence is None:
             return None
         reshaping = Reshaping(self.links, (), self.presence)
@@ -125,7 +125,7 @@ def _errors(law: Law, pattern: FormationArrays, time: Array, position: Array) ->
 
 
 def compile_anchors(experiment: Experiment, names: Sequence[str], only: Sequence[str] | None = None) -> Anchors | None:
-    """The anchors of these robots, or of some `only`, each once; None if there are none."""
+    """Anchors of these robots, or of some `only`, each once; None if there are none."""
     formation = experiment.formation
     anchored = formation.anchors if only is None else [name for name in formation.anchors if name in only]
     there = [(row, formation.anchors[name]) for row, name in enumerate(names) if name in anchored]

@@ -1,4 +1,4 @@
-"""From [channel] of an experiment to what its links do to poses (`agents.network.channel_model.Conditions`)."""
+"""Effects of [channel] on each link, as `agents.network.channel_model.Conditions`."""
 
 from __future__ import annotations
 
@@ -36,64 +36,64 @@ def link_effects(channel: Channel, own: LinkChannel | None = None) -> LinkEffect
 
 
 def virtual_conditions(experiment: Experiment, over: Links, seeds: Sequence[int], *, stream: str = "") -> Conditions:
-    """Of all links `over` of all repetitions, those of the first seed first; rows are the robots as in the file.
+    """Conditions of all links `over` of all repetitions, those of the first seed first; rows are those of the file.
 
-    What else goes between the same robots has another `stream`, and its own luck.
+    Other messages between the same robots have another `stream`, and their own random numbers.
     """
     ends = _Ends.of(experiment, over.select(np.arange(len(over) // len(seeds))), tuple(experiment.robots))
     return Conditions.side_by_side(_seeded(_of(experiment.channel, ends, experiment.duration_s), ends, seeds, stream))
 
 
 def receiver_conditions(
-    experiment: Experiment, over: Links, listeners: Sequence[str], *, stream: str = ""
+    experiment: Experiment, over: Links, receivers: Sequence[str], *, stream: str = ""
 ) -> Conditions:
-    """Of the links on which robots of one process listen, on a real network, which has a delay of its own.
+    """Conditions of the links on which robots of one process receive, on a real network with its own delay.
 
-    `over.listener` counts in `listeners`, `over.speaker` in the robots of the file.
+    `over.receiver` counts in `receivers`, `over.sender` in the robots of the file.
     """
-    ends = _Ends.of(experiment, over, listeners)
+    ends = _Ends.of(experiment, over, receivers)
     bare = _of(experiment.channel, ends, experiment.duration_s)
     bare = replace(bare, delay=np.where(bare.delay > OWN_S, bare.delay, 0.0))
     return _seeded(bare, ends, [experiment.seed], stream)[0]
 
 
-def conditions_to_centre(experiment: Experiment, speakers: Index) -> Conditions:
-    """Of poses that the centre hears from robots `speakers` (K,), rows of the file, on a real network."""
+def conditions_to_centre(experiment: Experiment, senders: Index) -> Conditions:
+    """Conditions of poses from `senders` (K,), rows of the file, to the central controller, on a real network."""
     names = tuple(experiment.robots)
-    link_pairs = [(row, row) for row in speakers.tolist()]
+    link_pairs = [(row, row) for row in senders.tolist()]
     return receiver_conditions(experiment, links(link_pairs), names, stream=TO_CENTRE)
 
 
-def conditions_from_centre(experiment: Experiment, listeners: Sequence[str]) -> Conditions:
-    """Of goals that those of the robots `listeners` hear which are guided, in their order, on a real network."""
+def conditions_from_centre(experiment: Experiment, receivers: Sequence[str]) -> Conditions:
+    """Conditions of goals to the guided ones of the robots `receivers`, in their order, on a real network."""
     names, told = tuple(experiment.robots), Plan(experiment).guided
-    link_pairs = [(row, names.index(name)) for row, name in enumerate(listeners) if name in told]
-    return receiver_conditions(experiment, links(link_pairs), listeners, stream=FROM_CENTRE)
+    link_pairs = [(row, names.index(name)) for row, name in enumerate(receivers) if name in told]
+    return receiver_conditions(experiment, links(link_pairs), receivers, stream=FROM_CENTRE)
 
 
 @dataclass(frozen=True)
 class _Ends:
-    """Who listens and who speaks on each link (E,), by name."""
+    """Receiver and sender of each link (E,), by name."""
 
-    listener: NDArray[np.str_]
-    speaker: NDArray[np.str_]
+    receiver: NDArray[np.str_]
+    sender: NDArray[np.str_]
 
     @classmethod
-    def of(cls, experiment: Experiment, links: Links, listeners: Sequence[str]) -> _Ends:
-        return cls(np.array(listeners)[links.receiver], np.array(tuple(experiment.robots))[links.sender])
+    def of(cls, experiment: Experiment, links: Links, receivers: Sequence[str]) -> _Ends:
+        return cls(np.array(receivers)[links.receiver], np.array(tuple(experiment.robots))[links.sender])
 
     def named(self, text: str) -> Mask:
-        """Which links (E,) a text such as "A > B" or "A - B" means."""
-        found = np.zeros(len(self.listener), dtype=bool)
-        for listener, speaker in link_pairs(text):
-            found |= (self.listener == listener) & (self.speaker == speaker)
+        """Mask (E,) of the links that a text such as "A > B" or "A - B" means."""
+        found = np.zeros(len(self.receiver), dtype=bool)
+        for receiver, sender in link_pairs(text):
+            found |= (self.receiver == receiver) & (self.sender == sender)
         return found
 
 
 def _of(channel: Channel, ends: _Ends, duration: float) -> Conditions:
     """Without keys."""
     effects = [link_effects(channel), *(link_effects(channel, own) for own in channel.links.values())]
-    count = len(ends.listener)
+    count = len(ends.receiver)
     which = np.zeros(count, dtype=np.intp)
     for number, text in enumerate(channel.links, start=1):
         which[ends.named(text)] = number
@@ -102,17 +102,17 @@ def _of(channel: Channel, ends: _Ends, duration: float) -> Conditions:
         there = np.full(count, not (outage.links or outage.robots))
         for text in outage.links:
             there |= ends.named(text)
-        there |= np.isin(ends.listener, outage.robots) | np.isin(ends.speaker, outage.robots)
+        there |= np.isin(ends.receiver, outage.robots) | np.isin(ends.sender, outage.robots)
         outages.append(Outage(outage.from_s, inf if outage.until_s is None else outage.until_s, there))
     return Conditions.from_effects(effects, which, outages, duration)
 
 
 def _seeded(bare: Conditions, ends: _Ends, seeds: Sequence[int], stream: str) -> list[Conditions]:
-    """For each seed, with keys of its own if anything is left to chance."""
+    """Conditions for each seed, with random keys of its own if anything is random."""
     if not (bare.loss.any() or bare.jitter.any()):
         return [bare] * len(seeds)
     more = (stream,) if stream else ()
-    both = [(*each, *more) for each in zip(ends.speaker.tolist(), ends.listener.tolist(), strict=True)]
+    both = [(*each, *more) for each in zip(ends.sender.tolist(), ends.receiver.tolist(), strict=True)]
     return [
         replace(bare, key=np.array([channel_model.key(seed, *each) for each in both], dtype=np.uint64))
         for seed in seeds

@@ -1,4 +1,4 @@
-"""The links of a formation as the file writes them: "A > B" (B listens to A), "A - B" (both listen)."""
+"""Links as the file writes them: "A > B" (B receives from A), "A - B" (both receive)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RELEASE: Final = 1.1  # of the range: what separates coming from going, so that 
 
 @dataclass(frozen=True)
 class LinkTarget:
-    """What a one-way link asks for: see `agents.formation.graph.Links`."""
+    """Target of a one-way link, see `agents.formation.graph.Links`."""
 
     wants: int
     distance: float
@@ -30,7 +30,7 @@ class LinkTarget:
 
 @dataclass(frozen=True)
 class OneWay:
-    """A one-way link: who listens to whom, for what, with which gain, and when."""
+    """One-way link: sender and receiver, target, gain, and the time or range in which it exists."""
 
     receiver: str  # name
     sender: str  # name
@@ -44,7 +44,7 @@ class OneWay:
 
 
 def link_pairs(text: str) -> tuple[tuple[str, str], ...]:
-    """The (listener, speaker) pairs that a link stands for, one or two.
+    """The (receiver, sender) pairs that a link stands for, one or two.
 
     Raises:
         ValueError: If it reads otherwise; the message is what to write instead.
@@ -57,7 +57,7 @@ def link_pairs(text: str) -> tuple[tuple[str, str], ...]:
 
 
 def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
-    """Every link that there may be, in the robots' order: by listener, then speaker.
+    """Every possible link, in the robots' order: by receiver, then sender.
 
     Raises:
         ValueError: If a link is not written as it must be; never for an experiment that `document.read` returned.
@@ -89,7 +89,7 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
 
 
 def link_target(experiment: Experiment, text: str, given: Target | float, listener: str) -> LinkTarget:
-    """What a link asks of one of its ends, each way that it can be told.
+    """Target of a link for one of its ends, as distance, offset and bearing.
 
     Args:
         experiment: For the heights that robots hold.
@@ -115,12 +115,12 @@ def link_target(experiment: Experiment, text: str, given: Target | float, listen
 
 
 def held_height(experiment: Experiment, name: str) -> float:
-    """The height that a robot holds [m]."""
+    """Height that a robot holds [m]."""
     return experiment.robots[name].hover or 0.0
 
 
 def _gain(experiment: Experiment, law: Law, wants: int) -> float:
-    """The formation's gain for what a link asks, as the law takes it."""
+    """The formation's gain for a kind of target, as the law takes it."""
     formation = experiment.formation
     by = getattr(law, "PULLS_BY", "gain")
     if by == "by link":

@@ -1,4 +1,4 @@
-"""A network without routers: where every member listens, and who is linked with whom."""
+"""Mesh without routers: the endpoint of every member, and which members connect to each other."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from experiments.definition.bodies import VICON_TWIN
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 
-ENDPOINTS: Final = "network.txt"  # what to say behind --connect to look at a run: @FOLDER/network.txt
+ENDPOINTS: Final = "network.txt"  # for --connect @FOLDER/network.txt, which looks at a run
 
 
 def member_endpoints(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
-    """The endpoints of all members of a mesh, each with its owner: robots, then whoever serves them.
+    """Endpoints of all members of a mesh, each with its owner: robots, then support processes.
 
     All cases of a file have the same: a robot is at one place in all of them.
 
@@ -50,7 +50,7 @@ def member_endpoints(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
 
 
 def listening_hosts(experiment: Experiment) -> dict[str, list[str]]:
-    """At which names of machines the identities of a lab listen in a mesh; nobody where there are routers."""
+    """Host names at which the identities of a lab listen in a mesh; empty with routers."""
     if experiment.network.topology != "mesh":
         return {}
     here = ["localhost", "127.0.0.1", "::1"]
@@ -60,14 +60,14 @@ def listening_hosts(experiment: Experiment) -> dict[str, list[str]]:
 
 
 def neighbour_endpoints(experiment: Experiment, names: Sequence[str], endpoints: Sequence[str]) -> list[str]:
-    """What of the endpoints concerns robots that share a process: see `topology.neighbour_endpoints`."""
+    """Endpoints to which robots of one process connect, see `agents.network.endpoints`."""
     if not topology.is_mesh(endpoints):
         return list(endpoints)
     return topology.near(endpoints, access_rights.senders_by_receiver(experiment), names)
 
 
 def member_rights(experiment: Experiment, endpoints: Sequence[str]) -> Rights | None:
-    """Who may do what, for a member of a mesh, which enforces it itself; None where routers do, or nobody."""
+    """Rights that a member of a mesh enforces itself; None with routers, or without a lab."""
     if not topology.is_mesh(endpoints) or lab.of(endpoints) is None:
         return None
     return access_rights.rights([experiment])

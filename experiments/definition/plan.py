@@ -90,12 +90,12 @@ class Plan:
 
     @cached_property
     def one_way_links(self) -> tuple[OneWay, ...]:
-        """Every link of the formation, by listener, then speaker."""
+        """Every link of the formation, by receiver, then sender."""
         return tuple(one_way_links(self.experiment, self.law))
 
     @cached_property
     def formation(self) -> FormationArrays:
-        """The same as arrays, with changes and presence."""
+        """The links as arrays, with changes and presence."""
         return FormationArrays.compiled(self.experiment, self.one_way_links)
 
     @property

@@ -1,4 +1,4 @@
-"""Robots in reserve: those on standby, which somebody may add to a run, and spares, which take over a name."""
+"""Reserves: robots on standby, which `zenpark robot add` lets join a run, and robots without an address."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 def without_standby(experiment: Experiment) -> Experiment:
-    """The experiment without its robots on standby, as it runs while nobody adds them: in virtual time nobody can."""
+    """Remove the robots on standby: no robot is added in virtual time, or before `zenpark robot add`."""
     robots = {name: robot for name, robot in experiment.robots.items() if not robot.standby}
     if len(robots) == len(experiment.robots):
         return experiment
@@ -32,7 +32,7 @@ def without_standby(experiment: Experiment) -> Experiment:
         )
         for outage in channel.outages
     ]
-    outages = [  # one that names nobody any more would mean everybody
+    outages = [  # an outage without names would mean all links
         short for short, whole in zip(outages, channel.outages, strict=True)
         if short.links or short.robots or not (whole.links or whole.robots)
     ]  # fmt: skip
@@ -60,10 +60,10 @@ def without_standby(experiment: Experiment) -> Experiment:
 
 
 def _between(links: Mapping[str, T], robots: Collection[str]) -> dict[str, T]:
-    """Those of the links whose ends are both among `robots`."""
+    """Links with both ends among `robots`."""
     return {text: to for text, to in links.items() if {*link_pairs(text)[0]} <= {*robots}}
 
 
 def robots_without_address(experiment: Experiment) -> dict[str, str]:
-    """Robots that nobody starts from here, for their hosts have no address; by robot its host."""
+    """Robots whose host has no address, so that they are not started from here; robot to host."""
     return {robot: name for name, host in experiment.hosts.items() if host.address is None for robot in host.robots}

@@ -31,14 +31,14 @@ _BELONGS: Final = "belongs in the experiment file: an arena file holds nothing b
 
 
 class _Whole(Part, frozen=True):
-    """What an arena file holds."""
+    """Content of an arena file."""
 
     arena: Arena
 
 
 @dataclass(frozen=True)
 class ArenaFile:
-    """An arena file that holds no error."""
+    """Arena file without errors."""
 
     name: str  # as the experiment names it
     label: str  # as its errors name it
@@ -47,18 +47,18 @@ class ArenaFile:
 
     @cached_property
     def places(self) -> dict[Keys, Place]:
-        """Where everything stands in it."""
+        """Places of all keys and values."""
         return places(self.text)
 
     def located(self, fault: Fault) -> Problem:
-        """A fault in it, with its place."""
+        """The problem of a fault, with its place."""
         stands, place = nearest(self.places, fault.path)
         offset = place.key if fault.on_key and stands == fault.path else place.value
         return at_offset(self.label, self.text, offset, fault.message, fault.hint)
 
 
 class Misnamed(ValueError):
-    """An arena file that cannot be had; the fault is the experiment's."""
+    """Arena file that cannot be read; the fault is in the experiment file."""
 
     def __init__(self, fault: Fault) -> None:
         super().__init__(fault.message)
@@ -66,14 +66,14 @@ class Misnamed(ValueError):
 
 
 def arena_file_name(document: Mapping[str, Any]) -> str | None:
-    """The arena file that a document names, if it names one as it should."""
+    """Name of the arena file of a document, if it names one correctly."""
     arena = document.get("arena")
     name = arena.get("file") if isinstance(arena, dict) else None
     return name if isinstance(name, str) else None
 
 
 def with_arena_file(document: Mapping[str, Any], file: ArenaFile | None) -> dict[str, Any]:
-    """A document with what its arena file holds in its own [arena], which names no file any more."""
+    """Merge an arena file into the [arena] of a document, which then names no file."""
     if file is None:
         return dict(document)
     own = {key: value for key, value in document["arena"].items() if key != "file"}
@@ -114,7 +114,7 @@ def load(name: str, folder: Path) -> ArenaFile:
 
 
 def _others(folder: Path) -> list[str]:
-    """Arena files that there are: beside the experiment file those without robots, and those of the catalogue."""
+    """Known arena files: those beside the experiment file (tables [arena], no robots), and those of the catalogue."""
     found = []
     for file in sorted(folder.glob("*.toml"))[:LOOKED_AT]:
         try:
@@ -127,7 +127,7 @@ def _others(folder: Path) -> list[str]:
 
 
 def _misshapen(content: Mapping[str, Any]) -> Iterator[Fault]:
-    """Everything by which the content is no arena file."""
+    """Faults by which the content is no arena file."""
     for fault in structure.faults(content, _Whole):
         path = fault.path
         if not path:

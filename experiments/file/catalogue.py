@@ -1,4 +1,4 @@
-"""The ready-made experiments of the catalogue, and the files that are begun from them."""
+"""Catalogue of ready-made experiments, and new files that begin as copies of them."""
 
 from __future__ import annotations
 
@@ -100,13 +100,13 @@ def _entry(name: str) -> Path:
 
 
 def no_entry(name: str) -> Problem:
-    """Neither a file nor an entry has this name."""
+    """Problem of a name that is neither a file nor an entry."""
     hint = did_you_mean(name, index.names())
     return Problem(name, 0, 0, "neither a file nor an experiment of the catalogue", f"{hint} (zenpark new copies one)")
 
 
 def find_file(name: str | Path) -> Path:
-    """The file of that name, or that of the catalogue entry; a folder of the same name does not hide an entry."""
+    """File of that name, or of the catalogue entry; a folder of the same name does not hide an entry."""
     file = Path(name)
     known = str(name) in index.names()
     try:

@@ -1,4 +1,4 @@
-"""Does an experiment make sense: what no single field of it can tell."""
+"""Consistency of an experiment: faults that no single field shows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from twins.sensing.range_sensors import SENSORS
 
 
 def standby_faults(experiment: Experiment) -> Iterator[Fault]:
-    """Reserves that nobody could call upon, or not one by one."""
+    """Faults of standby robots and spares."""
     robots = experiment.robots
     for name, robot in robots.items():
         if robot.standby and robot.process is not None:
@@ -45,7 +45,7 @@ def standby_faults(experiment: Experiment) -> Iterator[Fault]:
             message = f"'{name}' is behind a protocol twin ('{spare.body}'), which starts before the run only"
             yield Fault((*path, "body"), message, "give it the body twin, or a real one")
     if experiment.on_loss == "replace" and not experiment.spares:
-        message = "who is lost is to be replaced, but there is no spare"
+        message = "lost robots are to be replaced, but there is no spare"
         yield Fault(("on_loss",), message, 'add [spares.NAME], or say on_loss = "restart"')
 
 
@@ -57,11 +57,11 @@ _RESERVED: Final = (
     "centre",
     *KINDS,
 )  # they mean something in keys and in [disturbance]
-_WALL: Final = "wall"  # the border of the arena, where contacts are told
+_WALL: Final = "wall"  # name of the border of the arena in contacts
 
 
 def faults(experiment: Experiment) -> Iterator[Fault]:
-    """Everything that contradicts something else, with its path in the file."""
+    """All contradictions between fields, with their paths in the file."""
     yield from _rates(experiment)
     yield from arena_faults(experiment.arena)
     for name, robot in experiment.robots.items():
@@ -84,7 +84,7 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
 
 
 def arena_faults(arena: Arena) -> Iterator[Fault]:
-    """What is wrong with an arena by itself; paths begin at the top of a document."""
+    """Faults of an arena by itself; paths begin at the top of a document."""
     scene = Scene.furnished(arena.size, arena.obstacles, {}, walled=arena.walls)
     x, y, z = arena.size
     for number, (name, obstacle) in enumerate(arena.obstacles.items()):
@@ -108,7 +108,7 @@ def arena_faults(arena: Arena) -> Iterator[Fault]:
 
 
 def _furnished(experiment: Experiment) -> Iterator[Fault]:
-    """Do robots and what stands in the arena go together at the start."""
+    """Faults between robots, obstacles and start boxes at the start."""
     arena, robots = experiment.arena, experiment.robots
     scene = Scene.furnished(arena.size, arena.obstacles, {}, walled=arena.walls)
     for number, name in enumerate(arena.obstacles):
@@ -119,7 +119,7 @@ def _furnished(experiment: Experiment) -> Iterator[Fault]:
             if each.kind not in KINDS:
                 continue
             kind, place = KINDS[each.kind], np.array(each.start[:2])
-            if not outlines.at_height(scene, number, 0.0, kind.height):  # who flies stands on the floor before
+            if not outlines.at_height(scene, number, 0.0, kind.height):  # a flying robot stands on the floor before
                 continue
             missing = kind.radius - float(outlines.distance(scene, number, scene.pose[number], place))
             if missing > 1e-9:
@@ -213,7 +213,7 @@ def _hover(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
 
 
 def _triggers(experiment: Experiment) -> Iterator[Fault]:
-    """Does each trigger stand where it makes sense, with the prediction that it needs."""
+    """Triggers in the wrong place, or without the prediction that they need."""
     kind, _ = registry.split(experiment.trigger)
     spoken = registry.struct(registry.TRIGGERS, kind)
     if "communication" not in getattr(spoken, "places", ("communication",)):
@@ -238,7 +238,7 @@ def _triggers(experiment: Experiment) -> Iterator[Fault]:
 
 
 def _architecture(experiment: Experiment) -> Iterator[Fault]:
-    """Does a hybrid architecture name some of the robots, and not all."""
+    """A hybrid architecture must name some of the robots, and not all."""
     hybrid, path = experiment.architecture, ("architecture", "robots")
     if not isinstance(hybrid, Hybrid):
         return

@@ -1,4 +1,4 @@
-"""Does a formation make sense: its links, what they ask for, its anchors and its changes."""
+"""Consistency of a formation: its links and their targets, its anchors and its changes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROUNDED = 1e-3  # [m] heights written with three decimals
 
 
 def faults(experiment: Experiment) -> Iterator[Fault]:
-    """Everything in [formation] that contradicts something else."""
+    """All contradictions in [formation]."""
     found = list(_links(experiment))
     yield from found
     for name in experiment.formation.anchors:
@@ -67,14 +67,14 @@ def _links(experiment: Experiment) -> Iterator[Fault]:
 
 
 def kind_of(given: Target | float) -> str:
-    """The word for what a link asks for."""
+    """Name of the target of a link."""
     if not isinstance(given, Target):
         return "distance"
     return next(name for name in ("distance", "offset", "bearing") if getattr(given, name) is not None)
 
 
 def _asked(experiment: Experiment, text: str, given: Target | float, path: Path) -> Iterator[Fault]:
-    """Can the law do with what a link asks for, and can robots that hold their heights do it."""
+    """Targets that the law does not take, or that robots with held heights cannot meet."""
     name, _ = registry.split(experiment.formation.law)
     needs, kind = getattr(registry.struct(registry.LAWS, name), "NEEDS", "any"), kind_of(given)
     can = {"distance": ("distance", "offset"), "relative": ("offset",), "bearing": ("bearing", "offset")}

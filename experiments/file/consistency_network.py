@@ -1,4 +1,4 @@
-"""Do hosts, robots and network go together."""
+"""Consistency of hosts, robots, network and channel."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _WRITE: Final = {
 
 
 def host_faults(experiment: Experiment) -> Iterator[Fault]:
-    """Robots that nobody or two hosts have, processes and bodies that cannot be divided, endpoints that clash."""
+    """Faults of hosts: robots of two hosts or of none, processes that cannot be divided, endpoints that clash."""
     where: dict[str, str] = {}
     for host, each in experiment.hosts.items():
         for name, value in (("address", each.address), ("zenpark", each.zenpark), ("lab", each.lab)):
@@ -55,7 +55,7 @@ def _body(experiment: Experiment, host: str, number: int) -> Iterator[Fault]:
 
 
 def _processes(experiment: Experiment, where: dict[str, str]) -> Iterator[Fault]:
-    """A process is on one machine, and so are all of its robots."""
+    """Robots of one process must be on one machine."""
     first: dict[str, str] = {}
     for name, robot in experiment.robots.items():
         if robot.process is None:
@@ -100,7 +100,7 @@ def _network(experiment: Experiment) -> Iterator[Fault]:
 
 
 def _mesh(experiment: Experiment) -> Iterator[Fault]:
-    """A mesh has no routers, and who is elsewhere must be told where to listen."""
+    """Faults of a mesh, which has no routers: robots on other machines need an address."""
     network = experiment.network
     for name, given in (("listen", network.listen), ("connect", network.connect), ("routers", network.routers > 1)):
         if given:
@@ -132,7 +132,7 @@ ROUNDING: Final = 1e-9
 
 
 def channel_faults(experiment: Experiment) -> Iterator[Fault]:
-    """Everything in [channel] that contradicts something else."""
+    """All contradictions in [channel]."""
     channel = experiment.channel
     yield from _bursts(channel, ("channel",), channel)
     there = _heard(experiment) if channel.links or any(outage.links for outage in channel.outages) else None
@@ -171,7 +171,7 @@ def _pairs(text: str) -> tuple[tuple[str, str], ...]:
 def _link(
     experiment: Experiment, there: set[tuple[str, str]] | None, text: str, path: Path, *, on_key: bool = False
 ) -> Iterator[Fault]:
-    """Is this a link on which something is said; `there` are all of those, if they are known."""
+    """Faults of a text that names a link on which poses are sent; `there` are all of those, if known."""
     both = _pairs(text)
     if not both:
         yield Fault(path, f"{text!r} is no link", FORM, on_key=on_key)
@@ -189,7 +189,7 @@ def _link(
 
 
 def _heard(experiment: Experiment) -> set[tuple[str, str]] | None:
-    """Who listens to whom, for the formation or for avoidance; None where that cannot be told, which is said there."""
+    """The (receiver, sender) pairs of all links, for formation and avoidance; None if other faults hide them."""
     try:
         links = Plan(experiment).heard_links
     except (ValueError, KeyError):
@@ -199,7 +199,7 @@ def _heard(experiment: Experiment) -> set[tuple[str, str]] | None:
 
 
 def _bursts(held: LinkEffects, path: Path, own: LinkEffects | LinkChannel) -> Iterator[Fault]:
-    """Losses in a row: `held` is what holds on a link, `own` what stands at this place of the file."""
+    """Faults of burst losses: `held` are the effects on a link, `own` those at this place of the file."""
     loss, burst = held.loss, held.burst
     if burst is None or (own.loss is None and own.burst is None):
         return

@@ -1,4 +1,4 @@
-"""Reads an experiment file, with its cases and the changes of the command line, and says all that is wrong with it.
+"""Reading of an experiment file, its cases and the changes of the command line, with all errors at once.
 
 document = read("robotic-park", ["robots.CF01.hover=0.7"])
 for name, experiment in document.cases().items(): ...
@@ -34,7 +34,7 @@ _ABOVE: Final = (("arena",), ("arena", "file"))  # changes after which the arena
 
 @dataclass(frozen=True)
 class Document:
-    """An experiment file that holds no error."""
+    """Experiment file without errors."""
 
     path: Path  # the file that was read
     text: str  # as it stands there
@@ -118,7 +118,7 @@ def write_json(experiment: Experiment) -> bytes:
 
 @dataclass(frozen=True)
 class _Reading:
-    """One reading of one file: what is at hand when something must be located."""
+    """State of one reading, from which errors are located."""
 
     file: Path
     label: str
@@ -189,7 +189,7 @@ class _Reading:
     def _furnished(
         self, document: _Table, case: str, overrides: Sequence[Override], files: dict[str, ArenaFile]
     ) -> _Table:
-        """The document with what its arena file holds; that file is added to `files`."""
+        """Merge the arena file of a document; the file is added to `files`."""
         name = arena_file.arena_file_name(document)
         if name is None:
             return document
@@ -222,7 +222,7 @@ class _Reading:
         overrides: Sequence[Override],
         files: Mapping[str, ArenaFile] | None = None,
     ) -> None:
-        """Raises if there is any fault, all in the order of the file."""
+        """Raise DocumentError if there is any fault, all in the order of the file."""
         problems = dict.fromkeys(self._located(fault, overrides, files or {}) for fault in faults)
         if problems:
             ours = (self.label, *(problem.file for problem in problems if not problem.line))
@@ -250,7 +250,7 @@ class _Reading:
 
 
 def _unused(override: Override, documents: Sequence[Mapping[str, Any]]) -> Problem:
-    """A parameter that no trigger, law or plan of the experiment has."""
+    """Problem of a parameter that no trigger, law or plan of the experiment has."""
     end = next(end for end in range(1, len(override.path)) if structure.group_of(override.path[:end]))
     known = dict.fromkeys(name for document in documents for name in chosen_parameters(document, override.path[:end]))
     parameter = str(override.path[end])
@@ -261,7 +261,7 @@ def _unused(override: Override, documents: Sequence[Mapping[str, Any]]) -> Probl
 def _of_cases(
     tables: Mapping[str, _Table], found: Mapping[str, Sequence[Fault]], first: Sequence[Fault]
 ) -> Iterator[Fault]:
-    """Faults of the cases that the file without cases does not have, where the case's own table causes them."""
+    """Faults that a case adds to those of the file, at the key of the case that causes them."""
     for name, faults in found.items():
         for fault in faults:
             if fault in first:
@@ -274,7 +274,7 @@ def _of_cases(
 
 
 def _tables(document: _Table) -> dict[str, _Table]:
-    """What each case changes, as far as these are tables at all."""
+    """Tables of the cases; values that are no tables are left out."""
     cases = document.get("cases")
     return {name: table for name, table in cases.items() if isinstance(table, dict)} if isinstance(cases, dict) else {}
 
@@ -295,7 +295,7 @@ def _beginning(table: object, path: Keys) -> Keys:
 
 
 def case_document(experiment: Experiment) -> bytes:
-    """A case in one line, for robots that have no file of it; where the others are is no robot's business."""
+    """A case as one line of JSON for a robot without a file; without the hosts of the other robots."""
     arena = msgspec.structs.replace(experiment.arena, file=None)  # what stood there is in it
     return msgspec.json.encode(msgspec.structs.replace(experiment, arena=arena, hosts={}))
 

@@ -36,7 +36,7 @@ def schema() -> dict[str, Any]:
         field = definitions[owner]["properties"][name]
         kept = {key: field[key] for key in ("description", "default") if key in field}
         definitions[owner]["properties"][name] = {**kept, **_choice(group, definitions)}
-    for name, field in definitions["LinkChannel"]["properties"].items():  # told once, at the channel
+    for name, field in definitions["LinkChannel"]["properties"].items():  # as at the channel
         field["description"] = definitions["Channel"]["properties"][name]["description"]
     definitions["Robot"]["properties"]["kind"]["enum"] = list(KINDS)
     partial = {name + _CASE: _partial(each) for name, each in definitions.items()}

@@ -1,4 +1,4 @@
-"""Where things stand in a TOML or JSON file: from a path in the parsed document to line and column.
+"""Places in a TOML or JSON file, from a path in the parsed document to line and column; problems and faults.
 
 No maintained TOML reader tells positions. The scanner here runs over text that `tomllib` has accepted, and only when
 there is something to report, so it needs no checks of its own.
@@ -27,14 +27,14 @@ _BARE_VALUE: Final = re.compile(r"[^,\]}#\n]*")
 
 @dataclass(frozen=True)
 class Place:
-    """Where a key and its value begin, as offsets into the text."""
+    """Begin of a key and of its value, as offsets into the text."""
 
     key: int
     value: int
 
 
 def places(text: str, *, json: bool = False) -> dict[Path, Place]:
-    """Every path of a valid document, tables and list items included, and where it first stands."""
+    """Place of every path of a valid document, tables and list items included."""
     scan = _Scan(text, json)
     if json:
         scan.value((), _blank(text, 0))
@@ -118,7 +118,7 @@ class _Scan:
         return str(msgspec.json.decode(quoted) if self.json else tomllib.loads(f"key = {quoted}")["key"])
 
     def value(self, path: Path, at: int) -> int:
-        """Whatever stands behind `=`; where it ends."""
+        """Scan the value behind `=`; return its end."""
         opening = self.text[at : at + 1]
         if opening == "[":
             return self.several(path, at, "]")
@@ -128,7 +128,7 @@ class _Scan:
         return string.end() if string else _end(_BARE_VALUE, self.text, at)
 
     def several(self, path: Path, at: int, closing: str) -> int:
-        """A list or an inline table; where it ends."""
+        """Scan a list or an inline table; return its end."""
         number = 0
         at = _blank(self.text, at + 1)
         while at < len(self.text) and self.text[at] != closing:
@@ -155,12 +155,12 @@ def _blank(text: str, at: int) -> int:
 
 
 SHOWN = 100  # characters of a source line; longer ones are cut around the place
-MOST = 20  # problems that are told at once
+MOST = 20  # problems in one message
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Something wrong at a path of the document, not yet located in the text."""
+    """Error at a path of the document, not yet located in the text."""
 
     path: Path  # keys and list indices from the top of the document
     message: str  # what is wrong
@@ -170,7 +170,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Problem:
-    """Something wrong at a place. Line and column are 1-based, 0 where there is no text to point into."""
+    """Error at a place. Line and column are 1-based, 0 without a text to point into."""
 
     file: str  # as the user named it; or the command-line flag that is at fault
     line: int  # line number
@@ -191,7 +191,7 @@ class Problem:
 
 
 class DocumentError(ValueError):
-    """An experiment that cannot be read, with everything that is wrong with it."""
+    """Experiment that cannot be read, with all of its problems."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         told = [str(problem) for problem in problems[:MOST]]

@@ -1,4 +1,4 @@
-"""Does a document have the shape of an experiment: known keys, nothing missing, values of the right type and range.
+"""Type check of a parsed document against the structs of an experiment; each error has its path.
 
 `msgspec.convert` stops at the first error and does not tell which entry of a table it is in. The walk here goes down
 the same annotations and lets msgspec judge one value at a time, so that everything is found, each with its path.
@@ -38,7 +38,7 @@ _FIELDS: Final = frozenset(Experiment.__struct_fields__)
 
 
 def number_faults(value: object, path: Path = ()) -> Iterator[Fault]:
-    """Numbers that no experiment can hold, though TOML can write them."""
+    """Faults of numbers that TOML can write and no experiment can hold."""
     if isinstance(value, dict):
         for key, each in value.items():
             yield from number_faults(each, (*path, key))
@@ -54,7 +54,7 @@ def number_faults(value: object, path: Path = ()) -> Iterator[Fault]:
 
 
 def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment, path: Path = ()) -> list[Fault]:
-    """Everything by which a document is not what it should be; empty if `msgspec.convert` takes it.
+    """All faults of type, range and key; empty if `msgspec.convert` takes the document.
 
     A part of one may be looked at by itself: `path` is where it stands in the whole.
     """
@@ -66,7 +66,7 @@ def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experimen
 
 
 def group_of(path: Path) -> str | None:
-    """The entry-point group that the choice at this path is made from, if a choice stands there."""
+    """Entry-point group of the plug-in choice at a path; None if no choice stands there."""
     match path:
         case ("trigger",) | ("formation", "update"):
             group = registry.TRIGGERS
@@ -155,7 +155,7 @@ def _fields_of(struct: type[msgspec.Struct]) -> Mapping[str, msgspec.structs.Fie
 
 
 def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) -> Fault:
-    """A key that its table does not have; perhaps another one does."""
+    """Fault of an unknown key; the hint names another table or plug-in that has it."""
     if plugin is not None:
         group, kind = plugin
         other = _kind_with(group, [key])
@@ -167,7 +167,7 @@ def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) ->
 
 
 def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
-    """A plug-in and its parameters."""
+    """Faults of a plug-in choice and its parameters."""
     known, what = registry.names(group), group.rpartition(".")[2]
     if isinstance(value, dict) and not isinstance(value.get("kind"), str):
         for key in value:
@@ -200,7 +200,7 @@ def _judged(
     note: str,
     fields: Mapping[str, msgspec.structs.FieldInfo] | None = None,
 ) -> list[Fault]:
-    """What msgspec says of a value, in words."""
+    """Faults that msgspec finds in a value, in words."""
     try:
         msgspec.convert(value, annotation)
     except msgspec.ValidationError as error:
@@ -274,7 +274,7 @@ def _is_struct(annotation: object) -> bool:
 
 
 def _name(path: Path) -> str:
-    """How the user knows a path: the last key, with its indices."""
+    """Name of a path for the user: the last key, with its indices."""
     first = max((number for number, step in enumerate(path) if isinstance(step, str)), default=0)
     return "".join(f"[{step}]" if isinstance(step, int) else str(step) for step in path[first:])
 
@@ -287,7 +287,7 @@ OBJECT: Final = "write an object, '{\"name\": value}'"
 
 
 def parse_object(flag: str, text: str, struct: type[msgspec.Struct] | None = None, path: Path = ()) -> dict[str, Any]:
-    """The object that stands behind a flag.
+    """JSON object of a command-line flag.
 
     Args:
         flag: Such as "--obstacle".

@@ -1,1 +1,1 @@
-"""Converts Robotic Park's YAML."""
+"""Conversion of experiment files of Robotic Park's authors."""

@@ -36,7 +36,7 @@ RADIO: Final = re.compile(r"radio://(\d+)/\d+/(?:250K|1M|2M)/[0-9A-Fa-f]{10}")
 
 @dataclass(frozen=True)
 class Rates:
-    """How often, in their file: of poses and of decisions [Hz]."""
+    """Rates of poses and decisions [Hz]."""
 
     pose_hz: float
     coordination_hz: float
@@ -175,7 +175,7 @@ def _body(robot: Robot) -> tuple[str, str]:
 
 
 def _tools(park: Park, notes: Notes) -> None:
-    """What their file says of programs that zenpark has other means for."""
+    """Notes on their tools, for which zenpark has its own."""
     if park.tool and park.mode != "physical":
         notes.say(f"Operation: the simulator and its world ({park.tool}); twins are zenpark's own, in an empty arena")
     if park.kind != "formation":
@@ -222,7 +222,7 @@ def _divisor(what: str, hz: float, notes: Notes) -> float:
 
 
 def _trigger(park: Park, rates: Rates, notes: Notes) -> str:
-    """When poses are sent; one trigger for all."""
+    """Trigger of poses, one for all robots."""
     speaks = _most_thresholds("communication", [robot.speaks for robot in park.robots], notes)
     if not speaks.event:
         return f'{{ kind = "periodic", period_s = {1.0 / rates.pose_hz:g} }}'
@@ -232,7 +232,7 @@ def _trigger(park: Park, rates: Rates, notes: Notes) -> str:
 
 
 def _update(park: Park, notes: Notes) -> str:
-    """When the law is computed; empty for at every decision."""
+    """Control trigger; empty: the law is computed at every decision."""
     given = [task.update for _, task in tasks(park)]
     if not given:
         return ""

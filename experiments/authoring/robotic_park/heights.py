@@ -54,7 +54,7 @@ class Placed:
 
 
 def placed(wanted: Wanted, start: Array, climbs: Mask) -> Placed:
-    """Places at what is asked for, as well as it can be met.
+    """Best places for the targets.
 
     A formation that can be met at the heights of the starts stays there. Else heights are free, and least squares
     begin at the starts, at a dome above them and at starts that are moved at random (always the same ones): a single
@@ -154,7 +154,7 @@ SPACING: Final = 0.6  # [m] between robots whose start is made up
 
 @dataclass
 class Notes:
-    """What could not be carried over, each once."""
+    """Notes on what is not carried over, each once."""
 
     said: list[str] = field(default_factory=list)
 

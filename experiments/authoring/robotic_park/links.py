@@ -1,4 +1,4 @@
-"""From the relations of Robotic Park's robots to the links and anchors of an experiment file."""
+"""Links and anchors of an experiment file from the relations of Robotic Park's robots."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _divides(park: Park, robot: Robot) -> bool:
 
 
 def _weight(park: Park, robot: Robot) -> float:
-    """How much more the origin pulls than a neighbour, which is written into the same drivers."""
+    """Gain of the origin relative to a neighbour, as in the same drivers."""
     if park.architecture == CENTRAL or robot.place != "virtual":
         return 2.0
     return 1.0 if park.recent else 4.0
