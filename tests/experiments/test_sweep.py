@@ -17,7 +17,7 @@ from experiments.sweep import table as sweep_table
 from experiments.sweep.pareto import curves, front, pareto
 from experiments.sweep.runs import Stuck
 from experiments.sweep.sweep import side_by_side, sweep
-from experiments.sweep.workers import Processes, SweepError, Work, workers
+from experiments.sweep.workers import SweepError, Work, workers
 from tools.commands import sweep as commands
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
@@ -168,7 +168,7 @@ def test_how_many_fly_side_by_side_depends_on_their_number():
 
 
 def test_workers_with_other_code_are_refused():
-    with Processes(1) as crew, pytest.raises(SweepError, match="another version of zenpark"):
+    with workers(None, 1) as crew, pytest.raises(SweepError, match="another version of zenpark"):
         list(crew.done([Work("x", b'{"title":"","robots":{},"duration_s":1}', (1,), "other")]))
 
 
