@@ -1,4 +1,4 @@
-"""Figures in a notebook, and in a script that opens as one.
+"""Runs from Python: simulate an experiment, reopen a folder, show figures in a notebook.
 
 from experiments.run import show
 show(run.figures()["errors"], "figures/errors")     # the last line of a cell: shown below it, and kept as a file
@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from matplotlib.figure import Figure
 
@@ -42,7 +42,7 @@ class Picture:
     files: tuple[Path, ...] = ()
 
     def _repr_svg_(self) -> str:
-        """What notebooks ask for. The figures are drawn without pyplot, by which notebooks would find them."""
+        """SVG for notebooks; figures are drawn without pyplot, by which notebooks would find them."""
         return style.svg(self.figure)
 
 
@@ -68,25 +68,21 @@ def folder(default: str) -> Path:
     return Path(given[0]) if given else CHECKOUT / default
 
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 MOST_SAMPLES: Final = 2e7  # states of one robot; each takes about 300 bytes
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a run leaves."""
+    """Results of a run."""
 
     title: str  # of the experiment
-    seed: int  # of its noise
-    traces: dict[str, Trace]  # what happened, per case
-    metrics: dict[str, CaseMetrics]  # what it comes to, per case
-    folder: Path | None = None  # where the recordings are; None if none were made
-    source: str = ""  # the experiment file
-    # what the reader should know: robots lost, a damaged recording, a case that never began
-    notes: tuple[str, ...] = ()
-    made: float = field(default_factory=time.time)  # when, UTC [s]
+    seed: int  # of the noise
+    traces: dict[str, Trace]  # by case
+    metrics: dict[str, CaseMetrics]  # by case
+    folder: Path | None = None  # of the recordings; None if none were made
+    source: str = ""  # text of the experiment file
+    notes: tuple[str, ...] = ()  # robots lost, a damaged recording, a case that never began
+    made: float = field(default_factory=time.time)  # [s] UTC
 
     def figures(self) -> dict[str, Figure]:
         """The figures of the report, by name."""
@@ -100,7 +96,7 @@ class Run:
         return metrics_files.document(str(self.folder or ""), self.seed, list(self.metrics.values()))
 
 
-Told = Callable[[str, int, int], None]  # a case, seconds of it that are simulated, and how many it has
+Progress = Callable[[str, int, int], None]  # case, simulated seconds, seconds in all
 
 
 def simulate(read: Document, *, cases: Sequence[str] = (), seed: int | None = None, folder: Path | None = None) -> Run:
@@ -125,18 +121,20 @@ def simulate_seeds(
     *,
     cases: Sequence[str] = (),
     folder: Path | None = None,
-    tell: Told = lambda *_: None,
+    progress: Progress = lambda *_: None,
 ) -> list[Run]:
     """As `simulate`, once for each seed, side by side; recordings are made of the first seed only.
 
-    `tell` is called again and again with how far it is.
+    `progress` is called repeatedly.
     """
     _refuse_too_much(read.experiment, len(seeds))
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     for name, experiment in chosen(read, cases).items():
         experiment = standby.without_standby(experiment)  # noqa: PLW2901
-        log = simulation.simulate(experiment, seeds, tell=partial(_pass_on, tell, name, experiment.duration_s))
-        _pass_on(tell, name, experiment.duration_s, math.inf)
+        log = simulation.simulate(
+            experiment, seeds, progress=partial(_pass_progress, progress, name, experiment.duration_s)
+        )
+        _pass_progress(progress, name, experiment.duration_s, math.inf)
         for copy in range(len(seeds)):
             logbook = Logbook(log, experiment, name, copy)
             traces[copy][name] = logbook.trace()
@@ -156,8 +154,8 @@ def _refuse_too_much(experiment: Experiment, seeds: int) -> None:
         raise DocumentError([Problem("--seeds" if seeds > 1 else "duration_s", 0, 0, message, hint)])
 
 
-def _pass_on(tell: Told, case: str, duration_s: float, elapsed: float) -> None:
-    tell(case, int(min(elapsed, duration_s)) if elapsed > 0.0 else 0, math.ceil(duration_s))
+def _pass_progress(progress: Progress, case: str, duration_s: float, elapsed: float) -> None:
+    progress(case, int(min(elapsed, duration_s)) if elapsed > 0.0 else 0, math.ceil(duration_s))
 
 
 def reopen(folder: Path) -> Run:

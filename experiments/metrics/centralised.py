@@ -1,4 +1,4 @@
-"""What the architecture of a case costs: messages, delays, and the load of the centre."""
+"""Cost of the architecture of a case: messages, delays, and the load of the central controller."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Delays:
     largest: float | None
 
     @classmethod
-    def of(cls, delay: Array) -> Delays:
+    def of_series(cls, delay: Array) -> Delays:
         """Of all (A,)."""
         if not len(delay):
             return cls(None, None, None)
@@ -30,12 +30,12 @@ class Delays:
 
 
 def guided_rows(trace: Trace) -> Mask:
-    """Which robots (N,) a centre decides for."""
+    """Robots (N,) that the central controller guides."""
     return np.isin(np.array(trace.robots), trace.plan.guided)
 
 
 def centre_hears(trace: Trace) -> Mask:
-    """Which robots (N,) the centre listens to: those that it guides, and those to whom they listen."""
+    """Robots (N,) whose poses the central controller receives: those that it guides, and their neighbours."""
     rows = guided_rows(trace)
     net = trace.plan.links
     hears = rows.copy()
@@ -46,10 +46,10 @@ def centre_hears(trace: Trace) -> Mask:
 def delays(trace: Trace) -> list[Delays]:
     """Of each robot."""
     goals = trace.goals
-    none = Delays.of(np.zeros(0))
+    none = Delays.of_series(np.zeros(0))
     if goals is None:
         return [none] * len(trace.robots)
-    return [Delays.of(goals.delay[goals.follower == row]) for row in range(len(trace.robots))]
+    return [Delays.of_series(goals.delay[goals.follower == row]) for row in range(len(trace.robots))]
 
 
 def goals_to(trace: Trace) -> tuple[Index, Index]:
@@ -62,19 +62,19 @@ def goals_to(trace: Trace) -> tuple[Index, Index]:
 
 
 def deliveries(trace: Trace, sent: Index) -> int:
-    """Messages counted once for everybody who listens, when robots `sent` (N,) poses: to each other, to the centre, and
-    the goals."""
+    """Messages counted once per receiver, when robots `sent` (N,) poses: to each other, to the central controller, and
+    its goals."""
     listeners = np.bincount(trace.plan.heard_links.sender, minlength=len(sent)) + centre_hears(trace)
     return int(sent @ listeners) + (0 if trace.goals is None else len(trace.goals.sent))
 
 
 def guidance(trace: Trace) -> Guidance | None:
-    """What deciding in one process came to."""
+    """Metrics of the centralised architecture; None if each robot decides for itself."""
     goals = trace.goals
     if goals is None:
         return None
     duration = float(trace.time[-1] - trace.time[0])
-    all_of_them = Delays.of(goals.delay)
+    all_of_them = Delays.of_series(goals.delay)
     load = [report.load for report in goals.reports] if trace.clock == "real" else []
     missed = [report.missed for report in goals.reports]
     return Guidance(

@@ -1,4 +1,4 @@
-"""How near robots came to each other and to what stands in the arena, surface to surface, and what touched.
+"""Clearance between robots, obstacles and walls, surface to surface, and contacts.
 
 Robots are upright cylinders of the radius and height of their kind; a position is that of the lowest point. Everything
 is taken on true positions, at the samples of the trace; unknown ones touch nothing.
@@ -34,9 +34,9 @@ class Clearance:
     overlaps: tuple[Collision, ...]
 
     @classmethod
-    def of(cls, trace: Trace) -> Clearance:
+    def of_trace(cls, trace: Trace) -> Clearance:
         """Of a whole trace. What can be pushed counts only where nothing could have pushed it."""
-        names, solid = trace.robots, _Cylinders.of(trace)
+        names, solid = trace.robots, _Cylinders.of_trace(trace)
         robots: list[Approach | None] = [None] * len(names)
         arena: list[Approach | None] = [None] * len(names)
         overlaps: list[Collision] = []
@@ -55,7 +55,7 @@ class Clearance:
 
 
 def collisions(trace: Trace, clearance: Clearance) -> tuple[Collision, ...]:
-    """What touched, in order of time: what the world saw, and what no world watches for, worked out from positions.
+    """Contacts in order of time: those that the world reported; where no world watches, computed from positions.
 
     A world sees everything that touches a robot that it carries; robots that it does not carry are outside of it.
     """
@@ -86,7 +86,7 @@ class _Cylinders:
     flies: Mask
 
     @classmethod
-    def of(cls, trace: Trace) -> _Cylinders:
+    def of_trace(cls, trace: Trace) -> _Cylinders:
         kinds = [KINDS[trace.experiment.robots[name].kind] for name in trace.robots]
         height = np.array([kind.height for kind in kinds])
         radius, flies = np.array([kind.radius for kind in kinds]), np.array([kind.flies for kind in kinds])

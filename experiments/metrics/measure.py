@@ -1,4 +1,4 @@
-"""What a run comes to in numbers: the indices of the paper (section IV-B), and what says whether to believe them.
+"""Metrics of a run: the indices of the paper (section IV-B), and the numbers that show whether to trust them.
 
 All errors are taken on true positions. A robot that died has NaN positions from then on: its links are left out from
 that moment, integrals cover what is known (`coverage` says how much), and the means leave that robot out. The figures
@@ -42,7 +42,7 @@ from experiments.recording.trace import Trace
 
 WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
 BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
-TROUBLES: Final = ("late", "unread")  # kinds of events that tell of the run itself, not of a robot's doing
+TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
 KNOWN: Final = 0.95  # a robot whose position is known for less of the run counts as died
 
 
@@ -68,10 +68,10 @@ def measure(trace: Trace) -> CaseMetrics:
     """
     if len(trace.time) < 2:
         raise ValueError(f"case '{trace.case}' holds fewer than two samples: the run ended before it began")
-    names, errors = trace.robots, LinkErrors.of(trace)
+    names, errors = trace.robots, LinkErrors.of_trace(trace)
     bounds = bounds_of(trace)
     phases = _phases(trace, errors, bounds)
-    clearance = Clearance.of(trace)
+    clearance = Clearance.of_trace(trace)
     touched = collisions(trace, clearance)
     passed = passages(trace)
     robots = _robots(trace, errors, phases, touched, clearance, passed=passed)
@@ -152,7 +152,7 @@ def bounds_of(trace: Trace) -> list[tuple[float, int, int]]:
 
 
 def _phases(trace: Trace, errors: LinkErrors, bounds: Sequence[tuple[float, int, int]]) -> list[list[Phase]]:
-    """Per phase and robot: when it was acquired, and what was left of the error by its end."""
+    """Per phase and robot: time of acquisition and residual error."""
     window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0])))
     found = []
     for start, begin, end in bounds:
@@ -277,6 +277,6 @@ def _cost(robot: RobotMetrics) -> float:
 
 
 def _all(times: Sequence[float | None]) -> float | None:
-    """When the last one was there; None if one never was, or nobody is asked."""
+    """Time of the last one; None if one is missing, or there is none."""
     known = [when for when in times if when is not None]
     return max(known) if known and len(known) == len(times) else None

@@ -33,7 +33,7 @@ def in_heading(trace: Trace, difference: Array) -> tuple[Array, Array]:
 
 
 def agreement(trace: Trace) -> list[ShadowMetrics | None]:
-    """Per robot the figures of the twin beside it; None without one, or if both are never known together."""
+    """Metrics of each robot's shadow twin; None without one, or if both are never known together."""
     if trace.shadow_position is None or trace.shadow_yaw is None:
         return [None] * len(trace.robots)
     difference, turned = differences(trace), wrap(trace.shadow_yaw - trace.yaw)

@@ -1,4 +1,4 @@
-"""What metrics and figures take from a trace, as arrays: distance errors, acquisition, rotation, beliefs, gaps.
+"""Signals of a trace for metrics and figures, as arrays: distance errors, acquisition, rotation, beliefs, gaps.
 
 Positions that are unknown are NaN; nothing here lets one robot's NaN reach another robot's numbers.
 """
@@ -43,7 +43,7 @@ def leaders(trace: Trace) -> tuple[str, ...]:
 
 
 def own_links(net: Links, rows: int) -> Array:
-    """Which links count for which robot (E, N): those on which it listens, or if there are none, is listened to."""
+    """Links that count for each robot (E, N): those on which it receives, or without any, those on which it sends."""
     link = np.arange(len(net))
     hears, heard = np.zeros((2, len(net), rows))
     hears[link, net.receiver] = 1.0
@@ -53,10 +53,10 @@ def own_links(net: Links, rows: int) -> Array:
 
 @dataclass(frozen=True)
 class LinkErrors:
-    """How far the links are from what they ask for, and whose they are."""
+    """Errors of the links against their targets, and the robots that they count for."""
 
     time: Array  # (T,) [s]
-    net: Links  # the links
+    net: Links
     own: Array  # (E, N) 1 where a link counts for a robot, see `own_links`
     # (T, E) as the law measures it, |‖p_i − p_j‖ − d_ij| for distances [m]; NaN where an end is unknown or the link
     # is not there
@@ -65,7 +65,7 @@ class LinkErrors:
     away: Mask  # (T,) the network was away, see `network_away`: what is unknown then tells nothing of a robot
 
     @classmethod
-    def of(cls, trace: Trace) -> LinkErrors:
+    def of_trace(cls, trace: Trace) -> LinkErrors:
         """The errors of a whole trace."""
         pattern = trace.plan.formation
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
@@ -100,7 +100,7 @@ class LinkErrors:
         return after_last((outside.astype(float) @ self.own > 0.0) | unknown, self.time)
 
     def worst(self, names: Sequence[str]) -> list[tuple[float | None, str]]:
-        """Per robot the mean error of its worst link [m], and who is at the other end of it."""
+        """Per robot the mean error of its worst link [m], and the robot at its other end."""
         mean = mean_known(self.error)
         found: list[tuple[float | None, str]] = []
         for i, mine in enumerate(self.own.T > 0.0):
@@ -138,7 +138,7 @@ def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:
 
 def formation_errors(trace: Trace) -> Array:
     """e_i(t) (T, N) [m] of each robot over its own links, see `LinkErrors.per_robot`."""
-    return LinkErrors.of(trace).per_robot()
+    return LinkErrors.of_trace(trace).per_robot()
 
 
 def mean_known(values: Array) -> Array:
@@ -192,7 +192,7 @@ def net_rotation(position: Array, time: Array) -> float | None:
 
 
 def beliefs(trace: Trace, net: Links) -> Array:
-    """Error (T, E) [m] of what is believed on each link: the newest pose heard, carried on by the predictor since.
+    """Error (T, E) [m] of the believed position on each link: the newest pose received, extrapolated by the predictor.
 
     NaN before the first pose, and after a death.
     """
@@ -218,7 +218,7 @@ def beliefs(trace: Trace, net: Links) -> Array:
 
 
 def closest(position: Array) -> tuple[float, int, int, int]:
-    """Smallest distance [m] between two robots, its row in time, and who; infinite if there are no two."""
+    """Smallest distance [m] between two robots, its row in time, and their rows; infinite if there are no two."""
     best = (math.inf, 0, 0, 0)
     for i in range(position.shape[1] - 1):
         gap = norm(position[:, i + 1 :] - position[:, i, None])
@@ -229,7 +229,7 @@ def closest(position: Array) -> tuple[float, int, int, int]:
 
 
 def outside_arena(trace: Trace) -> Array:
-    """How far each robot was outside the arena at its farthest (N,) [m]; negative if it never was."""
+    """Largest distance of each robot outside the arena (N,) [m]; negative if it never was outside."""
     size = np.array(trace.experiment.arena.size)
     centre = np.array([0.0, 0.0, 0.5 * size[2]])  # the floor is at z = 0
     beyond = (np.abs(trace.true_position - centre) - 0.5 * size).max(axis=2)
@@ -242,7 +242,7 @@ def gaps(trace: Trace) -> list[Array]:
 
 
 def transmissions(trace: Trace) -> tuple[Index, Index]:
-    """Per robot: how many poses it sent, by its running numbers, and how many of them are in the recording."""
+    """Per robot: poses sent, by the running numbers, and those of them in the recording."""
     tables, rate = [trace.sent_by(row) for row in range(len(trace.robots))], trace.experiment.rates.pose_hz
     missing = [unrecorded(zip(own.stamp.tolist(), own.seq.tolist(), strict=True), rate) for own in tables]
     recorded = np.array([len(own) for own in tables], dtype=np.intp)
@@ -250,7 +250,7 @@ def transmissions(trace: Trace) -> tuple[Index, Index]:
 
 
 def passages(trace: Trace) -> tuple[Passage, ...]:
-    """Of every link on which something may be heard, those that only avoidance needs included."""
+    """Delivery statistics of every link, those that only avoidance needs included."""
     links, received = trace.plan.heard_links, trace.received
     count, link, took = len(links), received.link, received.arrival - received.stamp
     dropped = np.zeros(count, dtype=np.intp) if trace.dropped is None else trace.dropped

@@ -1,4 +1,4 @@
-"""Several runs together: of the same case with other seeds, and of one case beside another."""
+"""Statistics over runs: one case with several seeds, and one case against another."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 def spread(values: Sequence[float | None]) -> Spread:
-    """Of what is known among the values."""
+    """Of the known values."""
     known = [value for value in values if value is not None]
     n = len(known)
     deviation = statistics.stdev(known) if n > 1 else None

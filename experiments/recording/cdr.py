@@ -33,7 +33,7 @@ class Unencodable(ValueError):
 
 
 class Undecodable(ValueError):
-    """Bytes that are not the message they are said to be."""
+    """Bytes that are not a message of the type."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Clocks of several machines: how they lie to each other, how they drift apart, and stamps set right by that.
+"""Clock offsets between machines: measurement, drift, and correction of recorded stamps.
 
 A question goes to a host and comes back with its time (D. L. Mills, RFC 5905, section 8): between the two readings of
 our clock around it, the host's reading belongs to some moment. The middle is off by half the round trip at most,
@@ -20,11 +20,11 @@ from agents.network.messages import HostClock, State, Status
 
 @dataclass(frozen=True)
 class Sample:
-    """One question: when it left [s], what the host's clock said [s], when the answer was here [s]."""
+    """One question to a host and its answer."""
 
-    left: float
-    there: float
-    back: float
+    left: float  # [s] our clock, when the question left
+    there: float  # [s] the host's clock
+    back: float  # [s] our clock, when the answer came back
 
 
 def offset(samples: Sequence[Sample]) -> tuple[float, float]:
@@ -35,16 +35,15 @@ def offset(samples: Sequence[Sample]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """How one host's clock lay to ours over a run."""
+    """Offset of one host's clock from ours over a run."""
 
-    host: str  # its name
+    host: str
     robots: tuple[str, ...]  # that ran there
-    first: float  # offset at the beginning [s], which was taken off every stamp where it was made
-    last: float  # offset at the end [s]
-    uncertainty: float  # the larger of both measurements' [s]
-    over: float  # time between them [s]
-    # the largest error that was left in stamps when it was measured [s]; as much as `last` less `first` if they had
-    # not been corrected during the run
+    first: float  # [s] at the beginning; subtracted from every stamp where it was made
+    last: float  # [s] at the end
+    uncertainty: float  # [s] the larger of both measurements
+    over: float  # [s] between both measurements
+    # [s] largest measured error left in stamps; `last` less `first` if they were not corrected during the run
     worst: float = 0.0
 
     @property
@@ -53,9 +52,9 @@ class ClockOffset:
         return (self.last - self.first) / self.over if self.over > 0.0 else None
 
 
-def taken_off(said: Sequence[HostClock]) -> tuple[Array, Array]:
-    """When [s], and what [s], robots of a host took off its reading, to be interpolated: they went from each to the
-    next as fast as their clock does."""
+def correction_series(said: Sequence[HostClock]) -> tuple[Array, Array]:
+    """Times [s] and corrections [s] that robots of a host subtracted from its clock, to be interpolated: they went from
+    each to the next as fast as their clock does."""
     now = said[0].offset if said[0].applied is None else said[0].applied
     points = [(said[0].stamp, now)]
     for each in said[1:]:
@@ -67,31 +66,31 @@ def taken_off(said: Sequence[HostClock]) -> tuple[Array, Array]:
 
 
 class Correction:
-    """What drift has added to the stamps of robots on other machines, so that it can be taken off again."""
+    """Correction of stamps from other machines by the drift of their clocks."""
 
-    def __init__(self, said: Iterable[HostClock]) -> None:
-        """`said` is all that was measured in a run, in order of time for each host."""
-        self._of: dict[str, tuple[Array, Array, Array, Array]] = {}
-        self._lies: dict[str, list[HostClock]] = {}
-        for each in said:
-            self._lies.setdefault(each.host, []).append(each)
-        for measured in self._lies.values():
-            stamps = np.array([each.stamp for each in measured])
-            offsets = np.array([each.offset for each in measured])
-            for robot in measured[-1].robots:
-                self._of[robot] = stamps, offsets, *taken_off(measured)
+    def __init__(self, measured: Iterable[HostClock]) -> None:
+        """`measured` are all offsets of a run, in order of time for each host."""
+        self._series: dict[str, tuple[Array, Array, Array, Array]] = {}
+        self._measured: dict[str, list[HostClock]] = {}
+        for each in measured:
+            self._measured.setdefault(each.host, []).append(each)
+        for own in self._measured.values():
+            stamps = np.array([each.stamp for each in own])
+            offsets = np.array([each.offset for each in own])
+            for robot in own[-1].robots:
+                self._series[robot] = stamps, offsets, *correction_series(own)
 
     def __call__(self, robot: str, stamp: float) -> float:
         """A stamp [s] that a robot's process made, on the conductor's clock."""
-        if robot not in self._of:
+        if robot not in self._series:
             return stamp
-        stamps, offsets, when, what = self._of[robot]
+        stamps, offsets, when, what = self._series[robot]
         return stamp - float(np.interp(stamp, stamps, offsets) - np.interp(stamp, when, what))
 
     def state(self, said: State) -> State:
-        """Telemetry with every stamp set right: its own, and those of poses and goals that were heard.
+        """Telemetry with all stamps corrected: its own, and those of received poses and goals.
 
-        When goals were sent is stamped by the centre, which runs where the conductor does.
+        Goals are stamped by the central controller, which runs on the conductor's machine.
         """
         heard = [
             replace(each, stamp=self(each.speaker, each.stamp), arrived=self(said.robot, each.arrived))
@@ -104,11 +103,11 @@ class Correction:
         return replace(said, stamp=self(said.robot, said.stamp), heard=heard, followed=followed)
 
     def status(self, said: Status) -> Status:
-        """A status with its stamp and its start set right."""
+        """A status with its stamp and its start corrected."""
         return replace(said, stamp=self(said.robot, said.stamp), started=self(said.robot, said.started))
 
-    def lies(self) -> tuple[ClockOffset, ...]:
-        """What there is to tell of each host."""
+    def offsets(self) -> tuple[ClockOffset, ...]:
+        """The offset of each host."""
         return tuple(
             ClockOffset(
                 host,
@@ -119,12 +118,12 @@ class Correction:
                 measured[-1].stamp - measured[0].stamp,
                 _worst(measured),
             )
-            for host, measured in self._lies.items()
+            for host, measured in self._measured.items()
         )
 
 
 def _worst(said: Sequence[HostClock]) -> float:
-    """The largest difference between a measured offset and what robots took off just then [s]."""
+    """Largest difference between a measured offset and the correction at that time [s]."""
     stamps = np.array([each.stamp for each in said])
     offsets = np.array([each.offset for each in said])
-    return float(np.abs(offsets - np.interp(stamps, *taken_off(said))).max())
+    return float(np.abs(offsets - np.interp(stamps, *correction_series(said))).max())

@@ -1,4 +1,4 @@
-"""What was sent, lost or dropped of poses, by their numbers and by what robots counted."""
+"""Poses lost and dropped, by their running numbers and by the counters of robots."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from experiments.definition.plan import Plan
 from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
 
-STATUS_S: Final = 1.0  # what happened in the run is counted by a status at most this much after its end
+STATUS_S: Final = 1.0  # a status at most this much after the end of a run still counts for it
 
 
 def unrecorded(poses: Iterable[tuple[float, int]], rate: float) -> int:
-    """How many poses a robot sent between those that are recorded, by stamp [s] and number, in order of time.
+    """Poses that a robot sent between the recorded ones, given by stamp [s] and number in order of time.
 
-    A robot says at most `rate` poses in a second [1/s]; see `agents.network.validation.missed`.
+    A robot transmits at most `rate` poses in a second [1/s]; see `agents.network.validation.missed`.
     """
     return sum(missed(last, seq, then - before, rate) for (before, last), (then, seq) in pairwise(poses))
 
@@ -34,14 +34,14 @@ def lost(
     run: tuple[float, float],
     rate: float,
 ) -> Index:
-    """(N,) what was lost of each robot, as `playback.read` defines it.
+    """(N,) lost poses of each robot, as `playback.read` defines them.
 
     Args:
         robots: Names.
         poses: Of each, in order of time.
         statuses: Of each, in order of time.
         run: Its beginning and end in UTC [s].
-        rate: Poses that a robot says in a second at most [1/s].
+        rate: Largest rate of transmissions of a robot [1/s].
     """
     total: Counter[str] = Counter()
     begin, end = run[0] - ROUNDING_S, run[1] + ROUNDING_S
@@ -64,7 +64,7 @@ def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float
 
 
 def dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
-    """(E,) what the modelled network dropped on each of `Plan.heard_links`; `statuses` of each robot."""
+    """(E,) poses that the modelled network dropped on each of `Plan.heard_links`; `statuses` of each robot."""
     links, robots = plan.heard_links, plan.names
     found = [_by_speaker(said, run, "dropped") for said in statuses]
     ends = zip(links.receiver.tolist(), links.sender.tolist(), strict=True)

@@ -23,9 +23,17 @@ from experiments.recording.losses import STATUS_S, dropped, growth, lost
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
 from experiments.recording.topics import JSON, METADATA, TOPICS, SentGoal, SentPose
-from experiments.recording.trace import ROUNDING_S, Goals, Trace, looked_for, received_in_run, sent_in_run, within
+from experiments.recording.trace import (
+    ROUNDING_S,
+    Goals,
+    Trace,
+    contacts_watched,
+    messages_in_run,
+    received_in_run,
+    sent_in_run,
+)
 
-HOLD_PERIODS: Final = 2.0  # for so many state periods a robot is where it last said; then nobody knows
+HOLD_PERIODS: Final = 2.0  # a sample is valid for so many state periods
 EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the whole run are not that much early
 LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
 NOWHERE: Final = (math.nan, math.nan, math.nan)
@@ -41,12 +49,12 @@ class NotStarted(RecordingError):
 
 @dataclass(frozen=True)
 class Playback:
-    """A recording, read."""
+    """A recording as a trace."""
 
-    trace: Trace  # what happened, until the end of the run
-    started: float  # the common start, UTC [s]; of a virtual run the one that it pretends
+    trace: Trace  # until the end of the run
+    started: float  # [s] UTC of the common start; of a virtual run `trace.EPOCH`
     complete: bool  # the recorder finished the file and nothing in it is damaged
-    messages: int  # how many the file holds, those of other programs included
+    messages: int  # in the file, those of other programs included
 
 
 def read(path: Path) -> Playback:
@@ -137,7 +145,7 @@ class _Content:
         return min(began, default=None)
 
     def length(self, start: float, duration: float) -> float:
-        """How long the run lasted from the common start on [s], at most as long as it was to last."""
+        """Length of the run from the common start on [s], at most `duration`."""
         said = [
             (event.stamp - start, event.text != "landing")
             for event in self[Event]
@@ -187,14 +195,17 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
     ]
     statuses = _by_robot(content[Status], robots)
     last = [_by_the_end(own, start + duration) for own in statuses]
-    sampled = [_Sampled.of(own, start, time, HOLD_PERIODS / rate) for own in states]
+    sampled = [_Sampled.of_states(own, start, time, HOLD_PERIODS / rate) for own in states]
 
     def column(what: str) -> Array:
         return np.stack([getattr(own, what) for own in sampled], axis=1)
 
     turned = any(state.attitude is not None for state in content[State])
     shadowed = any(state.shadow_position is not None for state in content[State])
-    contacts, world = within(content[Contact], start, duration), within(content[WorldState], start, duration)
+    contacts, world = (
+        messages_in_run(content[Contact], start, duration),
+        messages_in_run(content[WorldState], start, duration),
+    )
     plan = Plan(experiment)
     goals = _goals(content, states, robots, start, duration) if plan.guided else None
     return Trace(
@@ -222,18 +233,18 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         ),
         interventions=_counted(last, "interventions"),
         avoided=_counted(last, "avoided"),
-        contacts=contacts if looked_for(contacts, world) else None,
+        contacts=contacts if contacts_watched(contacts, world) else None,
         world=world,
         attitude=column("attitude") if turned else None,
         shadow_position=column("shadow_position") if shadowed else None,
         shadow_yaw=column("shadow_yaw")[:, :, 0] if shadowed else None,
         goals=goals,
-        clocks=Correction(content[HostClock]).lies(),
+        clocks=Correction(content[HostClock]).offsets(),
     )
 
 
 def _counted(last: Sequence[Status | None], what: str) -> Index:
-    """A counter of each robot, 0 of those that said nothing."""
+    """A counter of each robot, 0 without a status."""
     return np.array([getattr(status, what) if status else 0 for status in last], dtype=np.intp)
 
 
@@ -265,7 +276,7 @@ class _Sampled:
     shadow_yaw: Array
 
     @classmethod
-    def of(cls, states: list[State], start: float, time: Array, hold: float) -> _Sampled:
+    def of_states(cls, states: list[State], start: float, time: Array, hold: float) -> _Sampled:
         t = np.array([state.stamp for state in states]) - start
         grid = (time, hold)
 
@@ -324,7 +335,7 @@ def _received(states: list[list[State]], plan: Plan, start: float, duration: flo
 
 
 def _goals(content: _Content, states: list[list[State]], robots: Sequence[str], start: float, duration: float) -> Goals:
-    """What the central controller and the robots that it guides sent each other."""
+    """Messages between the central controller and the robots that it guides."""
     row = {name: number for number, name in enumerate(robots)}
     goals = sorted((g for g in content[SentGoal] if g.robot in row), key=lambda goal: (goal.stamp, row[goal.robot]))
     sent = [(row[g.robot], g.seq, g.stamp, g.received, *g.position, *NOWHERE, _number(g.yaw), g.size) for g in goals]

@@ -1,4 +1,4 @@
-"""The whole records of an MCAP file, finished or not: what a killed recorder or a full disk left behind counts.
+"""Reads and recovers MCAP files, finished or not: what a killed recorder or a full disk left behind counts.
 
 Readers that seek need the summary that only a finished file has. This one goes through the file from its beginning, and
 checks each record before it is believed, so that damage costs the records it hit and those that depend on them.
@@ -45,9 +45,9 @@ class Message(NamedTuple):
 
 @dataclass
 class Records:
-    """What a file holds. Everything but the messages grows while `messages` is iterated."""
+    """Content of a file; everything but the messages grows while `messages` is iterated."""
 
-    path: Path  # where the file is
+    path: Path
     header: Header | None = None  # profile and library
     schemas: dict[int, Schema] = field(default_factory=dict)  # by their id in the file
     channels: dict[int, Channel] = field(default_factory=dict)  # by their id in the file
@@ -131,10 +131,10 @@ def _stranger(path: Path, magic: bytes) -> str:
 
 @dataclass(frozen=True)
 class Recovered:
-    """What was found."""
+    """Result of `recover`."""
 
-    messages: int  # how many
-    robots: tuple[str, ...]  # whose, in the order in which they appear
+    messages: int
+    robots: tuple[str, ...]  # in the order in which they appear
     complete: bool  # the source was whole already, and no target was written
 
 

@@ -1,4 +1,4 @@
-"""Telemetry, which comes when it comes, on the uniform grid of a trace: nothing is known where nobody said anything."""
+"""Telemetry at irregular times, resampled onto the uniform grid of a trace; NaN in holes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The folder of a run: its place and name, and the file that it was flown from."""
+"""The folder of a run: its place and name, and the copy of its experiment file."""
 
 from __future__ import annotations
 
@@ -7,23 +7,17 @@ import shutil
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from experiments.file.document import Document
 from experiments.file.problems import DocumentError, Problem
 
-if TYPE_CHECKING:
-    pass
-
-
 RUNS: Final = Path("runs")
-
-
 SOURCE: Final = "experiment.toml"
 
 
 def new_folder(read: Document, out: str | None) -> Path:
-    """Makes the folder of a run: `out`, or one below `runs` that tells experiment and time.
+    """Makes the folder of a run: `out`, or one below `runs` with experiment and time in its name.
 
     Raises:
         DocumentError: If it holds something already, or cannot be made.
@@ -43,7 +37,7 @@ def new_folder(read: Document, out: str | None) -> Path:
 
 
 def _folder_of_now(runs: Path, name: str) -> Path:
-    """Makes a folder that nobody else has, however many runs begin in the same second."""
+    """Makes a folder of its own, however many runs begin in the same second."""
     stamp = datetime.now().astimezone().strftime("%Y-%m-%dT%H-%M-%S")
     for number in itertools.count(1):
         folder = runs / (f"{name}-{stamp}" if number == 1 else f"{name}-{stamp}-{number}")
@@ -54,6 +48,6 @@ def _folder_of_now(runs: Path, name: str) -> Path:
 
 
 def remove_unused(folder: Path) -> None:
-    """Removes the folder of a run in which nothing was run: there is no recording, and no process has said anything."""
+    """Removes the folder of a run without a recording and without a process's log."""
     if not any(folder.glob("*.mcap")) and not any(folder.glob("logs/*")):
         shutil.rmtree(folder, ignore_errors=True)

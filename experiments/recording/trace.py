@@ -1,4 +1,4 @@
-"""What happened in one case of a run, as arrays; made by the virtual clock, or read back from a recording."""
+"""Trace of one case of a run, as arrays; made by the virtual clock, or read back from a recording."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ M = TypeVar("M", Contact, WorldState)
 
 
 def finds_contacts(engine: str | Mapping[str, object]) -> bool:
-    """Whether an engine says of itself that it finds contacts, see `twins.engines.engine.EngineFactory`."""
+    """Whether an engine declares that it finds contacts, see `twins.engines.engine.EngineFactory`."""
     try:
         factory = registry.struct(registry.ENGINES, registry.split(engine)[0])
     except (registry.PluginError, msgspec.ValidationError):  # a recording is read where that engine is not installed
@@ -34,19 +34,19 @@ def finds_contacts(engine: str | Mapping[str, object]) -> bool:
     return bool(getattr(factory, "contacts", False))
 
 
-def within(said: Iterable[M], start: float, duration: float) -> tuple[M, ...]:
-    """What was said in a run that began at `start` [s], in order of time, which then counts from there."""
+def messages_in_run(sent: Iterable[M], start: float, duration: float) -> tuple[M, ...]:
+    """Messages of a run that began at `start` [s], in order of time, with stamps that count from there."""
     kept = [
         msgspec.structs.replace(each, stamp=max(each.stamp - start, 0.0))
-        for each in said
+        for each in sent
         if -ROUNDING_S <= each.stamp - start <= duration + ROUNDING_S
     ]
     return tuple(sorted(kept, key=lambda each: each.stamp))
 
 
-def looked_for(contacts: Sequence[Contact], world: Iterable[WorldState]) -> bool:
-    """Whether somebody watched for contacts: there are some, or an engine that would have found them."""
-    return bool(contacts) or any(finds_contacts(engine) for engine in {said.engine for said in world})
+def contacts_watched(contacts: Sequence[Contact], world: Iterable[WorldState]) -> bool:
+    """Whether contacts were watched for: there are some, or an engine that would have found them."""
+    return bool(contacts) or any(finds_contacts(engine) for engine in {report.engine for report in world})
 
 
 @dataclass(frozen=True)

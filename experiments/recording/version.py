@@ -15,7 +15,7 @@ SHOWN: Final = 8  # characters of a digest that people compare
 
 @cache
 def digest(root: Path = ROOT) -> str:
-    """SHA-256 over names and contents of all modules, in hexadecimal; what stands beside them is not code."""
+    """SHA-256 over names and contents of all modules, in hexadecimal; other files are not code."""
     total = hashlib.sha256()
     for file in sorted(file for name in PACKAGES for file in (root / name).rglob("*.py")):
         content = file.read_bytes()
@@ -24,7 +24,7 @@ def digest(root: Path = ROOT) -> str:
 
 
 def number() -> str:
-    """The version as it was installed."""
+    """The installed version."""
     try:
         return version("zenpark")
     except PackageNotFoundError:

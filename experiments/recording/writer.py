@@ -37,7 +37,7 @@ class Block:
 
 
 class ChunkIndices:
-    """Stands where the writer has a list: it appends, and goes through it once, at the end."""
+    """Chunk indices in an unnamed file, in place of the writer's list, which grows in memory with the recording."""
 
     def __init__(self, folder: Path) -> None:
         """The file without a name is in `folder`, and gone with the process."""
@@ -270,7 +270,7 @@ def _drawing() -> Callable[[State], bytes]:
 
 
 class _Unbuffered:
-    """A file whose every write is the kernel's when it returns, so that a kill loses none of it.
+    """An unbuffered file: a write is the kernel's when it returns, so that a kill loses none of it.
 
     Not a `RawIOBase`: around one of those, `mcap` puts a buffer.
     """

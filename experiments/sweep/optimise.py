@@ -28,7 +28,7 @@ from experiments.sweep.sweep import Bench, folder_of, origin
 from experiments.sweep.table import MEANS, RATIOS, Row, words_of
 from experiments.sweep.workers import SweepError, workers
 
-Tell = Callable[[str, int, int], None]  # case, evaluations done, of at most so many
+Progress = Callable[[str, int, int], None]  # case, evaluations done, of at most so many
 
 FINE: Final = 0.01  # of a range: closer than this the search does not look
 SIGMA: Final = 0.3  # of a range: how far it looks at first
@@ -139,7 +139,7 @@ def tune(
     out: str | Path | None = None,
     scheduler: str | None = None,
     processes: int | None = None,
-    tell: Tell = lambda _case, _done, _of: None,
+    progress: Progress = lambda _case, _done, _of: None,
 ) -> Tuned:
     """Seeks the parameters of each case that has any of the axes; what was tried before is not run again.
 
@@ -152,7 +152,7 @@ def tune(
         out: Where runs are kept and looked for.
         scheduler: Address of a dask scheduler; None: on this machine.
         processes: On this machine; None: one for each core.
-        tell: Told of the case, of evaluations done, and of how many there are at most.
+        progress: Told of the case, of evaluations done, and of how many there are at most.
 
     Raises:
         DocumentError: If the file or an argument is wrong.
@@ -195,14 +195,14 @@ def tune(
         with workers(scheduler, processes) as crew:
             bench = Bench(store, crew)
             for name, mine in ranges.items():
-                rows = search.run(cma, bench, name, mine, tell)
+                rows = search.run(cma, bench, name, mine, progress)
                 tried += rows
                 best = search.choose(bench, rows, mine)
                 picked.append(best)
                 for cell in search.again(best, mine):
                     plan.setdefault((cell.case, cell.digest), cell)
             final = sorted(plan.values(), key=lambda cell: cell.case != reference)
-            if not bench.fill(final, seeds, lambda _done, _of: None):
+            if not bench.run_missing(final, seeds, lambda _done, _of: None):
                 raise KeyboardInterrupt
             reported = bench.rows(final, seeds)
     return Tuned(read, wish, tuning, seeds, tuple(reported), tuple(tried), tuple(picked), folder, tuple(notes))
@@ -238,14 +238,14 @@ class _Search:
         looked_at: list[Row] = []
         for begin in range(0, min(ROUNDS * ROUND, len(ranked)), ROUND):
             pairs = [self.again(row, axes) for row in ranked[begin : begin + ROUND]]
-            if not bench.fill([cell for pair in pairs for cell in pair], fresh, lambda _done, _of: None):
+            if not bench.run_missing([cell for pair in pairs for cell in pair], fresh, lambda _done, _of: None):
                 raise KeyboardInterrupt
             looked_at += [bench.rows(pair, fresh)[-1] for pair in pairs]
             if any(self.wish.rank(row) < BROKEN for row in looked_at):
                 break
         return min(looked_at, key=self.wish.rank)
 
-    def run(self, cma: Any, bench: Bench, case: str, axes: Sequence[Axis], tell: Tell) -> list[Row]:  # noqa: ANN401
+    def run(self, cma: Any, bench: Bench, case: str, axes: Sequence[Axis], progress: Progress) -> list[Row]:  # noqa: ANN401
         """Everything that is tried for a case, each once; raises KeyboardInterrupt on Ctrl-C."""
         first, more = EVALUATIONS
         most = first + more * len(axes)
@@ -254,20 +254,20 @@ class _Search:
         strategy = cma.CMAEvolutionStrategy([0.5] * max(2, len(axes)), SIGMA, options)
         known: dict[tuple[str, ...], Row] = {}
         asked = 0
-        tell(case, 0, most)
+        progress(case, 0, most)
         while not strategy.stop():
             points = strategy.ask()
             wanted = [tuple(axis.at(float(x)) for axis, x in zip(axes, point, strict=False)) for point in points]
             fresh = [values for values in dict.fromkeys(wanted) if values not in known]
             cells = {values: self.cells(dict(zip(axes, values, strict=True)), case) for values in fresh}
             plan = [cell for pair in cells.values() for cell in pair]
-            if not bench.fill(plan, searched(self.tuning), lambda _done, _of: None):
+            if not bench.run_missing(plan, searched(self.tuning), lambda _done, _of: None):
                 raise KeyboardInterrupt
             for values, pair in cells.items():
                 known[values] = bench.rows(pair, searched(self.tuning))[-1]
             strategy.tell(points, [self.wish.rank(known[values]) for values in wanted])
             asked += len(points)
-            tell(case, min(asked, most), most)
+            progress(case, min(asked, most), most)
         return list(known.values())
 
 

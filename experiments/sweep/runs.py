@@ -138,7 +138,7 @@ def _flown(experiment: Experiment, seeds: tuple[int, ...]) -> tuple[list[Figures
 
 
 def _figures(trace: Trace) -> Figures:
-    errors = LinkErrors.of(trace)
+    errors = LinkErrors.of_trace(trace)
     _, begin, end = bounds_of(trace)[0]
     window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0])))
     acquired = errors.part(begin, end).acquired(window, trace.experiment.tolerance)

@@ -40,7 +40,7 @@ SHARE: Final = 3  # each worker gets its part in at least so many pieces, so tha
 MOST_BYTES: Final = 2e8  # of positions that one process logs
 AROUND_S: Final = 15.0  # take-off and landing are logged, too
 
-Tell = Callable[[int, int], None]  # runs done, of how many
+Progress = Callable[[int, int], None]  # runs done, of how many
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def sweep(
     out: str | Path | None = None,
     scheduler: str | None = None,
     processes: int | None = None,
-    tell: Tell = lambda _done, _of: None,
+    progress: Progress = lambda _done, _of: None,
 ) -> Found:
     """Runs a sweep, or what is missing of it; after Ctrl-C it gives what is done.
 
@@ -88,7 +88,7 @@ def sweep(
         out: Where runs are kept and looked for.
         scheduler: Address of a dask scheduler; None: on this machine.
         processes: On this machine; None: one for each core.
-        tell: Told of progress.
+        progress: Told of progress.
 
     Raises:
         DocumentError: If the file or an argument is wrong.
@@ -108,7 +108,7 @@ def sweep(
         notes = store.changed_since(origin(read, [cell.experiment for cell in plan]))
         with workers(scheduler, processes) as crew:
             bench = Bench(store, crew)
-            whole = bench.fill(plan, seeds, tell)
+            whole = bench.run_missing(plan, seeds, progress)
         rows = bench.rows(plan, seeds)
         failures = bench.failures(plan, seeds)
         missing = 0 if whole else sum(len(bench.missing(cell, seeds)) for cell in _distinct(plan))
@@ -122,7 +122,7 @@ class Bench:
     store: Store
     crew: Workers
 
-    def fill(self, plan: Sequence[Cell], seeds: Sequence[int], tell: Tell) -> bool:
+    def run_missing(self, plan: Sequence[Cell], seeds: Sequence[int], progress: Progress) -> bool:
         """Does what is missing; False after Ctrl-C, which keeps what is done."""
         lacking = [(cell, self.missing(cell, seeds)) for cell in _distinct(plan)]
         total = sum(len(cell_seeds) for _, cell_seeds in lacking)
@@ -141,12 +141,12 @@ class Bench:
             for k in range(0, len(missing), size)
         ]
         done = 0
-        tell(0, total)
+        progress(0, total)
         try:
             for work, outcome in self.crew.done(works):
                 self.store.add(work.cell, work.code, outcome)
                 done += len(work.seeds)
-                tell(done, total)
+                progress(done, total)
         except KeyboardInterrupt:
             return False
         return True

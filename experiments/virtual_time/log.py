@@ -1,4 +1,4 @@
-"""What a virtual run logged, as traces and as recordings: the same that a real run leaves."""
+"""The log of a virtual run as traces and as recordings, which are those of a real run."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from experiments.recording.trace import (
     WALL,
     Goals,
     Trace,
+    contacts_watched,
     finds_contacts,
-    looked_for,
+    messages_in_run,
     received_in_run,
     sent_in_run,
-    within,
 )
 from experiments.recording.writer import Recording
-from experiments.virtual_time.network import Steered
+from experiments.virtual_time.network import CentreLog
 from experiments.virtual_time.simulation import Log
 
 
-def goal_messages(steered: Steered, names: Sequence[str], first: int) -> Iterator[tuple[float, messages.Goal]]:
+def goal_messages(steered: CentreLog, names: Sequence[str], first: int) -> Iterator[tuple[float, messages.Goal]]:
     """Goals of one repetition, and when they were sent since the common start [s].
 
     Args:
@@ -58,9 +58,9 @@ def goal_messages(steered: Steered, names: Sequence[str], first: int) -> Iterato
 
 
 def centre_receipts(
-    steered: Steered, sample: Array, first: int, rows: int
+    steered: CentreLog, sample: Array, first: int, rows: int
 ) -> dict[tuple[int, int], list[messages.GoalReceipt]]:
-    """Goals that reached the robots of one repetition, by the number of the `sample` (T,) that tells of it, and row."""
+    """Goals that reached robots of one repetition, by number of the `sample` (T,) and row."""
     own = steered.followed.between(first, first + rows)
     assert own.extra is not None
     at = np.searchsorted(sample, own.arrival - ROUNDING_S)
@@ -93,7 +93,9 @@ def centre_report(goals: Goals, names: Sequence[str], duration: float) -> messag
     )
 
 
-def goals_of(steered: Steered, names: Sequence[str], first: int, duration: float, encoding: messages.Encoding) -> Goals:
+def goals_of(
+    steered: CentreLog, names: Sequence[str], first: int, duration: float, encoding: messages.Encoding
+) -> Goals:
     """Goals of one repetition in virtual time, whose first row is `first`."""
     rows, end = len(names), first + len(names)
     sizes = [len(messages.encode(goal, encoding)) for _, goal in goal_messages(steered, names, first)]
@@ -136,7 +138,10 @@ class Logbook:
         log, mine, duration = self._log, self._mine, self._experiment.duration_s
         run = (log.time >= -ROUNDING_S) & (log.time <= duration + ROUNDING_S)
         rows = len(log.names)
-        contacts, world = within(self._contacts(), EPOCH, duration), within(self._world(), EPOCH, duration)
+        contacts, world = (
+            messages_in_run(self._contacts(), EPOCH, duration),
+            messages_in_run(self._world(), EPOCH, duration),
+        )
         return Trace(
             case=self._case,
             experiment=self._experiment,
@@ -160,7 +165,7 @@ class Logbook:
             ),
             interventions=log.interventions[mine],
             avoided=log.avoided[mine],
-            contacts=contacts if looked_for(contacts, world) else None,
+            contacts=contacts if contacts_watched(contacts, world) else None,
             world=world,
             attitude=_part(log.attitude, run, mine),
             shadow_position=_part(log.shadow_position, run, mine),
@@ -325,7 +330,7 @@ class Logbook:
         return self._scene.names[k] if k < len(self._scene.names) else WALL
 
     def _world(self) -> Iterator[messages.WorldState]:
-        """What a world would say of itself at 1 Hz; nothing where robots are alone in an empty place."""
+        """Reports of a world at 1 Hz; none where robots are alone in an empty place."""
         log, chosen, scene = self._log, self._experiment.world.engine, self._scene
         if log.lean or not (scene.names or log.touches or finds_contacts(chosen)):
             return
@@ -355,11 +360,11 @@ class Logbook:
     def _counts(self, row: Index, time: Array) -> tuple[Index, Index]:
         """How often each row occurs until the end of the run, and until the end of everything."""
         rows = len(self._log.names)
-        within = time <= self._experiment.duration_s + ROUNDING_S
-        return np.bincount(row[within], minlength=rows), np.bincount(row, minlength=rows)
+        messages_in_run = time <= self._experiment.duration_s + ROUNDING_S
+        return np.bincount(row[messages_in_run], minlength=rows), np.bincount(row, minlength=rows)
 
     def _events(self) -> Iterator[tuple[float, str, str, str]]:
-        """What the conductor says, and what went wrong, in order of time."""
+        """Events of the conductor and hazards, in order of time."""
         yield from sorted([*self._conducted(), *self._hazards()], key=lambda event: event[0])
 
     def _hazards(self) -> Iterator[tuple[float, str, str, str]]:
@@ -367,7 +372,7 @@ class Logbook:
             yield each.time, "hazard", self._log.names[each.row - self._mine.start], each.text
 
     def _incidents(self) -> Iterator[Incident]:
-        """What was wrong with the robots of this repetition."""
+        """Hazards of the robots of this repetition."""
         return (each for each in self._log.incidents if self._mine.start <= each.row < self._mine.stop)
 
     def _conducted(self) -> Iterator[tuple[float, str, str, str]]:
@@ -384,13 +389,13 @@ def _part(column: Array | None, run: Mask, mine: slice) -> Array | None:
 
 
 def _known(value: Any) -> Any:  # noqa: ANN401 - a number or a list of them
-    """For the wire: as a tuple; None if it is NaN."""
+    """As messages have it: a tuple; None if it is NaN."""
     if isinstance(value, list):
         return None if math.isnan(value[0]) else tuple(value)
     return None if math.isnan(value) else value
 
 
 def _three(columns: Sequence[Any], row: int) -> tuple[Any, Any, Any]:
-    """Of a row: attitude, and where its shadow is and looks; None where it has none."""
+    """Of a row: attitude, position and yaw of its shadow twin; None where it has none."""
     attitude, position, yaw = (None if column is None else _known(column[row]) for column in columns)
     return attitude, position, yaw

@@ -1,4 +1,4 @@
-"""The centre of a run in virtual time: what it hears, its goals on their way to the robots, and a log of both."""
+"""The network of a virtual run: poses between robots, poses and goals of the central controller, and their log."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
 
 
-class Channel:
-    """Carries what rows say to whoever listens; each repetition has its own luck.
+class VirtualChannel:
+    """The modelled channel for the links of all repetitions, each with random numbers of its own.
 
     Attributes:
-        instant: What is said on a tick is known to all, or lost, before they decide on it.
+        instant: A pose sent on a tick is received, or lost, before the decisions on it.
     """
 
     def __init__(self, experiment: Experiment, links: Links, seeds: Sequence[int], *, stream: str = "") -> None:
-        """`links` of all repetitions, those of the first seed first; each `stream` has its own luck."""
+        """`links` of all repetitions, those of the first seed first; each `stream` has random numbers of its own."""
         self._channel = channel_model.Channel(
             link_conditions.virtual_conditions(experiment, links, seeds, stream=stream)
         )
@@ -56,7 +56,7 @@ class Channel:
         start: float,
         extra: Array | None = None,
     ) -> None:
-        """Rows say where they are: pose, `seq` and what goes along of all rows (N, ...), of which `rows` speak.
+        """Transmits poses: pose, `seq` and `extra` of all rows (N, ...), of which `rows` transmit.
 
         `start` is the common start [s]; NaN or infinity as long as it is not known: nothing is lost before.
         """
@@ -81,11 +81,11 @@ class Channel:
         )
 
     def due(self, t: float) -> PoseTable | None:
-        """What has arrived by `t` [s], in order of arrival."""
+        """Poses that have arrived by `t` [s], in order of arrival."""
         return self._channel.due(t)
 
     def _sizes(self, stamp: float, rows: Index, said: tuple[Index, Array, Array, Array]) -> Index:
-        """(N,) bytes of the payloads of the rows that speak, as they would stand on the wire."""
+        """(N,) bytes of the payloads of `rows`, as a real network carries them."""
         found = np.zeros(len(said[0]), dtype=np.intp)
         columns = zip(*(each[rows].tolist() for each in said), strict=True)
         for row, (number, place, moves, turned) in zip(rows.tolist(), columns, strict=True):
@@ -95,7 +95,7 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Steered:
+class CentreLog:
     """Messages between robots and the central controller in all repetitions, in the time of the experiment [s].
 
     `link` is the row of the robot in each table.
@@ -108,11 +108,11 @@ class Steered:
     lost_goals: Index  # (R,) to each robot
 
 
-class Steering:
-    """A centre for all repetitions of an experiment. It has one process's share of the network: what robots say to it,
-    and what it says to them, takes as long and is lost as often as what robots say to each other.
+class VirtualCentre:
+    """The central controllers of all repetitions. Their poses and goals take as long and are lost as often as poses
+    between robots.
 
-    Phases and the common start are the conductor's, and known to everybody at once, as they are to the robots.
+    Phases and the common start are the conductor's, and known at once, as they are to the robots.
 
     Attributes:
         centre: The decision.
@@ -128,7 +128,7 @@ class Steering:
         told = np.flatnonzero(self.centre.guided)
         ends = [[(row, row) for row in group.tolist()] for group in (self.centre.needed, told)]
         self._poses, self._goals = (
-            Channel(experiment, links(pairs), seeds, stream=stream)
+            VirtualChannel(experiment, links(pairs), seeds, stream=stream)
             for pairs, stream in zip(ends, (TO_CENTRE, FROM_CENTRE), strict=True)
         )
         self._poses_of, self._goals_of = (np.array([row for row, _ in pairs], dtype=np.intp) for pairs in ends)
@@ -136,19 +136,19 @@ class Steering:
         self._goal, self._still = np.full((rows, 3), np.nan), np.zeros((rows, 3))
         self._extra = np.full((rows, 2), np.nan)
 
-    def _counted(self, channel: Channel, rows: Index) -> Index:
+    def _counted(self, channel: VirtualChannel, rows: Index) -> Index:
         counts = np.zeros(len(self._seq), dtype=np.intp)
         counts[rows] = channel.lost
         return counts
 
-    def say(  # noqa: PLR0917 - as `Channel.send`
+    def transmit(  # noqa: PLR0917 - as `VirtualChannel.send`
         self, t: float, rows: Index, seq: Index, position: Array, velocity: Array, yaw: Array, *, start: float
     ) -> None:
-        """Robots say where they are, to whoever listens; see `Channel.send`."""
+        """Robots say where they are, to whoever listens; see `VirtualChannel.send`."""
         self._poses.send(t, rows, seq, position, velocity, yaw=yaw, start=start, extra=yaw[:, None])
 
     def deliver(self, t: float, agent: Agent) -> None:
-        """Hands out at `t` [s] what has arrived: poses to the centre, goals to the robots."""
+        """Delivers at `t` [s]: poses to the central controller, goals to the robots."""
         arrived = self._poses.due(t)
         if arrived is not None and arrived.extra is not None:
             rows = self._poses_of[arrived.link]
@@ -184,9 +184,9 @@ class Steering:
         sent = PoseTable(rows, self._seq[rows], now, now, told.goal, still, told.yaw, extra=told.pose_stamp[:, None])
         self._sent.append(sent)
 
-    def logged(self, begin: float) -> Steered:
-        """All of it, when the common start was at `begin` [s]."""
-        return Steered(
+    def logged(self, begin: float) -> CentreLog:
+        """The log, with times since the common start at `begin` [s]."""
+        return CentreLog(
             sent=_goals(self._sent, begin),
             followed=_goals(self._followed, begin),
             received=_joined(self._received, begin),
@@ -219,33 +219,33 @@ class VirtualNetwork:
         """For all repetitions; `lean` as for `experiments.virtual_time.simulation.simulate`."""
         assignment, rows = agent.assignment, len(agent.assignment.names)
         self._agent, self._lean = agent, lean
-        self._channel = Channel(experiment, assignment.links, seeds)
-        self._steering = None if assignment.guided is None else Steering(experiment, seeds)
+        self._channel = VirtualChannel(experiment, assignment.links, seeds)
+        self._centre = None if assignment.guided is None else VirtualCentre(experiment, seeds)
         self._seq: Index = np.zeros(rows, dtype=np.intp)
         agent.mark_alive(np.arange(len(assignment.links)))  # all robots are there from the beginning
         self._sent: list[PoseTable] = []
         self._received: list[PoseTable] = []
 
     def carry(self, t: float, state: BodyState) -> Transmission:
-        """The first half of the tick at `t` [s]: what has arrived is heard, and robots speak.
+        """The first half of the tick at `t` [s]: robots receive, then transmit.
 
-        Without any delay, what they say is known to all before the second half; and so are the goals that follow.
+        Without any delay, poses are received before the second half; and so are the goals that follow.
         """
-        agent, steering, instant = self._agent, self._steering, self._channel.instant
+        agent, centre, instant = self._agent, self._centre, self._channel.instant
         self._deliver(t)
         said = agent.transmit(t, state)
         if len(said.rows):
-            self._say(t, said, state.yaw)
+            self._transmit(t, said, state.yaw)
             if instant:
                 self._deliver(t)
-        if steering is not None and agent.decision_due:
-            steering.decide(t, agent)
+        if centre is not None and agent.decision_due:
+            centre.decide(t, agent)
             if instant:
-                steering.deliver(t, agent)
+                centre.deliver(t, agent)
         return said
 
-    def _say(self, t: float, said: Transmission, yaw: Array) -> None:
-        """Robots speak to those who listen. Before the common start nothing is lost."""
+    def _transmit(self, t: float, said: Transmission, yaw: Array) -> None:
+        """Transmits poses. Before the common start nothing is lost."""
         speak, start = said.rows, float(self._agent.lifecycle.start_at.min())
         self._seq[speak] += 1
         now = np.full(len(speak), t)
@@ -255,18 +255,18 @@ class VirtualNetwork:
             told = (said.position[speak], said.velocity[speak], yaw[speak])
             self._sent.append(PoseTable(speak, self._seq[speak], now, now, *told))
         self._channel.send(t, speak, self._seq, said.position, said.velocity, yaw=yaw, start=start)
-        if self._steering is not None:
-            self._steering.say(t, speak, self._seq, said.position, said.velocity, yaw, start=start)
+        if self._centre is not None:
+            self._centre.transmit(t, speak, self._seq, said.position, said.velocity, yaw, start=start)
 
     def _deliver(self, t: float) -> None:
-        """What has arrived is heard."""
+        """Delivers poses and goals that have arrived."""
         heard = self._channel.due(t)
         if heard is not None:
             self._agent.receive(heard.link, heard.position, heard.velocity, heard.stamp, heard.arrival)
             if not self._lean:
                 self._received.append(heard)
-        if self._steering is not None:
-            self._steering.deliver(t, self._agent)
+        if self._centre is not None:
+            self._centre.deliver(t, self._agent)
 
     def sent(self, begin: float) -> PoseTable:
         """Poses of all rows, which `link` holds; times since the common start at `begin` [s]."""
@@ -281,6 +281,6 @@ class VirtualNetwork:
         """(E,) samples lost on each link, from the common start to the end of the experiment."""
         return self._channel.lost
 
-    def steered(self, begin: float) -> Steered | None:
-        """What went between robots and centre; None if every robot decides for itself."""
-        return None if self._steering is None else self._steering.logged(begin)
+    def steered(self, begin: float) -> CentreLog | None:
+        """Messages of the central controller; None if each robot decides for itself."""
+        return None if self._centre is None else self._centre.logged(begin)

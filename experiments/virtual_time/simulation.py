@@ -23,7 +23,7 @@ from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.virtual_time.conductor import VirtualConductor
-from experiments.virtual_time.network import Steered, VirtualNetwork
+from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from twins.body import TwinBody
 from twins.engines.engine import Touch
 
@@ -62,12 +62,12 @@ class Log:
     shadow_position: Array | None
     shadow_yaw: Array | None  # (K, R) of those twins
     waited: Mask  # (repetitions,) that got an order later than alone, because another one was late
-    steered: Steered | None = None  # None if each robot decides for itself
+    steered: CentreLog | None = None  # None if each robot decides for itself
     incidents: tuple[Incident, ...] = ()  # hazards of robots
 
 
 class _Samples:
-    """Rows of a log while it grows."""
+    """Samples of a log that grows."""
 
     def __init__(self) -> None:
         self._columns: list[tuple[Any, ...]] = []
@@ -86,7 +86,7 @@ def simulate(
     *,
     lean: bool = False,
     landing: bool = True,
-    tell: Callable[[float], object] = lambda _: None,
+    progress: Callable[[float], object] = lambda _: None,
 ) -> Log:
     """Flies one case of an experiment once for each seed.
 
@@ -96,7 +96,7 @@ def simulate(
         lean: Keep `true_position` and who sent when, and nothing of the other columns: a seventh of the memory, for
             sweeps. They are empty, and so is everything that was heard.
         landing: Let the robots land; else the log ends with the run.
-        tell: Called at state_hz with how far it is, in the time of the experiment [s]; NaN before its start is known.
+        progress: Called at state_hz with the time of the experiment [s]; NaN before its start is known.
 
     Raises:
         Stuck: If robots do not become ready, airborne or done.
@@ -136,7 +136,7 @@ def simulate(
                 avoided += actions.avoided
         touches += twin.touches()
         if (agent.tick - 1) % log_every == 0:  # the agent's count begins anew at the common start
-            tell(t - conductor.start_at)
+            progress(t - conductor.start_at)
             whole = (agent.lifecycle.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
             states.add(t, *((*blank, state.true_position, *blank) if lean else whole))
             more = () if lean else tuple(value for value in _extra(state) if value is not None)
@@ -190,5 +190,5 @@ def _measured(state: BodyState) -> tuple[Array, ...]:
 
 
 def _extra(state: BodyState) -> tuple[Array | None, ...]:
-    """What there is of in all samples or in none."""
+    """Columns that exist in all samples or in none."""
     return state.attitude, state.shadow_position, state.shadow_yaw

@@ -12,7 +12,7 @@ from agents.network import messages
 from experiments.definition.experiment import Channel as Parameters
 from experiments.definition.experiment import Experiment, LinkChannel, Network, Outage, Robot
 from experiments.recording.trace import EPOCH
-from experiments.virtual_time.network import Channel
+from experiments.virtual_time.network import VirtualChannel
 
 DT = 0.01
 # 0 and 1 hear each other, 2 hears both
@@ -30,7 +30,7 @@ class Talk:
     def __init__(self, parameters, *, net=NET, names="ABC", seeds=(1,), start=0.0, **parts):
         rows = len(names)
         self.rows, self.seq, self.tick = rows * len(seeds), np.zeros(rows * len(seeds), dtype=np.intp), 0
-        self.channel = Channel(crowd(parameters, names, **parts), net.repeated(len(seeds), rows), seeds)
+        self.channel = VirtualChannel(crowd(parameters, names, **parts), net.repeated(len(seeds), rows), seeds)
         self.start = start
         self.heard = []
 
@@ -206,7 +206,7 @@ def test_the_default_is_what_it_was():
 
 
 def test_what_goes_along_arrives_with_its_pose():
-    channel = Channel(crowd(Parameters(delay_s=0.01, loss=0.4)), NET, [1], stream="goals")
+    channel = VirtualChannel(crowd(Parameters(delay_s=0.01, loss=0.4)), NET, [1], stream="goals")
     still, yaw = np.zeros((3, 3)), np.zeros(3)
     for k in range(100):
         place = np.full((3, 3), float(k))
@@ -221,7 +221,7 @@ def test_what_goes_along_arrives_with_its_pose():
 def test_streams_have_their_own_luck():
     gone = []
     for stream in ("", "goals"):
-        channel = Channel(crowd(Parameters(loss=0.5)), NET, [1], stream=stream)
+        channel = VirtualChannel(crowd(Parameters(loss=0.5)), NET, [1], stream=stream)
         gone.append(channel._channel.lost(np.zeros(2000, dtype=np.intp), np.arange(2000)))
     assert (gone[0] & gone[1]).mean() == pytest.approx(0.25, abs=0.04)
 
@@ -237,4 +237,4 @@ def test_streams_have_their_own_luck():
     ],
 )
 def test_what_takes_no_time_is_known_at_once(parameters, instant):
-    assert Channel(crowd(parameters), NET, [1]).instant == instant
+    assert VirtualChannel(crowd(parameters), NET, [1]).instant == instant

@@ -38,7 +38,7 @@ def alone(way, arena, kind="khepera4"):
 
 
 def test_the_closest_approach_is_between_surfaces_with_time_and_who():
-    found = Clearance.of(pair(along_x(0.3 + 0.2 * np.cos(T))))
+    found = Clearance.of_trace(pair(along_x(0.3 + 0.2 * np.cos(T))))
     closest = pytest.approx(0.1 - 2.0 * R, abs=1e-5)
     at = pytest.approx(math.pi, abs=STEP)
     assert found.robots == (Approach(("A", "B"), closest, at), Approach(("B", "A"), closest, at))
@@ -46,25 +46,25 @@ def test_the_closest_approach_is_between_surfaces_with_time_and_who():
 
 
 def test_every_time_together_is_one_collision_as_deep_as_it_became():
-    found = Clearance.of(pair(along_x(0.14 + 0.05 * np.cos(2.0 * np.pi * T))))
+    found = Clearance.of_trace(pair(along_x(0.14 + 0.05 * np.cos(2.0 * np.pi * T))))
     assert [each.time_s for each in found.overlaps] == [pytest.approx(at + 0.26) for at in range(4)]
     for each in found.overlaps:
         assert (each.first, each.second, each.impulse) == ("A", "B", None)
         assert each.overlap == pytest.approx(0.05, abs=1e-5)
-    apart = Clearance.of(pair(along_x(np.full_like(T, 2.0 * R))))
+    apart = Clearance.of_trace(pair(along_x(np.full_like(T, 2.0 * R))))
     assert apart.overlaps == ()  # they stand side by side
 
 
 def test_a_drone_over_a_ground_robot_is_as_far_off_as_it_is_high():
     above = pair(along_x(np.full(50, 0.02), 0.5), ("turtlebot3", "crazyflie"))
     gap = 0.5 - TURTLEBOT3.height
-    assert Clearance.of(above).robots[0].gap == pytest.approx(gap)
-    assert Clearance.of(above).overlaps == ()
+    assert Clearance.of_trace(above).robots[0].gap == pytest.approx(gap)
+    assert Clearance.of_trace(above).overlaps == ()
     beside = pair(along_x(np.full(50, 0.5), 0.5), ("turtlebot3", "crazyflie"))
     level = 0.5 - CRAZYFLIE.radius - TURTLEBOT3.radius
-    assert Clearance.of(beside).robots[0].gap == pytest.approx(math.hypot(level, gap))
+    assert Clearance.of_trace(beside).robots[0].gap == pytest.approx(math.hypot(level, gap))
     into = pair(along_x(np.full(50, 0.02), TURTLEBOT3.height - 0.5 * CRAZYFLIE.height), ("turtlebot3", "crazyflie"))
-    assert Clearance.of(into).overlaps == (Collision(0.0, "A", "B", None, pytest.approx(0.5 * CRAZYFLIE.height)),)
+    assert Clearance.of_trace(into).overlaps == (Collision(0.0, "A", "B", None, pytest.approx(0.5 * CRAZYFLIE.height)),)
 
 
 def obstacles(**named):
@@ -92,7 +92,7 @@ FENCE = Obstacle(wall=[(0.0, -1.0), (0.0, 0.0), (1.0, 0.0)], at=(1.0, 0.0))
     ],
 )
 def test_distance_to_what_stands_in_the_arena(thing, place, gap):
-    found = Clearance.of(alone([(*place, 0.0)] * 3, obstacles(thing=thing)))
+    found = Clearance.of_trace(alone([(*place, 0.0)] * 3, obstacles(thing=thing)))
     assert found.arena == (Approach(("A", "thing"), pytest.approx(gap), 0.0),)
     assert [each.overlap for each in found.overlaps] == [pytest.approx(-gap)] * (gap < 0.0)
 
@@ -100,7 +100,7 @@ def test_distance_to_what_stands_in_the_arena(thing, place, gap):
 def test_what_moves_is_where_it_is_then():
     plan = {"kind": "line", "move_by": [-2.0, 0.0], "speed": 0.5}
     arena = obstacles(cart=msgspec.structs.replace(POST, plan=plan), stone=Obstacle(radius=0.1, at=(0.0, 2.0)))
-    found = Clearance.of(alone(np.zeros((len(T), 3)), arena))
+    found = Clearance.of_trace(alone(np.zeros((len(T), 3)), arena))
     assert [(each.second, each.time_s) for each in found.overlaps] == [("cart", pytest.approx(1.46, abs=1.01 * STEP))]
     assert found.overlaps[0].overlap == pytest.approx(0.2 + R)
     assert found.arena[0] == Approach(("A", "cart"), pytest.approx(-0.2 - R), pytest.approx(2.0))
@@ -111,7 +111,7 @@ def test_what_moves_is_where_it_is_then():
 def test_distance_to_the_walls(x, y, size):
     arena = Arena(size=(*size, 2.0), walls=True)
     gap = min(0.5 * size[0] - abs(x), 0.5 * size[1] - abs(y)) - R
-    found = Clearance.of(alone([(x, y, 0.0)] * 2, arena))
+    found = Clearance.of_trace(alone([(x, y, 0.0)] * 2, arena))
     assert found.arena == (Approach(("A", "wall"), pytest.approx(gap, abs=1e-12), 0.0),)
     assert len(found.overlaps) == (gap < -1e-6)
 
@@ -119,9 +119,9 @@ def test_distance_to_the_walls(x, y, size):
 def test_what_is_unknown_touches_nothing():
     way = along_x(np.full_like(T, 0.1))
     way[50:100] = np.nan
-    found = Clearance.of(pair(way, arena=Arena(size=(10.0, 10.0, 3.0))))
+    found = Clearance.of_trace(pair(way, arena=Arena(size=(10.0, 10.0, 3.0))))
     assert [each.time_s for each in found.overlaps] == [0.0, pytest.approx(2.0)]
-    nobody = Clearance.of(pair(np.full_like(way, np.nan), arena=Arena(size=(10.0, 10.0, 3.0))))
+    nobody = Clearance.of_trace(pair(np.full_like(way, np.nan), arena=Arena(size=(10.0, 10.0, 3.0))))
     assert (nobody.robots, nobody.arena[1], nobody.overlaps) == ((None, None), None, ())
 
 
@@ -140,23 +140,23 @@ def with_contacts(known, *contacts, clock="virtual", **bodies):
 def test_what_an_engine_saw_stands_for_what_overlaps():
     known = pair(along_x(np.full_like(T, 0.1)))
     seen = with_contacts(known, Contact(1.5, "B", "wall", 0.2, 0.001), Contact(0.5, "A", "B", 0.1, 0.0005))
-    assert [each.time_s for each in collisions(known, Clearance.of(known))] == [0.0]
-    assert collisions(seen, Clearance.of(seen)) == (
+    assert [each.time_s for each in collisions(known, Clearance.of_trace(known))] == [0.0]
+    assert collisions(seen, Clearance.of_trace(seen)) == (
         Collision(0.5, "A", "B", 0.1, 0.0005),
         Collision(1.5, "B", "wall", 0.2, 0.001),
     )
     quiet = with_contacts(known)
-    assert collisions(quiet, Clearance.of(quiet)) == ()
+    assert collisions(quiet, Clearance.of_trace(quiet)) == ()
 
 
 @pytest.mark.parametrize(("bodies", "count"), [({}, 1), ({"A": "world"}, 0), ({"A": "world", "B": "world"}, 0)])
 def test_robots_that_no_world_carries_are_watched_by_their_positions(bodies, count):
     known = with_contacts(pair(along_x(np.full_like(T, 0.1))), clock="real", **bodies)
-    assert len(collisions(known, Clearance.of(known))) == count
+    assert len(collisions(known, Clearance.of_trace(known))) == count
 
 
 def test_what_was_pushed_away_is_no_longer_where_it_stood():
     box = obstacles(box=Obstacle(radius=0.2, at=(0.1, 0.0), mass=0.5))
     known = alone(np.zeros((5, 3)), box)
-    assert len(Clearance.of(known).overlaps) == 1  # nothing can push it without an engine that sees contacts
-    assert Clearance.of(with_contacts(known)).arena == (None,)
+    assert len(Clearance.of_trace(known).overlaps) == 1  # nothing can push it without an engine that sees contacts
+    assert Clearance.of_trace(with_contacts(known)).arena == (None,)

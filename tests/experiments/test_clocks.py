@@ -40,7 +40,7 @@ def test_drift_is_taken_off_and_the_offset_was_before():
     assert [right("CF01", float(stamp)) for stamp in stamped] == pytest.approx(list(true), abs=1e-5)
     assert right("KH01", begin + 5.0) == begin + 5.0, "measured once"
     assert right("TB01", begin + 5.0) == begin + 5.0, "it ran here"
-    lab2, lab1 = right.lies()
+    lab2, lab1 = right.offsets()
     assert (lab2.host, lab2.robots, lab2.over) == ("lab2", ("CF01",), 600.0)
     assert lab2.drift == pytest.approx(drift)
     assert lab1.drift is None
@@ -59,4 +59,4 @@ def test_goals_on_the_way_are_as_late_as_they_were():
 
 def test_nothing_measured_nothing_changed():
     assert Correction([])("CF01", 12.5) == 12.5
-    assert Correction([]).lies() == ()
+    assert Correction([]).offsets() == ()

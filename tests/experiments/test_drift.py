@@ -48,7 +48,7 @@ def test_what_is_left_stays_small_however_long_the_run(ppm, most):
     stamps = (true + left)[until]
     mended = np.array([right("CF01", float(stamp)) for stamp in stamps[::50]])
     assert np.abs(mended - true[until][::50]).max() < 2.5 * UNCERTAINTY_S, "what is left is taken off the recording"
-    (lie,) = right.lies()
+    (lie,) = right.offsets()
     assert lie.worst == pytest.approx(np.abs(left).max(), abs=1e-3)
 
 

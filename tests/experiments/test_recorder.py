@@ -64,20 +64,20 @@ def test_what_the_world_says_is_taken_down_if_it_can_be_true(
             for key, message in said:
                 # MessagePack keeps what is not finite; JSON would say null
                 other.put(key, messages.encode(message, "msgpack"), encoding=messages.MSGPACK)
-            recorder.take()
+            recorder.receive()
             return bool(taken.contacts and taken.worlds)
 
         eventually(heard)
     assert set(map(str, taken.contacts)) == {str(touched(0.3))}
     assert set(map(str, taken.worlds)) == {str(world(0.2))}
     assert recorder.malformed >= 5
-    recorder.complain()
-    recorder.complain()
+    recorder.report_malformed()
+    recorder.report_malformed()
     texts = [(event.kind, event.source, event.text) for event in taken.events]
     assert [(kind, source) for kind, source, _ in texts] == [("unread", "recorder")] * 2
     assert {text.split(" on ")[1].split(": ")[0] for *_, text in texts} == {KEYS.contact, KEYS.world}
     before = recorder.malformed
-    recorder.complain(last=True)
+    recorder.report_malformed(last=True)
     assert (recorder.malformed, len(taken.events)) == (before, 2)  # nothing new
 
 

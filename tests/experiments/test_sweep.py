@@ -42,9 +42,9 @@ class Progress:
         return self.told[-1][0] if self.told else 0
 
 
-def swept(folder, *given, tell=None, **more):
+def swept(folder, *given, progress=None, **more):
     options = {"settings": SHORT, "processes": 1, "out": folder, **more}
-    return sweep("triangle", given or [AXIS, "seeds=3"], tell=tell or Progress(), **options)
+    return sweep("triangle", given or [AXIS, "seeds=3"], progress=progress or Progress(), **options)
 
 
 def tables(found):
@@ -80,12 +80,12 @@ def test_the_table_has_the_figures_of_single_runs(done):
 
 def test_nothing_is_run_twice(done):
     progress = Progress()
-    again = swept(done.folder, tell=progress)
+    again = swept(done.folder, progress=progress)
     assert (progress.ran, again.rows, again.notes) == (0, done.rows, ())
-    more = swept(done.folder, AXIS, "seeds=4", tell=progress)
+    more = swept(done.folder, AXIS, "seeds=4", progress=progress)
     assert (progress.ran, more.rows[0].seeds) == (3, 4)
     progress = Progress()
-    swept(done.folder, "trigger.threshold=0.005,0.01,0.02", "seeds=2:4", tell=progress)
+    swept(done.folder, "trigger.threshold=0.005,0.01,0.02", "seeds=2:4", progress=progress)
     assert progress.ran == 3
 
 
@@ -97,15 +97,15 @@ def test_batches_do_not_change_the_table(done, tmp_path, monkeypatch):
 def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path, monkeypatch):
     monkeypatch.setattr(sweeps, "MOST_SEEDS", 2)
     progress = Progress(end_after=3)
-    part = swept(tmp_path, tell=progress)
+    part = swept(tmp_path, progress=progress)
     assert (part.missing, [row.seeds for row in part.rows]) == (6, [3])
     with (tmp_path / "runs.jsonl").open("ab") as file:
         file.write(b'{"cell":"cut off in mid')
     progress = Progress()
-    whole = swept(tmp_path, tell=progress)
+    whole = swept(tmp_path, progress=progress)
     assert (progress.ran, whole.missing) == (6, 0)
     assert tables(whole) == tables(done)
-    assert swept(tmp_path, tell=(quiet := Progress())).rows == done.rows
+    assert swept(tmp_path, progress=(quiet := Progress())).rows == done.rows
     assert quiet.ran == 0
 
 
@@ -116,7 +116,7 @@ def test_a_changed_file_is_noticed_and_runs_anew_what_it_changes(tmp_path):
     folder = tmp_path / "runs"
     sweep(file, [AXIS, "seeds=2"], out=folder, processes=1)
     file.write_text(text.replace("threshold = 0.01", "threshold = 0.01, minimum_interval_s = 0.1"))
-    found = sweep(file, [AXIS, "seeds=2"], out=folder, processes=1, tell=(progress := Progress()))
+    found = sweep(file, [AXIS, "seeds=2"], out=folder, processes=1, progress=(progress := Progress()))
     assert found.notes == ("the experiment file has changed: what it changes is run anew",)
     assert progress.ran == 4  # the two cells of `event`; `periodic` is as it was
     assert min(row.gap_min_s for row in found.rows if row.case == "event") == pytest.approx(0.1)
@@ -150,7 +150,7 @@ def test_two_sweeps_do_not_share_a_folder(tmp_path):
         with pytest.raises(DocumentError, match="another sweep is at work in it"):
             swept(tmp_path, "seeds=1")
 
-    swept(tmp_path, "seeds=1", tell=meanwhile)
+    swept(tmp_path, "seeds=1", progress=meanwhile)
 
 
 def test_a_tuning_word_and_a_range_without_a_number_are_for_the_search(tmp_path):

@@ -155,7 +155,7 @@ def recorder() -> Iterator[Target]:
 
         def take(data: bytes) -> None:
             net.deliver(data)
-            made.take()
+            made.receive()
 
         return take
 

@@ -91,7 +91,7 @@ def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int) -> 
             range(first, first + seeds),
             cases=options.cases,
             folder=folder,
-            tell=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
+            progress=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
         )
 
 

@@ -119,7 +119,7 @@ def _sweep(request: _Request) -> int:
             out=request.out,
             scheduler=request.scheduler,
             processes=request.processes,
-            tell=lambda done, of: bar.show("runs", done, of),
+            progress=lambda done, of: bar.show("runs", done, of),
         )
     table = sweep_table.document(found.read.experiment.title, found.seeds, found.rows)
     _write_table(found.folder, found.rows, table)
@@ -156,7 +156,7 @@ def _optimise(request: _Request, wished: str) -> int:
                 out=request.out,
                 scheduler=request.scheduler,
                 processes=request.processes,
-                tell=lambda case, done, of: bar.show(f"{case}: tried", done, of),
+                progress=lambda case, done, of: bar.show(f"{case}: tried", done, of),
             )
     except KeyboardInterrupt:
         print("interrupted: what was tried is kept; the same command goes on from there", file=sys.stderr)

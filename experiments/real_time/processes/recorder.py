@@ -63,7 +63,7 @@ class Recorder:
         """Whether no robot is left."""
         return not self._alive
 
-    def take(self, *, last: bool = False) -> None:
+    def receive(self, *, last: bool = False) -> None:
         """Writes what has arrived; states of protocol twins wait for the truth behind them, but for the `last` time.
 
         Raises:
@@ -87,7 +87,7 @@ class Recorder:
         """Messages that could not be read."""
         return sum(count for count, _ in self._unread.values())
 
-    def complain(self, *, last: bool = False) -> None:
+    def report_malformed(self, *, last: bool = False) -> None:
         """Says in the recording what could not be read: of each key at once, and at the `last` how much it was.
 
         Raises:
@@ -194,19 +194,19 @@ def record(launch: RecorderLaunch) -> int:
         flush_at = time.monotonic() + FLUSH_S
         last = float("inf")
         while not asked.wait(POLL_S):
-            recorder.take()
+            recorder.receive()
             now = time.monotonic()
             router.silent_since(now)
             if now > flush_at:
-                recorder.complain()
+                recorder.report_malformed()
                 recording.flush()
                 flush_at = now + FLUSH_S
             if lost.is_set():
                 last = min(last, now + AFTER_S)
                 if recorder.alone or now > last or not network.connected(joint.session):
                     break
-        recorder.take(last=True)
-        recorder.complain(last=True)
+        recorder.receive(last=True)
+        recorder.report_malformed(last=True)
     return 0
 
 
