@@ -61,7 +61,7 @@ def test_every_kind_is_known_to_those_that_do_it_and_that_look_after_it():
     tables = {*injection.SIGNALS, *injection.CABLES, *injection.CLOCKS}
     assert tables <= set(KINDS)
     assert set(KINDS) - tables == {"double", "read-error", "disk", "corrupt"}, "done by functions of their own"
-    looked_after = {name.removeprefix("_after_").replace("_", "-") for name in vars(chaos_round.Flight)}
+    looked_after = {name.removeprefix("_after_").replace("_", "-") for name in vars(chaos_round.ChaosRound)}
     assert {kind for kind in KINDS if kind in looked_after} == {
         "kill", "bits", "clock", "read-error", "clock-behind", "double", "frozen-router", "mocap-clock"
     }  # fmt: skip

@@ -20,7 +20,7 @@ def seen():
 
 def test_all_is_well(seen):
     assert seen.violations() == []
-    assert seen.deformed(set(TRIANGLE), 1.0) < 0.001
+    assert seen.formation_error(set(TRIANGLE), 1.0) < 0.001
     assert seen.nearest == pytest.approx(0.6 - 2 * 0.0704, abs=0.02)
 
 
@@ -49,14 +49,14 @@ def test_above_is_not_in_the_way(seen):
 
 def test_a_deformed_formation(seen):
     seen.place("KH02", (0.5, 0.0, 0.0))
-    assert seen.deformed(set(TRIANGLE), 1.0) == pytest.approx(0.2, abs=0.01)
-    assert seen.deformed({"KH01", "CF01"}, 1.0) < 0.001, "links of those that are gone do not count"
+    assert seen.formation_error(set(TRIANGLE), 1.0) == pytest.approx(0.2, abs=0.01)
+    assert seen.formation_error({"KH01", "CF01"}, 1.0) < 0.001, "links of those that are gone do not count"
 
 
 def test_nobody_knows_where_it_is(seen):
     seen.place("KH02", (np.nan, 0.0, 0.0))
     assert seen.violations() == []
-    assert seen.deformed(set(TRIANGLE), 1.0) == np.inf
+    assert seen.formation_error(set(TRIANGLE), 1.0) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -70,5 +70,5 @@ def test_nobody_knows_where_it_is(seen):
     ],
 )
 def test_commands(seen, robot, setpoint, sane):
-    assert (seen.insane(Command(robot, 1, 0.0, "drive", setpoint)) == "") == sane
-    assert seen.insane(Command(robot, 1, 0.0, "land")) == ""
+    assert (seen.invalid_command(Command(robot, 1, 0.0, "drive", setpoint)) == "") == sane
+    assert seen.invalid_command(Command(robot, 1, 0.0, "land")) == ""

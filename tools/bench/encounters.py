@@ -34,17 +34,12 @@ PAIRS: Final = tuple(itertools.combinations_with_replacement(KINDS, 2))
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of encounters (M).
+    """What became of encounters (M)."""
 
-    Attributes:
-        gap: (M,) smallest distance between the surfaces of two robots beside each other [m]; negative: they overlapped.
-        missed: (M,) how far from its goal the farthest robot was at the end [m].
-        avoided: (M,) share of the ticks on which avoidance changed what some robot did.
-    """
-
+    # (M,) smallest distance between the surfaces of two robots beside each other [m]; negative: they overlapped
     gap: Array
-    missed: Array
-    avoided: Array
+    missed: Array  # (M,) how far from its goal the farthest robot was at the end [m]
+    avoided: Array  # (M,) share of the ticks on which avoidance changed what some robot did
 
     @property
     def collided(self) -> Mask:

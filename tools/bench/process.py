@@ -24,17 +24,11 @@ FLIGHT_S: Final = 20.0
 
 
 class Spent(NamedTuple):
-    """CPU time and memory of a process at one moment.
+    """CPU time and memory of a process at one moment."""
 
-    Attributes:
-        at: [s, monotonic]
-        cpu_s: Since it began [s].
-        rss_mb: Memory that it has [MB].
-    """
-
-    at: float
-    cpu_s: float
-    rss_mb: float
+    at: float  # [s, monotonic]
+    cpu_s: float  # since it began [s]
+    rss_mb: float  # memory that it has [MB]
 
     @classmethod
     def of(cls, pid: int) -> Spent:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -12,9 +13,12 @@ from experiments.real_time.conductor.run_view import FROZEN_S, OUTPUT, News, Pro
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from experiments.report.page import Finding
+
 REFRESH_S: Final = 0.25
 LINE_S: Final = 5.0
 EVENTS: Final = 5  # the last so many are shown below the table
+MARKS: Final = {"good": "✓", "fair": "!", "bad": "✗", "plain": "·"}
 QUIET: Final = ("robot",)  # kinds of events that the table shows better
 
 
@@ -197,3 +201,9 @@ def _bar(*, transient: bool) -> Any:  # noqa: ANN401 - rich is imported only her
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     console = Console(stderr=True)
     return Progress(*columns, TimeRemainingColumn(), console=console, transient=transient, get_time=time.monotonic)
+
+
+def print_findings(findings: Sequence[Finding]) -> None:
+    """Print the verdict of a page, a line for each finding."""
+    for finding in findings:
+        print(f"{MARKS[finding.mark]} {finding.text}")

@@ -34,7 +34,7 @@ def run(
         interrupted: Asked whether the user wants to end.
         say: Gets a line for each fault and each round.
     """
-    from tools.reliability.chaos_round import Flight
+    from tools.reliability.chaos_round import ChaosRound
     from tools.reliability.fault_script import Fault
 
     waiting, left = list(rounds), list[Fault]()
@@ -44,11 +44,11 @@ def run(
     while (waiting or left) and not interrupted() and barren < BARREN:
         if not waiting:
             waiting, left = again(left), []
-        flight = Flight(setting, waiting.pop(0), len(ends) + 1, interrupted, say)
-        ends.append(flight.fly())
-        outcomes += flight.outcomes
+        flown = ChaosRound(setting, waiting.pop(0), len(ends) + 1, interrupted, say)
+        ends.append(flown.run())
+        outcomes += flown.outcomes
         left += ends[-1].left
-        barren = 0 if flight.outcomes else barren + 1
+        barren = 0 if flown.outcomes else barren + 1
     return outcomes, ends
 
 
@@ -155,6 +155,7 @@ def _kinds(given: Sequence[str]) -> list[str]:
 
 
 def _print(result: Result) -> None:
+    from tools.commands.progress import print_findings
     from tools.reliability import chaos_report
 
     made = chaos_report.table(result)
@@ -162,6 +163,4 @@ def _print(result: Result) -> None:
     widths = [max(len(row[column]) for row in rows) for column in range(len(made.head))]
     for row in rows:
         print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-    marks = {"good": "✓", "fair": "!", "bad": "✗", "plain": "·"}
-    for finding in chaos_report.findings(result):
-        print(f"{marks[finding.mark]} {finding.text}")
+    print_findings(chaos_report.findings(result))

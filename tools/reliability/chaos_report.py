@@ -22,53 +22,30 @@ from tools.reliability.fault_script import KINDS, NATURES, Fault, Round
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What a fault did.
+    """What a fault did."""
 
-    Attributes:
-        round: In which it was done, counted from 1.
-        fault: As in the script.
-        victim: To whom it was done.
-        at_s: When, from the common start [s].
-        note: What there is to say of it.
-        recovered: Whether all healed in time.
-        begin_s: From its begin until then [s].
-        end_s: From its end [s]; 0 if the formation had healed while it lasted.
-        ended: Whether robots came down instead of going on, the dead not counted.
-        violations: What must not have happened.
-    """
-
-    round: int
-    fault: Fault
-    victim: str
-    at_s: float
-    note: str
-    recovered: bool
-    begin_s: float
-    end_s: float
-    ended: bool
-    violations: list[str]
+    round: int  # in which it was done, counted from 1
+    fault: Fault  # as in the script
+    victim: str  # to whom it was done
+    at_s: float  # when, from the common start [s]
+    note: str  # what there is to say of it
+    recovered: bool  # whether all healed in time
+    begin_s: float  # from its begin until then [s]
+    end_s: float  # from its end [s]; 0 if the formation had healed while it lasted
+    ended: bool  # whether robots came down instead of going on, the dead not counted
+    violations: list[str]  # what must not have happened
 
 
 class Ended(msgspec.Struct, frozen=True):
-    """How a round ended.
+    """How a round ended."""
 
-    Attributes:
-        round: Counted from 1.
-        left: Faults that it had no time for.
-        violations: What was wrong that no fault explains.
-        nearest_m: How near robots came to each other, between surfaces [m].
-        gone_s: After its end, how long until all of its processes were gone [s].
-        missed: Share of the ticks that robots missed which were never stopped: how busy the machine was.
-        recording: Its folder, if there is a recording.
-    """
-
-    round: int
-    left: list[Fault]
-    violations: list[str]
-    nearest_m: float
-    gone_s: float
-    missed: float
-    recording: str
+    round: int  # counted from 1
+    left: list[Fault]  # faults that it had no time for
+    violations: list[str]  # what was wrong that no fault explains
+    nearest_m: float  # how near robots came to each other, between surfaces [m]
+    gone_s: float  # after its end, how long until all of its processes were gone [s]
+    missed: float  # share of the ticks that robots missed which were never stopped: how busy the machine was
+    recording: str  # its folder, if there is a recording
 
 
 def line(outcome: Outcome) -> str:

@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-import msgspec
 import numpy as np
 
 from agents.arrays import Array
@@ -34,8 +33,8 @@ from tools.reliability.cables import Cables
 from tools.reliability.chaos_report import Ended, Outcome, line, misrecorded
 from tools.reliability.fault_script import Fault, Round
 from tools.reliability.injection import Injector
-from tools.reliability.observer import Eyes
-from tools.reliability.run_process import Watched
+from tools.reliability.observer import Observer
+from tools.reliability.run_process import Request, WatchedRun
 from tools.reliability.spoilt_process import Switch
 
 POLL_S: Final = 0.02
@@ -49,7 +48,6 @@ NOTICE_S: Final = 1.0  # after which it must have stopped
 FEWEST: Final = 3  # running robots with which a round goes on
 LATEST_S: Final = 4.0  # before the end no fault is begun that could not heal
 LEAD_S: Final = 1.0  # the start is announced not longer before
-CABLES: Final = "cables.json"
 SWITCHES: Final = "switches"
 LEASE_S: Final = 60.0  # of a patient router, as ROS 2 sets it
 DEAF_S: Final = 1.0  # after which whoever listens to a robot that is there again has heard it
@@ -66,29 +64,19 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Setting:
-    """What all rounds have in common.
+    """What all rounds have in common."""
 
-    Attributes:
-        file: The experiment.
-        case: Its case.
-        experiment: The same, changes applied.
-        folder: Where each round gets a folder.
-        changes: As behind `--set`.
-        bodies: As behind `--bodies`.
-        seed: Of what the script leaves open: bits, segments, nonsense.
-    """
-
-    file: Path
-    case: str
-    experiment: Experiment
-    folder: Path
-    changes: Sequence[str]
-    bodies: str | None
-    seed: int
+    file: Path  # the experiment
+    case: str  # its case
+    experiment: Experiment  # the same, changes applied
+    folder: Path  # where each round gets a folder
+    changes: Sequence[str]  # as behind `--set`
+    bodies: str | None  # as behind `--bodies`
+    seed: int  # of what the script leaves open: bits, segments, nonsense
 
 
 @dataclass
-class _Running:
+class _ActiveFault:
     """A fault that was begun: to whom, when (monotonic [s]), when it was lifted, since when all is well again."""
 
     fault: Fault
@@ -109,13 +97,13 @@ class _Running:
     died: bool = False
     violations: list[str] = field(default_factory=list)
 
-    def deplore(self, text: str) -> None:
+    def add_violation(self, text: str) -> None:
         """A violation of an invariant, reported once."""
         if text not in self.violations:
             self.violations.append(text)
 
 
-class Flight:
+class ChaosRound:
     """One round.
 
     Attributes:
@@ -132,7 +120,7 @@ class Flight:
         self._dead: dict[str, float] = {}  # killed by us, and when
         self._off: set[str] = set()  # robots whose clock is not that of the others
         self._conductor_dead = self._disk_full = False
-        self._now: _Running | None = None
+        self._now: _ActiveFault | None = None
         self._started: float | None = None
         self._at = 0.0
         self._well: float | None = None  # since when all is well, before a fault
@@ -141,7 +129,7 @@ class Flight:
         for link in Plan(setting.experiment).one_way_links:
             self._hears[link.receiver].add(link.sender)
 
-    def fly(self) -> Ended:
+    def run(self) -> Ended:
         """Runs the round to its end; leaves no process behind."""
         setting = self._setting
         folder = setting.folder / f"round-{self._number:03}"
@@ -158,7 +146,6 @@ class Flight:
             Switch(switches / "lease").write(LEASE_S if stage == "patient router" else 0.0)
             cables = stack.enter_context(Cables(random))
             laid = {group: {end: cables.lay(group, end) for end in routers} for group in dict.fromkeys(groups.values())}
-            (folder / CABLES).write_bytes(msgspec.json.encode(laid))
             launcher = stack.enter_context(Launcher(folder / "logs"))
             own = [*setting.changes, f"network.listen={json.dumps(routers)}"]
             own.append(f"network.routers={len(routers)}")
@@ -166,29 +153,31 @@ class Flight:
                 flying = [name for name, robot in experiment.robots.items() if KINDS[robot.kind].flies]
                 own += [f'robots.{name}.position="external"' for name in flying or experiment.robots]
                 own.append('positioning="vicon-twin"')
-            watched = Watched(
+            watched = WatchedRun(
                 launcher,
-                setting.file,
-                folder,
-                cases=[setting.case],
-                changes=own,
-                bodies=setting.bodies,
-                cables=folder / CABLES,
-                switches=switches,
+                Request(
+                    str(setting.file),
+                    str(folder),
+                    setting.case,
+                    own,
+                    setting.bodies,
+                    cables=laid,
+                    switches=str(switches),
+                ),
             )
             stack.callback(self._sweep, watched)
-            injector = Injector(watched, launcher, cables, switches, random, groups=groups, recording=recording)
+            self._injector = Injector(watched, launcher, cables, switches, random, groups=groups, recording=recording)
             nearest, missed = math.inf, 0.0
             try:
                 with network.open_session(routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
-                    eyes = Eyes(session, experiment)
-                    self._follow(watched, injector, eyes)
-                    nearest, missed = eyes.invariants.nearest, self._missed(eyes)
+                    self._observer = Observer(session, experiment)
+                    self._follow(watched)
+                    nearest, missed = self._observer.invariants.nearest, self._missed()
             except network.Unreachable as error:
                 self._wrong.append(f"it never began: {error}; {watched.process.tail()}")
             if self._now is not None:
                 self._unfinished(self._now)
-            injector.release()
+            self._injector.release()
             gone_s = self._finish(watched)
         if self._started is not None:
             self._wrong += misrecorded(recording, self.outcomes, disk_full=self._disk_full)
@@ -199,35 +188,35 @@ class Flight:
 
     # ------------------------------------------------------------------ the run
 
-    def _follow(self, watched: Watched, injector: Injector, eyes: Eyes) -> None:
+    def _follow(self, watched: WatchedRun) -> None:
         """Until the script is through, or the run ends."""
         duration = self._setting.experiment.duration_s
         began = time.monotonic()
         while watched.process.alive and not self._conductor_dead:
             time.sleep(POLL_S)
-            eyes.look()
+            self._observer.update()
             now = time.monotonic()
             for event in watched.news():
                 self._events.append(event)
                 if event.kind == "start":
                     self._started = now + max(0.0, min(LEAD_S, event.stamp - time.time()))
             if self._started is None:
-                eyes.judge()  # robots are placed
+                self._observer.violations()  # robots are placed
                 if now > began + BEGIN_S:
                     self._wrong.append(f"no common start within {BEGIN_S:g} s")
                     return
                 continue
             t = now - self._started
-            self._judge(eyes, now)
+            self._judge(now)
             if self._now is not None:
-                self._heal(self._now, injector, eyes, t, now)
-            elif self._through(t, duration) or not self._next(injector, eyes, t, now):
+                self._heal(self._now, t, now)
+            elif self._nothing_left(t, duration) or not self._next(t, now):
                 return
             if t > duration + END_S:
                 self._wrong.append(f"it does not end {END_S:g} s after its time")
                 return
 
-    def _through(self, t: float, duration: float) -> bool:
+    def _nothing_left(self, t: float, duration: float) -> bool:
         """Whether nothing more can be done in this round."""
         if not self._left or self._interrupted():
             return True
@@ -238,280 +227,283 @@ class Flight:
         """Whether the run's time is over: then the conductor lands everybody, and nobody is let in again."""
         return time.monotonic() - (self._started or 0.0) > self._setting.experiment.duration_s - NOTICE_S
 
-    def _judge(self, eyes: Eyes, now: float) -> None:
+    def _judge(self, now: float) -> None:
         """Gives what is wrong to the fault that is under way, or to the round."""
-        wrong = eyes.judge()
+        wrong = self._observer.violations()
         for name, since in self._dead.items():
-            told = eyes.told.get(name)
+            told = self._observer.command.get(name)
             if told is not None and told[1] > since + NOTICE_S and now < told[1] + POLL_S * 5:
                 wrong.append(f"{name} is dead and still commands its body")
         target = self._wrong if self._now is None else self._now.violations
         target += [each for each in wrong if each not in target]
 
-    def _next(self, injector: Injector, eyes: Eyes, t: float, now: float) -> bool:
+    def _next(self, t: float, now: float) -> bool:
         """Does the next fault when its time has come; False if there is nothing more to be done in this round."""
         if self._well is None:
-            live = eyes.running()
-            formed = bool(live) and not self._apart(eyes, live, now - FRESH_S, t)
+            live = self._observer.running()
+            formed = bool(live) and not self._not_in_formation(live, now - FRESH_S, t)
             self._formed_since = (self._formed_since or now) if formed else None
             if self._formed_since is not None and now - self._formed_since >= SETTLED_S:
                 self._well = now
             elif t > FORM_S:
-                why = self._apart(eyes, live, now - FRESH_S, t)
+                why = self._not_in_formation(live, now - FRESH_S, t)
                 self._wrong.append(f"not in formation {FORM_S:g} s after the start ({why}): no fault was done")
                 return False
             return True
-        return now < self._well + self._left[0].after_s or self._begin(injector, eyes, t, now)
+        return now < self._well + self._left[0].after_s or self._begin(t, now)
 
-    def _begin(self, injector: Injector, eyes: Eyes, t: float, now: float) -> bool:
+    def _begin(self, t: float, now: float) -> bool:
         """Does the next fault; False if there are too few robots left for it."""
-        running = eyes.running() - self._dead.keys()
+        running = self._observer.running() - self._dead.keys()
         if len(running) < FEWEST:
             return False
         fault = self._left.pop(0)
         victim = fault.victim
         if victim:
-            order = [*eyes.invariants.names, *eyes.invariants.names]
+            order = [*self._observer.invariants.names, *self._observer.invariants.names]
             victim = next(name for name in order[order.index(victim) :] if name in running)
-        before = eyes.invariants.position.copy()
-        note = injector.begin(fault, victim, eyes.session, eyes.keys)
+        before = self._observer.invariants.position.copy()
+        note = self._injector.begin(fault, victim, self._observer.session, self._observer.keys)
         if fault.kind == "kill":
             self._dead[victim] = now
         self._disk_full |= fault.kind == "disk"
         self._conductor_dead = fault.kind == "conductor"
-        eyes.orders.clear()
-        told = {name: status.incidents[-1].seq for name, status in eyes.status.items() if status.incidents}
-        self._now = _Running(fault, victim, now, note, before, there=running, events=len(self._events), told=told)
+        self._observer.orders.clear()
+        told = {name: status.incidents[-1].seq for name, status in self._observer.status.items() if status.incidents}
+        self._now = _ActiveFault(fault, victim, now, note, before, there=running, events=len(self._events), told=told)
         self._at = t
         if fault.kind == "conductor":
-            self._watch_landing(eyes, self._now)
+            self._watch_landing(self._now)
         return True
 
-    def _heal(self, running: _Running, injector: Injector, eyes: Eyes, t: float, now: float) -> None:
+    def _heal(self, active: _ActiveFault, t: float, now: float) -> None:
         """Lifts the fault when its time is over, and waits until all is well."""
-        fault = running.fault
-        if fault.kind in ("freeze", "partition") and running.lifted is None:
-            self._hold(running, eyes, now)
-        if running.lifted is None and now >= running.begun + fault.lasts_s:
-            injector.end(fault)
-            running.lifted = time.monotonic()
-        if running.lifted is None:
+        fault = active.fault
+        if fault.kind in ("freeze", "partition") and active.lifted is None:
+            self._hold(active, now)
+        if active.lifted is None and now >= active.begun + fault.lasts_s:
+            self._injector.end(fault)
+            active.lifted = time.monotonic()
+        if active.lifted is None:
             return
-        why = self._unwell(running, injector, eyes, t, now)
-        running.why = why or running.why
-        running.well_since = None if why else (running.well_since or now)
-        settled = running.well_since is not None and now - running.well_since >= SETTLED_S
+        why = self._not_recovered(active, t, now)
+        active.why = why or active.why
+        active.well_since = None if why else (active.well_since or now)
+        settled = active.well_since is not None and now - active.well_since >= SETTLED_S
         # who avoids others needs up to 35 s to come up with a leader that drives, without any fault
         driven = max((leg.at_s for leg in self._setting.experiment.timeline if leg.at_s <= t), default=-math.inf)
-        if not settled and (now < running.lifted + HEAL_S + fault.nature.heals_s or t < driven + FORM_S):
+        if not settled and (now < active.lifted + HEAL_S + fault.nature.heals_s or t < driven + FORM_S):
             return
         if not settled:
-            running.violations.append(f"not well {now - running.lifted:.0f} s later: {running.why}")
-        self._close(running, running.well_since, eyes)
+            active.violations.append(f"not well {now - active.lifted:.0f} s later: {active.why}")
+        self._close(active, active.well_since)
 
-    def _close(self, running: _Running, well: float | None, eyes: Eyes) -> None:
+    def _close(self, active: _ActiveFault, well: float | None) -> None:
         now = time.monotonic()
         well = now if well is None else well
-        if running.fault.kind == "read-error" or running.died:
-            self._dead[running.victim] = now
-        left = set() if self._conductor_dead or self._over() else running.there - self._dead.keys()
-        down = [name for name in sorted(left) if self._down(name, eyes)]
-        reasons = [f"{name}: {eyes.status[name].reason}" for name in down]
+        if active.fault.kind == "read-error" or active.died:
+            self._dead[active.victim] = now
+        left = set() if self._conductor_dead or self._over() else active.there - self._dead.keys()
+        down = [name for name in sorted(left) if self._down(name)]
+        reasons = [f"{name}: {self._observer.status[name].reason}" for name in down]
         outcome = Outcome(
             self._number,
-            running.fault,
-            running.victim,
+            active.fault,
+            active.victim,
             round(self._at, 2),
-            "; ".join(filter(None, (running.note, *reasons))),
-            not any(text.startswith("not well") for text in running.violations),
-            round(well - running.begun, 3),
-            round(max(0.0, well - (running.lifted or running.begun)), 3),
+            "; ".join(filter(None, (active.note, *reasons))),
+            not any(text.startswith("not well") for text in active.violations),
+            round(well - active.begun, 3),
+            round(max(0.0, well - (active.lifted or active.begun)), 3),
             bool(down),
-            list(running.violations),
+            list(active.violations),
         )
         self.outcomes.append(outcome)
         self._now, self._well = None, now
         self._say(line(outcome))
 
-    def _unfinished(self, running: _Running) -> None:
+    def _unfinished(self, active: _ActiveFault) -> None:
         """The run has ended before it could be seen whether all was well again: the fault is done once more."""
-        if running.violations:
-            self._wrong += [f"{running.fault.kind} {running.victim}: {text}" for text in running.violations]
-        self._left.insert(0, running.fault)
+        if active.violations:
+            self._wrong += [f"{active.fault.kind} {active.victim}: {text}" for text in active.violations]
+        self._left.insert(0, active.fault)
         self._now = None
 
-    def _hold(self, running: _Running, eyes: Eyes, now: float) -> None:
+    def _hold(self, active: _ActiveFault, now: float) -> None:
         """Nobody steers the victim: its body stops soon."""
-        if now < running.begun + NOTICE_S or not eyes.connected:
+        if now < active.begun + NOTICE_S or not self._observer.connected:
             return
-        if running.held_at is None:
-            running.held_at = eyes.invariants.where(running.victim)
-        if eyes.moved(running.victim, running.held_at) > HELD_M:
-            running.deplore(f"{running.victim} moved although nobody steered it")
+        if active.held_at is None:
+            active.held_at = self._observer.invariants.where(active.victim)
+        if self._observer.moved(active.victim, active.held_at) > HELD_M:
+            active.add_violation(f"{active.victim} moved although nobody steered it")
 
-    def _unwell(self, running: _Running, injector: Injector, eyes: Eyes, t: float, now: float) -> str:
+    def _not_recovered(self, active: _ActiveFault, t: float, now: float) -> str:
         """Why the run is not yet as it was; empty if it is."""
-        live = eyes.running() - self._dead.keys()
-        check = getattr(self, f"_after_{running.fault.kind.replace('-', '_')}", self._after_any)
-        away = running.there - live - self._dead.keys() - {running.victim}
-        away = {name for name in away if eyes.invariants.up(name) or not self._down(name, eyes)}
+        live = self._observer.running() - self._dead.keys()
+        check = getattr(self, f"_after_{active.fault.kind.replace('-', '_')}", self._after_any)
+        away = active.there - live - self._dead.keys() - {active.victim}
+        away = {name for name in away if self._observer.invariants.in_the_air(name) or not self._down(name)}
         return (
-            check(running, injector, eyes, live)
+            check(active, live)
             or (f"{', '.join(sorted(away))}: not back" if away else "")
-            or self._apart(eyes, live, max(running.lifted or now, now - FRESH_S), t)
+            or self._not_in_formation(live, max(active.lifted or now, now - FRESH_S), t)
         )
 
     # what of the effect of a fault has still to come, or to pass
 
-    def _after_any(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
-        kind = running.fault.kind
-        if running.victim:
-            return self._absent(running.victim, eyes, live, running.lifted or running.begun)
+    def _after_any(self, active: _ActiveFault, live: Set[str]) -> str:
+        kind = active.fault.kind
+        if active.victim:
+            return self._not_back(active.victim, live, active.lifted or active.begun)
         if kind in SAYS and not any(e.kind.startswith(SAYS[kind]) and "ended" in e.text for e in self._events):
             return f"nobody has said that the {SAYS[kind]} ended"
         return ""
 
-    def _after_kill(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
-        victim = running.victim
-        if victim in eyes.alive:
+    def _after_kill(self, active: _ActiveFault, live: Set[str]) -> str:
+        victim = active.victim
+        if victim in self._observer.alive:
             return f"{victim} is dead, and its token still stands"
-        blind = [name for name in live if victim in self._hears[name] and victim not in eyes.status[name].missing]
+        blind = [
+            name for name in live if victim in self._hears[name] and victim not in self._observer.status[name].missing
+        ]
         return f"{', '.join(blind)}: not noticed that {victim} is gone" if blind else ""
 
-    def _after_bits(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+    def _after_bits(self, active: _ActiveFault, live: Set[str]) -> str:
         """Some wrong bits make Zenoh's client abort its process, which TCP's own checksum would have kept from it."""
-        victim = running.victim
-        if not running.died and "SIGABRT" in self._lost_since(running):
-            running.died, running.note = True, "its process was aborted by Zenoh"
-        if running.died:
-            up = eyes.invariants.up(victim)
-            return f"{victim} has not come down yet" if up else self._after_kill(running, injector, eyes, live)
-        return self._after_any(running, injector, eyes, live)
+        victim = active.victim
+        if not active.died and "SIGABRT" in self._lost_since(active):
+            active.died, active.note = True, "its process was aborted by Zenoh"
+        if active.died:
+            up = self._observer.invariants.in_the_air(victim)
+            return f"{victim} has not come down yet" if up else self._after_kill(active, live)
+        return self._after_any(active, live)
 
-    def _lost_since(self, running: _Running) -> str:
+    def _lost_since(self, active: _ActiveFault) -> str:
         """What the conductor has said since the fault began of the end of the victim's process; empty if nothing."""
-        ends = [e.text for e in self._events[running.events :] if e.kind == "lost" and e.source == running.victim]
+        ends = [e.text for e in self._events[active.events :] if e.kind == "lost" and e.source == active.victim]
         return "".join(ends[:1])
 
-    def _after_read_error(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
-        victim = running.victim
-        if not any(order.robot == victim and order.action in ("land", "stop") for order in eyes.orders):
+    def _after_read_error(self, active: _ActiveFault, live: Set[str]) -> str:
+        victim = active.victim
+        if not any(order.robot == victim and order.action in ("land", "stop") for order in self._observer.orders):
             return f"the body of {victim} was told neither to land nor to stop"
-        if eyes.invariants.up(victim):
+        if self._observer.invariants.in_the_air(victim):
             return f"{victim} has not come down yet"
-        if not self._lost_since(running):  # it lands for as long as a landing may take, for it sees nothing of it
+        if not self._lost_since(active):  # it lands for as long as a landing may take, for it sees nothing of it
             return f"the process of {victim} has not ended yet"
-        return self._after_kill(running, injector, eyes, live)
+        return self._after_kill(active, live)
 
-    def _after_clock_behind(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
-        victim = running.victim
-        if running.restarted is None:
-            if victim in eyes.alive or not self._lost_since(running):
+    def _after_clock_behind(self, active: _ActiveFault, live: Set[str]) -> str:
+        victim = active.victim
+        if active.restarted is None:
+            if victim in self._observer.alive or not self._lost_since(active):
                 return f"nobody has said that {victim} is lost"
             self._off.add(victim)
-            running.restarted = time.monotonic()
-            injector.restart(victim, eyes.session, eyes.keys)
-        if (why := injector.answer.reason or injector.answer.refused.get(victim)) and not self._over():
-            running.deplore(f"{victim} is not let in again: {why}")
+            active.restarted = time.monotonic()
+            self._injector.restart(victim, self._observer.session, self._observer.keys)
+        if (why := self._injector.answer.reason or self._injector.answer.refused.get(victim)) and not self._over():
+            active.add_violation(f"{victim} is not let in again: {why}")
             return ""
-        if victim not in eyes.alive:
+        if victim not in self._observer.alive:
             return f"{victim} is not back"
-        running.back = running.back or time.monotonic()
+        active.back = active.back or time.monotonic()
         deaf = [name for name in live if victim in self._hears[name]]
-        deaf = [name for name in deaf if eyes.listened.get((name, victim), 0.0) < running.restarted]
-        if deaf and time.monotonic() - running.back > DEAF_S:
-            running.deplore(f"{', '.join(deaf)}: heard nothing of {victim} in the first {DEAF_S:g} s of its new life")
+        deaf = [name for name in deaf if self._observer.received_at.get((name, victim), 0.0) < active.restarted]
+        if deaf and time.monotonic() - active.back > DEAF_S:
+            active.add_violation(
+                f"{', '.join(deaf)}: heard nothing of {victim} in the first {DEAF_S:g} s of its new life"
+            )
         if deaf or victim not in live:
             return f"{victim} does not take part yet, or is not heard by {', '.join(deaf) or 'anybody'}"
         return ""
 
-    def _after_double(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
-        victim, second = running.victim, injector.second
+    def _after_double(self, active: _ActiveFault, live: Set[str]) -> str:
+        victim, second = active.victim, self._injector.second
         assert second is not None
-        for order in eyes.orders:
+        for order in self._observer.orders:
             if order.robot == victim and not self._over():
-                running.deplore(f"the body of {victim} was told to {order.action}")
+                active.add_violation(f"the body of {victim} was told to {order.action}")
         if second.alive:
             return f"the second process of {victim} is not refused yet"
         if second.handle.returncode != REFUSED:
-            running.deplore(f"the second process of {victim}: {second.exit}, {second.tail()[-200:]}")
+            active.add_violation(f"the second process of {victim}: {second.exit}, {second.tail()[-200:]}")
         return "" if victim in live else f"{victim} is not running any more"
 
-    def _after_frozen_router(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
+    def _after_frozen_router(self, active: _ActiveFault, live: Set[str]) -> str:
         limit = self._setting.experiment.safety.link_silence_s + NOTICED_S
         free = []
         for name in live - self._off:
-            since = [each.stamp - running.utc for each in self._held(name, "router", running, eyes)]
+            since = [each.stamp - active.utc for each in self._held(name, "router", active)]
             if not since:
                 free.append(name)
             elif min(since) > limit:
-                running.deplore(f"{name} held only {min(since):.1f} s after the router had frozen")
+                active.add_violation(f"{name} held only {min(since):.1f} s after the router had frozen")
         return f"{', '.join(free)}: never held while the router was frozen" if free else ""
 
-    def _after_mocap_clock(self, running: _Running, injector: Injector, eyes: Eyes, live: Set[str]) -> str:
-        for name in eyes.status:
-            for incident in self._held(name, "position", running, eyes):
-                running.deplore(f"{name}: {incident.text}")
+    def _after_mocap_clock(self, active: _ActiveFault, live: Set[str]) -> str:
+        for name in self._observer.status:
+            for incident in self._held(name, "position", active):
+                active.add_violation(f"{name}: {incident.text}")
         return ""
 
     _after_clock = _after_mocap_clock
 
-    @staticmethod
-    def _down(name: str, eyes: Eyes) -> bool:
+    def _down(self, name: str) -> bool:
         """Whether a robot says that it comes down, or is down."""
-        status = eyes.status.get(name)
+        status = self._observer.status.get(name)
         return status is not None and status.phase in ("landing", "done")
 
-    @staticmethod
-    def _held(name: str, what: str, running: _Running, eyes: Eyes) -> list[messages.Incident]:
+    def _held(self, name: str, what: str, active: _ActiveFault) -> list[messages.Incident]:
         """Since the fault began: what made a robot hold, or worse, of which `what` is part of the words."""
-        told = running.told.get(name, 0)
-        happened = [each for each in eyes.status[name].incidents if each.seq > told and what in each.text]
+        told = active.told.get(name, 0)
+        happened = [each for each in self._observer.status[name].incidents if each.seq > told and what in each.text]
         return [each for each in happened if each.text.startswith(("hold", "land", "cut"))]
 
-    @staticmethod
-    def _absent(victim: str, eyes: Eyes, live: Set[str], lifted: float) -> str:
+    def _not_back(self, victim: str, live: Set[str], lifted: float) -> str:
         """Why a victim that lives is not back, and not down either."""
-        if eyes.heard.get(victim, 0.0) < lifted:
+        if self._observer.status_at.get(victim, 0.0) < lifted:
             return f"{victim} says nothing yet"
-        if Flight._down(victim, eyes):
-            return f"{victim} has not come down yet" if eyes.invariants.up(victim) else ""
+        if self._down(victim):
+            return f"{victim} has not come down yet" if self._observer.invariants.in_the_air(victim) else ""
         return "" if victim in live else f"{victim} is not back"
 
-    def _apart(self, eyes: Eyes, live: Set[str], since: float, t: float) -> str:
+    def _not_in_formation(self, live: Set[str], since: float, t: float) -> str:
         """Why those who live are not in formation: silent since then, missing each other, or elsewhere."""
         if not live and not self._dead:
             return "nobody is running"
         for name in live:
-            if eyes.heard.get(name, 0.0) < since:
+            if self._observer.status_at.get(name, 0.0) < since:
                 return f"{name} says nothing yet"
-            absent = [other for other in eyes.status[name].missing if other in live]
+            absent = [other for other in self._observer.status[name].missing if other in live]
             if absent:
                 return f"{name} misses {', '.join(absent)}"
-        error = eyes.invariants.deformed(live, t)
+        error = self._observer.invariants.formation_error(live, t)
         return f"a link is {error:.3f} off" if error > self._setting.experiment.tolerance else ""
 
-    def _watch_landing(self, eyes: Eyes, running: _Running) -> None:
+    def _watch_landing(self, active: _ActiveFault) -> None:
         """The conductor is dead: robots land by themselves, and everything ends."""
-        running.lifted = running.begun
-        deadline = running.begun + LANDED_S
+        active.lifted = active.begun
+        deadline = active.begun + LANDED_S
         names = set(self._setting.experiment.robots) - self._dead.keys()
         while time.monotonic() < deadline:
             time.sleep(POLL_S)
-            eyes.look()
-            running.violations += [each for each in eyes.judge() if each not in running.violations]
-            down = [eyes.status[name].phase == "done" for name in names if name in eyes.status]
-            if all(down) and not any(map(eyes.invariants.up, eyes.invariants.names)):
+            self._observer.update()
+            active.violations += [each for each in self._observer.violations() if each not in active.violations]
+            down = [self._observer.status[name].phase == "done" for name in names if name in self._observer.status]
+            if all(down) and not any(map(self._observer.invariants.in_the_air, self._observer.invariants.names)):
                 break
         else:
-            up = [name for name in eyes.invariants.names if eyes.invariants.up(name)]
-            awake = [name for name in names if name in eyes.status and eyes.status[name].phase != "done"]
-            running.violations.append(f"not well {LANDED_S:g} s later: in the air {up}, not done {awake}")
-        self._close(running, time.monotonic(), eyes)
+            up = [name for name in self._observer.invariants.names if self._observer.invariants.in_the_air(name)]
+            awake = [
+                name for name in names if name in self._observer.status and self._observer.status[name].phase != "done"
+            ]
+            active.violations.append(f"not well {LANDED_S:g} s later: in the air {up}, not done {awake}")
+        self._close(active, time.monotonic())
 
     # ------------------------------------------------------------------ the end
 
-    def _finish(self, watched: Watched) -> float:
+    def _finish(self, watched: WatchedRun) -> float:
         """Ends the run if it has not ended; how long until all its processes were gone [s]."""
         began = time.monotonic()
         if watched.process.alive:
@@ -530,15 +522,15 @@ class Flight:
             self._wrong.append(f"the run ended with exit code {code}: {' '.join(watched.said)}")
         return gone
 
-    def _missed(self, eyes: Eyes) -> float:
+    def _missed(self) -> float:
         """Share of the ticks that robots missed which nobody stopped."""
         stopped = {each.victim for each in self.outcomes} | self._dead.keys()
-        statuses = [status for name, status in eyes.status.items() if name not in stopped and status.ticks]
+        statuses = [status for name, status in self._observer.status.items() if name not in stopped and status.ticks]
         ticks, missed = (sum(getattr(status, what) for status in statuses) for what in ("ticks", "missed"))
         return round(missed / (ticks + missed), 4) if ticks else 0.0
 
     @staticmethod
-    def _sweep(watched: Watched) -> None:
+    def _sweep(watched: WatchedRun) -> None:
         """Whatever happened: nothing of the run survives the round."""
         for pid in watched.processes():
             with contextlib.suppress(ProcessLookupError):

@@ -21,29 +21,17 @@ CONDUCTOR_AFTER: Final = 3  # nothing can befall a run after the death of its la
 
 @dataclass(frozen=True)
 class Nature:
-    """What all faults of a kind have in common.
+    """What all faults of a kind have in common."""
 
-    Attributes:
-        meant: What is done, for the report.
-        lasts_s: Until it is lifted [s]; 0 if it cannot be.
-        heals_s: What it takes about until all is well again [s].
-        victim: Whether it befalls one robot; else the whole run.
-        most: In one round.
-        stage: The only one on which it can be done; "plain": on each.
-        never: A stage on which it cannot be done.
-        size: Between which numbers its size is drawn.
-        signed: Whether the size may be negative as well.
-    """
-
-    meant: str
-    lasts_s: float = 0.0
-    heals_s: float = 1.5
-    victim: bool = True
-    most: int = 1_000
-    stage: Stage = "plain"
-    never: Stage | None = None
-    size: tuple[float, float] = (0.0, 0.0)
-    signed: bool = False
+    meant: str  # what is done, for the report
+    lasts_s: float = 0.0  # until it is lifted [s]; 0 if it cannot be
+    heals_s: float = 1.5  # what it takes about until all is well again [s]
+    victim: bool = True  # whether it befalls one robot; else the whole run
+    most: int = 1_000  # in one round
+    stage: Stage = "plain"  # the only one on which it can be done; "plain": on each
+    never: Stage | None = None  # A stage on which it cannot be done
+    size: tuple[float, float] = (0.0, 0.0)  # between which numbers its size is drawn
+    signed: bool = False  # whether the size may be negative as well
 
 
 NATURES: Final[Mapping[str, Nature]] = {
@@ -108,21 +96,13 @@ KINDS: Final = tuple(NATURES)
 
 
 class Fault(msgspec.Struct, frozen=True):
-    """One fault.
+    """One fault."""
 
-    Attributes:
-        kind: What happens.
-        after_s: So long after all was well again (or, of the first, after the formation had come together) [s].
-        lasts_s: Until it is lifted [s]; 0 if it cannot be.
-        victim: A robot; if it is gone by then, the next one that is there. Empty: the whole run.
-        size: Of a delay or a step of a clock [s], of a loss as a share.
-    """
-
-    kind: str
-    after_s: float
-    lasts_s: float = 0.0
-    victim: str = ""
-    size: float = 0.0
+    kind: str  # what happens
+    after_s: float  # so long after all was well again (or, of the first, after the formation had come together) [s]
+    lasts_s: float = 0.0  # until it is lifted [s]; 0 if it cannot be
+    victim: str = ""  # A robot; if it is gone by then, the next one that is there. Empty: the whole run
+    size: float = 0.0  # of a delay or a step of a clock [s], of a loss as a share
 
     @property
     def nature(self) -> Nature:

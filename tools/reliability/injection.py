@@ -19,11 +19,9 @@ from agents.network import messages
 from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
 from experiments.real_time.hosts.launcher import Launcher, Process
-from tools.reliability import processes
 from tools.reliability.cables import GOOD, Cables, Condition
 from tools.reliability.fault_script import Fault
-from tools.reliability.processes import PROC
-from tools.reliability.run_process import Watched
+from tools.reliability.run_process import PROC, WatchedRun
 from tools.reliability.spoilt_process import Switch
 
 # which process gets which signal, if it is not a robot's, and on which robots' cables what happens
@@ -57,7 +55,7 @@ class Injector:
 
     def __init__(
         self,
-        watched: Watched,
+        watched: WatchedRun,
         launcher: Launcher,
         cables: Cables,
         folder: Path,
@@ -167,8 +165,8 @@ class Injector:
         """A second process of a name: the same command again."""
         pid = self._running(victim)[0]
         words = (PROC / str(pid) / "cmdline").read_bytes().decode().rstrip("\0").split("\0")
-        tag = [f"{name}={value}" for name, value in processes.tag(self._watched.run).items()]
-        return self._launcher.spawn(f"double-{victim}-{pid}-{time.monotonic_ns()}", ["env", *tag, *words])
+        tag = self._watched.tag
+        return self._launcher.spawn(f"double-{victim}-{pid}-{time.monotonic_ns()}", ["env", tag, *words])
 
     def _fill(self) -> str:
         """The recording may not grow any more: the recorder gets the error of a disk that is full."""

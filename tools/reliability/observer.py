@@ -3,7 +3,7 @@
 seen = Invariants(experiment)
 seen.place("CF01", (0.1, 0.2, 0.8))
 seen.violations()                          # what is wrong now, each once for as long as it lasts
-seen.deformed({"CF01", "KH01"}, t=12.0)    # the largest error of the links that live
+seen.formation_error({"CF01", "KH01"}, t=12.0)    # the largest error of the links that live
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ STEP_M: Final = 0.6  # [m] outside the arena no goal may be
 
 
 class Invariants:
-    """Robots as solids, and what they want of each other."""
+    """Robots as solids, and the links that the formation asks for."""
 
     def __init__(self, experiment: Experiment) -> None:
-        """Nothing is known of anybody yet."""
+        """No position is known yet."""
         self.names = tuple(experiment.robots)
         row = {name: number for number, name in enumerate(self.names)}
         self._row = row
@@ -65,20 +65,20 @@ class Invariants:
         self._wrong: set[str] = set()
 
     def place(self, name: str, position: tuple[float, float, float]) -> None:
-        """Where a robot really is now [m]."""
+        """Set the true position of a robot [m]."""
         self.position[self._row[name]] = position
 
     def where(self, name: str) -> Array:
-        """(3,) where it was last [m]; NaN if nobody knows."""
+        """(3,) its last true position [m]; NaN if unknown."""
         return np.asarray(self.position[self._row[name]]).copy()
 
-    def up(self, name: str) -> bool:
+    def in_the_air(self, name: str) -> bool:
         """Whether a robot is in the air."""
         row = self._row[name]
         return bool(self.flies[row] and self.position[row, 2] > DOWN_M)
 
     def violations(self) -> list[str]:
-        """What has begun to be wrong since the last call."""
+        """Violations that have begun since the last call."""
         wrong = {*self._outside(), *self._overlaps()}
         new = sorted(wrong - self._wrong)
         self._wrong = wrong
@@ -101,11 +101,11 @@ class Invariants:
         both = (level < -TOUCH_M) & (upright < -TOUCH_M)
         return [f"{self.names[first[k]]} and {self.names[second[k]]} overlap" for k in np.flatnonzero(both).tolist()]
 
-    def deformed(self, live: Collection[str], t: float) -> float:
+    def formation_error(self, live: Collection[str], t: float) -> float:
         """The largest error of the links between robots that live [m, or rad of a direction]; 0 without any.
 
         Args:
-            live: Who is under way.
+            live: Robots that are under way.
             t: Since the common start [s].
         """
         here = np.array([name in live for name in self.names])
@@ -126,8 +126,8 @@ class Invariants:
         error = np.where(np.isnan(error), np.inf, error)
         return float(error[there].max())
 
-    def insane(self, command: Command) -> str:
-        """What is wrong with a command to a body; empty if nothing is."""
+    def invalid_command(self, command: Command) -> str:
+        """The fault of a command to a body; empty if it has none."""
         if command.action != "drive":
             return ""
         setpoint = np.array(command.setpoint or (np.nan,) * 4)
@@ -143,28 +143,12 @@ class Invariants:
         return f"{command.robot} is told {command.setpoint}" if bad else ""
 
 
-class Eyes:
-    """Looks, and keeps what was said last.
-
-    Attributes:
-        session: Of the laboratory.
-        keys: Of the realm.
-        invariants: Fed with where robots really are.
-        status: The last of each robot, and `heard` when it came (monotonic [s]).
-        heard: See `status`.
-        alive: Whose token stands.
-        truth: When the true place of each robot was last heard (monotonic [s]).
-        told: The last command to each body, and when it came.
-        orders: Commands to bodies that were not to drive, since whoever reads it emptied it.
-        listened: When a listener last said that it heard a speaker (monotonic [s]), by both.
-        wrong: Violations that have been seen since the last `judge`.
-        connected: Whether a router is there.
-    """
+class Observer:
+    """Receives what robots, bodies and world send, and checks the invariants on it."""
 
     def __init__(self, session: zenoh.Session, experiment: Experiment) -> None:
-        keys = self.keys = Keys(experiment.network.realm)
-        self._session = session
         self.session = session
+        keys = self.keys = Keys(experiment.network.realm)
         self.invariants = Invariants(experiment)
         self._statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
         self._states = pubsub.subscriber(session, keys.state("*"), 8192)
@@ -172,36 +156,34 @@ class Eyes:
         self._commands = pubsub.subscriber(session, keys.setpoint("*"), 8192)
         self._contacts = pubsub.subscriber(session, keys.contact, 1024)
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
+        # the last of each robot, and when it came; all times are monotonic [s]
         self.status: dict[str, messages.Status] = {}
-        self.heard: dict[str, float] = {}
-        self.alive: set[str] = set()
-        self.truth: dict[str, float] = {}
-        self.told: dict[str, tuple[messages.Command, float]] = {}
-        self.orders: list[messages.Command] = []
-        self.listened: dict[tuple[str, str], float] = {}
-        self.wrong: list[str] = []
-        self.connected = True
+        self.status_at: dict[str, float] = {}
+        self.command: dict[str, tuple[messages.Command, float]] = {}  # to each body, and when it came
+        self.alive: set[str] = set()  # robots whose token stands
+        self.orders: list[messages.Command] = []  # commands other than "drive", since the list was emptied
+        self.received_at: dict[tuple[str, str], float] = {}  # when (receiver, sender) last reported a pose
+        self.wrong: list[str] = []  # violations since the last `violations`
+        self.connected = True  # a router is there
 
-    def look(self) -> None:
-        """Takes in what was said since the last look."""
+    def update(self) -> None:
+        """Take in what was received since the last update."""
         now, names = time.monotonic(), self.invariants.names
-        self.connected = network.connected(self._session)
+        self.connected = network.connected(self.session)
         for status in by_robots(self._statuses.handler, messages.Status, keys=self.keys, robots=names):
-            self.status[status.robot], self.heard[status.robot] = status, now
+            self.status[status.robot], self.status_at[status.robot] = status, now
         for truth in by_robots(self._truths.handler, messages.Position, keys=self.keys, robots=names):
             self.invariants.place(truth.robot, truth.position)
-            self.truth[truth.robot] = now
         for state in by_robots(self._states.handler, messages.State, keys=self.keys, robots=names):
-            self.listened |= {(state.robot, heard.speaker): now for heard in state.heard}
+            self.received_at |= {(state.robot, heard.speaker): now for heard in state.heard}
             if state.true_position is not None:
                 self.invariants.place(state.robot, state.true_position)
-                self.truth[state.robot] = now
         for command in by_robots(self._commands.handler, messages.Command, keys=self.keys, robots=names):
-            self.told[command.robot] = command, now
+            self.command[command.robot] = command, now
             if command.action != "drive":
                 self.orders.append(command)
-            if insane := self.invariants.insane(command):
-                self.wrong.append(insane)
+            if invalid := self.invariants.invalid_command(command):
+                self.wrong.append(invalid)
         for sample in network.received(self._contacts.handler):
             with suppress(messages.Malformed):  # of our own making, as often as not
                 contact = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Contact)
@@ -213,19 +195,15 @@ class Eyes:
                 (self.alive.discard if sample.kind == zenoh.SampleKind.DELETE else self.alive.add)(name)
         self.wrong += self.invariants.violations()
 
-    def judge(self) -> list[str]:
+    def violations(self) -> list[str]:
         """Violations since the last call, each once."""
         found, self.wrong = list(dict.fromkeys(self.wrong)), []
         return found
 
     def running(self) -> set[str]:
-        """Robots that say that they run the experiment, and are there."""
+        """Robots whose phase is `running` and whose token stands."""
         return {name for name, status in self.status.items() if status.phase == "running" and name in self.alive}
 
-    def where(self) -> dict[str, Array]:
-        """Where everybody is."""
-        return {name: self.invariants.where(name) for name in self.invariants.names}
-
     def moved(self, name: str, before: Array) -> float:
-        """How far a robot is from where it was, seen from above [m]."""
+        """Horizontal distance of a robot from an earlier position [m]."""
         return float(np.linalg.norm((self.invariants.where(name) - before)[:2]))

@@ -1,27 +1,30 @@
-"""A run in a process of its own, for those that watch runs: `python -m tools.reliability.run_process FILE FOLDER`.
+"""A run in a process of its own, for those that watch runs: `python -m tools.reliability.run_process REQUEST`.
 
-Each event of the conductor is a line of JSON on standard output. Standard input is the lifeline: when it is lost,
-everybody lands.
+The request is a struct as JSON. Each event of the conductor is a line of JSON on standard output. Standard input is the
+lifeline: when it is lost, all robots land.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+import contextlib
+import os
+import resource
 import secrets
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final, Self
+
+import msgspec
 
 from agents.network import lab, messages
 from agents.network import session as network
 from agents.network.endpoints import EndpointError
 from agents.runtime.command_line import told_to_end
 from agents.runtime.lifeline import Lifeline
-from experiments.definition.bodies import BODIES
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.conduct import RunOptions, conduct
@@ -29,19 +32,34 @@ from experiments.real_time.conductor.conductor import RunFailed
 from experiments.real_time.conductor.run_view import Emergency, News, Progress
 from experiments.real_time.conductor.support import StandInError
 from experiments.real_time.hosts.hosts import HostError
-from experiments.real_time.hosts.launcher import Launcher, Process
-from tools.reliability import processes, spoilt_process
-from tools.reliability.processes import ROBOT
+from experiments.real_time.hosts.launcher import RUN, Launcher, Process
+from tools.reliability import spoilt_process
+from tools.reliability.spoilt_process import ROBOT, role_of
+
+PAGE: Final = resource.getpagesize()
+TICKS: Final = os.sysconf("SC_CLK_TCK")
+PROC: Final = Path("/proc")
+NAME: Final = "conductor"
+END_S: Final = 45.0  # landing, recording and router of an interrupted run
+EXPLAINED: Final = (DocumentError, HostError, RunFailed, StandInError, lab.LabError, EndpointError, network.Unreachable)
 
 
-class Cabled(Launcher):
+class Request(msgspec.Struct):
+    """A run in real time."""
+
+    file: str  # experiment file, or a name of the catalogue
+    folder: str  # for recordings and logs; it exists
+    case: str
+    changes: list[str] = []  # as behind `--set`
+    bodies: str | None = None  # as behind `--bodies`
+    cables: dict[str, dict[str, str]] = {}  # for each process of robots, its endpoint in place of each router's
+    switches: str | None = None  # folder, with which `tools.reliability.spoilt_process` spoils processes
+
+
+class CabledLauncher(Launcher):
     """Starts robots that find their routers at the ends of cables of their own, and processes that can be spoiled."""
 
-    def __init__(self, cables: Mapping[str, Mapping[str, str]], switches: Path | None, logs: Path) -> None:
-        """`cables` has, for each process of robots, the endpoint to use instead of each router's.
-
-        `switches` is for `tools.reliability.spoilt_process`; None: processes are as they are.
-        """
+    def __init__(self, cables: Mapping[str, Mapping[str, str]], switches: str | None, logs: Path) -> None:
         super().__init__(logs)
         self._cables, self._switches = cables, switches
 
@@ -51,12 +69,12 @@ class Cabled(Launcher):
         if module == ROBOT:
             arguments = tuple(own.get(word, word) for word in arguments)
         if self._switches is not None:
-            module, arguments = spoilt_process.MODULE, (str(self._switches), module, *arguments)
+            module, arguments = spoilt_process.MODULE, (self._switches, module, *arguments)
         return super().start(name, module, *arguments)
 
 
-class Told:
-    """Prints each event once."""
+class EventLines:
+    """Prints each event once, as a line of JSON."""
 
     def __init__(self) -> None:
         self._news = News()
@@ -64,113 +82,51 @@ class Told:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        return None
+    def __exit__(self, *_: object) -> None: ...
 
     def __call__(self, progress: Progress) -> None:
-        """Prints what is new."""
+        """Print new events."""
         if events := self._news.of(progress):
             sys.stdout.buffer.write(b"".join(messages.encode(event) + b"\n" for event in events))
             sys.stdout.buffer.flush()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line of the process."""
-    parser = argparse.ArgumentParser(prog="zenpark unattended", description="Runs an experiment in real time.")
-    parser.add_argument("file", help="experiment file, or a name of the catalogue")
-    parser.add_argument("folder", type=Path, help="where recordings and logs go; it exists")
-    parser.add_argument("--case", action="append", default=[], metavar="NAME", help="only this case")
-    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", dest="changes")
-    parser.add_argument("--bodies", choices=BODIES, help="what every robot is put into")
-    parser.add_argument("--cables", type=Path, help="JSON: for each process of robots, where it finds each router")
-    parser.add_argument(
-        "--switches", type=Path, help="folder, with which `tools.reliability.spoilt_process` spoils processes"
-    )
-    chosen = parser.parse_args(arguments)
-    cables: dict[str, dict[str, str]] = json.loads(chosen.cables.read_text("utf-8")) if chosen.cables else {}
+def main() -> int:
+    """Run the request of the command line."""
+    request = msgspec.json.decode(sys.argv[1], type=Request)
     over = threading.Event()
     Lifeline(over).start()
     try:
-        read = load(chosen.file, *chosen.changes)
         with told_to_end(over.set):
             conduct(
-                read,
-                chosen.folder,
-                RunOptions(cases=chosen.case, bodies=chosen.bodies, here=True),
-                show=Told(),
+                load(request.file, *request.changes),
+                Path(request.folder),
+                RunOptions(cases=[request.case], bodies=request.bodies, here=True),
+                show=EventLines(),
                 interrupted=over.is_set,
                 emergency=Emergency(),
-                launching=partial(Cabled, cables, chosen.switches),
+                launching=partial(CabledLauncher, request.cables, request.switches),
             )
-    except (
-        DocumentError,
-        HostError,
-        RunFailed,
-        StandInError,
-        lab.LabError,
-        EndpointError,
-        network.Unreachable,
-    ) as error:
+    except EXPLAINED as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+class WatchedRun:
+    """A run in a process of its own, and its events."""
 
-
-NAME: Final = "conductor"
-END_S: Final = 45.0  # landing, recording and router of an interrupted run
-
-
-class Watched:
-    """One such run.
-
-    Attributes:
-        run: The tag of all its processes.
-        process: Of the conductor.
-    """
-
-    def __init__(
-        self,
-        launcher: Launcher,
-        file: Path,
-        folder: Path,
-        *,
-        cases: Sequence[str] = (),
-        changes: Sequence[str] = (),
-        bodies: str | None = None,
-        cables: Path | None = None,
-        switches: Path | None = None,
-    ) -> None:
-        """Starts it.
-
-        Args:
-            launcher: Holds its lifeline.
-            file: The experiment.
-            folder: Where its recordings and logs go; it exists.
-            cases: Of the file; all if none is named.
-            changes: As behind `--set`.
-            bodies: As behind `--bodies`.
-            cables: Where robots find their routers (`tools.reliability.run_process`).
-            switches: With which its processes can be spoiled (`tools.reliability.spoilt_process`).
-        """
+    def __init__(self, launcher: Launcher, request: Request) -> None:
+        """Start it; `launcher` holds its lifeline."""
         self._launcher = launcher
-        self.run = secrets.token_hex(8)
-        spoilt = [] if switches is None else [spoilt_process.MODULE, str(switches)]
-        words = [sys.executable, "-m", *spoilt, "tools.reliability.run_process", str(file), str(folder)]
-        words += [part for case in cases for part in ("--case", case)]
-        words += [part for change in changes for part in ("--set", change)]
-        words += ["--bodies", bodies] if bodies is not None else []
-        words += ["--cables", str(cables)] if cables is not None else []
-        words += ["--switches", str(switches)] if switches is not None else []
-        variables = [f"{name}={value}" for name, value in processes.tag(self.run).items()]
-        self.process: Process = launcher.spawn(NAME, ["env", *variables, *words])
-        self.said: list[str] = []
+        self.tag = f"{RUN}={secrets.token_hex(8)}"  # in the environment of all its processes
+        spoilt = [] if request.switches is None else [spoilt_process.MODULE, request.switches]
+        words = [sys.executable, "-m", *spoilt, "tools.reliability.run_process", msgspec.json.encode(request).decode()]
+        self.process: Process = launcher.spawn(NAME, ["env", self.tag, *words])
+        self.said: list[str] = []  # lines that were no events
 
     def news(self) -> Iterator[messages.Event]:
-        """Events since the last call; other lines are kept in `said`."""
+        """Events since the last call."""
         for line in self.process.news():
             try:
                 yield messages.decode(line.encode(), messages.JSON, messages.Event)
@@ -178,14 +134,51 @@ class Watched:
                 self.said.append(line)
 
     def processes(self) -> dict[int, str]:
-        """All of it that runs now, and what each is."""
-        return processes.of_run(self.run)
+        """All processes of the run, with their roles."""
+        return _tagged(self.tag)
 
     def close(self) -> None:
-        """Asks it to end, as the death of whoever holds the lifeline does, and does not wait."""
+        """Cut the lifeline, as the death of its holder does, and do not wait."""
         assert self.process.handle.stdin is not None
         self.process.handle.stdin.close()
 
     def end(self) -> None:
-        """Robots land, and everything ends."""
+        """Land the robots and end all processes."""
         self._launcher.end([NAME], grace_s=END_S)
+
+
+def _tagged(tag: str) -> dict[int, str]:
+    """Processes with NAME=VALUE in their environment that still run, with their roles; zombies are gone."""
+    mark, found = tag.encode(), {}
+    for folder in PROC.glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # another user's, or gone meanwhile
+            if mark in (folder / "environ").read_bytes().split(b"\0"):
+                words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
+                found[int(folder.name)] = role_of(words)
+    return found
+
+
+@dataclass(frozen=True)
+class Usage:
+    """Resources of a process."""
+
+    rss_mb: float  # resident memory [MB]
+    threads: int
+    files: int  # open file descriptors
+    cpu_s: float  # CPU time since it began [s]
+
+
+def usage_of(pid: int) -> Usage | None:
+    """Resources of a process; None if it is gone."""
+    folder = PROC / str(pid)
+    try:
+        fields = (folder / "stat").read_bytes().rpartition(b")")[2].split()
+        files = sum(1 for _ in (folder / "fd").iterdir())
+    except OSError:
+        return None
+    # counted from the state, which is field 3 of proc_pid_stat(5): utime 14, stime 15, num_threads 20, rss 24
+    return Usage(int(fields[21]) * PAGE / 1e6, int(fields[17]), files, (int(fields[11]) + int(fields[12])) / TICKS)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

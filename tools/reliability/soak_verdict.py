@@ -35,39 +35,23 @@ THICK: Final = {"router": "#0072b2", "recorder": "#d55e00", "conductor": "#009e7
 
 
 class Row(msgspec.Struct, frozen=True):
-    """One process at one time; what only robots have is None of the others.
+    """One process at one time; what only robots have is None of the others."""
 
-    Attributes:
-        time_s: From the common start [s].
-        process: A robot's name, "router", "recorder", "conductor".
-        rss_mb: Resident memory [MB].
-        threads: How many.
-        files: Open file descriptors.
-        cpu_s: CPU time since its begin [s].
-        recording_mb: Size of the recording, of the recorder.
-        lost: Poses of its neighbours that never came.
-        missed: Ticks that it missed, of `ticks`.
-        ticks: See `missed`.
-        malformed: Payloads that it refused.
-        heard: Poses that it heard since the sample before; `delay_s` is the median from speaker to listener [s].
-        delay_s: See `heard`.
-        longest_s: The largest delay [s].
-    """
-
-    time_s: float
-    process: str
-    rss_mb: float
-    threads: int
-    files: int
-    cpu_s: float
-    recording_mb: float | None = None
-    lost: int | None = None
-    missed: int | None = None
-    ticks: int | None = None
-    malformed: int | None = None
+    time_s: float  # from the common start [s]
+    process: str  # A robot's name, "router", "recorder", "conductor"
+    rss_mb: float  # resident memory [MB]
+    threads: int  # how many
+    files: int  # open file descriptors
+    cpu_s: float  # CPU time since its begin [s]
+    recording_mb: float | None = None  # size of the recording, of the recorder
+    lost: int | None = None  # poses of its neighbours that never came
+    missed: int | None = None  # ticks that it missed, of `ticks`
+    ticks: int | None = None  # see `missed`
+    malformed: int | None = None  # payloads that it refused
+    # poses that it heard since the sample before; `delay_s` is the median from speaker to listener [s]
     heard: int | None = None
-    delay_s: float | None = None
-    longest_s: float | None = None
+    delay_s: float | None = None  # see `heard`
+    longest_s: float | None = None  # the largest delay [s]
 
 
 COLUMNS: Final = tuple(each.name for each in msgspec.structs.fields(Row))
@@ -75,25 +59,15 @@ COLUMNS: Final = tuple(each.name for each in msgspec.structs.fields(Row))
 
 @dataclass(frozen=True)
 class Soaked:
-    """What was sampled.
+    """What was sampled."""
 
-    Attributes:
-        title: Of the experiment.
-        robots: That should have lived.
-        duration_s: That it should have lasted from the common start on.
-        rows: In order of time.
-        exit: Of the conductor's process.
-        died: Who ended before the end, and when [s].
-        interrupted: Whether the user ended it.
-    """
-
-    title: str
-    robots: tuple[str, ...]
-    duration_s: float
-    rows: Sequence[Row]
-    exit: int | None
-    died: dict[str, float]
-    interrupted: bool = False
+    title: str  # of the experiment
+    robots: tuple[str, ...]  # that should have lived
+    duration_s: float  # that it should have lasted from the common start on
+    rows: Sequence[Row]  # in order of time
+    exit: int | None  # of the conductor's process
+    died: dict[str, float]  # who ended before the end, and when [s]
+    interrupted: bool = False  # whether the user ended it
 
     def of(self) -> dict[str, list[Row]]:
         """The rows of each process."""
@@ -110,15 +84,10 @@ class Soaked:
 
 @dataclass(frozen=True)
 class Ends:
-    """A process at both ends of what counts.
+    """A process at both ends of what counts."""
 
-    Attributes:
-        first: Rows of the first window, and `last` those of the last.
-        last: See `first`.
-    """
-
-    first: Sequence[Row]
-    last: Sequence[Row]
+    first: Sequence[Row]  # rows of the first window, and `last` those of the last
+    last: Sequence[Row]  # see `first`
 
     def growth(self, what: Callable[[Row], float]) -> float:
         """Of the median, as a share of the first."""

@@ -23,10 +23,31 @@ from pathlib import Path
 from typing import Final
 
 from agents.clock import READING
-from tools.reliability import processes
 
 MODULE: Final = "tools.reliability.spoilt_process"
 _NUMBER: Final = struct.Struct("d")
+ROLES: Final = {  # by the module that a process runs
+    "agents.runtime.router": "router",
+    "experiments.real_time.processes.recorder": "recorder",
+    "experiments.real_time.processes.world": "world",
+    "experiments.real_time.processes.centre": "centre",
+    "tools.reliability.run_process": "conductor",
+    "bridges.vicon.publisher": "positioning",
+}
+ROBOT: Final = "experiments.real_time.processes.robot"
+OTHER: Final = "other"
+
+
+def role_of(words: Sequence[str]) -> str:
+    """Role of a process by its command line: a robot's name, "router", "recorder", "conductor", ..."""
+    for module, name in ROLES.items():
+        if module in words:
+            return name
+    if ROBOT in words:
+        names = words[words.index(ROBOT) + 2 :]
+        end = next((place for place, word in enumerate(names) if word.startswith("--") or not word), len(names))
+        return "+".join(names[:end])
+    return OTHER
 
 
 class Switch:
@@ -52,7 +73,7 @@ class Switch:
 
 def spoil(folder: Path, words: Sequence[str]) -> None:
     """Puts the switches of a folder between this process and what it will run."""
-    role = processes.role(words)
+    role = role_of(words)
     utc, everyone, own = time.time, Switch(folder / "clock"), Switch(folder / f"clock-{role}")
     time.time = lambda: utc() + everyone.read() + own.read()
     if own.read():  # a computer of its own
@@ -60,7 +81,7 @@ def spoil(folder: Path, words: Sequence[str]) -> None:
         os.environ.pop(READING, None)
     if role == "router":
         _announce(Switch(folder / "lease").read())
-    elif processes.ROBOT in words:
+    elif ROBOT in words:
         _break_body([Switch(folder / f"read-{name}") for name in role.split("+")])
 
 

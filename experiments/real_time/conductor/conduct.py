@@ -39,22 +39,15 @@ from experiments.recording.run_folder import SOURCE
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How an experiment is put on, as far as its file leaves that open.
+    """How an experiment is put on, as far as its file leaves that open."""
 
-    Attributes:
-        cases: Which of its cases; all if none is named.
-        bodies: What every robot is put into instead of the body that the file gives it: "twin", "world", or
-            "protocol" for its real bridge and a protocol twin.
-        here: Whether all robots run on this machine, whatever the file says of hosts.
-        lab: Folder of certificates, instead of the file's.
-        identity: Whose certificate the conductor shows, in a lab: an operator's.
-    """
-
-    cases: Sequence[str] = ()
+    cases: Sequence[str] = ()  # which of its cases; all if none is named
+    # what every robot is put into instead of the body that the file gives it: "twin", "world", or "protocol" for its
+    # real bridge and a protocol twin
     bodies: str | None = None
-    here: bool = False
-    lab: str | None = None
-    identity: str = "operator"
+    here: bool = False  # whether all robots run on this machine, whatever the file says of hosts
+    lab: str | None = None  # folder of certificates, instead of the file's
+    identity: str = "operator"  # whose certificate the conductor shows, in a lab: an operator's
 
 
 def conduct(

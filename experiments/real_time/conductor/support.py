@@ -31,16 +31,11 @@ class StandInError(RuntimeError):
 
 @dataclass(frozen=True)
 class StandIns:
-    """What was started.
+    """What was started."""
 
-    Attributes:
-        experiment: With the addresses at which robots are.
-        names: Of the processes.
-        positioning: The process that says where robots are, by name, and what starts it again; None: there is none.
-    """
-
-    experiment: Experiment
-    names: tuple[str, ...]
+    experiment: Experiment  # with the addresses at which robots are
+    names: tuple[str, ...]  # of the processes
+    # the process that says where robots are, by name, and what starts it again; None: there is none
     positioning: tuple[str, Callable[[], Process]] | None
 
 
@@ -201,16 +196,11 @@ class Servants:
 
 @dataclass(frozen=True)
 class Router:
-    """A router of our own.
+    """A router of our own."""
 
-    Attributes:
-        name: Of its process.
-        listen: Where it listens.
-        link: The routers before it, which it seeks for as long as it lives, so that any two are linked once.
-    """
-
-    name: str
-    listen: Sequence[str]
+    name: str  # of its process
+    listen: Sequence[str]  # where it listens
+    # the routers before it, which it seeks for as long as it lives, so that any two are linked once
     link: Sequence[str] = ()
 
     def start(self, launcher: Launcher, rights: Path | None = None) -> None:
