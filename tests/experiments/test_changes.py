@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+import zenoh
 
 from agents.decision.lifecycle import Phase
-from agents.network import messages
+from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from experiments.definition.experiment import Experiment, Robot
 from experiments.file import document
@@ -74,9 +75,12 @@ class View:
         self._stage, self.robots, self.clock = stage, stage.robots, stage.clock
         self.waiting: deque[Query] = deque()
         self.orders = self
-        self.handler = self
+        self._queries, self._kind, self.malformed = self, messages.RunOrder, 0
         self.given: list[tuple[str, str]] = []
         self.said: list[tuple[str, str, str]] = []
+
+    def read(self) -> Iterator[tuple[zenoh.Query, messages.RunOrder]]:
+        return pubsub.Orders.read(self)  # type: ignore[arg-type]
 
     def try_recv(self) -> Query | None:
         return self.waiting.popleft() if self.waiting else None
