@@ -85,7 +85,7 @@ class View:
     def try_recv(self) -> Query | None:
         return self.waiting.popleft() if self.waiting else None
 
-    def say(self, kind: str, source: str, text: str) -> None:
+    def report(self, kind: str, source: str, text: str) -> None:
         self.said.append((kind, source, text))
 
     def order(self, names: Sequence[str], order: messages.Order) -> dict[str, messages.Reply]:
@@ -183,7 +183,7 @@ class Stage:
         self.crew.running.discard(name)
         self.robots[name].alive = False
         if not self.changes.expects(name, "its process ended"):
-            self.changes.lose(name)
+            self.changes.mark_lost(name)
 
     def ask(self, what: messages.ChangeKind, *names: str, **more: Any) -> Query:
         query = Query(messages.encode(messages.RunOrder(what, list(names), **more)))
@@ -192,7 +192,7 @@ class Stage:
 
     def go_on(self, seconds: float = 1.0) -> None:
         for _ in range(round(seconds / 0.5)):
-            self.changes.go_on()
+            self.changes.advance()
             self.clock.now += 0.5
 
     def after(self, query: Query, seconds: float = 1.0) -> messages.RunReply:

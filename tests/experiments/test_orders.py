@@ -11,7 +11,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
-from experiments.real_time.conductor.run_view import Overview, Progress, RobotView
+from experiments.real_time.conductor.run_view import NetworkView, Progress, RobotView
 from tests.conftest import RouterProcess
 from tests.experiments.recordings import START, status
 
@@ -46,7 +46,7 @@ def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProc
         thread = threading.Thread(target=answer)
         thread.start()
         try:
-            replies = orders.give(conductor, KEYS, [*names, "D"], messages.Order("hold"), 20.0)
+            replies = orders.send_order(conductor, KEYS, [*names, "D"], messages.Order("hold"), 20.0)
         finally:
             over.set()
             thread.join()
@@ -56,18 +56,18 @@ def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProc
 
 
 def test_when_a_robot_began_is_its_first_status_of_the_experiment() -> None:
-    view = Overview.__new__(Overview)
+    view = NetworkView.__new__(NetworkView)
     view.clock = Clock()
     view._progress = Progress("case", "running", None, 1.0, {"TB01": RobotView()})
     view.robots = view._progress.robots
-    view.say = lambda *_, **__: None  # type: ignore[method-assign]
+    view.report = lambda *_, **__: None  # type: ignore[method-assign]
     for phase, at in (("airborne", -0.1), ("running", 0.28), ("running", 1.28), ("landing", 2.0)):
         said = status(at=at)
-        view._heed(
+        view._receive_status(
             messages.decode(
                 messages.encode(said).replace(b'"run"', f'"{phase}"'.encode()), messages.JSON, messages.Status
             )
         )
     assert view.robots["TB01"].began == START + 0.28
-    view.robots["TB01"].forget()
+    view.robots["TB01"].forget_process()
     assert view.robots["TB01"].began is None

@@ -8,7 +8,7 @@ import pytest
 from agents.runtime import run_registry
 from experiments.definition.experiment import Formation, Host, Robot
 from experiments.file.problems import DocumentError
-from experiments.real_time.conductor.conduct import beside, hardware
+from experiments.real_time.conductor.conduct import check_other_runs, hardware
 from tests.agents.few import pair
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
@@ -58,13 +58,13 @@ def test_hardware_that_another_run_has_is_refused(
     monkeypatch.setattr(run_registry, "born", lambda _pid: "another")
     if not refused:
         same = sorted(mine.keys() & theirs.keys())
-        assert beside(me, [me, other], "x.toml") == [
+        assert check_other_runs(me, [me, other], "x.toml") == [
             f"another run is up with robots of these names ({name}): there, /runs/other, at tcp/127.0.0.1:7448"
             for name in same
         ]
         return
     with pytest.raises(DocumentError) as caught:
-        beside(me, [me, other], "x.toml")
+        check_other_runs(me, [me, other], "x.toml")
     (problem,) = caught.value.problems
     (name, body), *_ = mine.items()
     assert problem.message == f"{name} ({body}) is in another run, there, /runs/other, at tcp/127.0.0.1:7448"
@@ -72,4 +72,4 @@ def test_hardware_that_another_run_has_is_refused(
 
 
 def test_a_run_that_has_died_has_nothing() -> None:
-    assert beside(run({"CF01": RADIO}), [run({"CF01": RADIO}, born="long ago")], "x.toml") == []
+    assert check_other_runs(run({"CF01": RADIO}), [run({"CF01": RADIO}, born="long ago")], "x.toml") == []

@@ -197,7 +197,7 @@ def conductor() -> Iterator[Target]:
 
         def take(data: bytes) -> None:
             net.deliver(data, gone=len(data) % 16 == 0)
-            made._look()
+            made._update()
 
         return take
 
@@ -286,8 +286,8 @@ def answers() -> Iterator[Target]:
         kind = mime.decode("utf-8", "replace")
         made = [Sample(key.decode("utf-8", "replace"), kind, payload)]
         net.replies = [Reply(sample, good=len(data) % 8 > 0) for sample in made]
-        assert isinstance(orders.give(net.session, KEYS, ["KH01"], wire.Order("hold"))["KH01"], wire.Reply)  # type: ignore[arg-type]
-        assert isinstance(orders.give_world(net.session, KEYS, wire.WorldOrder("pause")), wire.WorldReply)  # type: ignore[arg-type]
+        assert isinstance(orders.send_order(net.session, KEYS, ["KH01"], wire.Order("hold"))["KH01"], wire.Reply)  # type: ignore[arg-type]
+        assert isinstance(orders.send_world_order(net.session, KEYS, wire.WorldOrder("pause")), wire.WorldReply)  # type: ignore[arg-type]
         assert readable(payload, kind).isprintable()
         for member in members(net.session):  # type: ignore[arg-type]
             msgspec.json.encode(member)

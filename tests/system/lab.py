@@ -111,7 +111,7 @@ class Watcher(Looking):
         return self.status[robot].phase if robot in self.status else ""
 
     def order(self, robot: str, order: messages.Order) -> messages.Reply:
-        return orders.give(self.session, self.keys, [robot], order, PATIENCE_S)[robot]
+        return orders.send_order(self.session, self.keys, [robot], order, PATIENCE_S)[robot]
 
     def close(self) -> None:
         self.session.close()  # type: ignore[no-untyped-call]

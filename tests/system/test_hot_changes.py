@@ -62,7 +62,7 @@ class Lab:
 
     def change(self, what: messages.ChangeKind, *names: str, **more: object) -> messages.RunReply:
         order = messages.RunOrder(what, list(names), **more)  # type: ignore[arg-type]
-        return orders.give_run(self.watcher.session, self.watcher.keys, order)
+        return orders.send_run_order(self.watcher.session, self.watcher.keys, order)
 
     def zenpark(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         return zenpark("robot", *arguments, "--connect", self.endpoint)

@@ -187,7 +187,7 @@ def test_nobody_speaks_for_a_robot_or_stops_everybody(laboratory: Laboratory, wh
 )
 def test_orders_are_the_operators(laboratory: Laboratory, who: str) -> None:
     with laboratory.session(who) as session:
-        reply = orders.give(session, KEYS, ["CF01"], messages.Order("land"))["CF01"]
+        reply = orders.send_order(session, KEYS, ["CF01"], messages.Order("land"))["CF01"]
         assert (reply.ok, reply.reason) == (False, "no answer")
         for key in ("park/*/order", "park/**", "park/CF01/*", "**"):
             assert not list(
@@ -216,7 +216,7 @@ def test_robots_are_changed_by_operators_only(laboratory: Laboratory, who: str) 
     order = messages.RunOrder("remove", ["CF01"], who="operator")
     with laboratory.session(who) as session:
         false = pubsub.Orders(session, KEYS.run_order, messages.RunOrder)
-        reply = orders.give_run(laboratory.watcher.session, KEYS, order, 0.5)
+        reply = orders.send_run_order(laboratory.watcher.session, KEYS, order, 0.5)
         assert "no conductor answers" in reply.reason
         assert not list(false.read()), "and it does not even hear of it"
         false.close()

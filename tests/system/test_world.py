@@ -85,7 +85,7 @@ class Desk(Looking):
         return list(self.at[name].position)
 
     def give(self, order: str, **fields: object) -> messages.WorldReply:
-        return orders.give_world(self.session, KEYS, messages.WorldOrder(order, **fields))  # type: ignore[arg-type]
+        return orders.send_world_order(self.session, KEYS, messages.WorldOrder(order, **fields))  # type: ignore[arg-type]
 
     def tell(self, name: str, action: str, **fields: object) -> None:
         self._seq += 1

@@ -317,7 +317,7 @@ class _Park:
         from experiments.real_time.conductor import orders  # noqa: PLC0415
 
         kinds: dict[str, messages.OrderKind] = {"takeoff": "takeoff", "start": "start"}
-        for name, reply in orders.give(
+        for name, reply in orders.send_order(
             self._session, self._keys, self._names, messages.Order(kinds[what], at=at)
         ).items():
             if not reply.ok:

@@ -162,7 +162,7 @@ def stations(
 
     from agents.network.endpoints import free_endpoint
     from experiments.definition import endpoints
-    from experiments.real_time.conductor.conduct import enforced
+    from experiments.real_time.conductor.conduct import write_rights
     from experiments.real_time.conductor.support import start_router
     from experiments.real_time.hosts.hosts import HostError, Station
     from experiments.real_time.hosts.launcher import Launcher
@@ -176,7 +176,7 @@ def stations(
         elif network.connect is None:
             own = network.listen or [free_endpoint(protocol="tls" if secure else "tcp")]
             routers = endpoints.routers(experiment, read.path, own, lab)
-            start_router(launcher, routers, enforced(read.cases().values(), routers, Path(folder)))
+            start_router(launcher, routers, write_rights(read.cases().values(), routers, Path(folder)))
         else:
             routers = endpoints.routers(experiment, read.path, network.connect, lab)
         begun: list[Station | HostError] = []

@@ -82,8 +82,8 @@ def order(
             print(f"zenpark: no robot is there in the realm '{realm}'; `zenpark keys` shows who is", file=sys.stderr)
             return 2
         receivers = robots or sorted(alive)
-        at = time.time() + orders.lead(len(receivers)) if what == "start" else None
-        replies = orders.give(session, keys, receivers, messages.Order(what, at=at))  # type: ignore[arg-type]
+        at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
+        replies = orders.send_order(session, keys, receivers, messages.Order(what, at=at))  # type: ignore[arg-type]
     for robot, reply in replies.items():
         print(f"{robot}: {'yes' if reply.ok else 'no'}, {reply.phase}" + (f": {reply.reason}" if reply.reason else ""))
     return int(not all(reply.ok for reply in replies.values()))
@@ -127,7 +127,7 @@ def world_order(
             raise WorldOrderError(f"{name or 'the obstacle'} has no place; say where, with --at X Y")
     order = messages.WorldOrder(what, steps=steps, name=name, kind=kind, at=at, yaw=yaw, obstacle=given)  # type: ignore[arg-type]
     with _session("world-order", connect, lab, identity) as session:
-        reply = orders.give_world(session, Keys(realm), order)
+        reply = orders.send_world_order(session, Keys(realm), order)
     if not reply.ok:
         print(f"no: {reply.reason}", file=sys.stderr)
         return 1
@@ -167,7 +167,7 @@ def _change(order: messages.RunOrder, connect: list[str] | None, realm: str, lab
     from tools.commands.network import printable
 
     with _session("zenpark robot", connect, lab, order.who) as session:
-        reply = orders.give_run(session, Keys(realm), order)
+        reply = orders.send_run_order(session, Keys(realm), order)
     if reply.reason:
         print(f"zenpark: {printable(reply.reason)}", file=sys.stderr)
         return 2

@@ -36,7 +36,7 @@ class Lines:
 
     def __call__(self, progress: Progress) -> None:
         """Prints what is new."""
-        for event in self._news.of(progress):
+        for event in self._news.new_events(progress):
             if event.kind == OUTPUT:
                 print(f"{event.source}| {event.text}", file=sys.stderr)
             elif event.kind not in QUIET:
@@ -70,7 +70,7 @@ class Table:
 
     def __call__(self, progress: Progress) -> None:
         """Draws the table anew, four times a second at most."""
-        for event in self._news.of(progress):
+        for event in self._news.new_events(progress):
             if event.kind == OUTPUT:
                 self._live.console.print(f"{event.source}| {event.text}", markup=False, highlight=False)
         now = time.monotonic()

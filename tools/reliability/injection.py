@@ -123,7 +123,7 @@ class Injector:
         order = messages.RunOrder("restart", [victim], who="chaos")
 
         def ask() -> None:
-            self.answer = orders.give_run(session, keys, order)
+            self.answer = orders.send_run_order(session, keys, order)
 
         self.answer = messages.RunReply()
         threading.Thread(target=ask, name="restart", daemon=True).start()

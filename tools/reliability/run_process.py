@@ -86,7 +86,7 @@ class EventLines:
 
     def __call__(self, progress: Progress) -> None:
         """Print new events."""
-        if events := self._news.of(progress):
+        if events := self._news.new_events(progress):
             sys.stdout.buffer.write(b"".join(messages.encode(event) + b"\n" for event in events))
             sys.stdout.buffer.flush()
 

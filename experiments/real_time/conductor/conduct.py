@@ -106,14 +106,14 @@ def conduct(
     endpoints = list(map(from_here, listening)) if own_router else listening
     if meshed:
         endpoints = secured(mesh.member_endpoints(embodied.values(), secure=secure), of_lab)
-    rights = enforced(embodied.values(), endpoints, folder, staging.identity)
+    rights = write_rights(embodied.values(), endpoints, folder, staging.identity)
     (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
     me = run_registry.mine(
         "run", read.experiment.title or read.path.stem, endpoints,
         folder=folder, realm=network.realm, identity=staging.identity, robots=hardware(embodied.values()),
     )  # fmt: skip
     with run_registry.registered(me) as unlisted, launching(folder / "logs") as launcher:
-        tell([*([unlisted] if unlisted else []), *beside(me, run_registry.runs(), str(read.path))])
+        tell([*([unlisted] if unlisted else []), *check_other_runs(me, run_registry.runs(), str(read.path))])
         for router in divided(listening, network.routers) if own_router else ():
             router.start(launcher, rights)
         hosts = Hosts(launcher, endpoints if meshed else listening)
@@ -164,7 +164,7 @@ def hardware(cases: Iterable[Experiment]) -> dict[str, str]:
     return found
 
 
-def beside(me: run_registry.Run, others: Iterable[run_registry.Run], file: str) -> list[str]:
+def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], file: str) -> list[str]:
     """What there is to say of runs that are up beside one and have robots of the same names.
 
     Raises:
@@ -201,7 +201,7 @@ def _has(other: run_registry.Run, name: str, body: str) -> bool:
     return body in other.robots.values()
 
 
-def enforced(
+def write_rights(
     cases: Collection[Experiment], endpoints: Sequence[str], folder: Path, operator: str = "operator"
 ) -> Path | None:
     """Who may do what, as a file for the router; None without a lab.

@@ -20,8 +20,8 @@ from experiments.file.document import write_json
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.crew import CaseProcesses
 from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
-from experiments.real_time.conductor.orders import lead
-from experiments.real_time.conductor.run_view import OUTPUT, Overview, Progress, RobotView, Show
+from experiments.real_time.conductor.orders import start_lead_s
+from experiments.real_time.conductor.run_view import OUTPUT, NetworkView, Progress, RobotView, Show
 from experiments.real_time.hosts.clock_drift import Drift
 from experiments.real_time.hosts.launcher import LAND_S
 
@@ -77,7 +77,7 @@ class Conductor:
             context.case, "starting", None, experiment.duration_s, self._robots, clock=self._clock
         )
         self._starting: set[str] = set()
-        self._crew = CaseProcesses(context)
+        self._processes = CaseProcesses(context)
 
     def run(self) -> Result:
         """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
@@ -90,34 +90,34 @@ class Conductor:
         clocks = self._context.hosts.join(self._experiment)
         start = ready = None
         try:
-            self._crew.prepare()
+            self._processes.prepare()
             with ExitStack() as stack:
                 self._join(stack)
                 self._adopt()
-                self._crew.start()
+                self._processes.start()
                 if self._until("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
-                    self._view.tell_clocks(clocks)
+                    self._view.report_clocks(clocks)
                     self._drift = stack.enter_context(Drift(self._context.hosts.followed()))
-                    self._view.say("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
+                    self._view.report("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
                     if self._take_off():
                         start = self._start()
                         self._walk(start)
                 self._land()
                 if start is not None:
                     self._drift.close()
-                    self._view.tell_drift(*self._drift.news())
+                    self._view.report_drift(*self._drift.news())
                     clocks, trouble = self._context.hosts.clocks()
-                    self._view.tell_clocks(clocks)
+                    self._view.report_clocks(clocks)
                     for each in trouble:
-                        self._view.say("clock", "conductor", each)
+                        self._view.report("clock", "conductor", each)
         except RunFailed as failure:
             self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: say it now
             self._progress.events.append(messages.Event(self._clock.utc(), "failed", "conductor", self._progress.phase))
             self._show(self._progress)
             raise
         finally:
-            self._crew.end()
+            self._processes.end()
         lost = tuple(name for name, seen in self._robots.items() if seen.left_because == "lost")
         return Result(self._context.recording, self._context.ended(), start, ready, lost)
 
@@ -127,12 +127,12 @@ class Conductor:
         Raises:
             RunFailed: If one of them has flown already.
         """
-        away = self._crew.away
+        away = self._processes.away
         if self._experiment.network.connect is not None or away:  # a router of our own has nobody else
             self._progress.phase = "looking who is there"
             began = time.monotonic()
             while (past := time.monotonic() - began) < ADOPT_S or (self._flown() and past < LEAVE_S):
-                self._look()
+                self._update()
                 time.sleep(POLL_S)
         if flown := self._flown():
             raise RunFailed(
@@ -140,9 +140,9 @@ class Conductor:
                 "started by hand flies once: end its process and start it again, next time with --once"
             )
         there = {name for name, seen in self._robots.items() if seen.alive}
-        for name in self._crew.adopt(there):
+        for name in self._processes.adopt(there):
             said = f"is there already, {self._robots[name].phase}" if name in there else f"is started on {away[name]}"
-            self._view.say("adopted", name, f"{said}; not started from here")
+            self._view.report("adopted", name, f"{said}; not started from here")
 
     def _flown(self) -> list[str]:
         """Robots that are there and have flown, or do."""
@@ -161,7 +161,7 @@ class Conductor:
         self._progress.phase = f"waiting until all are {phase}"
         deadline = time.monotonic() + limit_s
         while True:
-            self._look()
+            self._update()
             if self._context.ended():
                 return False
             meanwhile()
@@ -175,7 +175,7 @@ class Conductor:
                 if late and self._experiment.start.missing == "abort":
                     raise RunFailed(self._excuse(late, f"not {phase} after {limit_s:g} s"))
                 for name in late:
-                    self._view.say("late", name, f"not {phase} after {limit_s:g} s: {self._why(name)}")
+                    self._view.report("late", name, f"not {phase} after {limit_s:g} s: {self._why(name)}")
                 return True
             time.sleep(POLL_S)
 
@@ -204,10 +204,12 @@ class Conductor:
         for name, seen in self._robots.items():
             if not (seen.gone or AHEAD_S < seen.behind < BEHIND_S):
                 remedy = "set it (NTP), or let zenpark start the robot: [hosts]"
-                self._view.say("clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}")
+                self._view.report(
+                    "clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}"
+                )
         there = [name for name, seen in self._robots.items() if seen.reached("airborne") and not seen.gone]
-        at = self._clock.utc() + lead(len(there))
-        self._view.say("start", "conductor", "common start", stamp=at)
+        at = self._clock.utc() + start_lead_s(len(there))
+        self._view.report("start", "conductor", "common start", stamp=at)
         self._order(messages.Order("start", at=at), there)
         self._starting = {*there}
         return at
@@ -223,15 +225,15 @@ class Conductor:
         self._repeat_at = start
         self._progress.phase = "starting together"
         while (now := self._clock.utc()) < end + LAND_S and not self._context.ended():
-            self._look()
-            self._view.tell_drift(*self._drift.news())
+            self._update()
+            self._view.report_drift(*self._drift.news())
             self._progress.elapsed = now - start
             self._tell_tardy(start)
             self._start_late(start)
             while reached + 1 < len(times) and now - start >= times[reached + 1]:
                 reached += 1
                 self._progress.phase = names[reached]
-                self._view.say("phase", "conductor", names[reached], stamp=start + times[reached])
+                self._view.report("phase", "conductor", names[reached], stamp=start + times[reached])
             busy = self._changes.under_way
             left = [seen for name, seen in self._robots.items() if not seen.gone and name not in busy]
             if all(seen.reached("landing") for seen in left) and (left or not busy):
@@ -250,7 +252,7 @@ class Conductor:
         if late and now > self._repeat_at:
             self._repeat_at = now + LATE_S
             for name in late:
-                self._view.say("late", name, "still waits for the start; told again")
+                self._view.report("late", name, "still waits for the start; told again")
             self._view.order(late, messages.Order("start", at=start))
 
     def _tell_tardy(self, start: float) -> None:
@@ -261,22 +263,22 @@ class Conductor:
                 continue
             self._starting.remove(name)
             if seen.began is not None and (tardy := seen.began - start) > TARDY_S:
-                self._view.say("late", name, f"began {tardy:.2f} s after the common start")
+                self._view.report("late", name, f"began {tardy:.2f} s after the common start")
 
     def _land(self) -> None:
         """Everybody down."""
-        self._view.close_doors()
+        self._view.refuse_joining()
         self._changes.close()
         self._progress.phase = "stopped" if self._context.emergency else "landing"
         if self._context.emergency:
-            self._view.say("stop", "conductor", f"{self._context.emergency.words}; the run ends here")
+            self._view.report("stop", "conductor", f"{self._context.emergency.words}; the run ends here")
         how = "emergency stop" if self._context.emergency else "interrupted" if self._context.ended() else ""
-        self._view.say("phase", "conductor", "landing" + (f" ({how})" if how else ""))
+        self._view.report("phase", "conductor", "landing" + (f" ({how})" if how else ""))
         if any(not (seen.gone or seen.reached("landing")) for seen in self._robots.values()):
             self._order(messages.Order("land"))
         deadline = time.monotonic() + LAND_S
         while time.monotonic() < deadline:
-            self._look()
+            self._update()
             if all(
                 seen.gone or seen.reached("done") or seen.phase in ("starting", "idle")
                 for seen in self._robots.values()
@@ -289,7 +291,7 @@ class Conductor:
     # ------------------------------------------------------------------ what happens meanwhile
 
     def _join(self, stack: ExitStack) -> None:
-        self._view = Overview(
+        self._view = NetworkView(
             stack,
             self._experiment,
             self._context.endpoints,
@@ -299,36 +301,36 @@ class Conductor:
             clock=self._clock,
         )
         stack.callback(self._context.emergency.listen(self._view.session, self._keys).close)
-        self._changes = HotChanges(self._experiment, self._crew, self._view, self._keys)
+        self._changes = HotChanges(self._experiment, self._processes, self._view, self._keys)
 
-    def _look(self) -> None:
+    def _update(self) -> None:
         """Takes in what has happened since the last look."""
         view, now = self._view, self._clock.utc()
-        for name in view.look():
+        for name in view.update():
             self._miss(name)
-        for death in self._crew.deaths():
+        for death in self._processes.deaths():
             if death.kind == "lost" and self._changes.expects(death.source, death.text):
                 continue
-            view.say(death.kind, death.source, death.text)
+            view.report(death.kind, death.source, death.text)
             if death.kind == "recorder":
                 view.recording_begun = True  # nothing to wait for
             elif death.kind == "lost":
                 self._robots[death.source].alive = False
-                self._changes.lose(death.source)
-        self._progress.events += [messages.Event(now, OUTPUT, place, line) for place, line in self._crew.output()]
+                self._changes.mark_lost(death.source)
+        self._progress.events += [messages.Event(now, OUTPUT, place, line) for place, line in self._processes.output()]
         for name, seen in self._robots.items():
             if seen.left_because == "lost" and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
                 self._come_back(name, seen)
-        self._changes.go_on()
+        self._changes.advance()
         self._show(self._progress)
 
     def _miss(self, name: str) -> None:
         """The token of an adopted robot has vanished for good: all that is known of its end."""
-        if name not in self._crew.adopted or self._changes.expects(name, "it is gone"):
+        if name not in self._processes.adopted or self._changes.expects(name, "it is gone"):
             return
         if not self._robots[name].reached("landing"):  # who is down before the others takes its token back
-            self._view.say("lost", name, "is not on the network any more")
-            self._changes.lose(name)
+            self._view.report("lost", name, "is not on the network any more")
+            self._changes.mark_lost(name)
 
     def _come_back(self, name: str, seen: RobotView) -> None:
         """It was only away, or somebody started it again."""
@@ -336,9 +338,9 @@ class Conductor:
             return
         seen.left_because = ""
         joins = "" if seen.reached("running") else f"; `zenpark robot add {name}` lets it join the run"
-        self._view.say("back", name, f"alive again{joins}")
-        if not self._crew.runs(name):
-            self._crew.adopted.add(name)
+        self._view.report("back", name, f"alive again{joins}")
+        if not self._processes.runs(name):
+            self._processes.adopted.add(name)
 
     def _order(self, order: messages.Order, to: Sequence[str] | None = None) -> list[str]:
         """Gives an order to all robots that are left, or to some of them; says and returns who refused."""
@@ -346,7 +348,7 @@ class Conductor:
         replies = self._view.order([name for name in left if to is None or name in to], order)
         refused = {name: reply.reason for name, reply in replies.items() if not reply.ok}
         for name, reason in refused.items():
-            self._view.say("refused", name, f"{order.order}: {reason}")
+            self._view.report("refused", name, f"{order.order}: {reason}")
         return list(refused)
 
     # ------------------------------------------------------------------ words
@@ -363,7 +365,7 @@ class Conductor:
     def _excuse(self, names: Sequence[str], what: str) -> str:
         lines = [f"{', '.join(names)}: {what}; nothing has moved or all have landed"]
         for name in names:
-            last = self._crew.last_line(name)
+            last = self._processes.last_line(name)
             lines.append(f"  {name}: {self._why(name)}" + (f"\n    {last}" if last else ""))
         ended = all(self._robots[name].gone for name in names)
         remedy = "mend that" if ended else "give them more time with start.deadline_s"

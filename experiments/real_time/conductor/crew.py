@@ -123,7 +123,7 @@ class CaseProcesses:
 
     def _start(self, names: Sequence[str], file: Path, told: Experiment) -> None:
         group = self._group(names[0])
-        station, process = self._context.hosts.of(names[0]), self._process(group)
+        station, process = self._context.hosts.station_of(names[0]), self._process(group)
         if station is not None:
             told_case = document.case_document(told)
             self._abroad[f"{station.name}/{group}"] = station.start(process, names, told_case, self._launcher)

@@ -20,7 +20,7 @@ from experiments.definition.experiment import Experiment
 from experiments.real_time.conductor import replacement
 from experiments.real_time.conductor.crew import CaseProcesses
 from experiments.real_time.conductor.replacement import Refused, in_the_way
-from experiments.real_time.conductor.run_view import FROZEN_S, Overview
+from experiments.real_time.conductor.run_view import FROZEN_S, NetworkView
 from experiments.real_time.hosts.launcher import LAND_S
 
 CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
@@ -56,7 +56,7 @@ class _Change:
 class HotChanges:
     """Changes of the robots of one case."""
 
-    def __init__(self, experiment: Experiment, crew: CaseProcesses, view: Overview, keys: Keys) -> None:
+    def __init__(self, experiment: Experiment, crew: CaseProcesses, view: NetworkView, keys: Keys) -> None:
         """Refuses everything until `begin`.
 
         Args:
@@ -102,7 +102,7 @@ class HotChanges:
             return True
         return self._robots[name].gone
 
-    def lose(self, name: str) -> None:
+    def mark_lost(self, name: str) -> None:
         """A robot is lost; what the file says of that is done."""
         self._robots[name].left_because = "lost"
         policy = self._experiment.on_loss
@@ -112,11 +112,11 @@ class HotChanges:
             return
         self._losses[name] = self._losses.get(name, 0) + 1
         if self._losses[name] > RESTARTS:
-            self._view.say("given up", name, f"lost {self._losses[name]} times")
+            self._view.report("given up", name, f"lost {self._losses[name]} times")
             return
         self._begin(_Asked(messages.RunOrder(policy, names, who="on_loss")))
 
-    def go_on(self) -> None:
+    def advance(self) -> None:
         """Takes new orders, goes on with what is under way, and answers what is done."""
         for query, order in self._view.orders.read():
             self._accept(query, order)
@@ -172,7 +172,7 @@ class HotChanges:
             names = tuple(name for name in left if name in self._crew.companions(left[0]))
             left = [name for name in left if name not in names]
             for name in names:
-                self._view.say(asked.order.order, name, f"asked by {who if who.isprintable() else 'somebody'}")
+                self._view.report(asked.order.order, name, f"asked by {who if who.isprintable() else 'somebody'}")
             change = _Change(names, self._steps(asked.order, names), asked)
             if busy := sorted(self.under_way & {*names}):
                 self._answer(change, refused=f"{', '.join(busy)}: is being changed already; wait for that")
@@ -185,10 +185,10 @@ class HotChanges:
             self._ended.pop(name, None)
             if refused:
                 change.asked.refused[name] = refused
-                self._view.say("refused", name, f"{change.asked.order.order}: {refused}")
+                self._view.report("refused", name, f"{change.asked.order.order}: {refused}")
             else:
                 change.asked.done[name] = done
-                self._view.say("changed", name, done)
+                self._view.report("changed", name, done)
 
     def _reply(self) -> None:
         for asked in list(self._pending):
@@ -235,7 +235,7 @@ class HotChanges:
             if not reply.ok and name in self._crew.adopted:
                 raise Refused(f"{name} does not answer, and was not started from here: end its process where it runs")
             if not reply.ok:
-                self._view.say("silent", name, f"does not answer ({reply.reason}): its lifeline is cut")
+                self._view.report("silent", name, f"does not answer ({reply.reason}): its lifeline is cut")
                 self._crew.release(name)
         began, killed = time.monotonic(), False
         while still := [name for name in there if self._robots[name].alive or self._process_must_end(name, names)]:
@@ -245,14 +245,14 @@ class HotChanges:
             if not killed and (past > LAND_S or (past > FROZEN_S and all(map(self._frozen, still)))):
                 killed = True
                 for name in still:
-                    self._view.say("killed", name, f"still there after {past:.0f} s")
+                    self._view.report("killed", name, f"still there after {past:.0f} s")
                     self._crew.kill(name)
             if past > LAND_S + FROZEN_S:
                 raise Refused(f"{', '.join(still)}: cannot be ended")
             yield
         for name in names:
             self._robots[name].left_because = "removed"
-            self._robots[name].forget()
+            self._robots[name].forget_process()
         self._leaving -= {*names}  # the next process that ends is another one
 
     def _process_must_end(self, name: str, names: Sequence[str]) -> bool:

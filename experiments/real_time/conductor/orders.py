@@ -18,12 +18,12 @@ CHANGE_S: Final = 90.0  # a robot lands, its process ends, another starts, is re
 R = TypeVar("R", messages.Reply, messages.WorldReply, messages.RunReply)
 
 
-def lead(robots: int) -> float:
+def start_lead_s(robots: int) -> float:
     """How far ahead of the order a common start of so many robots lies [s]."""
     return LEAD_S + LEAD_EACH_S * robots
 
 
-def give(
+def send_order(
     session: zenoh.Session, keys: Keys, robots: Sequence[str], order: messages.Order, wait_s: float = REPLY_S
 ) -> dict[str, messages.Reply]:
     """Gives an order to robots, to all at once, and returns their replies; a refusal, with why, for one that is silent.
@@ -40,7 +40,7 @@ def give(
     return replies
 
 
-def give_world(
+def send_world_order(
     session: zenoh.Session, keys: Keys, order: messages.WorldOrder, wait_s: float = REPLY_S
 ) -> messages.WorldReply:
     """Gives an order to the world and returns its reply; one that says no, and why, when it does not answer."""
@@ -50,7 +50,7 @@ def give_world(
     return reply or messages.WorldReply(ok=False, paused=False, time=0.0, reason=why or nobody)
 
 
-def give_run(
+def send_run_order(
     session: zenoh.Session, keys: Keys, order: messages.RunOrder, wait_s: float = CHANGE_S
 ) -> messages.RunReply:
     """Gives an order to the conductor and returns its reply when all is done, or that no conductor answers."""

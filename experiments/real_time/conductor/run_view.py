@@ -61,7 +61,7 @@ class RobotView:
             taken out ("removed"), or nobody asked for it yet ("standby").
         vanished: Since when its token is missing [s, monotonic]; infinity while it is not, and when that was told.
         behind: The least time from a stamp of it to its arrival [s]: small, if its clock is right.
-        told: Number of the last incident that was said.
+        last_incident: Number of the last incident that was said.
         place: Where it last said that it was [m].
         origin: Where it, or its plan, began, as its last process said: x, y, z [m] and yaw [rad].
         former: The process whose statuses are of the past: the robot has a new one, or will have.
@@ -76,7 +76,7 @@ class RobotView:
     counted: tuple[float, int] = (0.0, 0)
     vanished: float = inf
     behind: float = inf
-    told: int = 0
+    last_incident: int = 0
     place: messages.Vector | None = None
     origin: messages.Setpoint | None = None
     former: int | None = None
@@ -95,11 +95,11 @@ class RobotView:
         """Whether it is in this phase or beyond."""
         return self.status is not None and ORDER.index(self.status.phase) >= ORDER.index(phase)
 
-    def forget(self) -> None:
+    def forget_process(self) -> None:
         """The process that it had is over: what it said last holds no more, but for where it was and began."""
         self.former = self.status.pid if self.status is not None else self.former
         self.status, self.alive, self.vanished = None, False, inf
-        self.rate, self.counted, self.behind, self.told = 0.0, (0.0, 0), inf, 0
+        self.rate, self.counted, self.behind, self.last_incident = 0.0, (0.0, 0), inf, 0
         self.began = None
 
 
@@ -123,7 +123,7 @@ class News:
     def __init__(self) -> None:
         self._told, self._case = 0, ""
 
-    def of(self, progress: Progress) -> list[messages.Event]:
+    def new_events(self, progress: Progress) -> list[messages.Event]:
         """What has happened since it was asked last."""
         if progress.case != self._case:
             self._case, self._told = progress.case, 0
@@ -139,7 +139,7 @@ ROUTER_S: Final = 10.0
 MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
 
 
-class Overview:
+class NetworkView:
     """The network as the conductor of a case sees it.
 
     Attributes:
@@ -189,7 +189,7 @@ class Overview:
         if list(endpoints) != [DEFAULT_ENDPOINT]:
             options = lab.options(endpoints[0]) if len(endpoints) == 1 else f"--connect @{folder / mesh.ENDPOINTS}"
             where = "a mesh" if topology.is_mesh(endpoints) else ", ".join(lab.bare(endpoints))
-            self.say("router", "conductor", f"{where}: look with `zenpark keys {options}`")
+            self.report("router", "conductor", f"{where}: look with `zenpark keys {options}`")
         self._clock = pubsub.publisher(self._session, keys.clock, messages.JSON)
         self._told = pubsub.pose_publisher(self._session, keys.experiment, messages.JSON)
         self._told.put(document.case_document(experiment))
@@ -209,16 +209,16 @@ class Overview:
         """Its session, for whoever hears more by it."""
         return self._session
 
-    def close_doors(self) -> None:
+    def refuse_joining(self) -> None:
         """Who joins from now on waits for the next run."""
         self._told.undeclare()  # type: ignore[no-untyped-call]
 
-    def look(self) -> list[str]:
+    def update(self) -> list[str]:
         """Takes in what has arrived since the last look; gives the robots whose token has vanished for good."""
         for sample in network.received(self._recorder_watch.handler):
             self.recording_begun |= sample.kind == zenoh.SampleKind.PUT
         for status in by_robots(self._statuses.handler, messages.Status, keys=self._keys, robots=self.robots):
-            self._heed(status)
+            self._receive_status(status)
         for state in by_robots(self._states.handler, messages.State, keys=self._keys, robots=self.robots):
             seen = self.robots[state.robot]
             if seen.error is not None:
@@ -232,27 +232,29 @@ class Overview:
         return self._missed()
 
     def order(self, names: Sequence[str], order: messages.Order) -> dict[str, messages.Reply]:
-        """Gives an order to robots, see `orders.give`."""
-        return orders.give(self._session, self._keys, names, order)
+        """Gives an order to robots, see `orders.send_order`."""
+        return orders.send_order(self._session, self._keys, names, order)
 
-    def say(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
+    def report(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
         """An event of the run, now or at `stamp` [s, UTC]."""
         event = messages.Event(self.clock.utc() if stamp is None else stamp, kind, source, text)
         self._progress.events.append(event)
         self._events.put(messages.encode(event))
 
-    def tell_clocks(self, clocks: Sequence[messages.HostClock]) -> None:
+    def report_clocks(self, clocks: Sequence[messages.HostClock]) -> None:
         """Says how the hosts' clocks lie, for the recording."""
         for each in clocks:
             self._clock.put(messages.encode(each))
-            self.say("clock", each.host, f"{each.offset * 1e3:+.2f} ms ± {each.uncertainty * 1e3:.2f} ms against ours")
+            self.report(
+                "clock", each.host, f"{each.offset * 1e3:+.2f} ms ± {each.uncertainty * 1e3:.2f} ms against ours"
+            )
 
-    def tell_drift(self, measured: Iterable[messages.HostClock], trouble: Iterable[str]) -> None:
+    def report_drift(self, measured: Iterable[messages.HostClock], trouble: Iterable[str]) -> None:
         """Says, for the recording, how the hosts' clocks have drifted and what their robots do about it."""
         for each in measured:
             self._clock.put(messages.encode(each))
         for text in trouble:
-            self.say("clock", "conductor", text)
+            self.report("clock", "conductor", text)
 
     def _missed(self) -> list[str]:
         """Robots whose token has been missing for long: where there is another router, it comes back at once."""
@@ -272,23 +274,23 @@ class Overview:
             if progress.silent_since == inf and not self._mesh and now - since > safety.link_silence_s:
                 progress.silent_since = since
                 what = f"robots hold, and land after {safety.offline_s:g} s"
-                self.say("router", "conductor", f"no router answers for {now - since:.1f} s: {what}")
+                self.report("router", "conductor", f"no router answers for {now - since:.1f} s: {what}")
         elif progress.silent_since < inf:
             away_s, progress.silent_since = now - progress.silent_since, inf
-            self.say("router", "conductor", f"a router answers again, after {away_s:.1f} s")
+            self.report("router", "conductor", f"a router answers again, after {away_s:.1f} s")
 
-    def _heed(self, status: messages.Status) -> None:
+    def _receive_status(self, status: messages.Status) -> None:
         seen = self.robots[status.robot]
         if status.phase not in ORDER or status.pid == seen.former:
             return
         if seen.status is not None and (seen.status.phase, seen.status.reason) != (status.phase, status.reason):
-            self.say("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
+            self.report("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
         if seen.status is not None and seen.status.pid != status.pid:
-            seen.told = 0
+            seen.last_incident = 0
         for incident in status.incidents:
-            if incident.seq > seen.told:
-                seen.told = incident.seq
-                self.say("hazard", status.robot, incident.text)
+            if incident.seq > seen.last_incident:
+                seen.last_incident = incident.seq
+                self.report("hazard", status.robot, incident.text)
         since, sent = seen.counted
         if status.stamp - since >= 0.9:
             seen.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0
@@ -304,23 +306,23 @@ class Emergency:
     """Listens for emergency stops as long as a run goes on, between its cases too.
 
     Attributes:
-        said: The first one that was heard; None: there was none.
+        stop: The first one that was heard; None: there was none.
     """
 
     def __init__(self) -> None:
-        self.said: messages.Stop | None = None
+        self.stop: messages.Stop | None = None
 
     def __bool__(self) -> bool:
-        return self.said is not None
+        return self.stop is not None
 
     @property
     def words(self) -> str:
         """Who stopped the run, and why; empty if nobody has."""
-        return "" if self.said is None else self.said.words
+        return "" if self.stop is None else self.stop.words
 
     def listen(self, session: zenoh.Session, keys: Keys) -> pubsub.ImmediateSubscriber:
         """Hears stops in a realm, for as long as what is returned is kept."""
-        return pubsub.ImmediateSubscriber(session, keys.estop, self._heed)
+        return pubsub.ImmediateSubscriber(session, keys.estop, self._receive_stop)
 
     @contextmanager
     def throughout(
@@ -343,8 +345,8 @@ class Emergency:
             declared.append(self.listen(session, keys))
             yield
 
-    def _heed(self, stop: messages.Stop) -> None:
-        self.said = self.said or stop
+    def _receive_stop(self, stop: messages.Stop) -> None:
+        self.stop = self.stop or stop
 
 
 OUTPUT: Final = "says"  # kind of the events that are a line of a process's output

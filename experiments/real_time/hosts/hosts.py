@@ -80,7 +80,7 @@ class Station:
             raise HostError(f"{name}: {error}") from None
         if shutil.which("ssh") is None:
             raise HostError(f"{name}: there is no ssh here; install it (Debian, Ubuntu: apt install openssh-client)")
-        words = self.words("station")
+        words = self.command("station")
         options = [part for pair in carried for part in pair]
         self.process = launcher.spawn(f"{STATION}{name}", ssh.command(self.address, words, options), answers=True)
         stdin, stdout = self.process.handle.stdin, self.process.handle.stdout
@@ -93,14 +93,14 @@ class Station:
         self._starting: list[Process] = []
         self._robots: list[tuple[Process, Launcher]] = []
         self._silent = False
-        self.set_out()
+        self.reset_clock()
 
-    def set_out(self) -> None:
+    def reset_clock(self) -> None:
         """Takes the wall clock as it is now: a step of it in mid-run is no drift of the host's."""
         self._ours = Clock()
         self.applied, self._robots = 0.0, []
 
-    def words(self, *arguments: str) -> list[str]:
+    def command(self, *arguments: str) -> list[str]:
         """A zenpark command as it is spelled there, of this run."""
         return ["env", f"{RUN}={self._run}", self.host.zenpark.removeprefix("~/"), *arguments]
 
@@ -230,7 +230,7 @@ class Station:
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
         connect += [] if self.lab is None else ["--lab", self.folder]
         correction = f"{-self.applied:.6f}"
-        words = self.words("agent", "-", *robots, *connect, f"--clock-correction={correction}", "--lifeline")
+        words = self.command("agent", "-", *robots, *connect, f"--clock-correction={correction}", "--lifeline")
         process = launcher.spawn(name, ssh.command(self.address, words), told=document + b"\n")
         self._starting.append(process)
         self._robots.append((process, launcher))
@@ -295,7 +295,7 @@ class Hosts:
 
     @staticmethod
     def _begin(station: Station, robots: Sequence[str]) -> HostClock:
-        station.set_out()
+        station.reset_clock()
         return station.follow(station.measure(robots).offset)
 
     def followed(self) -> list[tuple[Station, list[str]]]:
@@ -303,7 +303,7 @@ class Hosts:
         stations = dict.fromkeys(self._robots.values())
         return [(each, [name for name, place in self._robots.items() if place is each]) for each in stations]
 
-    def of(self, robot: str) -> Station | None:
+    def station_of(self, robot: str) -> Station | None:
         """Where a robot runs; None: here."""
         return self._robots.get(robot)
 
