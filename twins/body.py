@@ -19,7 +19,6 @@ from twins.sensing.range_sensors import RangeSensors
 
 CATCH_UP_S = 1.0  # a process that was frozen for longer resumes where it was: the lost time is not simulated
 FULL_WOBBLE = 0.2  # [m] hover jitter grows from the ground up to this height: a standing robot has none
-ENDURANCE_S = {"crazyflie": 420.0, "tello": 780.0, "khepera4": 18000.0, "turtlebot3": 9000.0}  # makers' figures
 
 
 class TwinBody:
@@ -59,7 +58,7 @@ class TwinBody:
         self._latency = Latency(nature, self._dt)
         self._command = np.full((rows, 4), np.nan)
         self._sensors = RangeSensors(request, self._world) if any(self._world.sensors) else None
-        self._endurance = np.array([ENDURANCE_S[k.name] for k in kinds])
+        self._endurance = np.array([k.endurance_s for k in kinds])
         self._used = np.zeros(rows)
         self._external_rows = np.flatnonzero(request.external)
         self._external = External(rows)

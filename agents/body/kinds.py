@@ -18,6 +18,8 @@ class Kind:
     flies: bool  # takes off and lands
     radius: float  # horizontal half-size [m]
     height: float  # vertical size [m]; a position is that of the lowest point, so a body reaches from z to z + height
+    mass: float  # [kg], maker's figure
+    endurance_s: float  # with a full battery, maker's figure
     speed: float  # largest speed [m/s]; per axis for flying robots
     turn_rate: float  # largest yaw rate [rad/s]
     response: float  # rate at which its position controller closes a position error [1/s]
@@ -32,6 +34,8 @@ CRAZYFLIE: Final = Kind(
     flies=True,
     radius=0.065,
     height=0.029,
+    mass=0.027,
+    endurance_s=420.0,
     speed=1.0,
     turn_rate=math.radians(200.0),
     response=2.0,  # position P of the firmware
@@ -44,6 +48,8 @@ TELLO: Final = Kind(
     flies=True,
     radius=0.10,
     height=0.041,
+    mass=0.080,
+    endurance_s=780.0,
     speed=1.0,  # rc 100
     turn_rate=math.radians(100.0),
     response=1.0,
@@ -56,6 +62,8 @@ KHEPERA4: Final = Kind(
     flies=False,
     radius=0.070,
     height=0.058,
+    mass=0.540,
+    endurance_s=18000.0,
     speed=0.2712,  # 400 units of 0.6781 mm/s, the cap of the paper's authors; the wheels could do three times that
     turn_rate=2.0 * 0.2712 / 0.1054,
     response=1.0,
@@ -67,6 +75,8 @@ TURTLEBOT3: Final = Kind(
     flies=False,
     radius=0.105,
     height=0.192,
+    mass=1.0,
+    endurance_s=9000.0,
     speed=0.22,
     turn_rate=2.84,
     response=1.0,

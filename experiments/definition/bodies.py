@@ -87,7 +87,7 @@ def shared_world(
     carried = []
     for name in names:
         robot = experiment.robots[name]
-        own = OF_KIND[robot.kind] if robot.sensors is None else tuple(robot.sensors)
+        own = OF_KIND.get(robot.kind, ()) if robot.sensors is None else tuple(robot.sensors)
         carried.append(own if used or robot.sensors else ())
     return World(
         copy=np.repeat(np.arange(copies), len(names)),

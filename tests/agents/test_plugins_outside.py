@@ -8,7 +8,10 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from agents.formation.graph import Links
 
 ROOT = Path(__file__).parents[2]
 
@@ -51,3 +54,15 @@ def test_the_trigger_of_the_docs_runs_from_outside(tmp_path):
     wrong = zenpark(tmp_path, "run", "triangle", "--virtual", "--set", choice.replace("metres", "meters"))
     assert wrong.returncode != 0
     assert "did you mean 'metres'?" in wrong.stderr
+
+
+def test_the_law_of_the_docs_pulls_to_the_distance_of_the_link():
+    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+    (source,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "Spring" in block]
+    names: dict[str, type] = {"__name__": "my_laws"}
+    exec(source, names)  # noqa: S102 - the page's own example
+    law = names["Spring"](constant=0.3)
+    links = Links(np.array([0]), np.array([1]), np.array([0.5]), np.array([1.0]))
+    position, heard = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0]])
+    assert law.offset(position, heard, links) == pytest.approx(np.array([[-0.15, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    assert law.error(position, heard, links) == pytest.approx([0.5])

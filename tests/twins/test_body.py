@@ -12,7 +12,7 @@ from agents.body.kinds import KINDS
 from agents.plugins.registry import load
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Rates, Robot
-from twins.body import CATCH_UP_S, ENDURANCE_S, TwinBody
+from twins.body import CATCH_UP_S, TwinBody
 
 DT = 0.01
 NATURE = {
@@ -277,17 +277,16 @@ def test_batteries():
     twin.takeoff(np.array([0]), np.array([0.5]))
     for tick in range(101, 301):
         state = twin.read(tick * DT)
-    assert state.battery[0] == pytest.approx(1.0 - 2.0 / ENDURANCE_S["crazyflie"])
+    assert state.battery[0] == pytest.approx(1.0 - 2.0 / KINDS["crazyflie"].endurance_s)
     rover = body("khepera4")
     for tick in range(1, 101):
         state = rover.read(tick * DT)
-    assert state.battery[0] == pytest.approx(1.0 - 1.0 / ENDURANCE_S["khepera4"], abs=1e-6)
+    assert state.battery[0] == pytest.approx(1.0 - 1.0 / KINDS["khepera4"].endurance_s, abs=1e-6)
 
 
 def test_every_kind_has_a_twin_and_a_stranger_has_none():
     for kind in KINDS:
         assert body(kind).read(0.0).position.shape == (1, 3)
-        assert kind in ENDURANCE_S
     whole = request({"R": Robot(kind="khepera4", start=[0.0, 0.0])})
     submarine = replace(KINDS["khepera4"], name="submarine")
     with pytest.raises(BodyError, match="no twin of a submarine; name another body"):

@@ -17,7 +17,6 @@ from experiments.virtual_time import simulation
 from tests.twins.planar_drive import DT, Drive, furnished, stage, still
 from twins.engines.point_mass import PointMass
 from twins.engines.pymunk_engine import Planar
-from twins.engines.pymunk_space import MASSES
 
 # without contact
 
@@ -126,7 +125,7 @@ def test_two_driven_at_each_other_touch_once_and_do_not_overlap(kind, aside):
     assert first.time == pytest.approx((gap - 2 * kind.radius) / (2 * kind.speed), abs=0.2)
     if aside == 0.0:
         assert len(drive.touches) == 1
-        mass = MASSES[kind.name]
+        mass = kind.mass
         # reduced mass × closing speed × (1 + restitution), and what the wheels push in that step
         blow = 0.5 * mass * 2.0 * kind.speed * 1.1
         assert blow * 0.999 < first.impulse < 1.001 * (blow + 0.7 * mass * 9.81 * 0.005)
@@ -190,7 +189,7 @@ def test_the_heavier_pushes_the_lighter_and_not_the_other_way_round():
 def test_a_blow_in_the_air_conserves_momentum_and_gives_no_energy():
     drive = Drive(stage([CRAZYFLIE, TELLO], [[0, 0], [2, 0]]), restitution=0.5)
     drive.aloft([[0, 0, 1.0], [1.2, 0, 1.0]])
-    mass = np.array([MASSES["crazyflie"], MASSES["tello"]])
+    mass = np.array([CRAZYFLIE.mass, TELLO.mass])
     setpoint = [[5, 0, 1, 0], [-0.5, 0, 0, 0]]
     while not drive.touches:
         before = drive.engine.velocity[:, 0].copy()

@@ -15,7 +15,7 @@ from agents.body.interface import BodyError, settings
 from agents.body.kinds import KHEPERA4
 from agents.decision.position_control import drive
 from agents.protocols import khepera4 as protocol
-from twins.body import CATCH_UP_S, ENDURANCE_S
+from twins.body import CATCH_UP_S
 from twins.devices.device import DeviceRequest, Faults
 from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Latency
@@ -273,7 +273,7 @@ class KheperaDevice:
         wanted = np.zeros((len(self._servers), 4))
         for row, server in enumerate(self._servers):
             robot = server.robot
-            robot.charge = max(0.0, robot.charge - self._faults.drain * self._dt / ENDURANCE_S["khepera4"])
+            robot.charge = max(0.0, robot.charge - self._faults.drain * self._dt / KHEPERA4.endurance_s)
             if robot.charge <= 0.0:
                 robot.halt()
             robot.run_goal_controller()

@@ -15,8 +15,9 @@ import numpy as np
 
 from agents.arrays import Array
 from agents.body.interface import BodyError, settings
+from agents.body.kinds import TELLO
 from agents.protocols import tello as protocol
-from twins.body import CATCH_UP_S, ENDURANCE_S, FULL_WOBBLE
+from twins.body import CATCH_UP_S, FULL_WOBBLE
 from twins.devices.device import DeviceRequest, Faults
 from twins.models.disturbance import HoverJitter, Latency
 from twins.models.noise import Noise
@@ -343,7 +344,7 @@ class TelloDevice:
         if not flying:
             return
         drone.motors_s += self._dt
-        drone.charge = max(0.0, drone.charge - drone.faults.drain * self._dt / ENDURANCE_S["tello"])
+        drone.charge = max(0.0, drone.charge - drone.faults.drain * self._dt / TELLO.endurance_s)
         alone = t - drone.last_command > protocol.AUTO_LAND_S
         if drone.mode is not Mode.LAND and (alone or drone.charge <= LANDING_CHARGE):
             model.land(np.array([row]))

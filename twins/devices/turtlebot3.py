@@ -25,7 +25,6 @@ from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
 from agents.protocols.turtlebot3 import Address, Settings
-from twins.body import ENDURANCE_S
 from twins.devices.device import Device, DeviceRequest, Faults
 from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Measurement
@@ -257,7 +256,7 @@ class TurtleBot3Twin:
             self._publish(row.scan, row.types, message, t)
 
     def _battery(self, t: float) -> None:
-        spent = self._used * self._faults.drain / ENDURANCE_S["turtlebot3"]
+        spent = self._used * self._faults.drain / TURTLEBOT3.endurance_s
         charge = max(0.0, self._faults.battery - spent)
         voltage = turtlebot3.EMPTY_V + charge * (turtlebot3.FULL_V - turtlebot3.EMPTY_V)
         now = self._clock.utc()

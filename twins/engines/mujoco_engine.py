@@ -113,6 +113,8 @@ class Drones(OnboardFlight):
         rows = len(kinds)
         self._ticks = max(1, math.ceil(dt * RATE_HZ - 1e-6))
         self._dt = dt / self._ticks
+        if unknown := sorted({kind.name for kind in kinds} - AIRFRAMES.keys()):
+            raise BodyError(f"the engine mujoco has no airframe of a {', '.join(unknown)}; choose another engine")
         frames = [AIRFRAMES[kind.name] for kind in kinds]
         step = self._dt / SUBSTEPS
         models = {frame: mujoco.MjModel.from_xml_string(mjcf(frame, scene, step, motor_lag)) for frame in frames}

@@ -15,7 +15,7 @@ from agents.arrays import Array, Index, Mask, clamp, every, norm, some, span
 from twins.engines.engine import Stage, Touch
 from twins.engines.point_mass import Models
 from twins.engines.pymunk_contacts import Contacts, Layers
-from twins.engines.pymunk_space import MASSES, Place, Surfaces
+from twins.engines.pymunk_space import Place, Surfaces
 from twins.models.onboard_flight import TOUCHDOWN
 from twins.models.quadrotor import GRAVITY
 
@@ -85,7 +85,7 @@ class PlanarEngine(Models):
         rows = len(stage.kinds)
         self._layers = _build_layers(stage)
         self._tall = np.array([stage.kinds[row].height for row in self.in_air])
-        mass = np.array([MASSES[stage.kinds[row].name] for row in self.in_air])
+        mass = np.array([stage.kinds[row].mass for row in self.in_air])
         self._force = (mass / self._step)[:, None]  # changes the speed by 1 m/s in one step
         self._build_copies(stage, choice)
         self._wobble = np.zeros((rows, 2))

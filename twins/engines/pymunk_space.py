@@ -16,7 +16,6 @@ from twins.models.differential import DRIVES
 from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene
 
-MASSES: Final = {"crazyflie": 0.027, "tello": 0.080, "khepera4": 0.540, "turtlebot3": 1.0}  # [kg], makers' figures
 WALL_DEPTH: Final = 1.0  # [m] thickness of the arena's walls, outwards: nothing passes through
 GRAIN: Final = 32  # points per side for the mean lever of the friction under a box
 
@@ -63,7 +62,7 @@ class Place:
 
     def add_robot(self, row: int, kind: Kind, *, mirrored: bool) -> None:
         """Add a robot; a mirrored robot pushes others and cannot be pushed."""
-        mass = MASSES[kind.name]
+        mass = kind.mass
         if mirrored:
             body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         else:

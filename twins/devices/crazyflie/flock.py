@@ -9,9 +9,10 @@ import numpy as np
 from agents.arrays import Array, Mask
 from agents.body.external_pose import velocity_after
 from agents.body.interface import BodyRequest
+from agents.body.kinds import CRAZYFLIE
 from agents.protocols.crazyflie import Lighthouse, Loco, Outside, chosen
 from agents.protocols.crtp import Info, Power
-from twins.body import CATCH_UP_S, ENDURANCE_S, FULL_WOBBLE
+from twins.body import CATCH_UP_S, FULL_WOBBLE
 from twins.devices.crazyflie.commander import Commander
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import Plan, Planner
@@ -89,7 +90,7 @@ class Flock:
         self.quadrotor = Quadrotor(request.kinds, request.start, request.yaw, self.dt)
         self.memories = [Memories() for _ in range(rows)]
         self.charge = np.full(rows, faults.battery)  # 0 to 1
-        self._drain = self.dt * faults.drain / ENDURANCE_S["crazyflie"]
+        self._drain = self.dt * faults.drain / CRAZYFLIE.endurance_s
         spatial = np.ones((rows, 3))
         noise = Noise(request.names, request.seeds, "measurement", 4)
         self._measurement = Measurement(request.disturbance, spatial, noise)
