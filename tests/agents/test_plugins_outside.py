@@ -60,7 +60,7 @@ def test_the_law_of_the_docs_pulls_to_the_distance_of_the_link():
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     (source,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "Spring" in block]
     names: dict[str, type] = {"__name__": "my_laws"}
-    exec(source, names)  # noqa: S102 - the page's own example
+    exec(source, names)
     law = names["Spring"](constant=0.3)
     links = Links(np.array([0]), np.array([1]), np.array([0.5]), np.array([1.0]))
     position, heard = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0]])
