@@ -11,7 +11,7 @@ import math
 import re
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Final, Generic, TypeVar
 
@@ -57,116 +57,13 @@ def codec(kind: type[S]) -> Codec[S]:
     Raises:
         TypeError: If a field has another type, or a name that ROS does not allow.
     """
-    record = _record(kind)
     writer = _Writer()
-    rebuilt = writer.visit(record, "o")
+    rebuilt = writer.struct(kind, "o")
     writer.flush()
     encode, decode = writer.functions(rebuilt)
-    return Codec(f"{PACKAGE}/msg/{kind.__name__}", _schema(record), encode, decode)
-
-
-@dataclass(frozen=True)
-class _Scalar:
-    ros: str
-    code: str
-    optional: bool = False
-
-
-@dataclass(frozen=True)
-class _Text:
-    ros: str = "string"
-
-
-@dataclass(frozen=True)
-class _Array:
-    length: int
-    optional: bool = False
-
-
-@dataclass(frozen=True)
-class _Record:
-    kind: type[msgspec.Struct]
-    fields: tuple[tuple[str, _Shape], ...]
-
-    @property
-    def ros(self) -> str:
-        return f"{PACKAGE}/{self.kind.__name__}"
-
-
-@dataclass(frozen=True)
-class _Sequence:
-    item: _Scalar | _Text | _Record
-
-
-@dataclass(frozen=True)
-class _Table:
-    pass
-
-
-_Shape = _Scalar | _Text | _Array | _Record | _Sequence | _Table
-_PLAIN: Final[dict[type[mi.Type], _Shape]] = {
-    mi.BoolType: _Scalar("bool", "?"),
-    mi.IntType: _Scalar("int64", "q"),
-    mi.FloatType: _Scalar("float64", "d"),
-    mi.StrType: _Text(),
-}
-
-
-def _record(kind: type[msgspec.Struct]) -> _Record:
-    info = mi.type_info(kind)
-    assert isinstance(info, mi.StructType)
-    if not info.fields:
-        raise TypeError(f"{kind.__name__} has no fields; a ROS message needs at least one")
-    for field in info.fields:
-        if not FIELD.fullmatch(field.name):
-            raise TypeError(f"{kind.__name__}.{field.name}: ROS wants lower_snake_case")
-    where = kind.__name__
-    return _Record(kind, tuple((field.name, _shape(field.type, f"{where}.{field.name}")) for field in info.fields))
-
-
-def _shape(kind: mi.Type, where: str) -> _Shape:
-    found = _PLAIN.get(type(kind))
-    match kind:
-        case mi.StructType(cls=cls):
-            found = _record(cls)
-        case mi.TupleType(item_types=items) if items and all(isinstance(item, mi.FloatType) for item in items):
-            found = _Array(len(items))
-        case mi.ListType(item_type=item):
-            inner = _shape(item, where)
-            if isinstance(inner, _Text | _Record) or (isinstance(inner, _Scalar) and not inner.optional):
-                found = _Sequence(inner)
-        case mi.DictType(key_type=mi.StrType(), value_type=mi.IntType()):
-            found = _Table()
-        case mi.UnionType(types=(one, mi.NoneType()) | (mi.NoneType(), one)):
-            inner = _shape(one, where)
-            if isinstance(inner, _Array) or (isinstance(inner, _Scalar) and inner.code != "?"):
-                found = replace(inner, optional=True)
-    if found is None:
-        raise TypeError(f"{where}: no ROS message can hold {type(kind).__name__} here")
-    return found
-
-
-def _schema(record: _Record) -> str:
-    """The definition of a message, followed by those of the messages inside it, each once."""
-    own: list[str] = []
-    others: dict[str, str] = {}
-    for name, shape in record.fields:
-        inner = shape.item if isinstance(shape, _Sequence) else shape
-        if isinstance(inner, _Record):
-            first, *rest = _schema(inner).split(SEPARATOR)
-            others.update({inner.ros: first}, **{text.splitlines()[0].removeprefix("MSG: "): text for text in rest})
-        match shape:
-            case _Sequence(item=item):
-                own.append(f"{item.ros}[] {name}")
-            case _Array(length=length):
-                own.append(f"float64[{length}] {name}")
-            case _Table():
-                own += [f"string[] {name}_keys", f"int64[] {name}_values"]
-            case _:
-                own.append(f"{shape.ros} {name}")
-    parts = ["\n".join(own) + "\n"]
-    parts += [text if text.startswith("MSG: ") else f"MSG: {name}\n{text}" for name, text in others.items()]
-    return SEPARATOR.join(parts)
+    first, *others = writer.definitions.items()
+    texts = [first[1], *(f"MSG: {name}\n{text}" for name, text in others)]
+    return Codec(f"{PACKAGE}/msg/{kind.__name__}", SEPARATOR.join(texts), encode, decode)
 
 
 SEPARATOR: Final = "=" * 80 + "\n"
@@ -175,10 +72,18 @@ _PAD8: Final = tuple(bytes((4 - n) % 8) for n in range(8))  # the encapsulation 
 _COUNT: Final = struct.Struct("<I")
 
 
+_NUMBERS: Final[dict[type[mi.Type], tuple[str, str]]] = {
+    mi.BoolType: ("bool", "?"),
+    mi.IntType: ("int64", "q"),
+    mi.FloatType: ("float64", "d"),
+}
+
+
 class _Writer:
-    """Writes the encoder (`put`) and the decoder (`take`) of a message side by side."""
+    """Writes the encoder (`put`), the decoder (`take`) and the definitions of a message side by side."""
 
     def __init__(self) -> None:
+        self.definitions: dict[str, str] = {}  # ros2msg text by type: of the message, then of those inside it
         self._put: list[str] = []
         self._take: list[str] = []
         self._indent = " " * 8
@@ -202,36 +107,66 @@ class _Writer:
         self._taken: list[str] = []  # ... and where it is taken to
         self._offset: int | None = 0  # modulo 8, unknown behind a text or a sequence
 
-    def visit(self, shape: _Shape, value: str) -> str:
-        """Puts the expression `value`; returns the expression that the decoder rebuilds it with."""
-        match shape:
-            case _Scalar(code=code, optional=optional):
-                if optional:
-                    held, missing = self._name("o"), "NAN" if code == "d" else "-1"
-                    value = f"{missing} if ({held} := {value}) is None else {held}"
-                (rebuilt,) = self._fixed(code, value)
-                if optional:
-                    rebuilt = f"None if {_absent(rebuilt) if code == 'd' else f'{rebuilt} == -1'} else {rebuilt}"
-            case _Array(length=length, optional=optional):
-                if optional:
-                    held = self._name("o")
-                    value = f"({'NAN, ' * length}) if ({held} := {value}) is None else {held}"
-                taken_all = self._fixed("d" * length, f"*({value})")
-                rebuilt = f"({', '.join(taken_all)},)"
-                if optional:
-                    rebuilt = f"None if {' and '.join(map(_absent, taken_all))} else {rebuilt}"
-            case _Text():
-                rebuilt = self._text(value)
-            case _Record(kind=kind, fields=fields):
-                made = self._name("T", kind)
-                parts = [f"{name}={self.visit(inner, f'{value}.{name}')}" for name, inner in fields]
-                rebuilt = f"{made}({', '.join(parts)})"
-            case _Sequence(item=item):
-                rebuilt = self._sequence(item, value)
-            case _Table():
-                keys = self._sequence(_Text(), value)
-                rebuilt = f"dict(zip({keys}, {self._sequence(_Scalar('int64', 'q'), f'{value}.values()')}))"
-        return rebuilt
+    def struct(self, kind: type[msgspec.Struct], value: str) -> str:
+        """Puts the struct `value`; returns the expression that the decoder rebuilds it with.
+
+        Raises:
+            TypeError: See `codec`.
+        """
+        info = mi.type_info(kind)
+        assert isinstance(info, mi.StructType)
+        if not info.fields:
+            raise TypeError(f"{kind.__name__} has no fields; a ROS message needs at least one")
+        made, own = self._name("T", kind), f"{PACKAGE}/{kind.__name__}"
+        self.definitions[own] = self.definitions.get(own, "")  # before those inside it
+        parts, lines = [], []
+        for field in info.fields:
+            where, inner = f"{kind.__name__}.{field.name}", f"{value}.{field.name}"
+            if not FIELD.fullmatch(field.name):
+                raise TypeError(f"{where}: ROS wants lower_snake_case")
+            match field.type:
+                case mi.DictType(key_type=mi.StrType() as key, value_type=mi.IntType() as number):
+                    (keys, _), (values, _) = (
+                        self._sequence(key, inner, where),
+                        self._sequence(number, f"{inner}.values()", where),
+                    )
+                    parts.append(f"{field.name}=dict(zip({keys}, {values}))")
+                    lines += [f"string[] {field.name}_keys", f"int64[] {field.name}_values"]
+                case _:
+                    rebuilt, ros = self._visit(field.type, inner, where)
+                    parts.append(f"{field.name}={rebuilt}")
+                    lines.append(f"{ros} {field.name}")
+        self.definitions[own] = "\n".join(lines) + "\n"
+        return f"{made}({', '.join(parts)})"
+
+    def _visit(self, kind: mi.Type, value: str, where: str) -> tuple[str, str]:
+        """Puts the expression `value`; returns the expression that rebuilds it, and its type in ROS."""
+        match kind:
+            case mi.StructType(cls=cls):
+                return self.struct(cls, value), f"{PACKAGE}/{cls.__name__}"
+            case mi.StrType():
+                return self._text(value), "string"
+            case mi.BoolType() | mi.IntType() | mi.FloatType():
+                ros, code = _NUMBERS[type(kind)]
+                return self._fixed(code, value)[0], ros
+            case mi.TupleType(item_types=items) if items and all(isinstance(item, mi.FloatType) for item in items):
+                taken = self._fixed("d" * len(items), f"*({value})")
+                return f"({', '.join(taken)},)", f"float64[{len(items)}]"
+            case mi.ListType(item_type=mi.StructType() | mi.StrType() | mi.BoolType() | mi.IntType() | mi.FloatType()):
+                return self._sequence(kind.item_type, value, where)
+            case mi.UnionType(types=(one, mi.NoneType()) | (mi.NoneType(), one)) if isinstance(
+                one, mi.IntType | mi.FloatType | mi.TupleType
+            ):
+                held = self._name("o")
+                missing = "-1" if isinstance(one, mi.IntType) else "NAN"
+                if isinstance(one, mi.TupleType):
+                    missing = f"({'NAN, ' * len(one.item_types)})"
+                rebuilt, ros = self._visit(one, f"({missing} if ({held} := {value}) is None else {held})", where)
+                numbers = rebuilt.strip("(,)").split(", ")
+                known = "{0} == -1" if isinstance(one, mi.IntType) else "{0} != {0}"
+                absent = " and ".join(known.format(each) for each in numbers)
+                return f"None if {absent} else {rebuilt}", ros
+        raise TypeError(f"{where}: no ROS message can hold {type(kind).__name__} here")
 
     def flush(self) -> None:
         """Ends the run: what comes next has no fixed place."""
@@ -296,7 +231,7 @@ class _Writer:
         self._lines("", f"i += 4 + {length}")
         return taken
 
-    def _sequence(self, item: _Scalar | _Text | _Record, value: str) -> str:
+    def _sequence(self, item: mi.Type, value: str, where: str) -> tuple[str, str]:
         self.flush()
         self._offset = None
         held, length, taken = self._name("o"), self._name("n"), self._name("v")
@@ -304,28 +239,26 @@ class _Writer:
             f"{held} = {value}; out += PAD4[len(out) & 3]; out += count(len({held}))",
             f"i += -i & 3; {length}, = counted(data, i); i += 4",
         )
-        if isinstance(item, _Scalar) and item.code == "?":
+        if type(item) in _NUMBERS:
+            ros, code = _NUMBERS[type(item)]
+            size = struct.calcsize(f"<{code}")
+            if size == 8:
+                self._lines(f"if {held}: out += PAD8[len(out) & 7]", f"if {length}: i += 4 - i & 7")
             self._lines(
-                f"out += pack(f'{{len({held})}}?', *{held})",
-                f"{taken} = list(unpack_from(f'{{{length}}}?', data, i)); i += {length}",
-            )
-        elif isinstance(item, _Scalar):
-            self._lines(f"if {held}: out += PAD8[len(out) & 7]", f"if {length}: i += 4 - i & 7")
-            self._lines(
-                f"out += pack(f'<{{len({held})}}{item.code}', *{held})",
-                f"{taken} = list(unpack_from(f'<{{{length}}}{item.code}', data, i)); i += 8 * {length}",
+                f"out += pack(f'<{{len({held})}}{code}', *{held})",
+                f"{taken} = list(unpack_from(f'<{{{length}}}{code}', data, i)); i += {size} * {length}",
             )
         else:
             each = self._name("o")
             self._lines(f"for {each} in {held}:", f"{taken} = []")
             self._lines("", f"for _ in range({length}):")
             self._indent += "    "
-            rebuilt = self.visit(item, each)
+            rebuilt, ros = self._visit(item, each, where)
             self.flush()
             self._lines("", f"{taken}.append({rebuilt})")
             self._indent = self._indent[:-4]
             self._offset = None
-        return taken
+        return taken, f"{ros}[]"
 
     def _lines(self, put: str, take: str) -> None:
         if put:
@@ -338,10 +271,6 @@ class _Writer:
         if value is not None:
             self._names[name] = value
         return name
-
-
-def _absent(number: str) -> str:
-    return f"{number} != {number}"
 
 
 def _text(value: str) -> bytes:
