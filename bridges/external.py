@@ -23,7 +23,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import EndpointError
 from agents.network.shutdown import leave
-from agents.runtime.range_inbox import HeardRanges
+from agents.runtime.range_inbox import RangeInbox
 
 Action = Literal["drive", "takeoff", "land", "stop"]
 
@@ -110,7 +110,7 @@ class ExternalBody:
         session, keys, mime = self._session, self._keys, messages.MIME["json"]
         rows = range(len(self._names))
         self._positions = MeasuredPositions(session, keys, self._names, rows, REACH)
-        self._ranges = HeardRanges(session, keys, self._names, rows)
+        self._ranges = RangeInbox(session, keys, self._names, rows)
         self._setpoints = [pubsub.publisher(session, keys.setpoint(name), mime) for name in self._names]
         self._orders = [pubsub.urgent_publisher(session, keys.setpoint(name), mime) for name in self._names]
         pause = threading.Event()

@@ -26,7 +26,7 @@ from agents.network.keys import Keys
 from agents.protocols import ros2
 from agents.protocols.ros2 import Distro, Message, Types
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
-from agents.runtime.command_line import add_network, reached, told_to_end
+from agents.runtime.command_line import add_network, on_termination, reached
 from agents.runtime.lifeline import Lifeline
 
 NODE: Final = "zenpark"
@@ -262,7 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.lifeline:
         Lifeline(stop).start()
     try:
-        with told_to_end(stop.set):
+        with on_termination(stop.set):
             serve(
                 reached(chosen),
                 ros_endpoints=chosen.ros,

@@ -150,7 +150,7 @@ def options(endpoint: str) -> str:
     return f"--connect {plain}" + (f" --lab {folder}" if mark else "")
 
 
-def of(endpoints: Sequence[str]) -> Path | None:
+def lab_of(endpoints: Sequence[str]) -> Path | None:
     """The lab of some endpoints.
 
     Raises:

@@ -90,7 +90,7 @@ def _others(
     """Names (their liveliness keys) with an earlier claim than `rank`, or with another owner if `owners` count."""
     deadline = time.monotonic() + ANSWER_S
     while True:
-        found = {key: network.here(session, Keys.lives(key)) for key in alive}
+        found = {key: network.tokens_present(session, Keys.lives(key)) for key in alive}
         if pause.is_set():
             raise network.Unreachable("told to end before the name was taken")
         if None not in found.values() and network.connected(session):
@@ -130,7 +130,7 @@ def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -
     free = taken = inf
     while not pause.is_set():
         linked = network.connected(session)
-        found = [network.here(session, Keys.lives(key)) for key in alive]
+        found = [network.tokens_present(session, Keys.lives(key)) for key in alive]
         now = time.monotonic()
         if not linked or None in found or not network.connected(session):
             free = inf

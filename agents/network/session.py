@@ -211,7 +211,7 @@ def _gathered(session: zenoh.Session, members: int, gather_s: float, gone: threa
 
 
 def _silence(endpoints: Sequence[str], identity: str) -> str:
-    folder = lab.of(endpoints)
+    folder = lab.lab_of(endpoints)
     refused = (
         ""
         if folder is None
@@ -318,7 +318,7 @@ class RouterWatch:
         return False
 
 
-def links(session: zenoh.Session) -> int:
+def count_links(session: zenoh.Session) -> int:
     """Number of links of a session."""
     return len(session.info.transports())
 
@@ -328,7 +328,7 @@ def deserted(session: zenoh.Session) -> bool:
     return all(transport.whatami == zenoh.WhatAmI.ROUTER for transport in session.info.transports())
 
 
-def here(session: zenoh.Session, keyexpr: str, wait_s: float = ASK_S) -> set[str] | None:
+def tokens_present(session: zenoh.Session, keyexpr: str, wait_s: float = ASK_S) -> set[str] | None:
     """Keys of the liveliness tokens that match; None without a reply within `wait_s`."""
     found = set()
     for reply in session.liveliness().get(keyexpr, timeout=wait_s):

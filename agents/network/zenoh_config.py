@@ -117,7 +117,7 @@ def _of_lab(
     Raises:
         LabError: If the lab has no such identity, or its register does not go with the rights.
     """
-    folder = lab.of(endpoints)
+    folder = lab.lab_of(endpoints)
     if folder is None:
         return {}, None
     settings = lab.settings(folder, identity, listens=listens)

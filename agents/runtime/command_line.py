@@ -21,7 +21,7 @@ from agents.runtime.lifeline import SILENCE_S
 
 
 @contextmanager
-def told_to_end(end: Callable[[], object]) -> Iterator[None]:
+def on_termination(end: Callable[[], object]) -> Iterator[None]:
     """Inside, each SIGINT and SIGTERM calls `end`; afterwards the former handlers hold."""
 
     def handle(_signal: int, _frame: FrameType | None) -> None:

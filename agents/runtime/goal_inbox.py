@@ -1,4 +1,4 @@
-"""Goals as they come over the network to robots that are guided, and whether the centre is there."""
+"""Reception of goals by guided robots, and liveliness of the central controller."""
 
 from __future__ import annotations
 
@@ -19,12 +19,10 @@ from agents.network.keys import Keys
 from agents.runtime.pose_inbox import NEWS
 
 
-class HeardGoals:
-    """The goals of the rows of one process; polled.
+class GoalInbox:
+    """Goals for the guided rows of one process, through the modelled channel; polled."""
 
-    Attributes:
-        news: Per row, goals that it got since somebody emptied this; for telemetry.
-    """
+    news: list[deque[messages.GoalReceipt]]  # by row, for telemetry, which empties them
 
     def __init__(
         self,
@@ -36,9 +34,9 @@ class HeardGoals:
         reach: messages.Vector,
         conditions: Conditions | None = None,
     ) -> None:
-        """Listens for the guided rows of `agent`; no goal beyond `reach` [m] is believed.
+        """Subscribes for the guided rows of `agent`; goals beyond `reach` [m] are refused.
 
-        `conditions` are what is done to the goals of each guided row on their way; None: nothing.
+        `conditions` are the effects of the modelled channel on the goals of each guided row; None: none.
         """
         self._session, self._agent, self._guidance, self._reach = session, agent, guidance, reach
         self._names: Sequence[str] = agent.assignment.names
@@ -59,28 +57,28 @@ class HeardGoals:
         """Goals that were refused."""
         return sum(inbox.malformed for inbox in self._inboxes)
 
-    def take(self, t: float, utc: float) -> None:
-        """Takes in what has come by `t` [s] of a clock that was 0 at `utc`."""
+    def receive(self, t: float, utc: float) -> None:
+        """Receives all until `t` [s] of a clock that was 0 at `utc`."""
         for token, there in self._watch.changes():
             if token != self._centre:
                 self._begin(Keys.life_of(token), there=there)
             elif there:
                 self._guidance.mark_alive()
-            elif network.connected(self._session):  # without a router every token is gone, and that is another matter
+            elif network.connected(self._session):  # without a router every token vanishes, which proves nothing
                 self._guidance.mark_lost(t)
         for link, (row, inbox) in enumerate(zip(self._rows.tolist(), self._inboxes, strict=True)):
             for goal, sample in inbox.read_samples(partial(self._check, row, utc + t)):
                 self._receive(link, goal, len(sample.payload), t, utc)
         if (got := self._channel.due(t)) is not None and got.extra is not None:
-            said = (got.link.tolist(), got.seq.tolist(), got.stamp.tolist(), got.position, got.extra.tolist())
-            for link, seq, stamp, position, (toward, sent, pose) in zip(*said, strict=True):
+            columns = (got.link.tolist(), got.seq.tolist(), got.stamp.tolist(), got.position, got.extra.tolist())
+            for link, seq, stamp, position, (toward, sent, pose) in zip(*columns, strict=True):
                 which = self._rows[[link]]
                 news = self._agent.receive_goal(which, position[None], np.array([toward]), np.array([stamp]))
                 if news.any():
                     self.news[which[0]].append(messages.GoalReceipt(seq, utc + sent, utc + pose, utc + t))
 
     def _begin(self, life: str | None, *, there: bool) -> None:
-        """A centre of another session counts its goals anew; its clock may be behind that of the last one."""
+        """Resets the numbers for a new central controller: its clock may be behind that of the former one."""
         if life is None or not there or life == self._life:
             return
         if self._life:

@@ -1,7 +1,7 @@
-"""The lifeline of a process: its standard input, on which whoever started it writes a byte now and then.
+"""Parent-death detection: the launcher writes a heartbeat to the standard input of a process.
 
-End of file means that the starter is gone, silence that it hangs or that the network to it is cut. It works the same
-for a local process and through ssh, and needs no help of the operating system that the other one lacks.
+End of file means that the launcher is gone, silence that it hangs or that the network to it is cut. This works for a
+local process and through ssh alike, on every operating system.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-BEAT_S: Final = 0.5  # the starter writes one byte this often
+BEAT_S: Final = 0.5  # period of the heartbeat
 SILENCE_S: Final = 3.0
 LONGEST: Final = 4096  # of a line [bytes]
 
 
 class Lifeline:
-    """Watches a file descriptor in a daemon thread and sets `lost` when the starter is gone.
+    """Watches a file descriptor in a daemon thread and sets `lost` when the launcher is gone.
 
-    What to do then is the owner's business: a robot lands first.
+    The owner reacts: a robot lands first.
 
     Args:
         lost: Set once, after `reason` was.
         timeout_s: Silence [s] that counts as loss.
-        fd: What to watch; standard input unless told otherwise.
-        told: Called in that thread with each line that is no heartbeat: what the starter has to say later on.
+        fd: File descriptor; standard input if left out.
+        told: Called in that thread with each line that is no heartbeat.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Lifeline:
         self._thread = threading.Thread(target=self._watch, name="lifeline", daemon=True)
 
     def start(self) -> None:
-        """Begins to watch."""
+        """Starts to watch."""
         self._thread.start()
 
     def join(self, timeout_s: float | None = None) -> None:

@@ -1,6 +1,6 @@
-"""The robot process: a deadline loop around the decision. Everything here is I/O; everything decided is `agents.agent`.
+"""The robot process: a deadline loop around the decision. Here is the I/O; `agents.agent` decides.
 
-One plain loop on the monotonic clock, no asyncio, no callbacks: what arrives waits in ring channels and is polled.
+One plain loop on the monotonic clock, no asyncio, no callbacks: received samples wait in ring channels and are polled.
 """
 
 from __future__ import annotations
@@ -31,19 +31,21 @@ from agents.network import session as network
 from agents.network.name_ownership import ANSWER_S, NameTaken, OwnershipCheck, claim
 from agents.network.shutdown import FAREWELL_S, STOPPED_S, leave
 from agents.network.zenoh_config import ASK_S
-from agents.runtime.command_line import told_to_end
-from agents.runtime.goal_inbox import HeardGoals
+from agents.runtime.command_line import on_termination
+from agents.runtime.goal_inbox import GoalInbox
 from agents.runtime.lifeline import Lifeline
 from agents.runtime.orders import LAND, STOP, carry_out
-from agents.runtime.pose_inbox import Neighbours
-from agents.runtime.range_inbox import HeardRanges, instead
+from agents.runtime.pose_inbox import PoseInbox
+from agents.runtime.range_inbox import RangeInbox, replace_rows
 from agents.runtime.setup import Setup
 from agents.runtime.telemetry import Counts, Telemetry
 from agents.runtime.watchdog import AGAIN_S, Watchdog
 
-STOP_YIELD_S: Final = 0.05  # after an emergency stop a robot does nothing for so long: others' motors come first
-ROUTER_S: Final = 0.045  # between two looks at the router
-STOOD_S: Final = 0.5 * network.ROBOT_LEASE_S  # a process that stood still for longer may have lost its name
+STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors
+ROUTER_S: Final = 0.045  # between two checks of the router
+STOOD_S: Final = (
+    0.5 * network.ROBOT_LEASE_S
+)  # a process that stood still for longer may have lost the ownership of its name
 _CLOCK: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # goes on while the machine sleeps
 
 
@@ -60,23 +62,23 @@ class Runtime:
         self._counts = Counts.nothing(len(self._names))
         self._state_slot = 0
         self._stopping: str | None = None
-        self._leaving: set[int] = set()  # rows that were told to go while the run goes on
-        self._retired: set[int] = set()  # rows that come down, or are down, while the run goes on
-        self._cut_off = False  # motors were cut by a stop that the loop has not seen yet
-        self._airborne = False  # a row was in the air when its body said so last, or took off since
+        self._leaving: set[int] = set()  # rows that were ordered to leave the run
+        self._retired: set[int] = set()  # rows that land, or have landed, while the run goes on
+        self._cut_off = False  # motors were cut by a stop that the loop has not polled yet
+        self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._joined = False
         self._utc = self._now = self._next = 0.0
-        self._looked = np.inf  # when the process ran last, on `_CLOCK` [s]
+        self._looked = np.inf  # [s] last run of the process, on `_CLOCK`
         self._ownership = OwnershipCheck([setup.keys.alive(name) for name in assignment.names])
-        self._hands_off = False  # another process may drive the bodies, or does
+        self._hands_off = False  # another process drives the bodies, or may do so
         self._told: Callable[[], str | None] = lambda: None
         self._reach = validation.reach_of(assignment.limits.low, assignment.limits.high)
         self._everyone = np.arange(len(self._names))
         self._began = setup.clock.utc()
         self._owned: list[zenoh.LivelinessToken] = []
-        self._tokens: dict[int, zenoh.LivelinessToken] = {}  # of rows on which neighbours count
+        self._tokens: dict[int, zenoh.LivelinessToken] = {}  # of rows that are alive for their neighbours
         self._tokens_lock = threading.Lock()  # the watchdog's alarm takes them back from another thread
-        self._coming_down = False  # for good: the loop is over
+        self._coming_down = False  # the loop is over
         self._watchdog = Watchdog(body, self._everyone, alarm=self._call_for_help, silence_s=setup.loop_silence_s)
 
     def run(self) -> int:
@@ -85,7 +87,7 @@ class Runtime:
         Raises:
             BodyError: If the body cannot be opened.
             NameTaken: If another process owns the name of a robot, or took it while this one stood still or was cut
-                off: then the body is left as it is, for it is the other one's.
+                off: then the body belongs to that process and is left as it is.
             network.Unreachable: If no router answers.
         """
         lost = threading.Event()
@@ -94,8 +96,8 @@ class Runtime:
             rope.start()
         asked = threading.Event()
 
-        # on the way out everything is tried, the last entry first, whatever the others raise
-        with told_to_end(asked.set), ExitStack() as out:
+        # at the end all steps are tried, the last entry first, even if others raise
+        with on_termination(asked.set), ExitStack() as out:
             session = network.open_session(
                 self._setup.endpoints,
                 name="+".join(self._names),
@@ -126,7 +128,7 @@ class Runtime:
         return "told to leave" if len(self._leaving) == len(self._names) else None
 
     def _come_down(self) -> None:
-        """Lands what is still in the air, because something broke on the way, before the motors are switched off."""
+        """Lands robots that still fly after an error, before the motors are switched off."""
         if self._hands_off:
             return
         self._coming_down = True
@@ -141,10 +143,9 @@ class Runtime:
             raise failures[0]
 
     def _order_down(self, order: Callable[[Index], object], limit_s: float) -> None:
-        """Gives an order, and again until it is taken and no row is in the air any more, or for so long [s].
+        """Repeats an order until it succeeds and no row flies any more, for at most `limit_s` [s].
 
-        A body that does not say how it is gets all of that time if it was in the air before. The first error is raised
-        at the end.
+        A body that cannot be read gets all of that time if it flew before. The first error is raised at the end.
         """
         if self._hands_off:
             return
@@ -168,7 +169,7 @@ class Runtime:
             raise failures[0]
 
     def _in_the_air(self, failures: list[Exception]) -> bool:
-        """Whether a row flies, as its body says, or said last: what it raises is noted."""
+        """Whether a row flies, by the last successful reading of its body; an error is noted."""
         with _noted(failures):
             self._airborne = some(self._body.read(self._now).flying)
         return self._airborne
@@ -176,11 +177,11 @@ class Runtime:
     # ------------------------------------------------------------------ the network
 
     def _take_names(self, session: zenoh.Session, stop: threading.Event) -> None:
-        """Takes the ownership of the robots' names, before any body is touched.
+        """Claims the names of the robots, before any body is touched.
 
         Raises:
             NameTaken: If another process owns one of them.
-            network.Unreachable: If no router answers who does.
+            network.Unreachable: If no router answers.
         """
         keys, setup = self._setup.keys, self._setup
         tokens = [keys.alive(name) for name in self._names]
@@ -196,7 +197,7 @@ class Runtime:
         return ", ".join(self._setup.keys.whose(token) or token for token in str(taken).split(", "))
 
     def _mine(self) -> bool:
-        """Whether the names are this process's, as far as is known.
+        """Whether the names belong to this process; False while that is being checked.
 
         Raises:
             NameTaken: If another process has taken one of them.
@@ -211,15 +212,16 @@ class Runtime:
             ) from None
 
     def _make_sure(self) -> bool:
-        """Whether the process stood still since the last call: then it has waited until it knew that its names are its
-        own. Until then it must not tell its bodies anything, for another process may drive them.
+        """Whether the process stood still since the last call; then it has waited until the ownership was certain.
+
+        Until then it must not command its bodies, since another process may drive them.
 
         Raises:
             NameTaken: If another process has taken one of them.
             network.Unreachable: If the process was told to end, and no router has said so within `ANSWER_S`.
         """
         last, self._looked = self._looked, time.clock_gettime(_CLOCK)
-        if self._looked - last < STOOD_S or self._watchdog.tripped:  # one that is watched over does not stand still
+        if self._looked - last < STOOD_S or self._watchdog.tripped:  # a hanging loop is the business of the watchdog
             return False
         woke, self._hands_off = self._looked, True
         self._ownership.begin(self._session)
@@ -227,8 +229,8 @@ class Runtime:
             if self._looked - woke > ANSWER_S and self._told() is not None:
                 names = ", ".join(self._names)
                 raise network.Unreachable(
-                    f"{names}: told to end after it stood still, and no router says who owns the name now; its body is "
-                    "left as it is"
+                    f"{names}: told to end after it stood still, and no router answers who owns the name now; its body "
+                    "is left as it is"
                 )
             self._watchdog.beat()
             time.sleep(self._dt)
@@ -251,15 +253,15 @@ class Runtime:
         ranging = tuple(self._setup.ranging) or ("body",) * len(names)
         seen_by_world = [row for row, source in enumerate(ranging) if source == "world"]
         self._from_world = np.array(seen_by_world, dtype=np.intp)
-        self._ranges = HeardRanges(session, keys, names, seen_by_world) if seen_by_world else None
-        self._neighbours = neighbours = Neighbours(
+        self._ranges = RangeInbox(session, keys, names, seen_by_world) if seen_by_world else None
+        self._neighbours = neighbours = PoseInbox(
             session, keys, self.agent, reach=self._reach, conditions=self._setup.conditions
         )
         guidance = self.agent.guidance
         self._goals = None
         if guidance is not None:
             of_goals = self._setup.goal_conditions
-            self._goals = HeardGoals(session, keys, self.agent, guidance, reach=self._reach, conditions=of_goals)
+            self._goals = GoalInbox(session, keys, self.agent, guidance, reach=self._reach, conditions=of_goals)
         self._telemetry = Telemetry(
             session,
             keys,
@@ -274,38 +276,38 @@ class Runtime:
         self._be_there()
 
     def _be_there(self) -> None:
-        """Neighbours count on these robots from now on."""
+        """Declares the tokens by which neighbours know that these robots are alive."""
         with self._tokens_lock:
             for row, name in enumerate(self._names):
                 if row not in self._retired and row not in self._tokens:
                     self._tokens[row] = pubsub.alive_token(self._session, self._setup.keys.alive(name))
 
     def _call_for_help(self, why: str) -> None:
-        """From a thread of the watchdog's: neighbours must not count on robots whose loop hangs, or is over."""
+        """Removes the robots from the formation while their loop hangs, or is over; called by the watchdog's thread."""
         print(f"{', '.join(self._names)}: {why}; landing it", flush=True)
         if self._joined:
-            self._telemetry.alarm(why, self._setup.clock.utc())
+            self._telemetry.repeat_statuses(why, self._setup.clock.utc())
             with self._tokens_lock:
-                # tokens of a loop that has recovered meanwhile stay
+                # a loop that has recovered meanwhile keeps its tokens
                 hangs = self._coming_down or bool(self._watchdog.tripped)
                 tokens = [self._tokens.pop(row) for row in list(self._tokens)] if hangs else []
             for token in tokens:
                 token.undeclare()  # type: ignore[no-untyped-call]
 
     def _recover(self, why: str) -> None:
-        """The loop runs again after the watchdog had its robots land: they do, whatever was decided before."""
+        """Lands the robots after the watchdog ordered it, although the loop runs again."""
         for row in np.flatnonzero(self.agent.lifecycle.active).tolist():
             self.agent.lifecycle.land(row, why)
         self.agent.land_here()
         self._be_there()
 
-    def _wake(self, slept: float) -> None:
-        """The process stood still for so long [s]: until it has heard the others again, it holds."""
+    def _hold_after_suspend(self, slept: float) -> None:
+        """Holds position until neighbour poses are fresh again, after the loop was suspended for `slept` [s]."""
         self.agent.health.mark_resumed(self._next, slept)
         print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
     def _listen(self, t: float) -> None:
-        """Takes in what has arrived since the last tick."""
+        """Receives all since the last tick."""
         agent = self.agent
         outside = agent.health
         outside.offline_since = self._cut_off_since(t)
@@ -313,8 +315,8 @@ class Runtime:
             outside.conductor_lost_since = np.inf if there else min(outside.conductor_lost_since, t)
         self._neighbours.listen(t, self._utc)
         if self._goals is not None:
-            self._goals.take(t, self._utc)
-        self._heed_stops()
+            self._goals.receive(t, self._utc)
+        self._apply_stops()
         if (located := self._located) is not None:
             for row, taken, position, yaw in located.receive(self._utc, t):
                 self._body.locate(row, taken, position, yaw)
@@ -325,8 +327,8 @@ class Runtime:
             last.answer()
 
     def _cut_off_since(self, t: float) -> float:
-        """Since when the routers are gone [s]; infinity while one is there."""
-        if t >= self._router_due:  # a look at the router costs as much as a law
+        """Time [s] since which no router answers; infinity while one does."""
+        if t >= self._router_due:  # a check of the router costs as much as a law
             self._router_due = t + ROUTER_S
             before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
             if before < np.inf and self._silent_since == np.inf:
@@ -335,14 +337,14 @@ class Runtime:
         return self._silent_since
 
     def _cut(self, _stop: messages.Stop) -> None:
-        """Motors off as soon as an emergency stop is heard, in the thread that receives; the loop does the rest."""
+        """Cuts the motors on reception of an emergency stop, in the receiving thread; the loop does the rest."""
         self._cut_off = True
         self._body.stop(self._everyone)
 
-    def _heed_stops(self) -> None:
-        """Emergency stops of everybody, after `_cut`."""
+    def _apply_stops(self) -> None:
+        """Ends the lifecycle of all rows after an emergency stop, see `_cut`."""
         for stop in network.received(self._estop):
-            self._cut_off = False  # the phases say it from now on
+            self._cut_off = False  # the phases hold it from now on
             for row in range(len(self._names)):
                 self.agent.lifecycle.stop(row, stop.words)
 
@@ -361,7 +363,7 @@ class Runtime:
         with query:
             waits = self.agent.lifecycle.phase[row] == Phase.AIRBORNE
             slept = self.agent.health.suspended_s
-            # the conductor left long ago
+            # the conductor has given up waiting
             if order.order == "takeoff" and slept > ASK_S and self.agent.health.just_resumed(t):
                 refusal, value = f"the process stood still for {slept:.1f} s; ask again", None
             else:
@@ -371,9 +373,9 @@ class Runtime:
                 self._leaving.add(row)
             if (
                 order.order == "start" and order.at is not None and not refusal and waits
-            ):  # one that runs keeps its grid
+            ):  # a running robot keeps its ticks
                 self._align(order.at - self._utc)
-                self._telemetry.due = t  # whoever decides for it must know in time when it begins
+                self._telemetry.due = t  # the central controller must know the start in time
             phase = Phase(self.agent.lifecycle.phase[row]).word
             reply = messages.Reply(self._names[row], not refusal, phase, refusal, value)
             query.reply(key, messages.encode(reply, self._setup.encoding), encoding=self._mime)
@@ -381,7 +383,7 @@ class Runtime:
     # ------------------------------------------------------------------ the loop
 
     def _align(self, at: float) -> None:
-        """Moves the grid of ticks so that one falls on `at`: robots that start together then decide together."""
+        """Shifts the ticks so that one falls on `at`: robots that start together then decide together."""
         self._next = at - floor((at - self._now) / self._dt - 1e-6) * self._dt
 
     def _loop(self, stopping: Callable[[], str | None]) -> None:
@@ -413,7 +415,7 @@ class Runtime:
             self._next += behind * self._dt
             self.agent.skip_ticks(behind)
             if behind * self._dt > self._setup.loop_silence_s:
-                self._wake(behind * self._dt)
+                self._hold_after_suspend(behind * self._dt)
             t = self._now = self._next
             self._counts.late_s = max(self._counts.late_s, time.monotonic() - zero - t)
             self._next = t + self._dt
@@ -427,11 +429,11 @@ class Runtime:
             if (self._stopping is not None or self._setup.once) and (
                 t > farewell or (self.agent.lifecycle.phase == Phase.DONE).all()
             ):
-                self._telemetry.report(t, everything=True)
+                self._telemetry.send_statuses(t, everything=True)
                 return
 
     def _yield_after_stop(self) -> None:
-        """Leaves the processor to those whose motors still run."""
+        """Sleeps, so that other processes get the CPU to stop their motors."""
         ticks = ceil(STOP_YIELD_S / self._dt)
         self._next += ticks * self._dt
         self.agent.tick += ticks
@@ -446,11 +448,12 @@ class Runtime:
             known = np.isfinite(located.ahead)
             state.ahead = located.ahead if state.ahead is None else np.where(known, located.ahead, state.ahead)
         if self._ranges is not None:
-            state = replace(state, rays=instead(state.rays, self._ranges.read(self._utc, t), self._from_world))
-        said = self.agent.transmit(t, state)
-        for row in said.rows if not self._retired else [row for row in said.rows if row not in self._retired]:
-            self._say(int(row), said, float(state.yaw[row]), t)
-        actions = self.agent.act(t, state, said)
+            state = replace(state, rays=replace_rows(state.rays, self._ranges.read(self._utc, t), self._from_world))
+        transmission = self.agent.transmit(t, state)
+        for row in transmission.rows:
+            if row not in self._retired:
+                self._send_pose(int(row), transmission, float(state.yaw[row]), t)
+        actions = self.agent.act(t, state, transmission)
         self._act(actions)
         if self._retired or not self.agent.lifecycle.all_running:
             self._retire(t)
@@ -463,20 +466,19 @@ class Runtime:
         slot = (self.agent.tick - 1) // self._state_every
         if slot != self._state_slot:
             self._state_slot = slot
-            telemetry.tell(state, actions, t)
-            telemetry.scan(state)
-        telemetry.report(t, everything=t >= telemetry.due, state=state, changed=self._neighbours.changed)
+            telemetry.send_states(state, actions, t)
+            telemetry.send_ranges(state)
+        telemetry.send_statuses(t, everything=t >= telemetry.due, state=state, changed=self._neighbours.changed)
         self._neighbours.changed = False
 
     def _retire(self, t: float) -> None:
-        """Who is told to leave, or comes down unasked, takes its token back and is silent: none must follow it down.
+        """Undeclares the tokens of rows that leave, or land unasked, and silences them: no neighbour must follow them.
 
-        When the experiment is over the latter says again that it is there; whoever was ordered down is told about
-        elsewhere.
+        The latter declare theirs again after the experiment; rows that were ordered to land keep theirs.
         """
         life = self.agent.lifecycle
         during = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
-        # those who serve robots whose launcher is gone go when the tokens do (`agents.network.shutdown`)
+        # support processes without a launcher end with the last token (`agents.network.shutdown`)
         down = self.agent.descending if self._stopping is None else life.phase == Phase.DONE
         for row in np.flatnonzero(down).tolist():
             unasked = during[row] and not life.reason[row].startswith((messages.EMERGENCY, LAND, STOP))
@@ -484,17 +486,17 @@ class Runtime:
                 self._retired.add(row)
                 with self._tokens_lock:
                     token = self._tokens.pop(row, None)
-                if token is not None:  # else the watchdog has taken it back
+                if token is not None:  # else the watchdog has undeclared it
                     token.undeclare()  # type: ignore[no-untyped-call]
         if back := [row for row in self._retired if not (during[row] or row in self._leaving)]:
             self._retired.difference_update(back)
             self._be_there()
 
     def _act(self, actions: Actions) -> None:
-        """What the body must do, the motors-off first."""
+        """Commands the body, motors-off first."""
         duties = actions.commands
         stale = self._make_sure()
-        overruled = self._cut_off or self._watchdog.tripped  # another thread has told the body to stop or to land
+        overruled = self._cut_off or self._watchdog.tripped  # another thread has ordered the body to stop or to land
         if duties is not None:
             told = ((self._body.stop, duties.stop), (self._body.land, duties.land))
             call_all(partial(order, rows) for order, rows in told if len(rows))
@@ -504,15 +506,15 @@ class Runtime:
         if not overruled and not stale:
             self._body.command(actions.setpoint)
 
-    def _say(self, row: int, said: Transmission, yaw: float, t: float) -> None:
+    def _send_pose(self, row: int, transmission: Transmission, yaw: float, t: float) -> None:
         """Sends a row's pose to its neighbours."""
         self._counts.sent[row] += 1
         pose = messages.pose(
             self._names[row],
             self._counts.sent[row],
             self._utc + t,
-            said.position[row].tolist(),
-            said.velocity[row].tolist(),
+            transmission.position[row].tolist(),
+            transmission.velocity[row].tolist(),
             yaw,
         )
         payload = messages.encode(pose, self._setup.encoding)
@@ -522,7 +524,7 @@ class Runtime:
 
 @contextmanager
 def _noted(failures: list[Exception]) -> Iterator[None]:
-    """The first error inside is kept, to be raised when everything has been tried."""
+    """Keeps the first error, to be raised when all has been tried."""
     try:
         yield
     except Exception as error:  # noqa: BLE001

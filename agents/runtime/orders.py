@@ -1,4 +1,4 @@
-"""What a robot does with an order: obeys, or says why not. Pure; the process around it only carries the words."""
+"""Execution of orders to a robot, or the reason of a refusal. Pure; the loop receives and replies."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import msgspec
 from agents.agent import Agent
 from agents.network.messages import Order
 
-SOON_S: Final = 3600.0  # a common start further ahead than this is a mistake of somebody's clock
+SOON_S: Final = 3600.0  # a common start further ahead results from a wrong clock
 LAND: Final = "ordered to land"
 STOP: Final = "ordered to stop"
 OWN: Final = ("clamp", "tracking_gain")
 PAUSED: Final = "told to hold"
 
-Answer = tuple[str, float | None]  # why it is refused (empty: it is not), and the value of a parameter
+Answer = tuple[str, float | None]  # reason of a refusal (empty: none), and the value of a parameter
 
 
 def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Answer:
@@ -25,12 +25,12 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
     Args:
         agent: The decision that the row belongs to.
         row: Of the robot.
-        order: What it is told.
+        order: To carry out.
         t: Now, on the process's clock [s].
         utc: UTC time at which that clock stood at 0 [s].
 
     Returns:
-        Why it is refused (empty: it is not), and the value of a parameter that was asked for or set.
+        Reason of a refusal (empty: none), and the value of a parameter that was read or set.
     """
     match order.order:
         case "takeoff":

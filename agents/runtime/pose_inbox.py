@@ -1,4 +1,4 @@
-"""What comes from the neighbours of a process's rows: their poses, through the modelled network, and who is there."""
+"""Reception of the neighbours' poses, through the modelled channel, and liveliness of the neighbours."""
 
 from __future__ import annotations
 
@@ -18,41 +18,40 @@ from agents.network import messages, pubsub, validation
 from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
 
-LATE_S: Final = 3.0  # a network delays no pose longer: Zenoh holds one back for 2 s where another is missing
-PROOFS: Final = 3  # so many late poses in succession: one may be the last value of a robot that is silent
+LATE_S: Final = 3.0  # longest delay of a pose in a network: Zenoh holds one back for 2 s behind a missing one
+PROOFS: Final = 3  # late poses in succession that prove a slow clock: one may be the last value of a silent robot
 
 
-class Coming(Enum):
-    """A change of the liveliness of a robot."""
+class TokenChange(Enum):
+    """Change of the liveliness of a robot."""
 
-    CAME = 1
-    WENT = 2
-    ANEW = 3  # its process is another one than before
+    APPEARED = 1
+    VANISHED = 2
+    NEW_SESSION = 3  # its process is another one than before
 
 
 class ReceivedPose(NamedTuple):
-    """A pose that is news."""
+    """A valid pose that is newer than those before it."""
 
-    pose: messages.Pose  # checked
-    size: int  # of its payload [bytes]
-    missed: int  # poses before it that never came
-    # when the pose was measured (UTC [s]), as far as its stamp can be true: not after its arrival; of a clock that is
-    # behind, not earlier before it than a network delays poses
+    pose: messages.Pose
+    size: int  # [bytes] of its payload
+    missed: int  # lost poses before it
+    # [s] UTC of the measurement, as far as its stamp can be true: not after its arrival, and, if the clock of the robot
+    # is behind, not longer before it than a network delays poses
     measured: float
-    anew: bool  # whether it is the first of a new life: what was known of the robot is of the past
+    anew: bool  # first pose of a new session of the robot: earlier knowledge is void
 
 
 class NeighbourSubscription:
-    """Listens to one robot.
+    """Subscription to one robot: drops duplicates, counts losses, tracks liveliness."""
 
-    Attributes:
-        name: Of the robot.
-        links: (K,) on which it is heard.
-        lost: Poses that never came; whoever listens counts them, because it knows since when they matter.
-        stale: Poses that were left out because a newer one was known, or because they are of a life that is over.
-        behind: Age [s] of the last pose on arrival if the clock of the robot is behind: the last poses were older than
-            a network delays them. 0 if not.
-    """
+    name: str  # of the robot
+    links: Index  # (K,) links with this sender
+    lost: int  # lost poses; counted by the caller, which knows from when on they matter
+    stale: int  # poses that were dropped: older than a known one, or of a former session
+    # [s] age of the last pose on arrival if the clock of the robot is behind: the last poses were older than the
+    # longest delay of a network; else 0
+    behind: float
 
     def __init__(
         self,
@@ -65,16 +64,16 @@ class NeighbourSubscription:
         rate: float,
         depth: int = pubsub.POSES,
     ) -> None:
-        """Listens.
+        """Subscribes to the robot `name`.
 
         Args:
-            session: To the network.
+            session: Of the process.
             keys: Of the realm.
             name: Of the robot.
-            links: (K,) on which it is heard.
-            reach: Largest |x|, |y|, |z| that is believed [m].
-            rate: Poses that it says in a second at most [1/s].
-            depth: Newest poses that may wait.
+            links: (K,) links with this sender.
+            reach: Largest |x|, |y|, |z| of a valid pose [m].
+            rate: Largest rate of its poses [1/s].
+            depth: Poses that may wait.
         """
         self.name, self.links, self._reach, self._rate = name, links, reach, rate
         self._poses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.pose(name), depth), messages.Pose, keys=keys)
@@ -96,12 +95,11 @@ class NeighbourSubscription:
         return self._poses.malformed
 
     def news(self, now: float) -> Iterator[ReceivedPose]:
-        """Poses that have come until `now` (UTC [s]), oldest first: what cannot be true is refused, what is known left
-        out.
+        """Poses received until `now` (UTC [s]), oldest first, without invalid and known ones.
 
-        A new session of the robot, or a clock that was set back in one session, begins anew.
+        A new session of the robot resets the order of poses, as does a clock that was set back in one session.
         """
-        before = self._heard_at  # what waited with others while this process stood still was not heard then
+        before = self._heard_at  # poses that waited while this process stood still count as one reception
         check = partial(validation.check_pose, now=now, reach=self._reach)
         for pose, sample in self._poses.read_samples(check):
             life = _session_of(sample)
@@ -111,36 +109,36 @@ class NeighbourSubscription:
             anew = life is not None and self._live(life)
             if pose.stamp <= self._stamp and pose.seq > self._seq:  # its clock was set back
                 self._seq, self._stamp, anew = 0, 0.0, True
-            if pose.stamp <= self._stamp:  # equal: told again after a reconnection
+            if pose.stamp <= self._stamp:  # equal: repeated after a reconnection
                 self.stale += pose.stamp < self._stamp
                 continue
             self._weigh(now, now - pose.stamp)
             since = pose.stamp - self._stamp
             missed = validation.missed(self._seq, pose.seq, since, self._rate) if self._seq else 0
             self._seq, self._stamp = pose.seq, pose.stamp
-            # A clock that is behind: a predictor must not carry the pose on over that time. News from before the last
-            # news came, too late for a network, tell it at once; the first pose ever may be one of a silent robot.
+            # A clock that is behind: a predictor must not extrapolate over that time. A pose from before the last
+            # reception, too late for a network, proves it at once; the first pose ever may be that of a silent robot.
             slow = self.behind or (pose.stamp < before and now - pose.stamp > LATE_S)
             measured = now - LATE_S if slow else validation.taken(pose.stamp, now)
             self._heard_at = now
             yield ReceivedPose(pose, len(sample.payload), missed, measured, anew)
 
-    def comings(self) -> Iterator[Coming]:
-        """Changes of its liveliness, oldest first."""
+    def comings(self) -> Iterator[TokenChange]:
+        """Changes of the liveliness of the robot, oldest first."""
         for token, there in self._alive.changes():
             if token == self._token:
-                if there and self._gone and self._life is None and self._stamp:  # no token tells which life it is
+                if there and self._gone and self._life is None and self._stamp:  # no token names its session
                     self._seq, self._stamp = 0, 0.0
-                    yield Coming.ANEW
+                    yield TokenChange.NEW_SESSION
                 self._gone = not there
-                yield Coming.CAME if there else Coming.WENT
+                yield TokenChange.APPEARED if there else TokenChange.VANISHED
             elif (life := Keys.life_of(token)) is not None and life not in self._past:
                 if there and self._live(life):
-                    yield Coming.ANEW
+                    yield TokenChange.NEW_SESSION
                 self._owned = there if life == self._life else self._owned
 
     def _live(self, life: str) -> bool:
-        """Takes in the session of the robot's process; whether that is a new life, after another one."""
+        """Stores the session of the robot's process; returns whether it follows another one."""
         if life == self._life:
             return False
         before, self._life = self._life, life
@@ -150,34 +148,32 @@ class NeighbourSubscription:
         return before is not None
 
     def _weigh(self, now: float, age: float) -> None:
-        """Counts how often, at different times, a pose was `age` [s] old when it arrived."""
+        """Detects a clock that is behind, from the `age` [s] of poses on arrival."""
         if age <= LATE_S:
             self._old, self.behind = 0, 0.0
-        elif now > self._old_at:  # what waited while this process stood still came at once, and counts once
+        elif now > self._old_at:  # poses that waited while this process stood still arrive at once, and count once
             self._old, self._old_at = self._old + 1, now
             self.behind = age if self._old >= PROOFS else 0.0
 
 
 def _session_of(sample: zenoh.Sample) -> str | None:
-    """Session that published a sample, if its publisher says so."""
+    """Session that published a sample, if the sample names it."""
     source = sample.source_info
     return None if source is None else str(source.source_id.zid)
 
 
-NEWS: Final = 20_000  # newest poses that wait for telemetry, which takes them several times a second: 10 MB
+NEWS: Final = 20_000  # poses that wait for telemetry, which empties them several times a second: 10 MB
 
 
-class Neighbours:
-    """Those whom the rows of a process listen to.
+class PoseInbox:
+    """Poses of all neighbours of the rows of a process, through the modelled channel; polled."""
 
-    Attributes:
-        speakers: One for each name that is heard.
-        news: (n) the newest poses that got through to each row, which telemetry empties.
-        heard: (n) how many that were, ever.
-        dropped: (E,) samples that the modelled network dropped.
-        arrived: Poses of other processes that the network brought, ever, each once, before the modelled channel.
-        changed: Somebody came or went since whoever looks last said so.
-    """
+    speakers: list[NeighbourSubscription]  # one for each sender
+    news: list[deque[messages.Heard]]  # (n) newest received poses of each row, for telemetry, which empties them
+    heard: list[int]  # (n) received poses of each row
+    dropped: Index  # (E,) samples that the modelled channel dropped
+    arrived: int  # poses of other processes before the modelled channel, each counted once
+    changed: bool  # a neighbour appeared or vanished since the caller reset this
 
     def __init__(
         self,
@@ -188,14 +184,14 @@ class Neighbours:
         reach: messages.Vector,
         conditions: Conditions | None = None,
     ) -> None:
-        """Listens.
+        """Subscribes to the neighbours of the rows of `agent`.
 
         Args:
-            session: To the network.
+            session: Of the process.
             keys: Of the realm.
-            agent: Hears what gets through, and who is gone.
-            reach: Largest |x|, |y|, |z| that is believed [m].
-            conditions: What is done to poses on each link; None: nothing.
+            agent: Gets received poses and the loss of neighbours.
+            reach: Largest |x|, |y|, |z| of a valid pose [m].
+            conditions: Effects of the modelled channel on each link; None: none.
         """
         assignment = agent.assignment
         self._agent = agent
@@ -221,13 +217,13 @@ class Neighbours:
         return sum(speaker.malformed for speaker in self.speakers)
 
     def listen(self, t: float, utc: float) -> None:
-        """Takes in what has arrived at `t` [s] of the process's clock, which stood at 0 at `utc` [s]."""
+        """Receives all until `t` [s] of a clock that was 0 at `utc` [s]."""
         for speaker in self.speakers:
             for coming in speaker.comings():
                 self.changed = True
-                if coming is Coming.CAME:
+                if coming is TokenChange.APPEARED:
                     self._agent.mark_alive(speaker.links)
-                elif coming is Coming.ANEW:
+                elif coming is TokenChange.NEW_SESSION:
                     self._begin(speaker)
                 else:
                     self._channel.forget(speaker.links)
@@ -250,12 +246,12 @@ class Neighbours:
             self._believe(got, utc)
 
     def _begin(self, speaker: NeighbourSubscription) -> None:
-        """A neighbour begins a new life."""
+        """Forgets a neighbour that has a new session."""
         self._channel.forget(speaker.links)
         self._agent.discard_poses(speaker.links)
 
     def _send(self, arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> None:
-        """Gives poses, each with the link on which it arrived, to the modelled network, all of a tick at once."""
+        """Puts poses, each with its link, into the modelled channel, all of a tick at once."""
         poses = [heard.pose for _, heard in arrived]
         measured = np.array([[heard.measured - utc] for _, heard in arrived])
         got = PoseTable(
@@ -280,8 +276,8 @@ class Neighbours:
             )  # fmt: skip
 
     def _believe(self, got: PoseTable, utc: float) -> None:
-        """Poses have got through."""
-        assert got.extra is not None  # all bring along when they were measured; what is recorded keeps its own stamp
+        """Passes poses that got through to the agent and to telemetry."""
+        assert got.extra is not None  # time of measurement; the recorded pose keeps its own stamp
         self._agent.receive(got.link, got.position, got.velocity, got.extra[:, 0], got.arrival)
         columns = (got.link, got.seq, got.stamp, got.arrival, got.position, got.velocity)
         for link, seq, stamp, arrival, position, velocity in zip(*(c.tolist() for c in columns), strict=True):

@@ -1,4 +1,4 @@
-"""Range readings on the network: a sweep as a message, and what somebody else says that some robots see."""
+"""Range readings on the network: messages of sweeps, and reception for robots with simulated sensors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from agents.body.interface import RangeScan, Rays
 from agents.network import messages, pubsub, validation
 from agents.network.keys import Keys
 
-OLD_S = 1.0  # readings older than this say nothing of where things are now
+OLD_S = 1.0  # older readings are dropped: objects may have moved
 
 
 def message(robot: str, utc: float, scan: RangeScan) -> messages.Ranges:
@@ -24,8 +24,8 @@ def message(robot: str, utc: float, scan: RangeScan) -> messages.Ranges:
     )
 
 
-def instead(own: Rays | None, heard: Rays | None, rows: Index) -> Rays | None:
-    """What bodies see by themselves, but for `rows`, which see what was heard, or nothing."""
+def replace_rows(own: Rays | None, heard: Rays | None, rows: Index) -> Rays | None:
+    """The readings of the bodies, with those of `rows` replaced by received ones, or removed."""
     if own is None:
         return heard
     kept = ~np.isin(own.row, rows)
@@ -39,11 +39,11 @@ def instead(own: Rays | None, heard: Rays | None, rows: Index) -> Rays | None:
     return Rays(row[order], time[order], bearing[order], elevation[order], distance[order])
 
 
-class HeardRanges:
+class RangeInbox:
     """The newest sweep of each of some rows, as received on their keys `ranges`."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, names: Sequence[str], rows: Sequence[int]) -> None:
-        """Listens for `rows` of those called `names`."""
+        """Subscribes for `rows` of the robots `names`."""
         self._scans: list[RangeScan | None] = [None] * len(names)
         self._inboxes = {
             row: pubsub.Inbox(pubsub.subscriber(session, keys.ranges(names[row]), 4), messages.Ranges, keys=keys)
@@ -62,7 +62,7 @@ class HeardRanges:
         return next((inbox.trouble for inbox in self._inboxes.values() if inbox.trouble), "")
 
     def read(self, utc: float, now: float) -> Rays | None:
-        """What is known at `now` [s] of a clock that was 0 at `utc`; sweeps older than `OLD_S` are forgotten."""
+        """The newest sweeps at `now` [s] of a clock that was 0 at `utc`; those older than `OLD_S` are dropped."""
         changed = False
         for row, inbox in self._inboxes.items():
             for ranges in inbox.read(partial(validation.check_ranges, now=utc + now)):

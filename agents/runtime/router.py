@@ -1,6 +1,6 @@
 """The router process: `python -m agents.runtime.router`.
 
-Light to start, for every experiment on one machine starts one.
+Light to start, since every run on one machine starts one.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
 from agents.network.session import deserted, prompt_threads
 from agents.network.shutdown import end, held
 from agents.network.zenoh_config import config, reason, settings
-from agents.runtime.command_line import told_to_end
+from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import Lifeline
 
-EMPTY_S: Final = 1.0  # nobody connected for this long: whoever lost its connection would have it again
+EMPTY_S: Final = 1.0  # no client for this long: a client that lost its connection would be back
 LOOK_S: Final = 0.1
-PORT_FREE_S: Final = 10.0  # so long may the port of a router that begins anew stay taken by what it was before
+PORT_FREE_S: Final = 10.0  # limit for the port of a router that restarts to become free
 AGAIN_S: Final = 0.1
-# How often it looks whether somebody's certificate has been revoked, and whether it was told to end: a signal that the
-# kernel gives to another thread, as after a SIGCONT, does not wake the one that waits.
+# Period of the checks for revoked certificates and for signals: a signal that the kernel delivers to another thread, as
+# after a SIGCONT, does not wake the waiting one.
 LOOK_AGAIN_S: Final = 0.5
 
 
@@ -48,11 +48,10 @@ def serve(
 
     Args:
         endpoints: Where to listen: on loopback, or anywhere with a lab.
-        link: Other routers: who is there is seen here, and the other way round.
+        link: Other routers, with which it shares all keys.
         lifeline: Whether standard input is a lifeline.
-        linger_s: How long it stays after its lifeline was lost, so that landing robots can still be seen [s]; less when
-            nobody is connected any more.
-        rights: Who may do what, in a lab.
+        linger_s: Time that it stays after its lifeline was lost, for robots that land [s]; less without clients.
+        rights: Of all identities, in a lab.
 
     Raises:
         EndpointError: If it cannot listen there, or the lab cannot be used.
@@ -83,7 +82,7 @@ def serve(
             rope.start()
             threading.Thread(target=leave, args=(open_now,), name="linger", daemon=True).start()
 
-    with told_to_end(stop.set):
+    with on_termination(stop.set):
         serve_router(endpoints, stop, link=link, ready=ready, rights=rights)
     if rope.reason is not None:
         print(f"router: {rope.reason}", file=sys.stderr)
@@ -100,14 +99,14 @@ def serve_router(
 ) -> None:
     """Runs a router on loopback endpoints, or on those of a lab, until `stop` is set.
 
-    When the register of its lab changes, the router begins anew with the rules that follow from it: certificates that
-    were revoked have no rights from then on. Its clients connect again by themselves.
+    When the register of its lab changes, the router restarts with the new rules: revoked certificates have no rights
+    from then on. Clients reconnect by themselves.
 
     Args:
         endpoints: Where it listens.
         stop: Ends it.
         link: Other routers, sought until they answer.
-        ready: Gets the router as soon as clients can connect, and again when it has begun anew.
+        ready: Gets the router as soon as clients can connect, also after a restart.
         rights: Who may do what, in a lab.
 
     Raises:
@@ -116,7 +115,7 @@ def serve_router(
     """
     register = _register(endpoints)
     patience_s = 0.0
-    seen = _stamp(register)  # before it is read: what changes in between is seen then
+    seen = _stamp(register)  # before reading: a change in between is detected
     chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
     while True:
         with held(_routing(chosen, endpoints, patience_s, stop)) as (session, _):
@@ -128,7 +127,7 @@ def serve_router(
                 seen = now
                 try:
                     chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
-                except EndpointError as error:  # what stood there before still holds
+                except EndpointError as error:  # the former rules still hold
                     print(f"router: {error}", file=sys.stderr, flush=True)
                     continue
                 print("router: the lab has changed; its rules are enforced from now on", flush=True)
@@ -154,7 +153,7 @@ def _routing(chosen: zenoh.Config, endpoints: Sequence[str], wait_s: float, stop
 
 def _register(endpoints: Sequence[str]) -> Path | None:
     """The register of the lab that endpoints belong to."""
-    folder = lab.of(endpoints)
+    folder = lab.lab_of(endpoints)
     return None if folder is None else folder / lab.REGISTER
 
 

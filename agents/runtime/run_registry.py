@@ -1,7 +1,7 @@
-"""The runs that are up on this machine: a small file for each, so that an emergency stop finds all of them.
+"""Registry of the runs on this machine: one small file each, so that an emergency stop finds all of them.
 
 The files lie in a folder that belongs to the user alone: `$ZENPARK_RUNS`, else `$XDG_RUNTIME_DIR/zenpark`, else
-`zenpark-UID` in the folder for temporary files. Other users' runs are not seen.
+`zenpark-UID` in the folder for temporary files. Runs of other users are not listed.
 """
 
 from __future__ import annotations
@@ -24,41 +24,41 @@ from agents.network.endpoints import UNIX, Endpoint
 from agents.user_folder import runtime_folder
 
 LARGEST: Final = 1 << 20  # [bytes] of a file
-KNOCK_S: Final = 0.3  # a router on this machine takes a connection sooner
+KNOCK_S: Final = 0.3  # longest time of a local router to accept a connection
 
 
 class Run(msgspec.Struct, frozen=True):
     """A run, or a router that was started by hand."""
 
-    what: Literal["run", "router"]  # which of both
-    pid: int  # its process
-    born: str  # when that process was started, as the operating system counts it; empty where that is not known
-    since: float  # the same, UTC [s]
+    what: Literal["run", "router"]
+    pid: int
+    born: str  # start of the process, in ticks of the operating system; empty if unknown
+    since: float  # [s] UTC start of the process
     title: str  # of the experiment
     folder: str  # of the results, absolute
     endpoints: list[str]  # routers, or members of a mesh, each with its lab
     realm: str = "park"  # first chunk of the keys
-    identity: str = "operator"  # whose certificate stops it, in a lab
+    identity: str = "operator"  # name in the certificate that may stop it, in a lab
     robots: dict[str, str] = {}  # name and address of hardware of each robot; the address is empty for a twin
 
     @property
     def alive(self) -> bool:
-        """Whether its process is up; what it started may be, for a while, when it is not."""
+        """Whether its process runs; processes that it started may outlive it for a while."""
         return born(self.pid) == self.born
 
     @property
     def where(self) -> str:
-        """Its routers, as people read them."""
+        """Its routers, for people."""
         return "a mesh" if topology.is_mesh(self.endpoints) else ", ".join(topology.bare(self.endpoints))
 
     @property
     def words(self) -> str:
-        """Which one it is."""
+        """Title, folder and routers, for people."""
         return f"{self.title}, {self.folder}, at {self.where}" if self.folder else f"{self.title}, at {self.where}"
 
 
 def born(pid: int) -> str | None:
-    """When a process was started, in ticks since the machine was; empty where that is not known, None: it is gone."""
+    """Start of a process, in ticks since boot; empty if unknown, None if the process is gone."""
     try:
         status = Path(f"/proc/{pid}/stat").read_text("ascii", "replace").rpartition(")")[2].split()
         return None if status[0] in "ZX" else status[19]
@@ -70,11 +70,11 @@ def born(pid: int) -> str | None:
     except ProcessLookupError:
         return None
     except (OSError, OverflowError):
-        pass  # another user's
+        pass  # of another user
     return ""
 
 
-def mine(
+def own_entry(
     what: Literal["run", "router"],
     title: str,
     endpoints: Sequence[str],
@@ -94,7 +94,7 @@ def mine(
 
 @contextmanager
 def registered(run: Run) -> Iterator[str]:
-    """Inside, a run is found by others; gives why it is not, empty if it is."""
+    """Inside, a run is registered; yields the reason if that failed, else an empty text."""
     file, why = None, ""
     try:
         file = runtime_folder() / f"{run.pid}-{run.born or 'x'}-{time.monotonic_ns()}.json"
@@ -142,7 +142,7 @@ def _read(file: Path) -> Run | None:
         run = msgspec.json.decode(file.read_bytes(), type=Run)
         for endpoint in topology.bare(run.endpoints):
             Endpoint.parse(endpoint)
-        lab.of(run.endpoints)
+        lab.lab_of(run.endpoints)
     except (OSError, ValueError, msgspec.MsgspecError, RecursionError):
         return None
     return run if run.pid > 0 and run.endpoints and run.realm else None

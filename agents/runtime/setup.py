@@ -1,4 +1,4 @@
-"""What a robot process is told of its network, its clock and its sensors."""
+"""Settings of a robot process: network, clock and sensors."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ Ranging = Literal["body", "world", "far"]
 
 @dataclass(frozen=True)
 class Setup:
-    """Where a robot process finds its network and how it talks."""
+    """Settings of a robot process."""
 
     keys: Keys  # key expressions of the realm
     endpoints: Sequence[str]  # routers, or the members of a mesh
-    encoding: messages.Encoding  # of the payloads that it sends
-    state_hz: float  # rate of telemetry
+    encoding: messages.Encoding  # of sent payloads
+    state_hz: float  # [1/s] rate of telemetry
     lifeline: bool  # whether standard input is a lifeline
-    located: Sequence[bool]  # which rows get their position from outside
-    # where each row's range readings come from: its body; the world, which says them on the row's key `ranges`
-    # ("world"); or that key too, but the body hears them by itself ("far"). Left out: the bodies.
+    located: Sequence[bool]  # rows with a position measured from outside
+    # source of the range readings of each row: its body; the world, by the key `ranges` of the row ("world"); or that
+    # key, received by the body itself ("far"). Left out: the bodies.
     ranging: Sequence[Ranging] = ()
-    # what is done to poses that have come from neighbours, on each link; None: nothing
+    # effects of the modelled channel on received poses, by link; None: none
     conditions: Conditions | None = None
-    goal_conditions: Conditions | None = None  # the same for goals that have come from a centre, for each guided row
+    goal_conditions: Conditions | None = None  # on received goals, by guided row
     clock: Clock = field(default_factory=Clock)  # of the experiment
-    once: bool = False  # whether the process ends when its robots are down after an experiment
-    rights: Rights | None = None  # who may do what, which robots enforce themselves in the mesh of a lab
-    # a loop without a tick for so long hangs: its robots are landed from outside of it [s]
+    once: bool = False  # the process ends when its robots are down after an experiment
+    rights: Rights | None = None  # enforced by the robots themselves in the mesh of a lab
+    # [s] without a tick after which the watchdog lands the robots
     loop_silence_s: float = SILENCE_S

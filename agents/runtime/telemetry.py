@@ -1,6 +1,6 @@
-"""What a robot process says of itself for people and recorders: telemetry, range readings, statuses.
+"""Telemetry of a robot process for people and recorders: states, range readings, statuses.
 
-Nothing here is needed by another robot; poses for the neighbours are the runtime's.
+No robot needs these; the poses for the neighbours are sent by the loop.
 """
 
 from __future__ import annotations
@@ -25,44 +25,42 @@ from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.runtime import range_inbox
-from agents.runtime.pose_inbox import Neighbours
+from agents.runtime.pose_inbox import PoseInbox
 
 STATUS_S: Final = 1.0
-INCIDENTS: Final = 16  # so many are told again
+INCIDENTS: Final = 16  # repeated in each status
 WORDS: Final = tuple(phase.word for phase in Phase)
 UNDER_WAY: Final = ("airborne", "running")
 
 
 @dataclass
 class Counts:
-    """What is counted in a process of n rows; ticks and interventions from the common start."""
+    """Counters of a process of n rows; ticks and interventions since the common start."""
 
-    sent: list[int]  # (n) poses said
-    interventions: Index  # (n,) ticks on which safety changed what had been decided
+    sent: list[int]  # (n) poses
+    interventions: Index  # (n,) ticks on which safety changed the decision
     avoided: Index  # (n,) ticks on which avoidance did
-    refused: int = 0  # orders that were
-    ticks: int = 0  # since the start, and `missed` ones
-    missed: int = 0  # see `ticks`
-    late_s: float = 0.0  # largest lateness of a tick since the last status
+    refused: int = 0  # orders
+    ticks: int = 0
+    missed: int = 0  # skipped ticks
+    late_s: float = 0.0  # [s] largest lateness of a tick since the last status
 
     @classmethod
     def nothing(cls, rows: int) -> Counts:
-        """Before anything was counted."""
+        """All zero."""
         return cls([0] * rows, *np.zeros((2, rows), dtype=np.intp))
 
     def begin(self) -> None:
-        """At the common start."""
+        """Resets the counters that begin at the common start."""
         self.ticks = self.missed = 0
         self.interventions[:] = self.avoided[:] = 0
 
 
 class Telemetry:
-    """Says how the rows of a process are.
+    """States, statuses and range readings of the rows of a process."""
 
-    Attributes:
-        utc: UTC time at which the process's clock was 0 [s].
-        due: When all rows' statuses are sent next, on the process's clock [s].
-    """
+    utc: float  # [s] UTC at which the clock of the process was 0
+    due: float  # [s] on that clock, of the next statuses of all rows
 
     def __init__(
         self,
@@ -71,7 +69,7 @@ class Telemetry:
         encoding: messages.Encoding,
         *,
         agent: Agent,
-        neighbours: Neighbours,
+        neighbours: PoseInbox,
         counts: Counts,
         malformed: Callable[[], int],
         ranged: Sequence[bool],
@@ -84,12 +82,11 @@ class Telemetry:
             keys: Of the realm.
             encoding: Of payloads.
             agent: Whose rows they are.
-            neighbours: Whom the rows listen to; what they said since the last telemetry is sent along and emptied.
+            neighbours: Poses received since the last state are sent with it, and removed.
             counts: Kept by the runtime.
             malformed: Number of payloads that were refused, other than poses.
-            ranged: (n) rows whose range readings are their own: the others' come from the network, where they need
-                not be said again.
-            followed: Goals that reached each row since the last telemetry; emptied here. None: nobody is guided.
+            ranged: (n) rows whose bodies measure ranges: those of the others come from the network already.
+            followed: Goals received by each row since the last state, removed here; None: no row is guided.
         """
         self._agent, self._neighbours, self._counts, self._malformed = agent, neighbours, counts, malformed
         self._encoding = encoding
@@ -111,8 +108,8 @@ class Telemetry:
         self._incidents: list[deque[messages.Incident]] = [deque(maxlen=INCIDENTS) for _ in names]
         self._numbers = [0] * len(names)
 
-    def tell(self, state: BodyState, actions: Actions, t: float) -> None:
-        """Sends the telemetry of every row; one that does not know where it is tells what it heard all the same."""
+    def send_states(self, state: BodyState, actions: Actions, t: float) -> None:
+        """Sends the state of every row, also of one whose position is unknown."""
         self._told += 1
         agent = self._agent
         position, velocity, truth = state.position.tolist(), state.velocity.tolist(), state.true_position.tolist()
@@ -143,8 +140,8 @@ class Telemetry:
             self._neighbours.news[row].clear()
             self._followed[row].clear()
 
-    def scan(self, state: BodyState) -> None:
-        """Sends the range readings that are new and the rows' own."""
+    def send_ranges(self, state: BodyState) -> None:
+        """Sends new range readings of the rows that measure them."""
         if state.rays is None:
             return
         for row in np.unique(state.rays.row).tolist():
@@ -155,10 +152,12 @@ class Telemetry:
                 ranges = range_inbox.message(self._names[row], self.utc, scan)
                 publisher.put(messages.encode(ranges, self._encoding))
 
-    def report(self, t: float, *, everything: bool, state: BodyState | None = None, changed: bool = False) -> None:
-        """Sends statuses: of all rows when asked for everything, else of those of which something has changed.
+    def send_statuses(
+        self, t: float, *, everything: bool, state: BodyState | None = None, changed: bool = False
+    ) -> None:
+        """Sends statuses: of all rows if `everything`, else of those that have changed.
 
-        `changed` says that neighbours came or went: what the phases alone would not tell.
+        `changed`: neighbours appeared or vanished, which the phases do not show.
         """
         agent, counts = self._agent, self._counts
         if not (everything or changed or agent.lifecycle.moved or agent.hazards.incidents):
@@ -217,7 +216,7 @@ class Telemetry:
             counts.late_s = 0.0
 
     def _note_incidents(self) -> None:
-        """Takes what happened out of the decision, and prints it: the log of a process outlives the network."""
+        """Moves incidents from the decision into statuses, and prints them: the log outlives the network."""
         happened = self._agent.hazards.incidents
         for incident in happened:
             row = incident.row
@@ -228,8 +227,8 @@ class Telemetry:
             print(f"{self._names[row]}: {incident.text}", flush=True)
         happened.clear()
 
-    def alarm(self, why: str, stamp: float) -> None:
-        """Says the last statuses again, with what has happened since; from any thread, while the loop hangs."""
+    def repeat_statuses(self, why: str, stamp: float) -> None:
+        """Repeats the last statuses with the reason `why`; from any thread, while the loop hangs."""
         for publisher, status in zip(self._statuses, self._said, strict=True):
             if status is not None:
                 phase = "landing" if status.phase in UNDER_WAY else status.phase
@@ -237,7 +236,7 @@ class Telemetry:
                 publisher.put(messages.encode(said, self._encoding))
 
     def _dropped_of(self, row: int) -> dict[str, int]:
-        """How many samples of whom a row did not get because the modelled network dropped them."""
+        """Samples for a row that the modelled channel dropped, by neighbour."""
         assignment = self._agent.assignment
         dropped = self._neighbours.dropped
         at = np.flatnonzero((dropped > 0) & (assignment.links.receiver == row))
@@ -246,7 +245,7 @@ class Telemetry:
 
 
 def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it
-    """A row of what a body may know or not, for the wire; None if it does not."""
+    """One row of an optional column of the body's state, for a message; None if unknown."""
     if column is None or not np.isfinite(column[row]).all():
         return None
     value = column[row].tolist()

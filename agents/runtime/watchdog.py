@@ -1,7 +1,7 @@
-"""A watchdog outside the control loop: a robot whose loop hangs is brought down by another thread of its process.
+"""Watchdog of the control loop: another thread of the process lands the robots when the loop hangs.
 
-It is as good as the interpreter: where a process is frozen, or native code keeps the interpreter's lock for ever, no
-thread of it runs, and the far end must act (docs/safety.md says who does, for each body).
+It depends on the interpreter: in a frozen process, or while native code keeps the interpreter's lock, no thread runs,
+and the far end must act (docs/safety.md tells which, for each body).
 """
 
 from __future__ import annotations
@@ -18,22 +18,21 @@ from agents.arrays import Index
 from agents.body.interface import Body
 
 SILENCE_S: Final = 0.5
-DOWN_S: Final = 10.0  # a robot whose loop hangs has so long to come down by itself,
-CUT_S: Final = 0.5  # and its body so long to take in that the motors go off; then the process ends
-AGAIN_S: Final = 0.5  # between two orders to land: the first may have got lost
-LOOKS: Final = 5  # in each silence
+DOWN_S: Final = 10.0  # limit for the robots of a loop that hangs to land,
+CUT_S: Final = 0.5  # and for the body to cut the motors; then the process ends
+AGAIN_S: Final = 0.5  # between two orders to land: the first may be lost
+LOOKS: Final = 5  # checks in each silence
 HUNG: Final = 70  # exit code of a process whose loop hung for good
 
 
 class Watchdog:
-    """Watches a loop that says `beat` on every turn, from `start` to `end` or inside a `with`, as often as wanted.
+    """Watches a loop that calls `beat` on every turn, from `start` to `end` or inside a `with`, repeatedly if wanted.
 
-    When no beat came for too long it has the body land, says so, and after `down_s` without a beat cuts the motors and
-    ends the process. Each call is made in a thread of its own: what the loop hangs in may hang here too.
-
-    Attributes:
-        tripped: Why the robots were told to land; empty while all is well, and again after `forgive`.
+    After `silence_s` without a beat it orders the body to land and raises the alarm, and after `down_s` more it cuts
+    the motors and ends the process. Each call has a thread of its own: it may hang as the loop does.
     """
+
+    tripped: str  # why the robots were ordered to land; empty before, and after `forgive`
 
     def __init__(
         self,
@@ -45,14 +44,14 @@ class Watchdog:
         down_s: float = DOWN_S,
         end: Callable[[int], object] = os._exit,
     ) -> None:
-        """Nothing is watched yet.
+        """Prepares the watchdog.
 
         Args:
             body: `land` and `stop` of it are called.
             rows: All of its rows.
-            alarm: Says to the others what has happened.
-            silence_s: Longest time without a beat.
-            down_s: From then until the motors are cut.
+            alarm: Tells the other processes the reason.
+            silence_s: Longest time without a beat [s].
+            down_s: From then until the motors are cut [s].
             end: Ends the process with an exit code.
         """
         self.tripped = ""
@@ -64,30 +63,30 @@ class Watchdog:
         self._at_work: dict[str, threading.Thread] = {}
 
     def beat(self) -> None:
-        """The loop goes round; costs 0.1 µs."""
+        """Reports a turn of the loop; costs 0.1 µs."""
         self._beats += 1
 
     def forgive(self) -> str:
-        """The loop runs again: why it had been taken for hanging. The robots must land all the same."""
+        """Clears and returns the reason when the loop runs again. The robots must land all the same."""
         why, self.tripped = self.tripped, ""
         return why
 
     def start(self) -> None:
-        """Watches from now on, if it does not already."""
+        """Starts to watch, unless it does already."""
         if self._thread is None:
             self._over.clear()
             self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
             self._thread.start()
 
     def end(self) -> None:
-        """Watches no longer."""
+        """Stops watching."""
         self._over.set()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
 
     def call_for_help(self, why: str) -> None:
-        """Says to the others that the robots come down, without waiting until that has been said."""
+        """Raises the alarm without waiting for it to be sent."""
         self._do("alarm", partial(self._alarm, why))
 
     def __enter__(self) -> Self:
@@ -106,7 +105,7 @@ class Watchdog:
         while not self._over.wait(period):
             last, looked = looked, time.monotonic()
             if looked - last > self._silence_s:
-                since += looked - last  # nobody in this process ran, or could have
+                since += looked - last  # the whole process stood still
                 continue
             if self._beats != seen:
                 seen, since, hung = self._beats, looked, 0.0
@@ -125,14 +124,14 @@ class Watchdog:
                 return
 
     def _give_up(self) -> None:
-        """Motors off, and out: the device's own watchdog and the starter do the rest."""
+        """Cuts the motors and ends the process; the watchdog of the device and the launcher do the rest."""
         self._do("stop", lambda: self._body.stop(self._rows))
         self._at_work["stop"].join(CUT_S)
-        if not self._over.wait(CUT_S):  # for what was said to leave the process
+        if not self._over.wait(CUT_S):  # time for messages to leave the process
             self._end(HUNG)
 
     def _do(self, what: str, call: Callable[[], object]) -> None:
-        """Calls in a thread of its own, unless the last call of that name has not come back."""
+        """Makes a call in a thread of its own, unless the last call of that name still runs."""
         last = self._at_work.get(what)
         if last is None or not last.is_alive():
             self._at_work[what] = threading.Thread(target=call, name=f"watchdog: {what}", daemon=True)

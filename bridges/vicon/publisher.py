@@ -24,7 +24,7 @@ from agents.network.keys import Keys
 from agents.network.shutdown import Farewell
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Malformed, Segment
-from agents.runtime.command_line import add_network, reached, told_to_end
+from agents.runtime.command_line import add_network, on_termination, reached
 from agents.runtime.lifeline import Lifeline
 from bridges.vicon.client import Frame, Reader
 
@@ -215,7 +215,7 @@ def run_bridge(
     if lifeline:
         Lifeline(lost).start()
     with (
-        told_to_end(stop.set),
+        on_termination(stop.set),
         network.open_session(endpoints, name="vicon", stop=stop, identity=identity) as session,
     ):
         keys, robots = Keys(realm), list(subjects)

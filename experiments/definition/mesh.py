@@ -68,6 +68,6 @@ def neighbour_endpoints(experiment: Experiment, names: Sequence[str], endpoints:
 
 def member_rights(experiment: Experiment, endpoints: Sequence[str]) -> Rights | None:
     """Rights that a member of a mesh enforces itself; None with routers, or without a lab."""
-    if not topology.is_mesh(endpoints) or lab.of(endpoints) is None:
+    if not topology.is_mesh(endpoints) or lab.lab_of(endpoints) is None:
         return None
     return access_rights.rights([experiment])

@@ -13,7 +13,7 @@ from agents.network import messages
 from agents.network.channel_model import Conditions
 from agents.network.keys import Keys
 from agents.plugins.predictors import ConstantVelocity
-from agents.runtime.pose_inbox import LATE_S, Neighbours
+from agents.runtime.pose_inbox import LATE_S, PoseInbox
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net, Payload
@@ -43,7 +43,7 @@ class Robot:
 
     def __init__(self, net: Net, conditions: Conditions | None = None) -> None:
         self.net, self.agent = net, Agent(Plan(pair()).assignment(("A",)))
-        self.neighbours = Neighbours(net.session, KEYS, self.agent, reach=(5.0, 5.0, 5.0), conditions=conditions)
+        self.neighbours = PoseInbox(net.session, KEYS, self.agent, reach=(5.0, 5.0, 5.0), conditions=conditions)
         (self.sender,) = self.neighbours.speakers
         self.t = 0.0
 

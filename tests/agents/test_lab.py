@@ -3,7 +3,7 @@ import pytest
 from agents.network import lab
 from agents.network.access_control import Grant, Rights
 from agents.network.endpoints import EndpointError
-from agents.network.lab import LabError, bare, files, of, options, register, require, secured
+from agents.network.lab import LabError, bare, files, lab_of, options, register, require, secured
 from agents.network.zenoh_config import config, settings
 from tools.commands import authority
 
@@ -20,7 +20,7 @@ def test_endpoints_carry_their_lab(folder):
     assert made == [f"tls/127.0.0.1:7447#lab={folder}", f"quic/lab.example.org:7448#lab={folder}"]
     assert secured(made, folder) == made
     assert bare(made) == ["tls/127.0.0.1:7447", "quic/lab.example.org:7448"]
-    assert of(made) == folder
+    assert lab_of(made) == folder
     assert options(made[0]) == f"--connect tls/127.0.0.1:7447 --lab {folder}"
     assert options("tcp/127.0.0.1:7447") == "--connect tcp/127.0.0.1:7447"
 
@@ -28,8 +28,8 @@ def test_endpoints_carry_their_lab(folder):
 def test_without_endpoints_a_lab_is_on_this_machine(folder):
     assert secured([], folder) == [f"tls/127.0.0.1:7447#lab={folder}"]
     assert secured([], None) == []
-    assert of(["tcp/127.0.0.1:7447"]) is None
-    assert of([]) is None
+    assert lab_of(["tcp/127.0.0.1:7447"]) is None
+    assert lab_of([]) is None
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "unixsock-stream/tmp/x"])
@@ -42,7 +42,7 @@ def test_a_lab_needs_endpoints_that_ask_for_certificates(folder, endpoint):
 
 def test_a_session_has_one_identity(folder):
     with pytest.raises(LabError, match="one lab or to none"):
-        of([f"tls/127.0.0.1:1#lab={folder}", "tls/127.0.0.1:2"])
+        lab_of([f"tls/127.0.0.1:1#lab={folder}", "tls/127.0.0.1:2"])
 
 
 def test_sessions_of_a_lab_show_certificates_and_ask_for_them(folder):

@@ -115,7 +115,7 @@ def faked(monkeypatch):
             return set(table.tokens) if table.answers else None
 
         monkeypatch.setattr(pubsub, "alive_token", declared)
-        monkeypatch.setattr(network, "here", here)
+        monkeypatch.setattr(network, "tokens_present", here)
         monkeypatch.setattr(network, "connected", lambda _session: True)
         monkeypatch.setattr(name_ownership.time, "monotonic", lambda: table.now)
         monkeypatch.setattr(network, "RETRY_S", 0.0)
@@ -205,9 +205,9 @@ def test_one_empty_answer_of_a_link_that_is_lost_is_not_taken_for_a_name_that_is
     table.tokens = [Keys.life(KEY, "new")]
     answers = iter([set(), set()])
     links = iter([True, True, True, False])  # the link is lost after the first answer
-    there = network.here
+    there = network.tokens_present
     monkeypatch.setattr(network, "connected", lambda _session: next(links, True))
-    monkeypatch.setattr(network, "here", lambda session, key: next(answers, None) or there(session, key))
+    monkeypatch.setattr(network, "tokens_present", lambda session, key: next(answers, None) or there(session, key))
     assert isinstance(table.together({"old": woken(table, "old", [])})["old"], NameTaken)
 
 

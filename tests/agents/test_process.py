@@ -7,14 +7,14 @@ import signal
 import pytest
 
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
-from agents.runtime.command_line import add_network, reached, told_to_end
+from agents.runtime.command_line import add_network, on_termination, reached
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_each_signal_is_heeded_each_time_and_then_no_more(number):
     before = signal.getsignal(number)
     told = []
-    with told_to_end(lambda: told.append(1)):
+    with on_termination(lambda: told.append(1)):
         os.kill(os.getpid(), number)
         os.kill(os.getpid(), number)
     assert told == [1, 1]
@@ -23,7 +23,7 @@ def test_each_signal_is_heeded_each_time_and_then_no_more(number):
 
 def test_what_was_before_comes_back_after_an_error():
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(ZeroDivisionError), told_to_end(print):
+    with pytest.raises(ZeroDivisionError), on_termination(print):
         _ = 1 / 0
     assert signal.getsignal(signal.SIGTERM) is before
 

@@ -15,7 +15,7 @@ from agents.network import messages, validation
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.runtime import range_inbox
-from agents.runtime.range_inbox import HeardRanges, instead
+from agents.runtime.range_inbox import RangeInbox, replace_rows
 from tests.conftest import RouterProcess
 
 KEYS = Keys()
@@ -57,13 +57,13 @@ def test_what_no_sensor_sees_is_refused(field: str, value: object, why: str) -> 
 def test_what_is_heard_takes_the_place_of_what_is_seen() -> None:
     own = Rays.gather([scan(1.0, 0.1, 0.2), scan(1.0, 0.3), scan(1.0, 0.4)])
     heard = Rays.gather([None, scan(2.0, 0.5, 0.6)])
-    rays = instead(own, heard, np.array([1, 2]))
+    rays = replace_rows(own, heard, np.array([1, 2]))
     assert rays is not None
     assert rays.row.tolist() == [0, 0, 1, 1]
     assert rays.distance.tolist() == [0.1, 0.2, 0.5, 0.6]
     assert rays.time.tolist() == [1.0, 1.0, 2.0, 2.0]
-    assert instead(None, heard, np.array([1])) is heard
-    assert instead(own, None, np.arange(3)) is None
+    assert replace_rows(None, heard, np.array([1])) is heard
+    assert replace_rows(own, None, np.arange(3)) is None
 
 
 @pytest.mark.system
@@ -71,7 +71,7 @@ def test_the_newest_sweep_of_each_row_is_known_until_it_is_old(
     router: RouterProcess, eventually: Callable[[Callable[[], object]], None]
 ) -> None:
     with network.open_session([router.endpoint], name="test") as session:
-        listener = HeardRanges(session, KEYS, ("CF01", "KH01"), [1])
+        listener = RangeInbox(session, KEYS, ("CF01", "KH01"), [1])
         utc = time.time() - 10.0
         assert listener.read(utc, 10.0) is None
 

@@ -11,7 +11,7 @@ import pytest
 
 from agents.network.endpoints import free_endpoint
 from agents.runtime import run_registry
-from agents.runtime.run_registry import Run, born, mine, registered, runs
+from agents.runtime.run_registry import Run, born, own_entry, registered, runs
 
 
 @pytest.fixture(autouse=True)
@@ -31,17 +31,19 @@ def dead() -> Run:
     started = born(process.pid)
     assert started is not None
     process.communicate(b"\n")
-    return msgspec.structs.replace(mine("run", "dead", nowhere()), pid=process.pid, born=started)
+    return msgspec.structs.replace(own_entry("run", "dead", nowhere()), pid=process.pid, born=started)
 
 
 def test_a_run_is_listed_as_long_as_it_is_up(folder: Path) -> None:
-    run = mine("run", "two", nowhere(), folder=Path("here"), realm="hall", robots={"CF01": "radio://0", "KH01": ""})
+    run = own_entry(
+        "run", "two", nowhere(), folder=Path("here"), realm="hall", robots={"CF01": "radio://0", "KH01": ""}
+    )
     assert runs() == []
     with registered(run) as why:
         assert why == ""
         assert runs() == [run]
         assert run.alive
-        with registered(mine("router", "a router by hand", nowhere())):
+        with registered(own_entry("router", "a router by hand", nowhere())):
             assert [each.what for each in runs()] == ["run", "router"]
         assert run.words == f"two, {Path('here').absolute()}, at {run.endpoints[0]}"
     assert runs() == []
@@ -62,7 +64,7 @@ def test_who_died_is_listed_only_while_its_router_answers(folder: Path) -> None:
 
 
 def test_another_process_of_the_same_number_is_not_the_run() -> None:
-    assert not msgspec.structs.replace(mine("run", "two", nowhere()), born="1").alive
+    assert not msgspec.structs.replace(own_entry("run", "two", nowhere()), born="1").alive
 
 
 @pytest.mark.parametrize(
@@ -80,7 +82,7 @@ def test_another_process_of_the_same_number_is_not_the_run() -> None:
     ids=range(8),
 )
 def test_garbage_is_left_alone_and_hides_nobody(folder: Path, text: bytes) -> None:
-    run = mine("run", "two", nowhere())
+    run = own_entry("run", "two", nowhere())
     with registered(run):
         (folder / "0.json").write_bytes(text)
         (folder / "1.json").mkdir()
@@ -91,11 +93,11 @@ def test_garbage_is_left_alone_and_hides_nobody(folder: Path, text: bytes) -> No
 
 def test_a_folder_that_others_can_write_to_is_not_believed(folder: Path) -> None:
     folder.mkdir(0o700)
-    (folder / "0.json").write_bytes(msgspec.json.encode(mine("run", "two", nowhere())))
+    (folder / "0.json").write_bytes(msgspec.json.encode(own_entry("run", "two", nowhere())))
     assert len(runs()) == 1
     folder.chmod(0o770)
     assert runs() == []
-    with registered(mine("run", "two", nowhere())) as why:
+    with registered(own_entry("run", "two", nowhere())) as why:
         assert "no folder of yours alone" in why
     folder.rename(folder.with_name("elsewhere"))
     folder.symlink_to(folder.with_name("elsewhere"))
@@ -106,10 +108,10 @@ def test_without_a_runtime_folder_it_is_one_of_the_users_own(tmp_path: Path, mon
     monkeypatch.delenv("ZENPARK_RUNS")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
-    with registered(mine("run", "two", nowhere())) as why:
+    with registered(own_entry("run", "two", nowhere())) as why:
         assert why == ""
         assert [path.name for path in tmp_path.iterdir()] == [f"zenpark-{os.getuid()}"]
     (tmp_path / "session").mkdir(0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "session"))
-    with registered(mine("run", "two", nowhere())):
+    with registered(own_entry("run", "two", nowhere())):
         assert len(list((tmp_path / "session" / "zenpark").iterdir())) == 1

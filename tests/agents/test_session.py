@@ -34,7 +34,7 @@ from agents.network.session import (
     RouterWatch,
     Unreachable,
     connected,
-    links,
+    count_links,
     open_session,
     received,
 )
@@ -340,7 +340,7 @@ def test_at_a_frozen_first_router_with_a_long_lease_all_goes_on_at_the_second(pa
             os.waitpid(patient_router.process.pid, os.WUNTRACED)
             until(lambda: {str(zid) for zid in robot.info.routers_zid()} not in (old, set()))
             arrived()
-            assert links(robot) == links(listener) == 1
+            assert count_links(robot) == count_links(listener) == 1
         arrived()
         token.undeclare()
         until(lambda: here == [zenoh.SampleKind.DELETE])

@@ -8,7 +8,7 @@ import pytest
 from agents.agent import Agent
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
-from agents.runtime.pose_inbox import NEWS, Neighbours
+from agents.runtime.pose_inbox import NEWS, PoseInbox
 from agents.runtime.telemetry import Counts, Telemetry
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
@@ -46,7 +46,7 @@ class Robot:
         self.body = TwinBody(bodies.body_request(experiment, ("A",), [1]))
         self.body.open()
         nowhere = None
-        self.neighbours = Neighbours(nowhere, Keys(), self.agent, reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
+        self.neighbours = PoseInbox(nowhere, Keys(), self.agent, reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
         self.telemetry = Telemetry(
             nowhere, Keys(), "json",  # type: ignore[arg-type]
             agent=self.agent, neighbours=self.neighbours, counts=Counts.nothing(1), malformed=lambda: 0, ranged=[True],
@@ -67,7 +67,7 @@ class Robot:
         actions = self.agent.act(t, state, self.agent.transmit(t, state))
         (publisher,) = self.telemetry._states
         publisher.states.clear()
-        self.telemetry.tell(state, actions, t)
+        self.telemetry.send_states(state, actions, t)
         return publisher.states
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from agents.agent import Agent
 from agents.network import messages
 from agents.network.keys import Keys
-from agents.runtime.goal_inbox import HeardGoals
+from agents.runtime.goal_inbox import GoalInbox
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.world_network import Exchange
@@ -34,7 +34,7 @@ def test_a_world_obeys_the_stop_of_a_process_whose_clock_is_behind_that_of_the_o
             """Whether it is carried out."""
             before = world._done.get("F", 0)
             net.deliver(sent(KEYS.setpoint("F"), messages.Command("F", seq, UTC, action, **more))[0])
-            world.listen(0.0)
+            world.receive(0.0)
             return world._done.get("F", 0) != before
 
         own(net, KEYS.alive("F"), "one")
@@ -51,13 +51,13 @@ def test_a_centre_whose_clock_is_behind_that_of_the_one_before_is_followed():
     experiment = pair(architecture="centralised")
     agent = Agent(Plan(experiment).assignment(("A",)))
     with Net().worn() as net:
-        goals = HeardGoals(net.session, KEYS, agent, agent.guidance, reach=(5.0, 5.0, 5.0))
+        goals = GoalInbox(net.session, KEYS, agent, agent.guidance, reach=(5.0, 5.0, 5.0))
 
         def tell(seq: int, t: float, x: float) -> float:
             """The goal that is pursued."""
             goal = messages.Goal("A", seq, UTC + t, (x, 0.0, 0.0), None, UTC + t)
             net.deliver(sent(KEYS.goal("A"), goal)[0])
-            goals.take(t, UTC)
+            goals.receive(t, UTC)
             return float(agent.guidance.goal[0, 0])
 
         own(net, KEYS.centre_alive, "one")

@@ -25,7 +25,7 @@ REAL = pair(
 
 
 def run(robots: dict[str, str], title: str = "here", born: str | None = None) -> run_registry.Run:
-    made = run_registry.mine("run", title, ["tcp/127.0.0.1:7448"], folder=Path("/runs/other"), robots=robots)
+    made = run_registry.own_entry("run", title, ["tcp/127.0.0.1:7448"], folder=Path("/runs/other"), robots=robots)
     return made if born is None else msgspec.structs.replace(made, born=born)
 
 

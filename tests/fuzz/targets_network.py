@@ -125,7 +125,7 @@ def world() -> Iterator[Target]:
             t += 0.01
             net.deliver(data)
             process._tick(t)
-            if process._pace.look(t, 0.01):
+            if process._pace.update(t, 0.01):
                 process._report(t)
             state = process._population.state
             assert np.isfinite(state.position[process._population.carried]).all()

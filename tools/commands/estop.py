@@ -109,7 +109,7 @@ class _Stop:
         from agents.network import session as network
 
         late = time.monotonic() > begun + network.GATHER_S
-        return topology.is_mesh(self.endpoints) and not late and network.links(session) < len(self.endpoints)
+        return topology.is_mesh(self.endpoints) and not late and network.count_links(session) < len(self.endpoints)
 
 
 @app.command()

@@ -90,7 +90,7 @@ def router(
     from agents.network.endpoints import DEFAULT_ENDPOINT
     from agents.network.lab import LabError, secured
     from agents.runtime.router import serve
-    from agents.runtime.run_registry import mine, registered
+    from agents.runtime.run_registry import own_entry, registered
 
     if file is None and lab is not None:
         raise LabError(f"name the experiment too, from which the rights follow: zenpark router FILE --lab {lab}")
@@ -102,7 +102,7 @@ def router(
     if print_config:
         print(json.dumps(of_zenohd(endpoints, linked, rights), indent=1))
         return 0
-    with registered(mine("router", "a router by hand", _places(endpoints))) as why:
+    with registered(own_entry("router", "a router by hand", _places(endpoints))) as why:
         if why:
             print(f"zenpark: {why}", file=sys.stderr)
         return serve(endpoints, link=linked, lifeline=lifeline, rights=rights)

@@ -23,7 +23,7 @@ import msgspec
 from agents.network import lab, messages
 from agents.network import session as network
 from agents.network.endpoints import EndpointError
-from agents.runtime.command_line import told_to_end
+from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import Lifeline
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
@@ -97,7 +97,7 @@ def main() -> int:
     over = threading.Event()
     Lifeline(over).start()
     try:
-        with told_to_end(over.set):
+        with on_termination(over.set):
             conduct(
                 load(request.file, *request.changes),
                 Path(request.folder),

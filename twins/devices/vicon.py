@@ -30,7 +30,7 @@ from agents.network.keys import Keys
 from agents.network.shutdown import Farewell
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment
-from agents.runtime.command_line import add_network, reached, told_to_end
+from agents.runtime.command_line import add_network, on_termination, reached
 from agents.runtime.lifeline import Lifeline
 from twins.devices.device import Faults
 
@@ -287,7 +287,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     host, port = chosen.listen
     try:
         with (
-            told_to_end(stop.set),
+            on_termination(stop.set),
             network.open_session(reached(chosen), name="vicon-twin", stop=stop, identity=chosen.identity) as session,
         ):
             vicon = ViconTwin(

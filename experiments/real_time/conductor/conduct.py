@@ -16,8 +16,7 @@ import msgspec
 from agents.network.access_control import rules
 from agents.network.endpoints import free_endpoints, from_here
 from agents.network.keys import Keys
-from agents.network.lab import LabError, register, require, secured
-from agents.network.lab import of as lab_of
+from agents.network.lab import LabError, lab_of, register, require, secured
 from agents.network.lab import options as lab_options
 from agents.network.zenoh_config import check_loopback
 from agents.plugins import registry as plugins
@@ -108,7 +107,7 @@ def conduct(
         endpoints = secured(mesh.member_endpoints(embodied.values(), secure=secure), of_lab)
     rights = write_rights(embodied.values(), endpoints, folder, staging.identity)
     (folder / mesh.ENDPOINTS).write_text("".join(f"{endpoint}\n" for endpoint in endpoints), "utf-8")
-    me = run_registry.mine(
+    me = run_registry.own_entry(
         "run", read.experiment.title or read.path.stem, endpoints,
         folder=folder, realm=network.realm, identity=staging.identity, robots=hardware(embodied.values()),
     )  # fmt: skip

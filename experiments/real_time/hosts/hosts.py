@@ -71,7 +71,7 @@ class Station:
         assert host.address is not None
         self.name, self.host, self.address = name, host, host.address
         self.clock: HostClock | None = None
-        self.lab = lab.of(routers)
+        self.lab = lab.lab_of(routers)
         self._routers = [Endpoint.parse(router) for router in lab.bare(routers)]
         self._run = f"{run}.{name}"  # two hosts may be one machine
         try:

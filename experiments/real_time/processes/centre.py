@@ -34,7 +34,7 @@ from agents.network.shutdown import end
 from agents.network.validation import reach_of
 from agents.plugins import registry
 from agents.runtime import command_line
-from agents.runtime.pose_inbox import Coming, NeighbourSubscription, ReceivedPose
+from agents.runtime.pose_inbox import NeighbourSubscription, ReceivedPose, TokenChange
 from agents.runtime.telemetry import resident_mb
 from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
@@ -118,9 +118,9 @@ class CentreProcess:
         for speaker in self._speakers:
             rows = self.centre.needed[speaker.links]
             for coming in speaker.comings():
-                if coming is Coming.CAME:
+                if coming is TokenChange.APPEARED:
                     self.centre.mark_alive(rows)
-                elif coming is Coming.ANEW:
+                elif coming is TokenChange.NEW_SESSION:
                     self._begin(speaker)
                 else:
                     self._channel.forget(speaker.links)

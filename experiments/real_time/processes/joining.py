@@ -23,7 +23,7 @@ from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, claim
 from agents.network.shutdown import held
-from agents.runtime.command_line import told_to_end
+from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import SILENCE_S, Lifeline
 from experiments.definition import mesh
 from experiments.definition.endpoints import routers
@@ -96,7 +96,7 @@ def joined(
     began = Clock().utc()
     if lost is not None:
         Lifeline(lost).start()
-    with told_to_end(on_signal):
+    with on_termination(on_signal):
         session = network.open_session(
             endpoints, name=name, stop=stop, rights=mesh.member_rights(experiment, endpoints)
         )
@@ -112,7 +112,7 @@ def joined(
             yield Network(session, Keys(experiment.network.realm), endpoints, declared)
 
 
-def offered(session: zenoh.Session, keys: Keys, names: Sequence[str]) -> Document:
+def wait_for_experiment(session: zenoh.Session, keys: Keys, names: Sequence[str]) -> Document:
     """Waits for a run that has robots of these names, and returns its experiment.
 
     Args:

@@ -27,7 +27,7 @@ from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, end, held
 from agents.plugins import registry
 from agents.runtime import command_line
-from agents.runtime.command_line import told_to_end
+from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import Lifeline
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Robot
@@ -184,7 +184,7 @@ def _serve(
     over, lost = threading.Event(), threading.Event()
     if lifeline:
         Lifeline(lost).start()
-    with told_to_end(over.set), ExitStack() as stack:
+    with on_termination(over.set), ExitStack() as stack:
         session, declared = None, list[object]()
         if connect:
             joined = held(network.open_session(connect, name=word, stop=over, identity=identity))

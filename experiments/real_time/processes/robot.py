@@ -84,7 +84,7 @@ def fly(launch: RobotLaunch) -> int:
             endpoints = command_line.secured_endpoints(launch.connect, launch.lab)
             session = stack.enter_context(network.open_session(endpoints, name=f"{names[0]} joins", identity=names[0]))
             keys = Keys(launch.realm)
-            read = joining.offered(session, keys, names)
+            read = joining.wait_for_experiment(session, keys, names)
             stack.callback(joining.ConductorWatch(session, keys).close)
         elif file == STDIN:
             print(f"{', '.join(names)}: on {socket.gethostname()}, process {os.getpid()}", flush=True)

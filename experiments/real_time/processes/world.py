@@ -51,7 +51,7 @@ class Pace:
     ticks: int = 0
     worked: float = 0.0
 
-    def look(self, now: float, dt: float) -> bool:
+    def update(self, now: float, dt: float) -> bool:
         """Whether a second is over at `now` [s]; the figures are then those of that second."""
         span = now - self.since
         if span < REPORT_S:
@@ -87,7 +87,7 @@ class WorldProcess:
 
     def find(self, there: Set[str]) -> list[str]:
         """Puts carried robots of those that are on the network where they say that they are; their names."""
-        return self._exchange.find(there)
+        return self._exchange.restore_positions(there)
 
     def run(self, over: threading.Event) -> None:
         """Until told to end at once, or until its starter and then its robots are gone."""
@@ -110,7 +110,7 @@ class WorldProcess:
             self._tick(due)
             due += dt
             pace.worked += time.monotonic() - zero - began
-            if pace.look(began, dt):
+            if pace.update(began, dt):
                 self._report(due)
             if self._lost.is_set() and self._farewell.over():
                 break
@@ -122,21 +122,21 @@ class WorldProcess:
             changed |= self._obey(query, order)
         if self._lost.is_set() and self.paused:
             self.paused, changed = False, True  # who must land cannot wait
-        self._exchange.listen(t)
+        self._exchange.receive(t)
         if not self.paused or self._steps:
-            self._exchange.act(t)
+            self._exchange.apply_commands(t)
             self._population.advance()
             self._pace.ticks += 1
             if self._steps:
                 self._steps -= 1
                 changed |= not self._steps
-        self._exchange.tell(t)
+        self._exchange.publish(t)
         if changed:
             self._report(t)
 
     def _enter(self) -> None:
         """After somebody came or went."""
-        self._exchange.enter()
+        self._exchange.update_rows()
         population = self._population
         carried = [name for name, here in zip(population.names, population.carried.tolist(), strict=True) if here]
         self._carried = carried
@@ -170,7 +170,7 @@ class WorldProcess:
             self.paused, self._steps = True, order.steps
         elif what == "reset":
             population.reset(order.name)
-            self._exchange.enter()
+            self._exchange.update_rows()
         else:
             if order.name is None:
                 raise Refused(f"{what} needs a name")

@@ -96,13 +96,13 @@ class Exchange:
         self._names: tuple[str, ...] = ()
         self._quiet = self._heard = np.zeros(0)
         self._place, self._velocity, self._yaw = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-        self.enter()
+        self.update_rows()
 
     def begin(self, monotonic: float) -> None:
         """The world's clock is 0 at this time of the monotonic one [s]."""
         self.utc = self._clock.at(monotonic)
 
-    def enter(self) -> None:
+    def update_rows(self) -> None:
         """The rows of the population, as they are now."""
         population, keys, session = self._population, self._keys, self._session
         names, rows = population.names, len(population.names)
@@ -152,7 +152,7 @@ class Exchange:
         if len(mirrored):
             self._update_mirrors()
 
-    def find(self, there: Set[str]) -> list[str]:
+    def restore_positions(self, there: Set[str]) -> list[str]:
         """Puts carried robots of those that are on the network where they say that they are; their names."""
         waiting = {
             name: self._states_of(name)
@@ -183,7 +183,7 @@ class Exchange:
 
     # ------------------------------------------------------------------ what is heard
 
-    def listen(self, t: float) -> None:
+    def receive(self, t: float) -> None:
         """Takes in what has arrived."""
         for token, there in self._owners.changes():
             if there:
@@ -203,7 +203,7 @@ class Exchange:
         if seconds > HANG_S:
             self._quiet = np.where(np.isfinite(self._quiet), np.maximum(self._quiet, t), self._quiet)
 
-    def act(self, t: float) -> None:
+    def apply_commands(self, t: float) -> None:
         """Passes on what robots were told; those that are told nothing hold, and land after a while."""
         population = self._population
         if self._router.silent_since(t) < inf:  # nobody can be heard: they hold, but need not land for that
@@ -219,7 +219,7 @@ class Exchange:
                 population.land(tired)
                 self._quiet[tired] = inf
                 for row in tired.tolist():
-                    self.say("silent", self._names[row], f"lands: it was told nothing for {LAND_S:g} s")
+                    self.publish_event("silent", self._names[row], f"lands: it was told nothing for {LAND_S:g} s")
         given = np.isfinite(self._given[:, 0])
         if some(given):
             population.drive(self._given, np.flatnonzero(given))
@@ -264,7 +264,7 @@ class Exchange:
         self.refused += 1
         if name not in self._strangers and len(self._strangers) < STRANGERS:
             self._strangers.add(name)
-            self.say(
+            self.publish_event(
                 "refused",
                 "world",
                 f"{name} is told what to do, but is not in this world: start the world with the experiment that has "
@@ -321,7 +321,7 @@ class Exchange:
 
     # ------------------------------------------------------------------ what is said
 
-    def tell(self, t: float) -> None:
+    def publish(self, t: float) -> None:
         """Where everybody is, what touched and what sensors see."""
         state, rows = self._population.state, self._carried
         stamp = round(self.utc + t, 6)
@@ -340,9 +340,9 @@ class Exchange:
             pair = frozenset((meeting.first, meeting.second))
             if pair not in self._met:
                 self._met.add(pair)
-                self.say("contact", meeting.first, f"touches {meeting.second} ({meeting.impulse:.3g} N s)")
+                self.publish_event("contact", meeting.first, f"touches {meeting.second} ({meeting.impulse:.3g} N s)")
 
-    def say(self, kind: str, source: str, text: str) -> None:
+    def publish_event(self, kind: str, source: str, text: str) -> None:
         """An event, for recorder and viewers."""
         print(f"{kind} {source}: {text}", flush=True)
         self._events.put(messages.encode(messages.Event(self._clock.utc(), kind, source, text)))
@@ -351,7 +351,7 @@ class Exchange:
         """Counts and says what was refused."""
         self.refused += 1
         self.trouble = reason
-        self.say("refused", source, reason)
+        self.publish_event("refused", source, reason)
 
     def _publish(
         self, publishers: list[tuple[str, zenoh.Publisher]], position: Array, yaw: Array, stamp: float
