@@ -1,9 +1,10 @@
-"""The whole decision of any number of robots: no clock, no I/O, no Zenoh, no randomness.
+"""Decision of any number of robots: no clock, no I/O, no Zenoh, no randomness.
 
-Time, measured poses and what was heard go in; who speaks, what the body must do and its setpoints come out. A robot's
-process calls this with one row, a radio's process with three, the virtual clock with all rows of all repetitions.
+Inputs are the time, measured poses and received messages; outputs are transmissions, commands and setpoints of the
+bodies. A robot's process calls this with one row, a radio's process with three, the virtual clock with all rows of all
+repetitions.
 
-A tick has two halves: `speak`, then `act`. Whoever carries messages may deliver between them what was just said.
+A tick has two halves, `transmit` and `act`; the caller may deliver the new transmissions between them.
 """
 
 from __future__ import annotations
@@ -36,51 +37,40 @@ from agents.safety.setpoint_filter import PoseValidity, SetpointFilter
 
 
 class Actions(msgspec.Struct, frozen=True):
-    """What comes out of a tick.
+    """Result of a tick."""
 
-    Attributes:
-        transmit: Rows that send their pose now.
-        setpoint: (N, 4) for the body, NaN rows for those that act by themselves.
-        commands: Take-offs, landings, stops; None on nearly every tick.
-        changed: (N,) safety had to change what was decided.
-        avoided: (N,) avoidance did.
-        position: (N, 3) that rows which speak say [m].
-        velocity: (N, 3) that they say [m/s].
-    """
-
-    transmit: Index
-    setpoint: Array
-    commands: BodyCommands | None
-    changed: Mask
-    avoided: Mask
-    position: Array
-    velocity: Array
+    transmit: Index  # (K,) rows that transmit their pose now
+    setpoint: Array  # (N, 4) for the body, NaN for rows that their bodies drive by themselves
+    commands: BodyCommands | None  # take-offs, landings, stops; None on nearly every tick
+    changed: Mask  # (N,) decided setpoint changed by safety
+    avoided: Mask  # (N,) decided setpoint changed by avoidance
+    position: Array  # (N, 3) transmitted by these rows [m]
+    velocity: Array  # (N, 3) likewise [m/s]
 
 
 NOBODY: Index = np.zeros(0, dtype=np.intp)
-CENTRE = "centre"  # what guided rows miss when nobody guides them
+CENTRE = "centre"  # missing neighbour of guided rows without guidance
 
 
 class Agent:
-    """The decision of N rows.
+    """Decision of N rows."""
 
-    Attributes:
-        tick: Number of the next tick; set to 0 at the common start, so that robots decide together.
-        goal: (N, 3) pursued [m].
-        goal_yaw: (N,) yaw wanted at the goal [rad], NaN for any.
-        error: (N,) Σ of the link errors as the rows see them [m]; 0 for those that are guided.
-        offset: (N, 3) decided last, before it was clamped [m].
-        decisions: Coordination decisions since the common start.
-        updates: (N,) how often each row computed its goal anew at one of them; of guided rows, how often it was told.
-        begun: Whether the first row has begun to run.
-        decision_due: Whether goals are decided on this tick; known from its first half on.
-        goal_computer: Computes the goals of rows that are not guided.
-        guidance: What the others were told; None if there are none, and `all_guided` if there are only such.
-        lifecycle: Phases.
-        hazards: What is wrong with the rows, and what is done about it.
-        origins: Where rows that came back were told that they began.
-        health: What only the process around the decision knows: told by it.
-    """
+    tick: int  # number of the next tick; 0 at the common start, so that robots decide together
+    goal: Array  # (N, 3) pursued [m]
+    goal_yaw: Array  # (N,) wanted at the goal [rad], NaN for any
+    error: Array  # (N,) Σ of the link errors as the rows know them [m]; 0 for guided rows
+    offset: Array  # (N, 3) decided last, before it was clamped [m]
+    decisions: int  # since the common start
+    updates: Index  # (N,) decisions at which each row computed its goal anew; of guided rows, received goals
+    begun: bool  # whether the first row has begun to run
+    decision_due: bool  # whether goals are decided on this tick; known from its first half on
+    goal_computer: GoalComputer  # of rows that are not guided
+    guidance: Guidance | None  # goals of the guided rows; None: no row is guided
+    all_guided: bool
+    lifecycle: Lifecycle
+    hazards: Hazards
+    origins: dict[int, Setpoint]  # of restarted rows, from their start orders
+    health: ProcessHealth  # set by the process around the decision
 
     def __init__(self, assignment: Assignment) -> None:
         rows = len(assignment.names)
@@ -90,7 +80,7 @@ class Agent:
         self.goal_yaw = np.full(rows, np.nan)
         self.error, self.offset = np.zeros(rows), np.zeros((rows, 3))
         self.decisions = 0
-        self.updates: Index = np.zeros(rows, dtype=np.intp)
+        self.updates = np.zeros(rows, dtype=np.intp)
         self.decision_due = False
         self._flies = flies = np.array([kind.flies for kind in assignment.kinds])
         self._guided = np.zeros(rows, dtype=bool) if assignment.guided is None else assignment.guided
@@ -101,77 +91,76 @@ class Agent:
         self.all_guided = bool(self._guided.all())
         self._holding = StationKeeping(self.goal_computer.ground)
         self.lifecycle = Lifecycle(flies, assignment.hover, assignment.duration)
-        self._voice = Transmitter(assignment.trigger, rows, assignment.predictor, kinds=assignment.kinds)
+        self._transmitter = Transmitter(assignment.trigger, rows, assignment.predictor, kinds=assignment.kinds)
         self._setpoint = np.full((rows, 4), np.nan)
         self.health, self.hazards = ProcessHealth(), Hazards(flies, assignment.limits)
         self._detector, self._preflight = Detector(assignment), Preflight(assignment)
         self.begun = False
         self._decided = self._asked = -1
-        self._duties: BodyCommands | None = None
+        self._commands: BodyCommands | None = None
         self._ordered = np.zeros(rows, dtype=bool)
-        self._individual = PositionController(assignment.kinds)
+        self._controller = PositionController(assignment.kinds)
         self._safety = SetpointFilter(assignment.kinds, assignment.limits)
-        self._sight = _sight(assignment)
+        self._perception = _perception(assignment)
         self._landing = Landing(assignment)
-        self.origins: dict[int, Setpoint] = {}
+        self.origins = {}
         self._nobody: Mask = np.zeros(rows, dtype=bool)
         self._everybody: Mask = np.ones(rows, dtype=bool)
-        self._wild = self._nobody
+        self._not_finite = self._nobody
         self._where: PoseValidity
         self._age: Array
 
-    # ------------------------------------------------------------------ what the outside tells
+    # ------------------------------------------------------------------ inputs
 
     @property
     def trigger(self) -> Trigger:
         """Who speaks when; may be replaced by one of the same kind."""
-        return self._voice.trigger
+        return self._transmitter.trigger
 
     @trigger.setter
     def trigger(self, trigger: Trigger) -> None:
-        self._voice.trigger = trigger
+        """Trigger of transmissions; may be replaced by one of the same kind."""
+        self._transmitter.trigger = trigger
 
     @property
     def last_transmission(self) -> LastEvent:
-        """What the neighbours were told."""
-        return self._voice.last_event
+        """Last transmission of each row."""
+        return self._transmitter.last_event
 
     @property
     def neighbours(self) -> NeighbourStates:
-        """What was heard on each link, and who takes part in the law."""
+        """Received poses, and the links that enter the law."""
         return self.goal_computer.neighbours
 
     @property
     def neighbour_poses(self) -> NeighbourPoses:
-        """What was heard on each link."""
+        """Last pose received on each link."""
         return self.neighbours.poses
 
     def receive(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
-        """See `NeighbourStates.hear`."""
+        """See `NeighbourStates.receive`."""
         self.neighbours.receive(at, position, velocity, stamp, arrived)
 
     def mark_lost(self, at: Index, t: float) -> None:
-        """See `NeighbourStates.lose`."""
+        """See `NeighbourStates.mark_lost`."""
         self.neighbours.mark_lost(at, t)
 
     def mark_alive(self, at: Index) -> None:
-        """See `NeighbourStates.find`."""
+        """See `NeighbourStates.mark_alive`."""
         self.neighbours.mark_alive(at)
 
     def discard_poses(self, at: Index) -> None:
-        """See `NeighbourStates.forget`."""
+        """See `NeighbourStates.discard_poses`."""
         self.neighbours.discard_poses(at)
 
-    def receive_goal(self, rows: Index, goal: Array, toward: Array, stamp: Array) -> Mask:
-        """See `Guidance.hear`; rows that nobody guides take no goals."""
+    def receive_goal(self, rows: Index, goal: Array, yaw: Array, stamp: Array) -> Mask:
+        """See `Guidance.receive`; rows without guidance take no goals."""
         return (
-            np.zeros(len(rows), dtype=bool)
-            if self.guidance is None
-            else self.guidance.receive(rows, goal, toward, stamp)
+            np.zeros(len(rows), dtype=bool) if self.guidance is None else self.guidance.receive(rows, goal, yaw, stamp)
         )
 
     def hold(self, row: int) -> str:
-        """Order to stay where it is; an empty answer means yes, else why not."""
+        """Order to stay in place; returns the reason of a refusal, empty when accepted."""
         if self.lifecycle.phase[row] not in (AIRBORNE, RUNNING):
             return f"cannot hold while {Phase(self.lifecycle.phase[row]).word}"
         self._ordered[row] = True
@@ -182,13 +171,13 @@ class Agent:
         self._ordered[row] = False
 
     def start(self, row: int, at: float, t: float = -np.inf, origin: Setpoint | None = None) -> str:
-        """Order to begin at `at` [s], or to go on after a hold.
+        """Order to begin at `at` [s], or to go on after a hold; returns as `hold`.
 
         Args:
             row: Of the robot.
             at: Common start [s].
             t: Now [s].
-            origin: x, y, z [m] and yaw [rad] where the plan of a robot began that comes back; None: it begins anew.
+            origin: x, y, z [m] and yaw [rad] at which the plan of a restarted robot began; None: it begins anew.
         """
         waits = self.lifecycle.phase[row] == AIRBORNE
         refusal = self.lifecycle.start(row, at)
@@ -203,11 +192,11 @@ class Agent:
         return refusal
 
     def origin(self, row: int) -> Setpoint | None:
-        """x, y, z [m] and yaw [rad] where the plan of a row began, or where it was told that it began."""
+        """x, y, z [m] and yaw [rad] at which the plan of a row began, by itself or by the start order."""
         return self.goal_computer.origin(row) or self.origins.get(row)
 
     def missing_neighbours(self, row: int) -> list[str]:
-        """Neighbours that a row has never heard, or that are gone; likewise its centre."""
+        """Neighbours that a row has never received, or that are lost; likewise its central controller."""
         names = [self.assignment.robots[s] for s in self.neighbours.missing_senders(row)]
         guidance = self.guidance
         if (
@@ -219,17 +208,17 @@ class Agent:
         return names
 
     def skip_ticks(self, ticks: int) -> None:
-        """So many ticks come too late to be made: called before each tick, mostly with 0."""
+        """Skip `ticks` that are too late; called before each tick, mostly with 0."""
         self.tick += ticks
         self.health.count_tick(ticks, 1.0 / self.assignment.body_hz)
 
     @property
     def descending(self) -> Mask:
-        """Rows (N,) that come down, or are down; not those that look for a place to."""
+        """Rows (N,) that land or have landed; not those on their way to a landing place."""
         return np.asarray((self.lifecycle.phase >= LANDING) & ~self._landing.aside)
 
     def land_here(self) -> None:
-        """Something else has made the bodies land: nobody looks for a better place any more."""
+        """The bodies land by other means: rows stop moving aside."""
         self._landing.land_in_place()
 
     # ------------------------------------------------------------------ the decision
@@ -239,41 +228,41 @@ class Agent:
         return self.act(t, state, self.transmit(t, state))
 
     def transmit(self, t: float, state: BodyState) -> Transmission:
-        """The first half of a tick: phases move on, and it is decided who speaks. What is said was measured."""
+        """First half of a tick: advance the phases, and decide which rows transmit their measured pose."""
         self.goal_computer.update_links(t)
         life = self.lifecycle
         self._age = t - state.time
         self._where = self._safety.validate_poses(state.position, state.yaw, self._age)
-        duties = life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
-        self._duties = self._landing.filter_commands(
-            t, duties, state, self._where, hearing=self.neighbours, late=self.health.loop_failing, phase=life.phase
+        commands = life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
+        self._commands = self._landing.filter_commands(
+            t, commands, state, self._where, neighbours=self.neighbours, late=self.health.loop_failing, phase=life.phase
         )
         assignment = self.assignment
         if life.moved and not self.begun and (life.phase == RUNNING).any():
             since = t - float(life.start_at[life.phase == RUNNING].min())
             self._decided = self._asked = -1
             self.begun, self.tick = True, round(since * assignment.body_hz)  # 0, unless it joins a run under way
-        # by number, not by remainder: a tick that was skipped because the process was late is made up for
+        # by number, not by remainder: a decision due on a skipped tick is made on the next one
         decision, question = self.tick // assignment.decide_every, self.tick // assignment.pose_every
         self.decision_due, self._decided = decision != self._decided, decision
         if question == self._asked:
             return Transmission(NOBODY, state.position, state.velocity)
         self._asked = question
         self.error, energy = self.goal_computer.errors(t, state.position)
-        return self._voice.transmit(
+        return self._transmitter.transmit(
             t, state.position, state.velocity,
             error=self.error, energy=energy, start=life.start_at, offset=self.offset,
             setpoint=self._setpoint,
         )  # fmt: skip
 
-    def act(self, t: float, state: BodyState, said: Transmission) -> Actions:
-        """The second half: goals, and what bodies do."""
+    def act(self, t: float, state: BodyState, transmission: Transmission) -> Actions:
+        """Second half of a tick: goals, setpoints and commands."""
         held = self.hazards.held
-        self._heed(t, state)
+        self._apply_hazards(t, state)
         if self.decision_due:
             self._decide(t, state)
         elif self.lifecycle.moved or held is not self.hazards.held:
-            # a row that has just arrived at its height, or must stop, needs a place to stay until the next decision
+            # a row that arrived at its height, or must stop, needs a place until the next decision
             held = (self.lifecycle.phase == RUNNING) & self.hazards.held
             self._stay(self._holding.held | held | (self.lifecycle.phase == AIRBORNE), state.position)
         if self.guidance is not None:
@@ -284,30 +273,32 @@ class Agent:
             goal = np.where(aside[:, None], self._landing.place, goal)
         age, where = self._age, self._where
         avoidance = self.assignment.avoidance
-        if avoidance is None or self._sight is None:
-            setpoint = self._individual.setpoint(goal, self.goal_yaw, state.position, state.yaw)
-            verdict = self._safety.check(setpoint, state.position, state.yaw, age, where=where)
+        if avoidance is None or self._perception is None:
+            setpoint = self._controller.setpoint(goal, self.goal_yaw, state.position, state.yaw)
+            filtered = self._safety.check(setpoint, state.position, state.yaw, age, where=where)
         else:
-            own, near = self._sight.sense(t, state, self.neighbour_poses)
+            own, near = self._perception.sense(t, state, self.neighbour_poses)
             wanted, goal = goal, self._deviate(avoidance, goal, own, near)
-            setpoint = self._individual.setpoint(goal, self.goal_yaw, state.position, state.yaw)
-            verdict = self._safety.check(setpoint, state.position, state.yaw, age, avoidance, own, near, where)
-            avoided = verdict.avoided
+            setpoint = self._controller.setpoint(goal, self.goal_yaw, state.position, state.yaw)
+            filtered = self._safety.check(setpoint, state.position, state.yaw, age, avoidance, own, near, where)
+            avoided = filtered.avoided
             if goal is not wanted:
                 avoided = avoided | (np.abs(goal - wanted) > 0.0).any(axis=1)
-        setpoint, changed, self._wild = verdict.setpoint, verdict.changed, verdict.not_finite
+        setpoint, changed, self._not_finite = filtered.setpoint, filtered.changed, filtered.not_finite
         if not self.lifecycle.all_running:
             phase = self.lifecycle.phase
             passive = ((phase < AIRBORNE) | (phase > RUNNING)) & ~aside
             setpoint = np.where(passive[:, None], np.where(self._flies, np.nan, 0.0)[:, None], setpoint)
-            changed, avoided, self._wild = changed & ~passive, avoided & ~passive, self._wild & ~passive
+            changed, avoided, self._not_finite = changed & ~passive, avoided & ~passive, self._not_finite & ~passive
         self.tick, self._setpoint = self.tick + 1, setpoint
-        return Actions(said.rows, setpoint, self._duties, changed, avoided, said.position, said.velocity)
+        return Actions(
+            transmission.rows, setpoint, self._commands, changed, avoided, transmission.position, transmission.velocity
+        )
 
     def _ready(self, t: float, state: BodyState) -> Mask:
         life, assignment = self.lifecycle, self.assignment
         if not life.waiting:
-            return self._nobody  # nobody asks any more
+            return self._nobody  # all rows have taken off
         lacks = np.zeros(len(life.phase), dtype=bool)
         if assignment.patience_s is None or t <= assignment.patience_s:
             lacks[assignment.links.receiver[assignment.unreceived(self.neighbours.stamp_once_alive)]] = True
@@ -329,9 +320,9 @@ class Agent:
                 life.set_missing(row, "its law wants something that is not finite")
         return ready
 
-    def _heed(self, t: float, state: BodyState) -> None:
-        """What is wrong is noticed, and has its consequences: rows hold, land, or have their motors cut."""
-        life, hearing, guidance = self.lifecycle, self.neighbours, self.guidance
+    def _apply_hazards(self, t: float, state: BodyState) -> None:
+        """Detect hazards and apply their outcomes: rows hold, land, or have their motors cut."""
+        life, neighbours, guidance = self.lifecycle, self.neighbours, self.guidance
         if life.all_running:
             active = cruising = running = self._everybody
             landing = self._nobody
@@ -342,20 +333,20 @@ class Agent:
             self._ordered,
             cruising,
             landing,
-            self.goal_computer.without_neighbours() if hearing.incomplete else None,
+            self.goal_computer.without_neighbours() if neighbours.incomplete else None,
             None if guidance is None else running & guidance.unguided(t),
             None if guidance is None else guidance.stamp,
             self.goal[:, 2],
-            self._wild,
+            self._not_finite,
             self._landing,
         )
-        seen = self._detector.detect(t, state, self._where, hearing, rows, self.health)
+        seen = self._detector.detect(t, state, self._where, neighbours, rows, self.health)
         for incident in self.hazards.update(t, seen, active, landing):
             end = life.stop if incident.outcome == Outcome.CUT else life.land
             end(incident.row, self.hazards.words(incident.cause))
 
     def _decide(self, t: float, state: BodyState) -> None:
-        """A new goal for every row that decides for itself and is under way; all others may have to stay."""
+        """New goals for running rows that decide for themselves; the others may have to stay."""
         phase = self.lifecycle.phase
         running = phase == RUNNING
         if some(running):
@@ -372,21 +363,21 @@ class Agent:
                 self.updates += new.due
         self._stay(self._holds(running) | (phase == AIRBORNE), state.position)
         if some(away := self._holding.held | ~running):
-            self.goal_computer.require_update(np.flatnonzero(away))  # whoever comes back has an old goal
+            self.goal_computer.require_update(np.flatnonzero(away))  # their goals are old when they return
 
     def _stay(self, held: Mask, position: Array) -> None:
-        """Rows that are held keep the place where that began."""
+        """Held rows keep the place where their hold began."""
         self.goal, self.goal_yaw = self._holding.hold_position(held, position, self.goal, self.goal_yaw)
 
     def _holds(self, running: Mask) -> Mask:
-        """Which running rows must stay: for their safety, or because no link is there that the law could listen to."""
+        """Running rows that must stay: for their safety, or because no link of the law is active."""
         held = running & self.hazards.held
         if len(self.neighbours.active) < len(self.assignment.links):
             held = held | (running & self.goal_computer.without_neighbours())
         return held
 
     def _follow(self, guidance: Guidance, position: Array) -> None:
-        """Guided rows go where they were told, from the moment on that they were."""
+        """Guided rows take their received goals, on the tick of reception."""
         phase = self.lifecycle.phase
         running = phase == RUNNING
         held = np.where(self._guided, self._holds(running) | (phase == AIRBORNE), self._holding.held)
@@ -400,12 +391,16 @@ class Agent:
         guidance.fresh[:] = False
 
     def _deviate(self, avoidance: Avoidance, wanted: Array, own: OwnState, near: Nearby) -> Array:
-        """The goals that are pursued; an avoidance that fails is named, for it may be somebody's first."""
+        """Goals after avoidance.
+
+        Raises:
+            PluginError: If the avoidance fails; the error names it.
+        """
         name = type(avoidance).__name__
         try:
             goal = avoidance.deviate(wanted, own, near, 1.0 / self.assignment.body_hz)
         except FAILURES as error:
-            raise PluginError(f"the avoidance {name} failed: {_what(error)}") from error
+            raise PluginError(f"the avoidance {name} failed: {type(error).__name__}: {error}") from error
         if np.shape(goal) != wanted.shape:
             raise PluginError(
                 f"`deviate` of the avoidance {name} must give a goal per row, {wanted.shape}, not {np.shape(goal)}"
@@ -413,11 +408,7 @@ class Agent:
         return goal
 
 
-def _what(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
-
-
-def _sight(assignment: Assignment) -> Perception | None:
+def _perception(assignment: Assignment) -> Perception | None:
     avoidance = assignment.avoidance
     if avoidance is None:
         return None
@@ -426,5 +417,5 @@ def _sight(assignment: Assignment) -> Perception | None:
 
 
 def links_by_sender(links: Links, speakers: Sequence[str]) -> dict[str, Index]:
-    """For each speaker's name, the links on which it is heard."""
+    """Links of each sender, by its name."""
     return {speakers[s]: np.flatnonzero(links.sender == s) for s in np.unique(links.sender)}

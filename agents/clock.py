@@ -1,11 +1,11 @@
-"""The clock of an experiment as one process reads it: that of its machine, set right by what it is known to lack.
+"""Clock of an experiment in one process: the machine's clock plus its known correction.
 
-The wall clock is read once and goes on with the monotonic one: a step in mid-run (NTP, an operator) moves nothing.
-All processes of a run on the launcher's machine share one reading, however late they are started.
+The wall clock is read once and continued with the monotonic one, so that a step in mid-run (NTP, an operator) changes
+nothing. All processes of a run on the launcher's machine share one reading, however late they are started.
 
-Clocks drift. Whoever started the process on another machine measures again during the run and says so on its lifeline,
-`clock -0.200131`; the process follows by going a little faster or slower, never back: stamps tell which of two
-samples is the newer one.
+Clocks drift. The starter of a process on another machine measures the offset again during the run and writes it to the
+process's lifeline, `clock -0.200131`; the process follows by going a little faster or slower, never back: stamps decide
+which of two samples is the newer one.
 """
 
 from __future__ import annotations
@@ -17,26 +17,22 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Final
 
-SLEW: Final = 0.005  # seconds per second; a hundred times what quartz drifts, and no body notices
-STEP_S: Final = 0.5  # more is no drift: somebody was suspended, or is mistaken
+SLEW: Final = 0.005  # [s/s] a hundred times the drift of quartz, harmless for any body
+STEP_S: Final = 0.5  # larger changes are no drift: a suspended or mistaken peer
 READING: Final = "ZENPARK_CLOCK"  # environment: UTC at which the machine's monotonic clock was 0 [s]
 _WORD: Final = b"clock "
 
 
 def correction_line(correction_s: float) -> bytes:
-    """The line by which a process is told its correction."""
+    """Line of the lifeline that sets the correction of a process."""
     return _WORD + f"{correction_s:.6f}\n".encode()
 
 
 @dataclass
 class Clock:
-    """UTC as everybody in the experiment reads it.
+    """UTC of the experiment."""
 
-    Attributes:
-        correction_s: What is added to this machine's UTC [s]; whoever starts a robot on another machine measures it.
-            Corrected where stamps are made, so that nobody who reads them needs to know on which machine they were.
-    """
-
+    # added to this machine's UTC where stamps are made, so that their readers need no machine [s]
     correction_s: float = 0.0
     _wanted: float = field(init=False, repr=False)
     _zero: float = field(init=False, repr=False)
@@ -55,7 +51,7 @@ class Clock:
         return self._zero + monotonic + self.correction_s
 
     def shared(self) -> dict[str, str]:
-        """The environment of processes on this machine that are to read this clock."""
+        """Environment of processes on this machine that share this clock."""
         return {READING: repr(self.at(0.0))}
 
     def follow(self, line: bytes) -> None:
@@ -73,7 +69,7 @@ class Clock:
             self._wanted = wanted
 
     def slew(self, dt: float) -> float:
-        """Goes on towards what was told, for a step of `dt` [s]; returns by how much the clock was moved [s]."""
+        """Approach the wanted correction for a step of `dt` [s]; returns the change [s]."""
         lacks = self._wanted - self.correction_s
         if lacks == 0.0:
             return 0.0

@@ -13,10 +13,10 @@ OWN: Final = stat.S_IRWXU
 
 
 def runtime_folder() -> Path:
-    """The user's folder, made if need be.
+    """The user's folder, created if missing.
 
     Raises:
-        OSError: If it cannot be made, or others could write there.
+        OSError: If it cannot be created, or others could write there.
     """
     chosen, runtime = os.environ.get("ZENPARK_RUNS"), os.environ.get("XDG_RUNTIME_DIR")
     if chosen:

@@ -1,1 +1,1 @@
-"""What overrules a decision: the setpoint filter, hazards and their detection, preflight, landing. Imports decision."""
+"""Setpoint filter, hazards and their detection, preflight, landing: all that overrules a decision. Imports decision."""

@@ -1,4 +1,4 @@
-"""What is wrong with robots now: the causes of `agents.safety.hazards`, as one tick shows them. Pure and row-wise."""
+"""Detection of hazards: the causes of `agents.safety.hazards` that are present on a tick. Pure and row-wise."""
 
 from __future__ import annotations
 
@@ -21,81 +21,69 @@ from agents.safety.setpoint_filter import OUTSIDE_M, PoseValidity
 
 
 class Separation:
-    """Distances on all links (E) of rows to those whom they hear, whether the law or only avoidance listens there.
+    """Distances on all links (E) of rows to the senders, whether used by the law or only by avoidance."""
 
-    Attributes:
-        touching: (E,) distance of the axes at which two upright robots side by side touch [m].
-    """
+    touching: Array  # (E,) distance of the axes at which two upright robots side by side touch [m]
 
     def __init__(self, assignment: Assignment) -> None:
-        """Of the rows of an assignment."""
         self._assignment, links = assignment, assignment.links
         own = np.array([kind.radius for kind in assignment.kinds])
         theirs = np.array([kind.radius for kind in assignment.robot_kinds])
         self.touching = own[links.receiver] + (theirs[links.sender] if len(theirs) else 0.0)
 
-    def distances(self, t: float, position: Array, hearing: NeighbourStates) -> Array:
-        """From rows at `position` (N, 3) to where others are believed to be at `t` [s]: (E,) [m].
+    def distances(self, t: float, position: Array, neighbours: NeighbourStates) -> Array:
+        """Distances (E,) [m] from rows at `position` (N, 3) to the extrapolated senders at `t` [s].
 
-        Infinite where nothing was heard, the own position is unknown, or the other is gone for long.
+        Infinite where nothing was received, the own position is unknown, or the sender is lost for long.
         """
         assignment = self._assignment
-        believed = hearing.extrapolate_all(assignment.predictor, t)
+        believed = neighbours.extrapolate_all(assignment.predictor, t)
         apart = norm(position[assignment.links.receiver] - believed)
-        there = np.isfinite(apart) & (t - hearing.poses.lost_since <= assignment.limits.link_silence_s)
+        there = np.isfinite(apart) & (t - neighbours.poses.lost_since <= assignment.limits.link_silence_s)
         return np.where(there, apart, np.inf)
 
     def receivers_of(self, which: Mask) -> Mask:
-        """Rows (N,) of which a link is among `which` (E,)."""
+        """Rows (N,) that receive on a link of `which` (E,)."""
         rows = np.zeros(len(self._assignment.names), dtype=bool)
         rows[self._assignment.links.receiver[which]] = True
         return rows
 
     def nearest_robot(self, row: int, distances: Array) -> tuple[float, str]:
-        """How far the nearest robot is from a row [m], and its name."""
+        """Distance of the nearest robot from a row [m], and its name."""
         links = self._assignment.links
         mine: Index = np.flatnonzero(links.receiver == row)
         at = int(mine[distances[mine].argmin()])
         return float(distances[at]), self._assignment.robots[links.sender[at]]
 
 
-SUNK: Final = 0.15  # [m] so far below its goal,
-SINKS: Final = 0.15  # [m/s] and this fast downward, a row is not flying where it wants to
-AHEAD_S: Final = 0.1  # no network here is later than this: what is stamped further ahead is from a clock that is ahead
-BEHIND: Final = 0.5  # share of the time after which a robot is blind; what is stamped so far behind is worth a warning
-# who was not heard so long after a standstill has had nothing new to say: what was missed comes with the next heartbeat
-# of its publisher, 0.5 s after what it said last, or with the history that is asked for after a reconnection
+SUNK: Final = 0.15  # [m] below its goal
+SINKS: Final = 0.15  # [m/s] and downward: the row does not fly to its goal
+AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
+BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
+# a neighbour silent for this long after a suspension had nothing new: missed poses come with the next heartbeat of its
+# publisher, 0.5 s after its last pose, or with the history that is requested after a reconnection
 SILENT_S: Final = 1.0
-LATE_WINDOW_S: Final = 1.0  # over so long it is counted how many ticks were missed,
-LATE_SHARE: Final = 0.9  # and with a larger share of them a control loop is none
+LATE_WINDOW_S: Final = 1.0  # window in which missed ticks are counted
+LATE_SHARE: Final = 0.9  # with a larger share of missed ticks the control loop fails
 
 
 @dataclass
 class ProcessHealth:
-    """What the process around a decision knows and the decision cannot see.
+    """State of the process around a decision, set by the process."""
 
-    Attributes:
-        offline_since: When the connection to the router was lost [s]; infinity while there is one.
-        conductor_lost_since: When the conductor was lost [s]; infinity while it is there, or never was.
-        missed_share: Share of the last ticks that were missed, 0 to 1.
-        resumed_at: When the process went on after it had stood still [s].
-        suspended_s: For how long it had stood still [s].
-        connected_since: Since when after that it has had a router [s].
-    """
-
-    offline_since: float = np.inf
-    conductor_lost_since: float = np.inf
-    missed_share: float = 0.0
-    resumed_at: float = -np.inf
-    suspended_s: float = 0.0
-    connected_since: float = -np.inf
+    offline_since: float = np.inf  # loss of the router [s]; infinity while connected
+    conductor_lost_since: float = np.inf  # loss of the conductor [s]; infinity while alive, or never seen
+    missed_share: float = 0.0  # of the last ticks, 0 to 1
+    resumed_at: float = -np.inf  # end of the last suspension [s]
+    suspended_s: float = 0.0  # its duration [s]
+    connected_since: float = -np.inf  # begin of the connection to a router after it [s]
 
     def mark_resumed(self, t: float, slept: float) -> None:
-        """The process goes on at `t` [s]; it had stood still for so long [s]."""
+        """The process resumed at `t` [s] after a suspension of `slept` [s]."""
         self.resumed_at, self.suspended_s, self.connected_since = t, slept, t
 
     def just_resumed(self, t: float) -> bool:
-        """Whether what was missed in a standstill may still be on its way at `t` [s]; ask on every tick."""
+        """Whether poses missed in a suspension may still be on their way at `t` [s]; call it on every tick."""
         recent = t < self.connected_since + SILENT_S
         if recent and self.offline_since < np.inf:
             self.connected_since = t
@@ -103,11 +91,11 @@ class ProcessHealth:
 
     @property
     def loop_failing(self) -> bool:
-        """Whether the control loop is none any more."""
+        """Whether the control loop misses so many ticks that it controls nothing."""
         return self.missed_share > LATE_SHARE
 
     def count_tick(self, missed: int, period: float) -> None:
-        """A tick has come after `missed` ones that did not; they are `period` apart [s]."""
+        """Count a tick after `missed` ones that did not take place; they are `period` apart [s]."""
         if missed or self.missed_share > 0.0:
             forget = -expm1(-period * (1 + missed) / LATE_WINDOW_S)
             self.missed_share += forget * (missed / (1 + missed) - self.missed_share)
@@ -116,36 +104,23 @@ class ProcessHealth:
 
 
 class RowStatus(msgspec.Struct, frozen=True):
-    """How rows (N,) stand in the experiment on a tick, for `Detector.look`.
+    """Status of rows (N,) in the experiment on a tick, for `Detector.detect`."""
 
-    Attributes:
-        ordered: Told to hold.
-        cruising: At their height or running: their setpoints are followed.
-        landing: On their way down.
-        without_neighbours: Nobody is left that the law could listen to; None: nobody is alone.
-        unguided: Run and are guided by nobody; None: nobody is guided.
-        goal_stamp: Decision times of the goals of guided rows [s], minus infinity for others; None: none is guided.
-        goal_height: Of their goals [m].
-        not_finite: The last setpoint was not made of finite numbers.
-        landing_places: Where those that land come down.
-    """
-
-    ordered: Mask
-    cruising: Mask
-    landing: Mask
-    without_neighbours: Mask | None
-    unguided: Mask | None
-    goal_stamp: Array | None
-    goal_height: Array
-    not_finite: Mask
-    landing_places: Landing
+    ordered: Mask  # hold by order
+    cruising: Mask  # at their height or running: their setpoints are followed
+    landing: Mask  # descending
+    without_neighbours: Mask | None  # the law has no input; None: nowhere
+    unguided: Mask | None  # running without guidance; None: no row is guided
+    goal_stamp: Array | None  # decision time of the goals of guided rows [s], −inf for others; None: no row is guided
+    goal_height: Array  # [m]
+    not_finite: Mask  # the last setpoint was not finite
+    landing_places: Landing  # of rows that land
 
 
 class Detector:
-    """Looks for causes on N rows."""
+    """Detects causes of hazards on N rows."""
 
     def __init__(self, assignment: Assignment) -> None:
-        """Of the rows of an assignment."""
         self._assignment, self._limits = assignment, assignment.limits
         self._flies = np.array([kind.flies for kind in assignment.kinds])
         self._everybody: Mask = np.ones(len(self._flies), dtype=bool)
@@ -153,10 +128,10 @@ class Detector:
         # the speed of flying kinds is per axis
         self._fastest = assignment.limits.overspeed * np.where(self._flies, np.sqrt(3.0), 1.0) * speed
         self._fastest_squared = self._fastest**2
-        self._slow_squared = np.minimum(self._fastest_squared, SINKS**2)  # who is slower neither sinks nor races
+        self._slow_squared = np.minimum(self._fastest_squared, SINKS**2)  # slower: neither sinks nor races
         self._all_fly = self._flies.tobytes()
-        links, watched = assignment.links, assignment.avoidance_only
-        self._lawful = np.ones(len(links), dtype=bool) if watched is None else ~watched
+        links, avoidance_only = assignment.links, assignment.avoidance_only
+        self._in_law = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._separation = Separation(assignment)
 
     def detect(  # noqa: PLR0917 - what there is to look at
@@ -164,14 +139,14 @@ class Detector:
         t: float,
         state: BodyState,
         where: PoseValidity,
-        hearing: NeighbourStates,
+        neighbours: NeighbourStates,
         rows: RowStatus,
-        outside: ProcessHealth,
+        health: ProcessHealth,
     ) -> list[Observation]:
-        """What is wrong at `t` [s]."""
+        """Causes present at `t` [s]."""
         seen: list[Observation] = []
         if not where.all_valid:
-            self._lost(t, state, where, seen)
+            self._outside(t, state, where, seen)
         if some(rows.ordered):
             seen.append(Observation(Cause.ORDERED, rows.ordered, lambda _: "by an operator"))
         if some(rows.not_finite):
@@ -180,36 +155,36 @@ class Detector:
             )
         self._measured(state, rows, seen)
         if self._limits.separation is not None:
-            self._near(t, state, hearing, seen)
-        if hearing.incomplete:
-            self._missed(t, hearing, rows, seen)
-        if hearing.clock_lag is not None:
-            self._behind(hearing, hearing.clock_lag, seen)
+            self._near(t, state, neighbours, seen)
+        if neighbours.incomplete:
+            self._lost_neighbours(t, neighbours, rows, seen)
+        if neighbours.clock_lag is not None:
+            self._lagging(neighbours, neighbours.clock_lag, seen)
         if rows.unguided is not None and some(rows.unguided):
             seen.append(Observation(Cause.CENTRE, rows.unguided, lambda _: "its centre is gone, or its goals are old"))
-        if outside.just_resumed(t):
-            self._forgotten(hearing, rows, outside, seen)
-        self._surroundings(t, outside, seen)
+        if health.just_resumed(t):
+            self._not_refreshed(neighbours, rows, health, seen)
+        self._surroundings(t, health, seen)
         return seen
 
-    def _forgotten(
-        self, hearing: NeighbourStates, rows: RowStatus, outside: ProcessHealth, seen: list[Observation]
+    def _not_refreshed(
+        self, neighbours: NeighbourStates, rows: RowStatus, health: ProcessHealth, seen: list[Observation]
     ) -> None:
-        """Rows that have not heard all who are there, or their centre, since the process stood still."""
-        heard, links = hearing.poses, self._assignment.links
-        silent = (heard.stamp < outside.resumed_at) & np.isfinite(heard.stamp) & np.isinf(heard.lost_since)
+        """Rows without a new pose of every alive neighbour, or a new goal, since the process was suspended."""
+        heard, links = neighbours.poses, self._assignment.links
+        silent = (heard.stamp < health.resumed_at) & np.isfinite(heard.stamp) & np.isinf(heard.lost_since)
         waits = np.zeros(len(self._flies), dtype=bool)
         waits[links.receiver[silent]] = True
         if rows.goal_stamp is not None:
-            waits |= (rows.goal_stamp < outside.resumed_at) & np.isfinite(rows.goal_stamp)
+            waits |= (rows.goal_stamp < health.resumed_at) & np.isfinite(rows.goal_stamp)
         if some(waits):
             seen.append(
                 Observation(
-                    Cause.STANDSTILL, waits, lambda _: f"for {outside.suspended_s:.1f} s; it waits for its neighbours"
+                    Cause.STANDSTILL, waits, lambda _: f"for {health.suspended_s:.1f} s; it waits for its neighbours"
                 )
             )
 
-    def _lost(self, t: float, state: BodyState, where: PoseValidity, seen: list[Observation]) -> None:
+    def _outside(self, t: float, state: BodyState, where: PoseValidity, seen: list[Observation]) -> None:
         """Position, and the arena."""
 
         def age(row: int) -> str:
@@ -227,7 +202,7 @@ class Detector:
         ]
 
     def _measured(self, state: BodyState, rows: RowStatus, seen: list[Observation]) -> None:
-        """What the body itself says."""
+        """Speed, battery, motors, sinking, clock, tilt and landing, as the body measures them."""
         limits = self._limits
         squared = np.vecdot(state.velocity, state.velocity)
         moving = not every(squared < self._slow_squared)
@@ -275,28 +250,28 @@ class Detector:
             if some(rows.landing_places.aside):
                 seen.append(Observation(Cause.BELOW, rows.landing_places.aside, rows.landing_places.robot_below))
 
-    def _near(self, t: float, state: BodyState, hearing: NeighbourStates, seen: list[Observation]) -> None:
-        """Other robots, where they are believed to be."""
+    def _near(self, t: float, state: BodyState, neighbours: NeighbourStates, seen: list[Observation]) -> None:
+        """Separation from other robots at their extrapolated places."""
         limit = self._limits.separation
         assert limit is not None
-        apart = self._separation.distances(t, state.position, hearing)
+        apart = self._separation.distances(t, state.position, neighbours)
         near = apart < limit
         if not some(near):
             return
 
-        def say(row: int) -> str:
+        def detail(row: int) -> str:
             distance, other = self._separation.nearest_robot(row, apart)
             return f"{distance:.2f} m from {other} (limit {limit:g} m)"
 
         inner = apart < np.maximum(0.5 * limit, self._separation.touching)
-        seen.append(Observation(Cause.SEPARATION, self._separation.receivers_of(near), say))
-        seen.append(Observation(Cause.TOUCHING, self._separation.receivers_of(inner), say))
+        seen.append(Observation(Cause.SEPARATION, self._separation.receivers_of(near), detail))
+        seen.append(Observation(Cause.TOUCHING, self._separation.receivers_of(inner), detail))
 
-    def _missed(self, t: float, hearing: NeighbourStates, rows: RowStatus, seen: list[Observation]) -> None:
-        """Neighbours that are gone."""
+    def _lost_neighbours(self, t: float, neighbours: NeighbourStates, rows: RowStatus, seen: list[Observation]) -> None:
+        """Lost neighbours."""
         links, assignment = self._assignment.links, self._assignment
-        since = hearing.poses.lost_since
-        gone = self._lawful & np.isfinite(since) & (t - since > self._limits.link_silence_s)
+        since = neighbours.poses.lost_since
+        gone = self._in_law & np.isfinite(since) & (t - since > self._limits.link_silence_s)
 
         def names(row: int) -> str:
             return ", ".join(assignment.robots[s] for s in links.sender[gone & (links.receiver == row)].tolist())
@@ -312,10 +287,10 @@ class Detector:
                 )
             )
 
-    def _behind(self, hearing: NeighbourStates, behind: Array, seen: list[Observation]) -> None:
-        """Neighbours whose clocks are behind."""
+    def _lagging(self, neighbours: NeighbourStates, behind: Array, seen: list[Observation]) -> None:
+        """Neighbours whose clocks lag."""
         links = self._assignment.links
-        late = (behind > 0.0) & (hearing.poses.lost_since == np.inf)
+        late = (behind > 0.0) & (neighbours.poses.lost_since == np.inf)
 
         def names(row: int) -> str:
             mine = np.flatnonzero(late & (links.receiver == row))
@@ -330,28 +305,26 @@ class Detector:
             rows[links.receiver[late]] = True
             seen.append(Observation(Cause.BEHIND, rows, names))
 
-    def _surroundings(self, t: float, outside: ProcessHealth, seen: list[Observation]) -> None:
-        """The process, and who is on the network."""
+    def _surroundings(self, t: float, health: ProcessHealth, seen: list[Observation]) -> None:
+        """Router, conductor and control loop."""
         everybody = self._everybody
-        if outside.offline_since < np.inf:
-            gone = t - outside.offline_since
+        if health.offline_since < np.inf:
+            gone = t - health.offline_since
             seen.append(Observation(Cause.ROUTER, everybody, lambda _: f"for {gone:.1f} s"))
-        elif outside.conductor_lost_since < np.inf:
-            since = t - outside.conductor_lost_since
+        elif health.conductor_lost_since < np.inf:
+            since = t - health.conductor_lost_since
             seen.append(Observation(Cause.CONDUCTOR, everybody, lambda _: f"for {since:.1f} s"))
-        if outside.loop_failing:
-            seen.append(
-                Observation(Cause.LATE, everybody, lambda _: f"{outside.missed_share:.0%} of the last second's")
-            )
+        if health.loop_failing:
+            seen.append(Observation(Cause.LATE, everybody, lambda _: f"{health.missed_share:.0%} of the last second's"))
 
 
 def clock_off(ahead: Array, silence_s: float) -> Mask:
-    """Rows whose positions come from a clock that is off; `ahead` (N,) as in `BodyState`, blind after `silence_s`."""
+    """Rows whose positions come from a wrong clock; `ahead` (N,) as in `BodyState`, invalid after `silence_s`."""
     return np.asarray((ahead > AHEAD_S) | (ahead < -BEHIND * silence_s))
 
 
 def clock_text(names: Sequence[str], ahead: Array, row: int) -> str:
-    """How far off the stamps of a row's positions are, in words; `ahead` (N,) as in `BodyState`."""
+    """Clock error of the positions of a row, in words; `ahead` (N,) as in `BodyState`."""
     seconds = float(ahead[row])
     return f"positions of {names[row]} are stamped {abs(seconds):.3g} s {'ahead' if seconds > 0.0 else 'behind'}"
 
@@ -363,6 +336,6 @@ def tilted(attitude: Array, limit: float) -> Mask:
 
 
 def tilt_angle(attitude: Array, row: int) -> float:
-    """How far a row leans [rad]: the angle between its own upward axis and the room's."""
+    """Angle [rad] between the upward axis of a row and that of the room."""
     _, x, y, _ = attitude[row].tolist()
     return 2.0 * asin(min(1.0, hypot(x, y)))

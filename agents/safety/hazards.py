@@ -1,10 +1,10 @@
-"""What may go wrong with a robot, and what is done about it: causes, outcomes, and the state machine between them.
+"""Hazards of a robot: causes, outcomes, and the state machine between them.
 
-Pure and row-wise: what is seen of each cause on a tick goes in (`agents.safety.detection`), and out come the rows that
-must hold, land or have their motors cut. The table `rules` is all there is to know about a cause.
+Pure and row-wise: the causes present on a tick go in (`agents.safety.detection`), and out come the rows that must
+hold, land or have their motors cut. The table `rules` is the whole definition of a cause.
 
-An outcome only ever becomes harder while its cause lasts: warn -> hold -> land -> cut. A hold ends when its cause has
-ended; landing and cutting do not, whatever happens.
+An outcome only becomes harder while its cause lasts: warn -> hold -> land -> cut. A hold ends when its cause has
+ended; landing and cutting never end.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ import numpy as np
 from agents.arrays import Array, Index, Mask, some
 from agents.body.limits import Limits
 
-QUIET_S: Final = 1.0  # a hazard is over when its cause was not seen for this long: one that flickers is told once
+QUIET_S: Final = 1.0  # absence of a cause that ends its hazard: a flickering one is reported once
 ROUNDING_S: Final = 1e-9
 NEVER: Final = np.inf
 
 
 class Outcome(IntEnum):
-    """What is done about a hazard; the numbers grow with severity."""
+    """Response to a hazard; the numbers grow with severity."""
 
     NONE = 0
-    WARN = 1  # it goes on, within its limits; people are told
-    HOLD = 2  # it stays where it is
-    LAND = 3  # flying robots come down, ground robots halt; neither goes on
+    WARN = 1  # goes on, within its limits; reported to people
+    HOLD = 2  # stays in place
+    LAND = 3  # flying robots land, ground robots halt, for good
     CUT = 4  # motors off at once
 
 
 class Cause(IntEnum):
-    """What may be wrong with a robot; the numbers are the rows of the state machine."""
+    """Cause of a hazard; the numbers are the rows of the state machine."""
 
     ORDERED = 0
     POSITION = 1
@@ -65,31 +65,18 @@ class Cause(IntEnum):
 
 @dataclass(frozen=True)
 class Rule:
-    """What is done about a cause.
+    """Response to a cause."""
 
-    Attributes:
-        words: What people read.
-        first: The outcome as soon as it has been seen for `after_s` without a break.
-        after_s: [s]; one number, or one for each row.
-        then: The outcome when that does not help for `then_s`.
-        then_s: [s] from the first time that it was seen; one number, or one for each row.
-        clears_s: A hold ends when the cause was not seen for this long [s].
-        repeats: Whether what comes back within `QUIET_S` counts as lasting all the time.
-        place: Whether who holds keeps the place where that began; else only its setpoints are stopped.
-        landing: Whether it is looked for while a robot lands as well.
-        grounded: Outcome of `then` for robots that do not fly, where it is another one.
-    """
-
-    words: str
-    first: Outcome
-    after_s: float | Array = 0.0
-    then: Outcome = Outcome.NONE
-    then_s: float | Array = NEVER
-    clears_s: float = 0.0
-    repeats: bool = False
-    place: bool = True
-    landing: bool = False
-    grounded: Outcome | None = None
+    words: str  # for people
+    first: Outcome  # outcome when the cause lasted for `after_s` without a break
+    after_s: float | Array = 0.0  # [s]; one number, or one for each row
+    then: Outcome = Outcome.NONE  # outcome after `then_s`
+    then_s: float | Array = NEVER  # [s] since the cause began; one number, or one for each row
+    clears_s: float = 0.0  # absence of the cause that ends a hold [s]
+    repeats: bool = False  # a cause that returns within `QUIET_S` counts as lasting
+    place: bool = True  # a hold keeps the place where it began; else only setpoints stop
+    landing: bool = False  # checked while a robot lands as well
+    grounded: Outcome | None = None  # `then` of robots that do not fly, where different
 
 
 _LOST: Final[Mapping[str, Outcome]] = {
@@ -120,14 +107,14 @@ RULES: Final[Mapping[Cause, Rule]] = {
     Cause.CENTRE: Rule("nobody guides it", Outcome.HOLD),
     Cause.BATTERY: Rule("its battery is low", Outcome.LAND, after_s=1.0),  # its voltage sags under a short load
     Cause.ROUTER: Rule("no connection to a router", Outcome.HOLD, then=Outcome.LAND),
-    Cause.CONDUCTOR: Rule("the conductor is gone", Outcome.WARN, after_s=2.0),  # who was cut off sees it back first
+    Cause.CONDUCTOR: Rule("the conductor is gone", Outcome.WARN, after_s=2.0),  # offline robots see it first again
     Cause.FALLEN: Rule("it came down by itself", Outcome.LAND),
     Cause.SETPOINT: Rule(
         "what it wants is not a setpoint", Outcome.HOLD, then=Outcome.LAND, then_s=0.5, repeats=True, place=False
     ),
     Cause.LATE: Rule("its control loop misses its ticks", Outcome.HOLD, then=Outcome.LAND, then_s=5.0, clears_s=0.5),
     Cause.LANDING: Rule("its landing takes too long", Outcome.CUT, landing=True),
-    # its device lands it, or its battery carries it no more: who hears it must not follow
+    # its device lands it, or its battery is empty: neighbours must not follow
     Cause.SINKING: Rule("it comes down by itself", Outcome.LAND, after_s=0.1),
     Cause.BELOW: Rule("a robot is below it", Outcome.WARN, landing=True),
     Cause.STANDSTILL: Rule("its process stood still", Outcome.HOLD),
@@ -148,7 +135,7 @@ def rules(limits: Limits) -> dict[Cause, Rule]:
 
 
 class Observation(NamedTuple):
-    """A cause that is seen on this tick: on which rows (N,), and how bad it is there, in words with numbers."""
+    """Cause present on this tick: its rows (N,), and its extent there, in words with numbers."""
 
     cause: Cause
     rows: Mask
@@ -156,7 +143,7 @@ class Observation(NamedTuple):
 
 
 class Incident(NamedTuple):
-    """A hazard began, became worse, or is over: when [s], on which row, which cause, what is done, and all in words."""
+    """Begin, change or end of a hazard: time [s], row, cause, outcome, and text."""
 
     time: float
     row: int
@@ -166,12 +153,10 @@ class Incident(NamedTuple):
 
 
 class Hazards:
-    """The state machine of N rows.
+    """State machine of N rows."""
 
-    Attributes:
-        held: (N,) rows that must keep their place.
-        incidents: What has happened since whoever reads it emptied it.
-    """
+    held: Mask  # (N,) rows that must keep their place
+    incidents: list[Incident]  # since the reader emptied the list
 
     def __init__(self, flies: Mask, limits: Limits) -> None:
         """Of rows that fly or not (N,)."""
@@ -197,18 +182,18 @@ class Hazards:
         self._level: Index = np.zeros(shape, dtype=np.intp)
         self._texts: list[dict[int, str]] = [{} for _ in flies]
         self._quiet = True
-        self.held: Mask = np.zeros(len(flies), dtype=bool)
+        self.held = np.zeros(len(flies), dtype=bool)
         self._nobody = self.held
-        self.incidents: list[Incident] = []
+        self.incidents = []
 
     def update(self, t: float, seen: Sequence[Observation], active: Mask, landing: Mask) -> list[Incident]:
-        """One tick: the rows that must land or be cut now, for the first time, each with why.
+        """Update for one tick; returns incidents of the rows that must land or be cut now, for the first time.
 
         Args:
             t: Now [s].
-            seen: Causes that are seen; one that is left out is not seen on any row.
+            seen: Causes present; a cause that is left out is present on no row.
             active: (N,) rows that climb, wait in the air, or run: the others have no hazards.
-            landing: (N,) rows that land: they have those that are looked for then.
+            landing: (N,) rows that land: they have the hazards with `Rule.landing`.
         """
         if self._quiet and not seen:
             return []
@@ -236,10 +221,10 @@ class Hazards:
         self._quiet = not (some(on) or some(now))
         if not some(level != before):
             return []
-        return self._tell(t, before, lasted, {sighting.cause: sighting for sighting in seen})
+        return self._record(t, before, lasted, {sighting.cause: sighting for sighting in seen})
 
-    def _tell(self, t: float, before: Index, lasted: Array, seen: Mapping[int, Observation]) -> list[Incident]:
-        """What has changed, in words; returns landings and cuts, the hardest of each row last."""
+    def _record(self, t: float, before: Index, lasted: Array, seen: Mapping[int, Observation]) -> list[Incident]:
+        """Record changes in words; returns landings and cuts, the hardest of each row last."""
         news = []
         for cause, row in np.argwhere(self._level != before).tolist():
             outcome = Outcome(self._level[cause, row])
@@ -256,14 +241,14 @@ class Hazards:
         return [incident for incident in news if incident.outcome >= Outcome.LAND]
 
     def words(self, cause: Cause) -> str:
-        """Of a cause, as a robot gives its reason for landing."""
+        """Words of a cause, as a robot gives its reason for landing."""
         return self._words[cause]
 
     def worst(self, row: int) -> str:
-        """The worst hazard that a row has, the outcome first; empty if it has none."""
+        """Text of the worst hazard of a row, the outcome first; empty if it has none."""
         texts = self._texts[row]
         return texts[max(texts, key=lambda cause: int(self._level[cause, row]))] if texts else ""
 
     def outcome(self, row: int) -> Outcome:
-        """What is done about the worst hazard of a row."""
+        """Outcome of the worst hazard of a row."""
         return Outcome(self._level[:, row].max())

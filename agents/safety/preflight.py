@@ -1,4 +1,4 @@
-"""What must be true of a robot before it takes off. Pure and row-wise; a row that fails says why."""
+"""Preflight checks: conditions for take-off, with the reason for each row that fails. Pure and row-wise."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ from agents.decision.neighbours import NeighbourStates
 from agents.safety.detection import ProcessHealth, Separation, clock_off, clock_text, tilt_angle, tilted
 from agents.safety.setpoint_filter import PoseValidity
 
-LOST_S: Final = 0.5  # a robot that was ready is so no more when a check has failed for this long
-FLOOR_M: Final = 0.5  # a drone that stands has at most this height: positioning systems differ about the floor
-REST_M_S: Final = 0.3  # and at most this speed
-LEVEL: Final = 0.35  # [rad] and leans at most so much
-WALL_M: Final = 0.05  # a place measured this far outside of the arena may still be in it
+LOST_S: Final = 0.5  # a ready robot whose check failed for this long is not ready any more
+FLOOR_M: Final = 0.5  # largest height of a standing drone: positioning systems differ about the floor
+REST_M_S: Final = 0.3  # and largest speed
+LEVEL: Final = 0.35  # [rad] and largest tilt
+WALL_M: Final = 0.05  # a place measured this far outside the arena may be inside
 
-Failing = tuple[Mask, Callable[[int], str]]  # rows (N,), and what to say of one of them
+Failing = tuple[Mask, Callable[[int], str]]  # rows (N,), and the reason of one
 
 
 class Preflight:
-    """The checks of N rows, and for how long each has failed one."""
+    """Checks of N rows, and the duration of each row's failure."""
 
     def __init__(self, assignment: Assignment) -> None:
-        """Of the rows of an assignment."""
         self._limits, self._assignment = assignment.limits, assignment
         self._flies = np.array([kind.flies for kind in assignment.kinds])
         self._separation = Separation(assignment)
@@ -40,46 +39,40 @@ class Preflight:
         t: float,
         state: BodyState,
         where: PoseValidity,
-        hearing: NeighbourStates,
-        outside: ProcessHealth,
+        neighbours: NeighbourStates,
+        health: ProcessHealth,
         lacking: tuple[Mask, Callable[[int], Sequence[str]]],
     ) -> dict[int, str]:
-        """Rows that must not take off at `t` [s], each with the first thing that is wrong with it.
+        """Rows that must not take off at `t` [s], each with the first reason.
 
-        Args:
-            t: Now [s].
-            state: Of the bodies.
-            where: What their poses are worth.
-            hearing: Of the rows.
-            outside: What the process knows.
-            lacking: (N,) rows that still wait for somebody, and for whom a row does.
+        `lacking`: (N,) rows without a pose of a neighbour, and the names of the missing ones of a row.
         """
         failing: dict[int, str] = {}
-        checks = [self._knows(t, state, where, outside, lacking), self._rests(state)]
+        checks = [self._situation(t, state, where, health, lacking), self._at_rest(state)]
         if self._limits.separation is not None:
-            checks.append(self._near(t, state.position, hearing, self._limits.separation))
-        for rows, say in chain.from_iterable(checks):
+            checks.append(self._near(t, state.position, neighbours, self._limits.separation))
+        for rows, reason in chain.from_iterable(checks):
             for row in np.flatnonzero(rows).tolist():
-                failing.setdefault(row, say(row))
+                failing.setdefault(row, reason(row))
         return failing
 
     def lost(self, t: float, failing: dict[int, str]) -> Index:
-        """Of the rows that fail, those (K,) that have failed for so long that they are not ready any more."""
+        """Failing rows (K,) that have failed for so long that they are not ready any more."""
         rows = np.array(list(failing), dtype=np.intp)
         since = np.full(len(self._flies), np.inf)
         since[rows] = np.minimum(self._since[rows], t)
         self._since = since
         return rows[t - since[rows] >= LOST_S]
 
-    def _knows(
+    def _situation(
         self,
         t: float,
         state: BodyState,
         where: PoseValidity,
-        outside: ProcessHealth,
+        health: ProcessHealth,
         lacking: tuple[Mask, Callable[[int], Sequence[str]]],
     ) -> Iterator[Failing]:
-        """Where it is, and who else is there."""
+        """Own position, neighbours, router, arena."""
         known = np.isfinite(state.position).all(axis=1) & (t - state.time <= self._limits.own_silence_s)
         ahead = np.zeros(len(known)) if state.ahead is None else state.ahead
 
@@ -90,15 +83,15 @@ class Preflight:
             return "no position of its own" + (f": {clock_text(self._assignment.names, ahead, row)}" if off else "")
 
         yield where.invalid, nowhere
-        waits, whom = lacking
-        yield waits, lambda row: "never heard " + ", ".join(whom(row))
-        if outside.offline_since < np.inf:
+        waits, missing = lacking
+        yield waits, lambda row: "never heard " + ", ".join(missing(row))
+        if health.offline_since < np.inf:
             yield np.ones(len(self._flies), dtype=bool), lambda _: "no connection to a router"
         if not where.all_valid:
             yield where.excess > WALL_M, lambda row: f"it is {where.excess[row]:.2f} m outside the arena"
 
-    def _rests(self, state: BodyState) -> Iterator[Failing]:
-        """Its body on the floor."""
+    def _at_rest(self, state: BodyState) -> Iterator[Failing]:
+        """Body at rest on the floor."""
         flies, height, least = self._flies, state.position[:, 2], self._limits.battery_min
         yield flies & (height > FLOOR_M), lambda row: f"it does not stand on the floor, but at z = {height[row]:.2f} m"
         fast = flies & (np.vecdot(state.velocity, state.velocity) > REST_M_S**2)
@@ -110,13 +103,13 @@ class Preflight:
         low = state.battery < least
         yield low, lambda row: f"its battery is at {state.battery[row]:.0%}, less than {least:.0%}"
 
-    def _near(self, t: float, position: Array, hearing: NeighbourStates, limit: float) -> Iterator[Failing]:
-        apart = self._separation.distances(t, position, hearing)
+    def _near(self, t: float, position: Array, neighbours: NeighbourStates, limit: float) -> Iterator[Failing]:
+        apart = self._separation.distances(t, position, neighbours)
         near = apart < limit
         if some(near):
 
-            def say(row: int) -> str:
+            def reason(row: int) -> str:
                 distance, other = self._separation.nearest_robot(row, apart)
                 return f"it is {distance:.2f} m from {other}, nearer than {limit:g} m"
 
-            yield self._separation.receivers_of(near), say
+            yield self._separation.receivers_of(near), reason

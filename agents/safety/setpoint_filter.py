@@ -1,4 +1,4 @@
-"""Safety, the last word before a body: whatever was decided, this is what may be sent."""
+"""Setpoint filter, the last stage before a body: limits every setpoint, whatever was decided."""
 
 from __future__ import annotations
 
@@ -14,53 +14,35 @@ from agents.body.limits import Limits
 from agents.plugins.avoidance import Avoidance, Nearby, OwnState
 from agents.plugins.registry import FAILURES, PluginError
 
-OUTSIDE_M = 0.25  # [m] this far outside the arena a robot is no longer under control
-ABSURD = 1e6  # [m, m/s, rad, rad/s] no place, speed or angle is that large; NaN is not smaller either
+OUTSIDE_M = 0.25  # [m] outside the arena: no longer under control
+ABSURD = 1e6  # [m, m/s, rad, rad/s] larger than any place, speed or angle; NaN is not smaller either
 ROUNDING = 1e-9  # smaller differences are arithmetic, not interventions
 
 
 @dataclass(frozen=True)
 class PoseValidity:
-    """Validity of the measured poses of N rows: known, fresh, inside the arena.
+    """Validity of the measured poses of N rows: known, fresh, inside the arena."""
 
-    Attributes:
-        all_valid: Every row knows where it is, and is inside the arena.
-        invalid: (N,) own position missing, stale or not finite: no closed loop is possible.
-        outside_wall: (N,) outside a wall, or above the ceiling.
-        outside: (N,) outside the arena beyond any doubt.
-        flyaway: (N,) so far outside that a flying row must be stopped there.
-        excess: (N,) distance from the arena [m], along the worst axis; 0 inside.
-    """
-
-    all_valid: bool
-    invalid: Mask
-    outside_wall: Mask
-    outside: Mask
-    flyaway: Mask
-    excess: Array
+    all_valid: bool  # every row knows its pose, and is inside the arena
+    invalid: Mask  # (N,) own pose missing, stale or not finite: no closed loop is possible
+    outside_wall: Mask  # (N,) outside a wall, or above the ceiling
+    outside: Mask  # (N,) outside the arena beyond any doubt
+    flyaway: Mask  # (N,) so far outside that a flying row must be stopped there
+    excess: Array  # (N,) distance from the arena along the worst axis [m]; 0 inside
 
 
 class FilteredSetpoint(msgspec.Struct, frozen=True):
-    """What may be sent, and what else must happen.
+    """Safe setpoints, and what was changed."""
 
-    Attributes:
-        setpoint: (N, 4) safe.
-        changed: (N,) the setpoint was not what had been decided.
-        invalid_pose: (N,) own position missing, stale or not finite: no closed loop is possible.
-        not_finite: (N,) it was not made of finite numbers although the row is not blind;
-            the setpoint sent instead keeps the row in place.
-        avoided: (N,) avoidance changed the setpoint.
-    """
-
-    setpoint: Array
-    changed: Mask
-    invalid_pose: Mask
-    not_finite: Mask
-    avoided: Mask
+    setpoint: Array  # (N, 4) safe
+    changed: Mask  # (N,) the setpoint differs from the decided one
+    invalid_pose: Mask  # (N,) own pose missing, stale or not finite: no closed loop is possible
+    not_finite: Mask  # (N,) decided setpoint not finite although the pose is valid; the row is kept in place instead
+    avoided: Mask  # (N,) changed by avoidance
 
 
 class SetpointFilter:
-    """Checks setpoints of rows of any kinds."""
+    """Filter for setpoints of rows of any kinds."""
 
     def __init__(self, kinds: Sequence[Kind], limits: Limits) -> None:
         takes = np.array([kind.takes for kind in kinds])
@@ -77,7 +59,7 @@ class SetpointFilter:
         flies = np.array([kind.flies for kind in kinds])[:, None]
         inside = np.array([limits.margin, limits.margin, 0.0])
         floor, ceiling = np.array([0.0, 0.0, np.inf]), np.array([0.0, 0.0, limits.margin])
-        self._low = limits.low + inside - np.where(flies, 0.0, floor)  # ground robots have no business with heights
+        self._low = limits.low + inside - np.where(flies, 0.0, floor)  # heights do not limit ground robots
         self._high = limits.high - inside - np.where(flies, ceiling, -floor)
         self._centre = 0.5 * (limits.low + limits.high)
         self._half = 0.5 * (limits.high - limits.low)
@@ -85,17 +67,17 @@ class SetpointFilter:
         self._sure = PoseValidity(True, *(self._nobody,) * 4, np.zeros(len(kinds)))
 
     def validate_poses(self, position: Array, yaw: Array, age: Array) -> PoseValidity:
-        """What poses are worth: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s]."""
+        """Validity of poses: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s]."""
         off = np.abs(position - self._centre)
         known = (np.abs(yaw) < ABSURD) & (age <= self.limits.own_silence_s)
         if every(off <= self._half) and every(known):
             return self._sure
-        blind = ~np.asarray(known & (np.abs(position) < ABSURD).all(axis=1))
-        off = np.where(blind[:, None], 0.0, off)  # what is not known is not outside
+        invalid = ~np.asarray(known & (np.abs(position) < ABSURD).all(axis=1))
+        off = np.where(invalid[:, None], 0.0, off)  # an unknown pose is not outside
         excess = np.maximum((off - self._half).max(axis=1), 0.0)
-        walls = (off[:, :2] > self._half[:2]).any(axis=1) | (~blind & (position[:, 2] > self.limits.high[2]))
+        walls = (off[:, :2] > self._half[:2]).any(axis=1) | (~invalid & (position[:, 2] > self.limits.high[2]))
         outside = np.asarray((off > self._half + OUTSIDE_M).any(axis=1))
-        return PoseValidity(False, blind, np.asarray(walls), outside, excess > self.limits.cut_outside, excess)
+        return PoseValidity(False, invalid, np.asarray(walls), outside, excess > self.limits.cut_outside, excess)
 
     def check(  # noqa: PLR0917 - the four that always are, and those of avoidance
         self,
@@ -108,49 +90,49 @@ class SetpointFilter:
         nearby: Nearby | None = None,
         where: PoseValidity | None = None,
     ) -> FilteredSetpoint:
-        """The last word.
+        """Safe setpoints.
 
         Args:
             setpoint: (N, 4) as decided, in the meaning of each row's kind.
             position: (N, 3) measured [m].
             yaw: (N,) measured [rad].
             age: (N,) of that measurement [s].
-            avoidance: Has its say after all limits.
-            own: For it.
-            nearby: For it.
-            where: What the pose is worth, if it has been asked already.
+            avoidance: Applied after all limits.
+            own: For the avoidance.
+            nearby: For the avoidance.
+            where: Validity of the pose, if known already.
         """
         where = self.validate_poses(position, yaw, age) if where is None else where
         sane = np.abs(setpoint) < ABSURD
         nobody = self._nobody
-        blind, wild = where.invalid, nobody
+        invalid, not_finite = where.invalid, nobody
         safe, here = setpoint.copy(), position
         troubled = not (where.all_valid and every(sane))
         if troubled:
-            wild = ~np.asarray(sane.all(axis=1) | blind)
-            here, yaw = np.where(blind[:, None], self._centre, position), np.where(blind, 0.0, yaw)
-            safe[blind | wild] = 0.0
-            stay = wild & self._takes_position
+            not_finite = ~np.asarray(sane.all(axis=1) | invalid)
+            here, yaw = np.where(invalid[:, None], self._centre, position), np.where(invalid, 0.0, yaw)
+            safe[invalid | not_finite] = 0.0
+            stay = not_finite & self._takes_position
             safe[stay, :3] = here[stay]
-        late = np.where(blind, 0.0, np.maximum(age, 0.0)) if troubled else np.maximum(age, 0.0)
+        late = np.where(invalid, 0.0, np.maximum(age, 0.0)) if troubled else np.maximum(age, 0.0)
         self._limit(safe, here, yaw, late)
         avoided = nobody
         if avoidance is not None and own is not None and nearby is not None:
             limited = safe
             wished = _wished(avoidance, limited, own, nearby)
-            safe = self._restrained(limited, wished, here, yaw, late, blind | wild)
+            safe = self._restrained(limited, wished, here, yaw, late, invalid | not_finite)
             if safe is not limited:
                 avoided = np.asarray((np.abs(safe - limited) > ROUNDING).any(axis=1))
         other = np.abs(safe - setpoint) > ROUNDING
         changed = np.asarray(other.any(axis=1)) if some(other) else nobody
         if troubled:
-            changed = (changed | wild) & ~blind
+            changed = (changed | not_finite) & ~invalid
             # a body that controls its position on board keeps its last setpoint while the position is not known here
-            safe[blind & self._takes_position] = np.nan
-        return FilteredSetpoint(safe, changed, blind, wild, avoided)
+            safe[invalid & self._takes_position] = np.nan
+        return FilteredSetpoint(safe, changed, invalid, not_finite, avoided)
 
     def _limit(self, setpoint: Array, here: Array, yaw: Array, age: Array) -> None:
-        """Brings setpoints (N, 4) within all limits, in place; rows were `here` (N, 3) [m] `age` (N,) [s] ago."""
+        """Bring setpoints (N, 4) within all limits, in place; rows were `here` (N, 3) [m] `age` (N,) [s] ago."""
         if self._any_position:
             rows = self._position
             setpoint[rows, :3] = self._near(setpoint[rows, :3], here[rows], rows)
@@ -164,10 +146,9 @@ class SetpointFilter:
     def _restrained(  # noqa: PLR0917 - what limits take
         self, setpoint: Array, wished: Array, here: Array, yaw: Array, age: Array, unknown: Mask
     ) -> Array:
-        """Setpoints (N, 4) that avoidance wishes instead of those that are within the limits, within the limits again.
+        """Setpoints (N, 4) that avoidance wishes instead of the limited ones, within the limits again.
 
-        A row that is not made of numbers is not taken, and `unknown` rows (N,), which do not know where they are or
-        what they want, stay as they are.
+        Rows that are not finite, and `unknown` rows (N,) without a pose or a setpoint, stay as they are.
         """
         other = np.asarray((wished != setpoint).any(axis=1) & np.isfinite(wished).all(axis=1))
         other &= ~unknown
@@ -216,7 +197,11 @@ class SetpointFilter:
 
 
 def _wished(avoidance: Avoidance, setpoint: Array, own: OwnState, nearby: Nearby) -> Array:
-    """What avoidance makes of setpoints (N, 4). It may be somebody's first: one that fails is named."""
+    """Setpoints (N, 4) after avoidance.
+
+    Raises:
+        PluginError: If the avoidance fails; the error names it.
+    """
     name = type(avoidance).__name__
     try:
         wished = np.asarray(avoidance.restrain(setpoint.copy(), own, nearby), dtype=float)

@@ -212,7 +212,7 @@ def test_the_goal_of_the_decision_itself_is_not_shifted():
 
 def test_without_avoidance_nobody_looks():
     agent, state = running_pair(None, 0.01)
-    assert agent._sight is None
+    assert agent._perception is None
     assert not agent.step(0.0, state).avoided.any()
 
 

@@ -69,7 +69,7 @@ class Bench:
         duties = BodyCommands(NOBODY, np.flatnonzero(self.asked), NOBODY) if self.asked.any() else None
         self.asked[:] = False
         out = self.landing.filter_commands(
-            self.t, duties, state, where, hearing=self.hearing, late=self.late, phase=self.phase
+            self.t, duties, state, where, neighbours=self.hearing, late=self.late, phase=self.phase
         )
         if out is not None:
             self.sinking[out.land] = True
