@@ -44,7 +44,7 @@ def explanation(found: dict[str, Path | None], root: Path) -> str:
 
 
 def _lean(words: list[str]) -> None:
-    """Becomes what a run starts on its hosts, small computers often: typer is for people, and takes as long to import.
+    """Become what a run starts on its hosts, small computers often: typer is for people, and takes as long to import.
 
     Returns if it is not that.
     """
@@ -60,7 +60,7 @@ def _lean(words: list[str]) -> None:
 
 
 def main() -> None:
-    """Checks the packages, then hands over to the command line."""
+    """Check the packages, then hand over to the command line."""
     root = Path(__file__).resolve().parent.parent
     found = intruders(root)
     if found:

@@ -73,7 +73,7 @@ def _explained() -> tuple[type[BaseException], ...]:
 
 
 def main() -> None:
-    """Runs a command. Exit codes: its own, 2 for what the user can mend, 130 for Ctrl-C."""
+    """Run a command. Exit codes: its own, 2 for what the user can mend, 130 for Ctrl-C."""
     try:
         app()
     except _explained() as error:

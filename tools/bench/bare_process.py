@@ -22,7 +22,7 @@ REALM = "bare"  # the robots of these names are in another realm of the same rou
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs until its standard input ends."""
+    """Run until its standard input ends."""
     parser = argparse.ArgumentParser(description="Sends and receives poses.")
     parser.add_argument("name")
     parser.add_argument("hz", type=float)

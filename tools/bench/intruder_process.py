@@ -35,7 +35,7 @@ LARGE_HZ: Final = 1_000.0  # half a gigabit per second
 def flood(
     endpoint: str, identity: str, key: str, what: Callable[[int], bytes], *, rate_hz: float, over: threading.Event
 ) -> None:
-    """Says something so many times a second, tells how often, and ends the process."""
+    """Send something so many times a second, report how often, and end the process."""
     with network.open_session([endpoint], name="intruder", identity=identity) as session:
         publisher = session.declare_publisher(key, encoding=messages.JSON)
 
@@ -60,7 +60,7 @@ def _at(rate_hz: float, once: Callable[[int], None], over: threading.Event) -> i
 
 
 def half_open(endpoint: str, over: threading.Event) -> int:
-    """Begins handshakes and never ends them; begins again when the router has dropped one."""
+    """Begin handshakes without completing them; begin again when the router has dropped one."""
     address = _address(endpoint)
     held: list[socket.socket] = []
     begun = 0
@@ -86,7 +86,7 @@ def half_open(endpoint: str, over: threading.Event) -> int:
 
 
 def garbage(endpoint: str, over: threading.Event) -> int:
-    """Connects, or sends datagrams, with what is no handshake at all."""
+    """Connect, or send datagrams, with bytes that are no handshake."""
     address = _address(endpoint)
     datagrams = endpoint.startswith("quic")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:

@@ -90,7 +90,7 @@ class Siege:
                 self.phases[number].late.append(status.late_s)
 
     def end(self) -> None:
-        """Ends the intruder of this phase."""
+        """End the intruder of this phase."""
         if self._process is None:
             return
         self._process.terminate()

@@ -46,7 +46,7 @@ class Meter:
         self.last: dict[str, Spent] = {}
 
     def look(self, pids: Mapping[str, int]) -> None:
-        """Measures now; processes that have ended are left out."""
+        """Measure now; processes that have ended are left out."""
         for name, pid in pids.items():
             try:
                 spent = Spent.of(pid)

@@ -121,7 +121,7 @@ def ring(count: int, body: str) -> Experiment:
 
 
 def places(endpoint: str, realm: str, starts: Mapping[str, Sequence[float]]) -> None:
-    """Says where everybody is, until it is ended: where they started, x, y [m]."""
+    """Publish the start places of all robots, x, y [m], until it is ended."""
     from agents.network import messages, pubsub  # noqa: PLC0415
     from agents.network import session as network  # noqa: PLC0415
     from agents.network.keys import Keys  # noqa: PLC0415

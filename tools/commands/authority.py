@@ -52,7 +52,7 @@ def create(
     days: float = DAYS,
     authority_days: float = AUTHORITY_DAYS,
 ) -> Register:
-    """Makes a lab: its folder, its authority, and a certificate for each identity.
+    """Make a lab: its folder, its authority, and a certificate for each identity.
 
     Args:
         folder: Must not hold a lab.
@@ -87,7 +87,7 @@ def create(
 
 
 def issue(folder: Path, identities: Mapping[str, Role], *, hosts: Sequence[str] = (), days: float = DAYS) -> Register:
-    """Adds identities to a lab. With `hosts` they may listen there, as a router does.
+    """Add identities to a lab. With `hosts` they may listen there, as a router does.
 
     Raises:
         LabError: If one is there already, or the authority's key is not on this machine.
@@ -107,7 +107,7 @@ def renew(
     days: float = DAYS,
     authority: bool = False,
 ) -> Register:
-    """Makes new keys and certificates on the same names; those before stay valid until they end.
+    """Make new keys and certificates on the same names; those before stay valid until they end.
 
     Args:
         folder: Of the lab.
@@ -129,7 +129,7 @@ def renew(
 
 
 def revoke(folder: Path, names: Sequence[str], *, days: float = DAYS) -> Register:
-    """Takes all rights from the present certificates of identities, and makes them new ones.
+    """Take all rights from the present certificates of identities, and make them new ones.
 
     Raises:
         LabError: If there is no such identity, or the authority's key is not on this machine.
@@ -203,7 +203,7 @@ def _issued(
     hosts: Sequence[str] = (),
     days: float,
 ) -> Register:
-    """Writes a key and a certificate for each identity, and last the register, which makes them count."""
+    """Write a key and a certificate for each identity, and last the register, which makes them count."""
     for name in identities:
         if name == AUTHORITY or not (name.isascii() and name.isidentifier() and name[0] != "_"):
             raise LabError(f"'{name}' cannot be an identity: write letters, digits and _, beginning with a letter")
@@ -280,7 +280,7 @@ def _private(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(file: Path, content: bytes, mode: int) -> None:
-    """Writes a file at once and whole, with its permissions from the beginning."""
+    """Write a file at once and whole, with its permissions from the beginning."""
     beside = file.with_name(f".{file.name}.new")
     try:
         beside.unlink(missing_ok=True)

@@ -278,7 +278,7 @@ def _mended(there: Station, router: Found, experiment: Experiment) -> str:
 
 
 def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -> bool:
-    """Adds what a host holds of the lab's certificates to its row; whether its robots would be let in."""
+    """Add what a host holds of the lab's certificates to its row; whether its robots would be let in."""
     from experiments.real_time.hosts import certificates
 
     wrong = there.distrusted(there.host.robots)
@@ -303,7 +303,7 @@ def table(rows: Sequence[Row], heading: Sequence[str] = HEADING) -> list[str]:
 
 
 def put(name: str, host: Host) -> str:
-    """Puts this zenpark on a host, and makes it ready; returns what it then says of itself.
+    """Put this zenpark on a host, and make it ready; return what it then says of itself.
 
     Raises:
         HostError: If there is no place for it, or it cannot be made ready there.
@@ -334,7 +334,7 @@ def put(name: str, host: Host) -> str:
 def deliver(
     name: str, host: Host, script: str, words: Sequence[object], cargo: bytes, *, limit_s: float, late: str, failed: str
 ) -> str:
-    """Lets a script unpack something on a host; returns what it said.
+    """Let a script unpack something on a host; return what it said.
 
     Args:
         name: Of the host.
@@ -434,7 +434,7 @@ rmdir .incoming
 
 
 def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
-    """Puts the certificates of some robots on a host, in place of what its folder held; returns what was done.
+    """Put the certificates of some robots on a host, in place of what its folder held; return what was done.
 
     Args:
         name: Of the host.

@@ -35,7 +35,7 @@ class Lines:
         return None
 
     def __call__(self, progress: Progress) -> None:
-        """Prints what is new."""
+        """Print what is new."""
         for event in self._news.new_events(progress):
             if event.kind == OUTPUT:
                 print(f"{event.source}| {event.text}", file=sys.stderr)
@@ -69,7 +69,7 @@ class Table:
         self._live.__exit__(None, None, None)
 
     def __call__(self, progress: Progress) -> None:
-        """Draws the table anew, four times a second at most."""
+        """Draw the table anew, four times a second at most."""
         for event in self._news.new_events(progress):
             if event.kind == OUTPUT:
                 self._live.console.print(f"{event.source}| {event.text}", markup=False, highlight=False)

@@ -265,7 +265,7 @@ def _command(file: str, options: RunOptions, *, virtual: bool, changes: Sequence
 
 
 def _write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
-    """Writes `metrics.csv` and `metrics.json` of a run into its folder."""
+    """Write `metrics.csv` and `metrics.json` of a run into its folder."""
     from experiments.report import metrics_files
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -275,7 +275,7 @@ def _write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
 
 
 def _write_report(runs: Sequence[Run], folder: Path, command: str) -> Path:
-    """Writes figures and report of a run into its folder; returns the report."""
+    """Write figures and report of a run into its folder; return the report."""
     from experiments.report import report as pages
     from experiments.report import style as figures
     from experiments.report.page import date_of

@@ -26,14 +26,7 @@ BARREN: Final = 3  # rounds without any fault, and it gives up
 def run(
     setting: Setting, rounds: Sequence[Round], *, interrupted: Callable[[], bool], say: Say
 ) -> tuple[list[Outcome], list[Ended]]:
-    """All rounds, and as many more as the faults take that had no time in theirs.
-
-    Args:
-        setting: Of all of them.
-        rounds: The script.
-        interrupted: Asked whether the user wants to end.
-        say: Gets a line for each fault and each round.
-    """
+    """Run all rounds, and more for faults that had no time in theirs."""
     from tools.reliability.chaos_round import ChaosRound
     from tools.reliability.fault_script import Fault
 

@@ -156,7 +156,7 @@ def findings(result: Result) -> list[Finding]:
 
 
 def write(folder: Path, result: Result, command: str) -> Path:
-    """Writes `chaos.json`, `chaos.html` and the figure into a folder."""
+    """Write `chaos.json`, `chaos.html` and the figure into a folder."""
     (folder / FILE).write_bytes(msgspec.json.format(msgspec.json.encode(result), indent=1))
     drawn = figure(result)
     style.save(drawn, folder / "figures", "recovery")

@@ -130,7 +130,7 @@ class ChaosRound:
             self._hears[link.receiver].add(link.sender)
 
     def run(self) -> Ended:
-        """Runs the round to its end; leaves no process behind."""
+        """Run the round to its end; no process is left behind."""
         setting = self._setting
         folder = setting.folder / f"round-{self._number:03}"
         folder.mkdir()
@@ -228,7 +228,7 @@ class ChaosRound:
         return time.monotonic() - (self._started or 0.0) > self._setting.experiment.duration_s - NOTICE_S
 
     def _judge(self, now: float) -> None:
-        """Gives what is wrong to the fault that is under way, or to the round."""
+        """Add new violations to the active fault, or to the round."""
         wrong = self._observer.violations()
         for name, since in self._dead.items():
             told = self._observer.command.get(name)
@@ -238,7 +238,7 @@ class ChaosRound:
         target += [each for each in wrong if each not in target]
 
     def _next(self, t: float, now: float) -> bool:
-        """Does the next fault when its time has come; False if there is nothing more to be done in this round."""
+        """Inject the next fault when its time has come; False if the round is over."""
         if self._well is None:
             live = self._observer.running()
             formed = bool(live) and not self._not_in_formation(live, now - FRESH_S, t)
@@ -253,7 +253,7 @@ class ChaosRound:
         return now < self._well + self._left[0].after_s or self._begin(t, now)
 
     def _begin(self, t: float, now: float) -> bool:
-        """Does the next fault; False if there are too few robots left for it."""
+        """Inject the next fault; False if too few robots are left for it."""
         running = self._observer.running() - self._dead.keys()
         if len(running) < FEWEST:
             return False
@@ -277,7 +277,7 @@ class ChaosRound:
         return True
 
     def _heal(self, active: _ActiveFault, t: float, now: float) -> None:
-        """Lifts the fault when its time is over, and waits until all is well."""
+        """Lift the fault when its time is over, and wait until all is well."""
         fault = active.fault
         if fault.kind in ("freeze", "partition") and active.lifted is None:
             self._hold(active, now)
@@ -504,7 +504,7 @@ class ChaosRound:
     # ------------------------------------------------------------------ the end
 
     def _finish(self, watched: WatchedRun) -> float:
-        """Ends the run if it has not ended; how long until all its processes were gone [s]."""
+        """End the run if it has not ended; how long until all its processes were gone [s]."""
         began = time.monotonic()
         if watched.process.alive:
             watched.close()
@@ -531,7 +531,7 @@ class ChaosRound:
 
     @staticmethod
     def _sweep(watched: WatchedRun) -> None:
-        """Whatever happened: nothing of the run survives the round."""
+        """Kill what is left of the run, whatever happened."""
         for pid in watched.processes():
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)

@@ -139,7 +139,7 @@ def script(
 
 
 def _deal(deck: list[str], robots: Sequence[str], duration_s: float, random: np.random.Generator) -> Round:
-    """Takes the faults of one round off the deck."""
+    """Take the faults of one round off the deck."""
     stage = NATURES[deck[0]].stage
     t, faults = FORM_S, list[Fault]()
     dealt: list[str] = []

@@ -64,17 +64,7 @@ class Injector:
         groups: Mapping[str, str],
         recording: Path,
     ) -> None:
-        """Before anything is done.
-
-        Args:
-            watched: The run.
-            launcher: Starts second processes of a name.
-            cables: Of its robots.
-            folder: Of its switches (`tools.reliability.spoilt_process`).
-            random: Of nonsense.
-            groups: The process of each robot.
-            recording: Where it is recorded.
-        """
+        """No fault is done yet."""
         self._watched, self._launcher, self._cables = watched, launcher, cables
         self._folder, self._random, self._groups, self._recording = folder, random, groups, recording
         self._stopped: list[int] = []
@@ -83,7 +73,7 @@ class Injector:
         self.answer = messages.RunReply()  # to the last restart
 
     def begin(self, fault: Fault, victim: str, session: zenoh.Session, keys: Keys) -> str:
-        """Does it; what there is to say of it.
+        """Inject a fault; return a note for the report.
 
         Args:
             fault: What.
@@ -112,14 +102,14 @@ class Injector:
         return f"{self.spoil(victim, session, keys)} payloads of nonsense" if kind == "corrupt" else ""
 
     def end(self, fault: Fault) -> None:
-        """Lifts it."""
+        """Lift a fault."""
         if fault.kind == "mocap-clock":
             self._switch(CLOCKS[fault.kind][0]).write(0.0)
         elif fault.lasts_s:
             self.release()
 
     def restart(self, victim: str, session: zenoh.Session, keys: Keys) -> None:
-        """Has the conductor start a robot again; does not wait for that."""
+        """Have the conductor start a robot again; do not wait for that."""
         order = messages.RunOrder("restart", [victim], who="chaos")
 
         def ask() -> None:

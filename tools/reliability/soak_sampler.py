@@ -95,12 +95,6 @@ def sample(  # noqa: PLR0915 - one loop that follows one run
 ) -> Soaked:
     """Run a case and sample it until it is over.
 
-    Args:
-        experiment: The case, changes applied.
-        request: The same for the process that runs it.
-        interrupted: Asked whether the user wants to end.
-        tell: Gets a line now and then.
-
     Raises:
         RunFailed: If it does not begin.
     """

@@ -212,7 +212,7 @@ def _punctual(soaked: Soaked) -> list[Finding]:
 
 
 def write(folder: Path, soaked: Soaked, findings: Sequence[Finding], command: str) -> Path:
-    """Writes `soak.html` and its figure into a folder."""
+    """Write `soak.html` and its figure into a folder."""
     drawn = figure(soaked)
     style.save(drawn, folder / "figures", "soak")
     return render(

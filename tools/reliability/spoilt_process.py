@@ -54,7 +54,7 @@ class Switch:
     """A number in a file that processes share; 0 at first."""
 
     def __init__(self, file: Path) -> None:
-        """Makes the file if there is none."""
+        """Make the file if there is none."""
         with file.open("a+b") as opened:
             if not opened.tell():
                 opened.write(bytes(_NUMBER.size))
@@ -72,7 +72,7 @@ class Switch:
 
 
 def spoil(folder: Path, words: Sequence[str]) -> None:
-    """Puts the switches of a folder between this process and what it will run."""
+    """Put the switches of a folder between this process and what it will run."""
     role = role_of(words)
     utc, everyone, own = time.time, Switch(folder / "clock"), Switch(folder / f"clock-{role}")
     time.time = lambda: utc() + everyone.read() + own.read()

@@ -60,7 +60,7 @@ def conduct(
     launching: Callable[[Path], Launcher] = Launcher,
     tell: Callable[[Sequence[str]], None] = lambda _: None,
 ) -> tuple[dict[str, Path], list[str]]:
-    """Runs an experiment in real time: a router, a process per robot, a recorder.
+    """Run an experiment in real time: a router, a process per robot, a recorder.
 
     Args:
         read: The experiment.

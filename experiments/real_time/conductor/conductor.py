@@ -56,12 +56,7 @@ class Conductor:
     """Runs one case."""
 
     def __init__(self, context: CaseContext, show: Show) -> None:
-        """Write the case as a file for its processes; nothing is started yet.
-
-        Args:
-            context: Of the case.
-            show: Called with the progress, about ten times a second.
-        """
+        """Write the case as a file for its processes; nothing is started yet."""
         self._context, self._show = context, show
         self._experiment = experiment = context.experiment
         context.file.write_bytes(write_json(experiment))
@@ -80,7 +75,7 @@ class Conductor:
         self._processes = CaseProcesses(context)
 
     def run(self) -> Result:
-        """Runs the case to its end, or until the user interrupts it; the robots are down in any case.
+        """Run the case to its end, or until the user interrupts it; the robots are down in any case.
 
         Raises:
             RunFailed: If robots are not ready in time and the file says that the run must not go on without them.
@@ -122,7 +117,7 @@ class Conductor:
         return Result(self._context.recording, self._context.ended(), start, ready, lost)
 
     def _adopt(self) -> None:
-        """Finds robots that were started by hand or at boot, which nobody needs to start.
+        """Find robots that were started by hand or at boot, which nobody needs to start.
 
         Raises:
             RunFailed: If one of them has flown already.
@@ -153,7 +148,7 @@ class Conductor:
     def _until(
         self, phase: str, limit_s: float, *, recorder: bool = False, meanwhile: Callable[[], None] = lambda: None
     ) -> bool:
-        """Waits until every robot that is left has reached a phase; False if the user interrupted.
+        """Wait until every robot that is left has reached a phase; False if the user interrupted.
 
         Raises:
             RunFailed: If they have not in time, unless the file says to go on without them.
@@ -215,7 +210,7 @@ class Conductor:
         return at
 
     def _walk(self, start: float) -> None:
-        """Follows the run to its end."""
+        """Follow the run to its end."""
         legs = sorted(self._experiment.timeline, key=lambda leg: leg.at_s)
         names = ["formation", *(f"{leg.robot} under way" for leg in legs)]
         times = [0.0, *(leg.at_s for leg in legs)]
@@ -304,7 +299,7 @@ class Conductor:
         self._changes = HotChanges(self._experiment, self._processes, self._view, self._keys)
 
     def _update(self) -> None:
-        """Takes in what has happened since the last look."""
+        """Take in what has happened since the last update."""
         view, now = self._view, self._clock.utc()
         for name in view.update():
             self._miss(name)
@@ -343,7 +338,7 @@ class Conductor:
             self._processes.adopted.add(name)
 
     def _order(self, order: messages.Order, to: Sequence[str] | None = None) -> list[str]:
-        """Gives an order to all robots that are left, or to some of them; says and returns who refused."""
+        """Give an order to all robots that are left, or to some of them; report and return those that refused."""
         left = [name for name, seen in self._robots.items() if not (seen.gone or seen.status is None)]
         replies = self._view.order([name for name in left if to is None or name in to], order)
         refused = {name: reply.reason for name, reply in replies.items() if not reply.ok}

@@ -92,14 +92,14 @@ class CaseProcesses:
         return sorted(self.adopted)
 
     def start(self) -> None:
-        """Starts all robots that are neither adopted nor on standby, on their machines."""
+        """Start all robots that are neither adopted nor on standby, on their machines."""
         robots = self._context.experiment.robots
         for names in self._groups.values():
             if missing := [name for name in names if not (name in self.adopted or robots[name].standby)]:
                 self._start(missing, self._addressed, self._reached)
 
     def start_again(self, names: Sequence[str], bodies: Mapping[str, Robot] | None = None) -> None:
-        """Starts the process of some robots while the run is under way.
+        """Start the process of some robots while the run is under way.
 
         They are told to be ready without neighbours that say nothing, which may be out of the run as well.
 
@@ -152,15 +152,15 @@ class CaseProcesses:
         return self._launcher.running(self._process(self._group(name)))
 
     def release(self, name: str) -> None:
-        """Cuts the lifeline of a robot's process: it lands by itself, and ends."""
+        """Cut the lifeline of a robot's process: it lands by itself, and ends."""
         self._launcher.release(self._process(self._group(name)))
 
     def kill(self, name: str) -> None:
-        """Ends the process of a robot that follows nothing else."""
+        """End the process of a robot that follows nothing else."""
         self._launcher.kill(self._process(self._group(name)))
 
     def end(self) -> None:
-        """Ends all but the router: robots land first, and the recorder sees it."""
+        """End all but the router: robots land first, and the recorder sees it."""
         self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
         self._launcher.end(self._centre, grace_s=2.0)  # its last word is recorded
         self._launcher.end([self._context.process("recorder")], grace_s=5.0)

@@ -57,14 +57,7 @@ class HotChanges:
     """Changes of the robots of one case."""
 
     def __init__(self, experiment: Experiment, crew: CaseProcesses, view: NetworkView, keys: Keys) -> None:
-        """Refuses everything until `begin`.
-
-        Args:
-            experiment: The case.
-            crew: Has the processes.
-            view: Of the network.
-            keys: Of the realm.
-        """
+        """Refuse everything until `begin`."""
         self._experiment, self._crew, self._view, self._keys = experiment, crew, view, keys
         self._robots = view.robots
         self._start: float | None = None
@@ -117,7 +110,7 @@ class HotChanges:
         self._begin(_Asked(messages.RunOrder(policy, names, who="on_loss")))
 
     def advance(self) -> None:
-        """Takes new orders, goes on with what is under way, and answers what is done."""
+        """Take new orders, continue the changes under way, and answer those that are done."""
         for query, order in self._view.orders.read():
             self._accept(query, order)
         for change in list(self._changes):
@@ -367,7 +360,7 @@ class HotChanges:
     def _room(
         self, places: dict[str, tuple[float, ...]], patience_s: float, *, body_stays: bool = False
     ) -> Generator[None]:
-        """Waits until nobody is where robots begin.
+        """Wait until the places where robots begin are free.
 
         Args:
             places: Where, x, y [m], by robot.

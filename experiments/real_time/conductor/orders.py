@@ -26,7 +26,7 @@ def start_lead_s(robots: int) -> float:
 def send_order(
     session: zenoh.Session, keys: Keys, robots: Sequence[str], order: messages.Order, wait_s: float = REPLY_S
 ) -> dict[str, messages.Reply]:
-    """Gives an order to robots, to all at once, and returns their replies; a refusal, with why, for one that is silent.
+    """Give an order to robots, to all at once, and return their replies; a refusal, with why, for one that is silent.
 
     A robot that hangs costs the others no time: each has the order before the first answer is waited for.
     """
@@ -43,7 +43,7 @@ def send_order(
 def send_world_order(
     session: zenoh.Session, keys: Keys, order: messages.WorldOrder, wait_s: float = REPLY_S
 ) -> messages.WorldReply:
-    """Gives an order to the world and returns its reply; one that says no, and why, when it does not answer."""
+    """Give an order to the world and return its reply; one that says no, and why, when it does not answer."""
     asked = session.get(keys.world_order, payload=messages.encode(order), encoding=messages.JSON, timeout=wait_s)
     reply, why = _read(asked, messages.WorldReply)
     nobody = "no world answers: is `zenpark world` running in this realm?"
@@ -53,7 +53,7 @@ def send_world_order(
 def send_run_order(
     session: zenoh.Session, keys: Keys, order: messages.RunOrder, wait_s: float = CHANGE_S
 ) -> messages.RunReply:
-    """Gives an order to the conductor and returns its reply when all is done, or that no conductor answers."""
+    """Give an order to the conductor and return its reply when all is done, or that no conductor answers."""
     asked = session.get(keys.run_order, payload=messages.encode(order), encoding=messages.JSON, timeout=wait_s)
     reply, why = _read(asked, messages.RunReply)
     nobody = (

@@ -38,11 +38,6 @@ class Spares:
     def successor(self, name: str, robot: Robot, order: messages.RunOrder) -> tuple[Robot, str | None]:
         """The robot that is called `name` from now on, and which spare it is, if it is one.
 
-        Args:
-            name: Of a robot.
-            robot: The one that has the name now.
-            order: To replace it.
-
         Raises:
             Refused: If there is no such spare or body, or it cannot be what `robot` was.
         """

@@ -159,16 +159,7 @@ class NetworkView:
         identity: str,
         clock: Clock,
     ) -> None:
-        """Joins the network.
-
-        Args:
-            stack: Closes the session.
-            experiment: The case.
-            endpoints: Routers.
-            progress: Takes in what is said, and has the robots.
-            folder: Of the run, where the endpoints are written down.
-            identity: Whose certificate it shows, in a lab.
-            clock: By which its events are stamped.
+        """Join the network.
 
         Raises:
             Unreachable: If no router answers.
@@ -214,7 +205,7 @@ class NetworkView:
         self._told.undeclare()  # type: ignore[no-untyped-call]
 
     def update(self) -> list[str]:
-        """Takes in what has arrived since the last look; gives the robots whose token has vanished for good."""
+        """Take in what has arrived since the last update; return the robots whose token has vanished for good."""
         for sample in network.received(self._recorder_watch.handler):
             self.recording_begun |= sample.kind == zenoh.SampleKind.PUT
         for status in by_robots(self._statuses.handler, messages.Status, keys=self._keys, robots=self.robots):
@@ -232,7 +223,7 @@ class NetworkView:
         return self._missed()
 
     def order(self, names: Sequence[str], order: messages.Order) -> dict[str, messages.Reply]:
-        """Gives an order to robots, see `orders.send_order`."""
+        """Give an order to robots, see `orders.send_order`."""
         return orders.send_order(self._session, self._keys, names, order)
 
     def report(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
@@ -242,7 +233,7 @@ class NetworkView:
         self._events.put(messages.encode(event))
 
     def report_clocks(self, clocks: Sequence[messages.HostClock]) -> None:
-        """Says how the hosts' clocks lie, for the recording."""
+        """Report the offsets of the hosts' clocks, for the recording."""
         for each in clocks:
             self._clock.put(messages.encode(each))
             self.report(
@@ -250,7 +241,7 @@ class NetworkView:
             )
 
     def report_drift(self, measured: Iterable[messages.HostClock], trouble: Iterable[str]) -> None:
-        """Says, for the recording, how the hosts' clocks have drifted and what their robots do about it."""
+        """Report, for the recording, how the hosts' clocks have drifted and what their robots do about it."""
         for each in measured:
             self._clock.put(messages.encode(each))
         for text in trouble:
@@ -266,7 +257,7 @@ class NetworkView:
         return missed
 
     def _watch_router(self, now: float) -> None:
-        """Says once that the router is silent for as long as robots wait before they hold, and once that it is back."""
+        """Report once that the router is silent for longer than `link_silence_s`, and once that it is back."""
         since, progress = self._router.silent_since(now), self._progress
         if since < inf:
             self._cut_off = now
@@ -321,14 +312,14 @@ class Emergency:
         return "" if self.stop is None else self.stop.words
 
     def listen(self, session: zenoh.Session, keys: Keys) -> pubsub.ImmediateSubscriber:
-        """Hears stops in a realm, for as long as what is returned is kept."""
+        """Receive stops in a realm, for as long as what is returned is kept."""
         return pubsub.ImmediateSubscriber(session, keys.estop, self._receive_stop)
 
     @contextmanager
     def throughout(
         self, endpoints: Sequence[str], keys: Keys, identity: str, *, starting: bool = False
     ) -> Iterator[None]:
-        """Hears stops by a session of its own: those of the cases are closed between them.
+        """Receive stops by a session of its own: those of the cases are closed between them.
 
         Args:
             endpoints: Routers.

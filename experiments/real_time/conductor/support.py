@@ -169,7 +169,7 @@ class Servants:
             )
 
     def keep(self, name: str, start: Callable[[], object]) -> None:
-        """Starts the process that says where robots are again as well: those who do not know hold, and drones land."""
+        """Supervise motion capture as well: robots without a position hold, and drones land."""
         hold = ": robots that do not know where they are hold, drones land"
         self._known[name] = _Servant(start, hold, hold)
 
@@ -180,7 +180,7 @@ class Servants:
         return self._centre
 
     def again(self, process: Process) -> tuple[str, str] | None:
-        """Starts one again that has died; what kind it is, and what is to be said. None if it is no servant."""
+        """Restart a process that has died; its role and the text of the event. None if it is not supervised."""
         servant = self._known.get(process.name)
         if servant is None:
             return None
@@ -204,7 +204,7 @@ class Router:
     link: Sequence[str] = ()
 
     def start(self, launcher: Launcher, rights: Path | None = None) -> None:
-        """Starts it; it outlives a killed launcher by as long as robots take to land. In a lab it enforces `rights`."""
+        """Start it; it outlives a killed launcher by as long as robots take to land. In a lab it enforces `rights`."""
         listen = [part for endpoint in self.listen for part in ("--listen", endpoint)]
         link = [part for endpoint in self.link for part in ("--connect", endpoint)]
         enforced = [] if rights is None else ["--rights", str(rights)]
@@ -214,7 +214,7 @@ class Router:
 
 
 def start_router(launcher: Launcher, endpoints: Sequence[str], rights: Path | None = None) -> None:
-    """Starts one router, which listens at all of these."""
+    """Start one router, which listens at all of these."""
     Router(ROUTER, endpoints).start(launcher, rights)
 
 

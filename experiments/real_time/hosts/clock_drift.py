@@ -30,10 +30,10 @@ class Followed(Protocol):
     clock: HostClock | None
 
     def measure(self, robots: Sequence[str], samples: int) -> HostClock:
-        """Measures its clock."""
+        """Measure its clock."""
 
     def follow(self, applied: float) -> HostClock:
-        """Tells its robots what to take off their stamps [s]."""
+        """Send its robots the correction of their stamps [s]."""
 
 
 def due(before: HostClock, now: HostClock) -> float:
@@ -72,7 +72,7 @@ class Drift:
         self.close()
 
     def close(self) -> None:
-        """Ends it; a second call does nothing."""
+        """End it; a second call does nothing."""
         self._over.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -97,7 +97,7 @@ class Drift:
                     self._trouble.append(f"{error}; its clock is not followed any more")
 
     def _measure(self, host: Followed, robots: list[str]) -> float:
-        """Measures one clock and has its robots follow; returns when to do so again [s]."""
+        """Measure one clock and have its robots follow; return when to do so again [s]."""
         before = host.clock
         assert before is not None
         assert before.applied is not None

@@ -56,7 +56,7 @@ class Station:
     """
 
     def __init__(self, name: str, host: Host, *, launcher: Launcher, routers: Sequence[str], run: str) -> None:
-        """Begins to connect; `greet` waits for it.
+        """Begin to connect; `greet` waits for the station.
 
         Args:
             name: Of the host.
@@ -96,7 +96,7 @@ class Station:
         self.reset_clock()
 
     def reset_clock(self) -> None:
-        """Takes the wall clock as it is now: a step of it in mid-run is no drift of the host's."""
+        """Take the wall clock as it is now: a step of it in mid-run is no drift of the host's."""
         self._ours = Clock()
         self.applied, self._robots = 0.0, []
 
@@ -105,7 +105,7 @@ class Station:
         return ["env", f"{RUN}={self._run}", self.host.zenpark.removeprefix("~/"), *arguments]
 
     def greet(self, address: str | None = None) -> None:
-        """Waits until the station answers.
+        """Wait until the station answers.
 
         Args:
             address: How hosts know this machine; left out: as ssh came from there.
@@ -165,7 +165,7 @@ class Station:
         return self.hello.zenpark == version.digest()
 
     def measure(self, robots: Sequence[str] = (), samples: int = SAMPLES) -> HostClock:
-        """Measures its clock, by some round trips; `robots` run there.
+        """Measure the host's clock, by some round trips; `robots` run there.
 
         Raises:
             HostError: If it does not answer.
@@ -179,7 +179,7 @@ class Station:
         return self.clock
 
     def follow(self, applied: float) -> HostClock:
-        """Has its robots take so much off its reading from now on [s], those that are started later too."""
+        """Set the correction of the host's clock for its robots [s], those that are started later too."""
         assert self.clock is not None
         self.applied = applied
         for process, launcher in self._robots:
@@ -217,14 +217,7 @@ class Station:
         return self.host.lab.removeprefix("~/")
 
     def start(self, name: str, robots: Sequence[str], document: bytes, launcher: Launcher) -> Process:
-        """Starts the process of some robots there.
-
-        Args:
-            name: Of the process.
-            robots: That it has.
-            document: The case, in one line.
-            launcher: Starts the ssh.
-        """
+        """Start the process of some robots there."""
         while len(self._under_way()) >= HANDSHAKES:
             time.sleep(POLL_S)
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
@@ -262,7 +255,7 @@ class Hosts:
         self._robots: dict[str, Station] = {}
 
     def join(self, experiment: Experiment) -> list[HostClock]:
-        """Connects the hosts of a case that have robots and an address; returns their clocks.
+        """Connect the hosts of a case that have robots and an address; return their clocks.
 
         Raises:
             HostError: With everything that is in the way, of every host.
@@ -318,7 +311,7 @@ class Hosts:
         return measured, trouble
 
     def sweep(self) -> list[str]:
-        """Kills what is left of the run on every host, and says what that was."""
+        """Kill what is left of the run on every host, and report what that was."""
         killed = []
         for station in self._stations.values():
             with suppress(HostError):  # its station does that by itself as soon as the lifeline is lost

@@ -107,7 +107,7 @@ class Launcher:
         self._beat.join()
 
     def start(self, name: str, module: str, *arguments: str) -> Process:
-        """Starts a module of this project in a process and session of its own; one thread per numeric library."""
+        """Start a module of this project in a process and session of its own; one thread per numeric library."""
         shared = {} if self.clock is None else self.clock.shared()
         return self.spawn(name, [sys.executable, "-m", module, *arguments], environment=shared)
 
@@ -120,7 +120,7 @@ class Launcher:
         answers: bool = False,
         environment: Mapping[str, str] | None = None,
     ) -> Process:
-        """Starts any command that holds its standard input as a lifeline.
+        """Start any command that holds its standard input as a lifeline.
 
         Args:
             name: Of the process, and of its log.
@@ -149,7 +149,7 @@ class Launcher:
         return process
 
     def tell(self, process: Process, line: bytes) -> None:
-        """Says a line on the lifeline of a process; one that has not read the last gets it no more."""
+        """Report a line on the lifeline of a process; one that has not read the last gets it no more."""
         with self._lock:
             if not process.untold:
                 process.untold += line
@@ -165,13 +165,13 @@ class Launcher:
             return name in self._processes and self._processes[name].alive
 
     def release(self, name: str) -> None:
-        """Cuts the lifeline of a process: robots land by themselves, then it ends, which `died` tells."""
+        """Cut the lifeline of a process: robots land by themselves, then it ends, which `died` tells."""
         with self._lock:
             if name in self._processes:
                 self._close(self._processes[name])
 
     def kill(self, name: str) -> None:
-        """Ends a process that does not even follow its lifeline, at once; `died` tells when it is gone."""
+        """End a process that does not even follow its lifeline, at once; `died` tells when it is gone."""
         with self._lock:
             if name in self._processes and self._processes[name].alive:
                 os.killpg(self._processes[name].handle.pid, signal.SIGKILL)
@@ -188,7 +188,7 @@ class Launcher:
         return dead
 
     def end(self, names: Iterable[str], grace_s: float) -> list[Process]:
-        """Ends processes: end of file on the lifeline, after `grace_s` SIGTERM, then SIGKILL; returns those killed."""
+        """End processes: end of file on the lifeline, after `grace_s` SIGTERM, then SIGKILL; return those killed."""
         with self._lock:
             ending = [self._processes.pop(name) for name in names if name in self._processes]
         for process in ending:
@@ -219,7 +219,7 @@ class Launcher:
 
     @staticmethod
     def _forget(process: Process) -> None:
-        """Lets go of what it answered, once it is over."""
+        """Close the pipe of its answers, once it is over."""
         if process.handle.stdout is not None:
             process.handle.stdout.close()
 
@@ -232,7 +232,7 @@ class Launcher:
 
     @staticmethod
     def _tell(process: Process) -> None:
-        """Writes what fits into the pipe: what reads at the other end may take its time."""
+        """Write as much as fits into the pipe: the reader may be slow."""
         if process.handle.stdin is not None:
             with contextlib.suppress(OSError, ValueError):  # dead, or frozen with a full pipe
                 while process.untold:

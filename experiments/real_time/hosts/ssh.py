@@ -50,13 +50,7 @@ _TROUBLE: Final = (
 
 
 def command(address: str, words: Sequence[str], options: Sequence[str] = ()) -> list[str]:
-    """The command line that runs a command on another machine, without a shell that stays in between.
-
-    Args:
-        address: Of the machine, as ssh takes it.
-        words: The command and its arguments, to be kept as they are.
-        options: Of ssh.
-    """
+    """The command line that runs a command on another machine, without a shell that stays in between."""
     settings = [part for name, value in OPTIONS.items() for part in ("-o", f"{name}={value}")]
     return ["ssh", "-T", *settings, *options, "--", address, f"exec {shlex.join(words)}"]
 

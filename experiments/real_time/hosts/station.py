@@ -76,7 +76,7 @@ class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def answer(question: Question, clock: float) -> Answer:
-    """Answers one question."""
+    """Answer one question."""
     code = version.digest()
     match question.ask:
         case "clock":
@@ -168,7 +168,7 @@ def _frozen(pid: int) -> bool:
 
 
 def kill(pids: Sequence[int]) -> list[int]:
-    """Kills processes; returns those that were still there."""
+    """Kill processes; return those that were still there."""
     killed = []
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
@@ -178,7 +178,7 @@ def kill(pids: Sequence[int]) -> list[int]:
 
 
 def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
-    """Answers until the lifeline is lost, then sees the robots off; returns the exit code of the process.
+    """Answer until the lifeline is lost, then wait until the robots have landed; return the exit code of the process.
 
     Args:
         fd: Where the questions come in.
