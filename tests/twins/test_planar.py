@@ -70,7 +70,7 @@ def test_an_experiment_runs_the_same_on_it_as_on_point_masses():
     one, other = logs
     np.testing.assert_allclose(other.true_position, one.true_position, atol=1e-9)
     np.testing.assert_allclose(other.error, one.error, atol=1e-9)
-    assert len(other.sent[0]) == len(one.sent[0])
+    assert len(other.sent.seq) == len(one.sent.seq)
     assert not other.touches
 
 
