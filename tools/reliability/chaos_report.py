@@ -22,29 +22,29 @@ from tools.reliability.fault_script import KINDS, NATURES, Fault, Round
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What a fault did."""
+    """Result of one fault."""
 
-    round: int  # in which it was done, counted from 1
+    round: int  # counted from 1
     fault: Fault  # as in the script
-    victim: str  # to whom it was done
-    at_s: float  # when, from the common start [s]
-    note: str  # what there is to say of it
-    recovered: bool  # whether all healed in time
-    begin_s: float  # from its begin until then [s]
-    end_s: float  # from its end [s]; 0 if the formation had healed while it lasted
-    ended: bool  # whether robots came down instead of going on, the dead not counted
-    violations: list[str]  # what must not have happened
+    victim: str  # a robot; empty: the whole run
+    at_s: float  # from the common start [s]
+    note: str  # for the report
+    recovered: bool  # in time
+    begin_s: float  # from its begin to the recovery [s]
+    end_s: float  # from its end to the recovery [s]; 0 if that came earlier
+    ended: bool  # robots came down instead of going on, dead ones not counted
+    violations: list[str]  # of the invariants
 
 
 class Ended(msgspec.Struct, frozen=True):
-    """How a round ended."""
+    """Result of one round."""
 
     round: int  # counted from 1
     left: list[Fault]  # faults that it had no time for
-    violations: list[str]  # what was wrong that no fault explains
-    nearest_m: float  # how near robots came to each other, between surfaces [m]
-    gone_s: float  # after its end, how long until all of its processes were gone [s]
-    missed: float  # share of the ticks that robots missed which were never stopped: how busy the machine was
+    violations: list[str]  # of the invariants, outside of a fault
+    nearest_m: float  # least distance between surfaces of two robots [m]
+    gone_s: float  # from its end until all of its processes were gone [s]
+    missed: float  # share of missed ticks of robots without a fault: the load of the machine
     recording: str  # its folder, if there is a recording
 
 

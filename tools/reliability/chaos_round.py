@@ -64,7 +64,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Setting:
-    """What all rounds have in common."""
+    """Settings of all rounds."""
 
     file: Path  # the experiment
     case: str  # its case
@@ -72,7 +72,7 @@ class Setting:
     folder: Path  # where each round gets a folder
     changes: Sequence[str]  # as behind `--set`
     bodies: str | None  # as behind `--bodies`
-    seed: int  # of what the script leaves open: bits, segments, nonsense
+    seed: int  # of bits, segments and nonsense, which the script leaves open
 
 
 @dataclass

@@ -21,17 +21,17 @@ CONDUCTOR_AFTER: Final = 3  # nothing can befall a run after the death of its la
 
 @dataclass(frozen=True)
 class Nature:
-    """What all faults of a kind have in common."""
+    """Properties of a kind of fault."""
 
-    meant: str  # what is done, for the report
-    lasts_s: float = 0.0  # until it is lifted [s]; 0 if it cannot be
-    heals_s: float = 1.5  # what it takes about until all is well again [s]
-    victim: bool = True  # whether it befalls one robot; else the whole run
+    meant: str  # for the report
+    lasts_s: float = 0.0  # until it is lifted [s]; 0: it cannot be
+    heals_s: float = 1.5  # usual time of the recovery [s]
+    victim: bool = True  # one robot; else the whole run
     most: int = 1_000  # in one round
     stage: Stage = "plain"  # the only one on which it can be done; "plain": on each
-    never: Stage | None = None  # A stage on which it cannot be done
-    size: tuple[float, float] = (0.0, 0.0)  # between which numbers its size is drawn
-    signed: bool = False  # whether the size may be negative as well
+    never: Stage | None = None  # a stage on which it cannot be done
+    size: tuple[float, float] = (0.0, 0.0)  # range of its size
+    signed: bool = False  # the size may be negative as well
 
 
 NATURES: Final[Mapping[str, Nature]] = {
@@ -98,11 +98,11 @@ KINDS: Final = tuple(NATURES)
 class Fault(msgspec.Struct, frozen=True):
     """One fault."""
 
-    kind: str  # what happens
+    kind: str
     after_s: float  # so long after all was well again (or, of the first, after the formation had come together) [s]
-    lasts_s: float = 0.0  # until it is lifted [s]; 0 if it cannot be
-    victim: str = ""  # A robot; if it is gone by then, the next one that is there. Empty: the whole run
-    size: float = 0.0  # of a delay or a step of a clock [s], of a loss as a share
+    lasts_s: float = 0.0  # until it is lifted [s]; 0: it cannot be
+    victim: str = ""  # a robot; if it is gone by then, the next that is alive. Empty: the whole run
+    size: float = 0.0  # delay or clock step [s], or share of lost segments
 
     @property
     def nature(self) -> Nature:

@@ -38,19 +38,19 @@ class Row(msgspec.Struct, frozen=True):
     """One process at one time; what only robots have is None of the others."""
 
     time_s: float  # from the common start [s]
-    process: str  # A robot's name, "router", "recorder", "conductor"
+    process: str  # a robot's name, "router", "recorder", "conductor"
     rss_mb: float  # resident memory [MB]
-    threads: int  # how many
+    threads: int
     files: int  # open file descriptors
     cpu_s: float  # CPU time since its begin [s]
     recording_mb: float | None = None  # size of the recording, of the recorder
-    lost: int | None = None  # poses of its neighbours that never came
+    lost: int | None = None  # poses of its neighbours that never arrived; None but for robots
     missed: int | None = None  # ticks that it missed, of `ticks`
-    ticks: int | None = None  # see `missed`
+    ticks: int | None = None
     malformed: int | None = None  # payloads that it refused
-    # poses that it heard since the sample before; `delay_s` is the median from speaker to listener [s]
+    # poses received since the sample before
     heard: int | None = None
-    delay_s: float | None = None  # see `heard`
+    delay_s: float | None = None  # median from sender to receiver [s]
     longest_s: float | None = None  # the largest delay [s]
 
 
@@ -59,15 +59,15 @@ COLUMNS: Final = tuple(each.name for each in msgspec.structs.fields(Row))
 
 @dataclass(frozen=True)
 class Soaked:
-    """What was sampled."""
+    """Samples of a soak."""
 
     title: str  # of the experiment
-    robots: tuple[str, ...]  # that should have lived
-    duration_s: float  # that it should have lasted from the common start on
+    robots: tuple[str, ...]  # by process
+    duration_s: float  # planned, from the common start [s]
     rows: Sequence[Row]  # in order of time
     exit: int | None  # of the conductor's process
-    died: dict[str, float]  # who ended before the end, and when [s]
-    interrupted: bool = False  # whether the user ended it
+    died: dict[str, float]  # processes that ended too early, and when [s]
+    interrupted: bool = False  # by the user
 
     def of(self) -> dict[str, list[Row]]:
         """The rows of each process."""
@@ -84,10 +84,10 @@ class Soaked:
 
 @dataclass(frozen=True)
 class Ends:
-    """A process at both ends of what counts."""
+    """Rows of a process after the warm-up: first and last window."""
 
-    first: Sequence[Row]  # rows of the first window, and `last` those of the last
-    last: Sequence[Row]  # see `first`
+    first: Sequence[Row]  # of the first window
+    last: Sequence[Row]  # of the last window
 
     def growth(self, what: Callable[[Row], float]) -> float:
         """Of the median, as a share of the first."""

@@ -42,12 +42,7 @@ class Death:
 
 
 class CaseProcesses:
-    """Starts, watches and ends the processes of one case.
-
-    Attributes:
-        adopted: Robots that somebody else has started, or will.
-        away: Robots that are started on a host without address, and that host.
-    """
+    """Starts, watches and ends the processes of one case."""
 
     def __init__(self, context: CaseContext) -> None:
         """Nothing is started yet."""
@@ -59,7 +54,8 @@ class CaseProcesses:
         self._standins: tuple[str, ...] = ()
         self._centre: tuple[str, ...] = ()
         self._servants = Servants(context)
-        self.adopted: set[str] = set()
+        self.adopted: set[str] = set()  # robots that others have started, or will
+        # hosts without address, by the robots that are started there
         self.away = standby.robots_without_address(context.experiment)
         self._addressed, self._reached = context.file, context.experiment
         self._joining = context.folder / f"{context.case}-joining.json"

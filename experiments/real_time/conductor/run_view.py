@@ -140,13 +140,7 @@ MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
 
 
 class NetworkView:
-    """The network as the conductor of a case sees it.
-
-    Attributes:
-        robots: What is known of each.
-        recording_begun: Whether the recorder is there.
-        orders: Asked of the conductor.
-    """
+    """The network as the conductor of a case sees it."""
 
     def __init__(
         self,
@@ -184,13 +178,13 @@ class NetworkView:
         self._clock = pubsub.publisher(self._session, keys.clock, messages.JSON)
         self._told = pubsub.pose_publisher(self._session, keys.experiment, messages.JSON)
         self._told.put(document.case_document(experiment))
-        self.orders = pubsub.Orders(self._session, keys.run_order, messages.RunOrder)
+        self.orders = pubsub.Orders(self._session, keys.run_order, messages.RunOrder)  # to the conductor
         self._token = pubsub.alive_token(self._session, keys.conductor)
         self._statuses = pubsub.pose_subscriber(self._session, keys.status("*"), 4096)
         self._states = pubsub.subscriber(self._session, keys.state("*"), 4096)
         self._watch = pubsub.AliveWatch(self._session, keys.alive("*"))
         self._recorder_watch = pubsub.AliveWatch(self._session, keys.recorder)
-        self.recording_begun = False
+        self.recording_begun = False  # the recorder is there
         self._cut_off = -inf
         self._router = network.RouterWatch(self._session, keys.conductor, endpoints)
         self._safety, self._mesh = experiment.safety, topology.is_mesh(endpoints)
@@ -294,14 +288,10 @@ class NetworkView:
 
 
 class Emergency:
-    """Listens for emergency stops as long as a run goes on, between its cases too.
-
-    Attributes:
-        stop: The first one that was heard; None: there was none.
-    """
+    """Listens for emergency stops as long as a run goes on, between its cases too."""
 
     def __init__(self) -> None:
-        self.stop: messages.Stop | None = None
+        self.stop: messages.Stop | None = None  # the first one received
 
     def __bool__(self) -> bool:
         return self.stop is not None

@@ -42,18 +42,7 @@ class HostError(RuntimeError):
 
 
 class Station:
-    """The connection to a host's station.
-
-    Attributes:
-        name: Of the host, in the experiment file.
-        host: What stands there.
-        address: As ssh takes it.
-        hello: What the station said of itself.
-        endpoints: Routers as the host reaches them.
-        clock: Its clock, as it was measured last.
-        applied: What robots there take off its reading [s].
-        lab: The folder of the lab, on this machine; None without one.
-    """
+    """The connection to a host's station."""
 
     def __init__(self, name: str, host: Host, *, launcher: Launcher, routers: Sequence[str], run: str) -> None:
         """Begin to connect; `greet` waits for the station.
@@ -70,8 +59,8 @@ class Station:
         """
         assert host.address is not None
         self.name, self.host, self.address = name, host, host.address
-        self.clock: HostClock | None = None
-        self.lab = lab.lab_of(routers)
+        self.clock: HostClock | None = None  # the last measurement
+        self.lab = lab.lab_of(routers)  # folder on this machine
         self._routers = [Endpoint.parse(router) for router in lab.bare(routers)]
         self._run = f"{run}.{name}"  # two hosts may be one machine
         try:
@@ -98,6 +87,7 @@ class Station:
     def reset_clock(self) -> None:
         """Take the wall clock as it is now: a step of it in mid-run is no drift of the host's."""
         self._ours = Clock()
+        # applied: correction of that clock by its robots [s]
         self.applied, self._robots = 0.0, []
 
     def command(self, *arguments: str) -> list[str]:
@@ -117,6 +107,7 @@ class Station:
         ports = iter(ssh.allocated(self.process.log.read_text(errors="replace")))
         here = address or self.hello.seen_from or "127.0.0.1"
         try:
+            # routers as the host reaches them
             self.endpoints = [str(self._abroad(router, ports, here)) for router in self._routers]
         except StopIteration:
             raise HostError(f"{self.name}: ssh does not say which port it forwards; use listen in [network]") from None
@@ -236,11 +227,7 @@ class Station:
 
 
 class Hosts:
-    """The hosts of one run.
-
-    Attributes:
-        routers: As this machine reaches them, those that listen everywhere as they listen.
-    """
+    """The hosts of one run."""
 
     def __init__(self, launcher: Launcher, routers: Sequence[str]) -> None:
         """No host is connected yet.
@@ -249,6 +236,7 @@ class Hosts:
             launcher: Starts the ssh of each process.
             routers: As this machine reaches them, those that listen everywhere as they listen.
         """
+        # routers: as this machine reaches them, those that listen everywhere as they listen
         self._launcher, self.routers = launcher, list(routers)
         self._run = secrets.token_hex(8)
         self._stations: dict[str, Station] = {}

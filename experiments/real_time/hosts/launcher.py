@@ -78,15 +78,12 @@ def is_router(process: str) -> bool:
 
 
 class Launcher:
-    """Processes of one run; a context manager that leaves none behind.
-
-    Attributes:
-        clock: That modules read which are started here; None: each reads the wall clock anew.
-    """
+    """Processes of one run; a context manager that leaves none behind."""
 
     def __init__(self, logs: Path) -> None:
         """Output of each process goes to a file in the folder `logs`."""
         self._logs = logs
+        # the clock of modules that are started here; None: each reads the wall clock anew
         self.clock: Clock | None = None
         self._processes: dict[str, Process] = {}
         self._lock = threading.Lock()
