@@ -86,7 +86,7 @@ show(pictures["events"], OUT / "events-raster")
 #
 # The raster shows it at a glance: whoever moves speaks, whoever stands is silent. The leader proves it best. It
 # stands for 21 s, then drives 0.75 m at 0.15 m/s. It needs δ/v = 67 ms for a centimetre; the trigger is asked every
-# 20 ms, so it speaks every 80 ms, and 0.75/0.01 = 75 times at most.
+# 20 ms, so it transmits every 80 ms, and 0.75/0.01 = 75 times at most.
 
 # %%
 ASKED_S = 0.02  # `pose_hz` is 50

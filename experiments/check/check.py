@@ -69,7 +69,7 @@ def telemetry(analysis: Analysis) -> Iterator[Claim]:
     if size > MAX_PAYLOAD:
         name = analysis.names[int(heard.argmax())]
         message = (
-            f"{name} may hear {size / HEARD_BYTES:.0f} poses between two samples of telemetry, "
+            f"{name} may receive {size / HEARD_BYTES:.0f} poses between two samples of telemetry, "
             f"{size / 1024.0:.0f} kB: each sample is sent in {int(np.ceil(size / MAX_PAYLOAD))} messages or more"
         )
         yield Claim("warning", "telemetry-split", message, "raise rates.state_hz", ("rates", "state_hz"))

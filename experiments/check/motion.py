@@ -237,7 +237,7 @@ def encounters(analysis: Analysis) -> Iterator[Claim]:
                 message = f"{names[row]} ends above {names[under]}, and goes aside before it lands"
                 yield Claim("note", "lands-beside", message, "", targets)
                 continue
-            message = f"{names[row]} ends above {names[under]}, which it does not hear, and would land on it"
+            message = f"{names[row]} ends above {names[under]}, from which it receives no poses, and would land on it"
             remedy = "change their distances, link them, or end the timeline elsewhere"
             yield Claim("warning", "lands-on", message, remedy, targets)
 
@@ -301,12 +301,12 @@ def rates(analysis: Analysis) -> Iterator[Claim]:
         if period is None:
             continue
         times, path = period / asked, ("trigger", field)
-        message = f"the trigger wants to speak every {period:g} s, but is asked every {asked:g} s"
+        message = f"the trigger asks for a transmission every {period:g} s, but is asked every {asked:g} s"
         if times < 1.0 - FORGIVEN:
             remedy = f"raise pose_hz in [rates] to {1.0 / period:g}, or {field} to {asked:g}"
             yield Claim("warning", "trigger-too-fast", message, remedy, path)
         elif field == "period_s" and abs(times - round(times)) > FORGIVEN * times:
-            message += f": it speaks every {math.ceil(times) * asked:g} s"
+            message += f": it transmits every {math.ceil(times) * asked:g} s"
             yield Claim("warning", "trigger-uneven", message, f"use a multiple of {asked:g}", path)
     if rates.pose_hz < rates.coordination_hz:
         message = f"decisions at {rates.coordination_hz:g} Hz see poses that come at {rates.pose_hz:g} Hz at most"

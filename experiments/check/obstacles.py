@@ -119,7 +119,7 @@ def perception(analysis: Analysis) -> Iterator[Claim]:
             message = f"{name} has no range sensors: it cannot avoid {listed(there)}"
             yield Claim("warning", "sees-nothing", message, remedy, ("robots", name))
         elif name in deaf:
-            message = f"{name} hears nobody and has no range sensors: it avoids nothing"
+            message = f"{name} has neither neighbours nor range sensors: it avoids nothing"
             remedy += ', or hears = "all" in [avoidance]'
             yield Claim("warning", "sees-nothing", message, remedy, ("robots", name))
 
@@ -138,7 +138,7 @@ def reality(analysis: Analysis) -> Iterator[Claim]:
             remedy = 'say which: sensors = ["multiranger"], or leave ranges out'
             yield Claim("warning", "ranges-of-nothing", message, remedy, ("robots", name, "ranges"))
         elif robot.ranges == "world" and bare:
-            message = f"{name} takes its ranges from a world in which nothing stands and nobody lives"
+            message = f"{name} takes its ranges from a world without obstacles and robots"
             remedy = 'add [arena.obstacles], a robot with body = "world", or leave ranges out'
             yield Claim("warning", "ranges-of-nothing", message, remedy, ("robots", name, "ranges"))
         if robot.shadow is not None and robot.body in TWINS:

@@ -73,7 +73,7 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
             continue
         quiet = False
     if quiet and len(pairs) < len(names) * (len(names) - 1) // 2:
-        message = f"only the {len(pairs)} pairs that hear each other keep the separation of {limit:g} m"
+        message = f"only the {len(pairs)} pairs with a link keep the separation of {limit:g} m"
         yield Claim("note", "separation", message, "", path)
 
 
@@ -85,7 +85,7 @@ def architecture(analysis: Analysis) -> Iterator[Claim]:
         return
     everyone, rate = len(steered) == len(experiment.robots), experiment.rates.coordination_hz
     whom = f"all {len(steered)} robots" if everyone else listed(steered)
-    rest = "" if everyone else "; the others decide for themselves, and hear these as before"
+    rest = "" if everyone else "; the others decide for themselves, and receive their poses as before"
     hold = f"if it is gone, or its goals are older than {experiment.safety.link_silence_s:g} s, they hold"
     what = "centralised" if everyone else "hybrid"
     yield Claim("note", what, f"{what}: a centre decides for {whom} {rate:g} times a second{rest}; {hold}", "", path)

@@ -40,7 +40,7 @@ def network(analysis: Analysis) -> Iterator[Claim]:
         lost = np.flatnonzero(~reachable(links, rows, sources) & listens)
         if len(lost):
             who = listed([names[row] for row in lost])
-            message = f"{who} cannot hear of the leader ({listed(leaders)}), neither directly nor through others"
+            message = f"{who} cannot be reached by the leader ({listed(leaders)}), neither directly nor through others"
             remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
             problems.append(Claim("error", "leader-unknown", message, remedy, path))
     linked = np.union1d(links.receiver, links.sender)
@@ -56,15 +56,19 @@ def network(analysis: Analysis) -> Iterator[Claim]:
         problems.append(Claim("error", "parts", message, "join them by links, or make them separate experiments", path))
     deaf = [names[row] for row in analysis.silent if names[row] not in leaders]
     if deaf:
-        message = f"{listed(deaf)} hears nobody and is no leader: it takes no part in the formation"
+        message = f"{listed(deaf)} has no neighbours and is no leader: it takes no part in the formation"
         problems.append(Claim("warning", "hears-nobody", message, f'add "... > {deaf[0]}" to its links', path))
     for name in leaders:
         if names.index(name) not in links.sender:
-            message, remedy = f"nobody listens to the leader {name}", f'add "{name} > ..." for one of the others'
+            message, remedy = f"no robot receives from the leader {name}", f'add "{name} > ..." for one of the others'
             problems.append(Claim("error" if len(leaders) == 1 else "warning", "leader-unheard", message, remedy, path))
     yield from problems
     if not problems:
-        said = f"everybody hears of {listed(leaders)}" if leaders else "no leader: the formation finds its own place"
+        said = (
+            f"every robot is reached by {listed(leaders)}"
+            if leaders
+            else "no leader: the formation finds its own place"
+        )
         whole = "the network is whole; " if analysis.parts == 1 else ""
         yield Claim("note", "connected", f"{whole}{said}")
 

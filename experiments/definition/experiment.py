@@ -85,15 +85,15 @@ class Robot(Part, frozen=True):
     sensors: Annotated[
         list[str] | None, Meta(description="range sensors of its twin; left out: those that its kind has")
     ] = None
-    ranges: Annotated[
-        Literal["body", "world"], Meta(description="its own range sensors, or what the world says it would see")
-    ] = "body"
+    ranges: Annotated[Literal["body", "world"], Meta(description="its own range sensors, or those of the world")] = (
+        "body"
+    )
     shadow: Annotated[Shadow | None, Meta(description="a twin beside it")] = None
     avoids: Annotated[
         bool, Meta(description="whether it keeps clear of others where the experiment has an avoidance")
     ] = True
     standby: Annotated[
-        bool, Meta(description="not started, and nobody waits for it, until `zenpark robot add` lets it join the run")
+        bool, Meta(description="not started and not waited for until `zenpark robot add` lets it join the run")
     ] = False
 
 
@@ -195,9 +195,9 @@ class Formation(Part, frozen=True):
     )
     clamp: Annotated[Positive, Meta(description="largest step of the goal per axis and decision [m]")] = 0.1
     tracking_gain: Annotated[NotNegative, Meta(description="k [1/(m²·decision)] (paper, eq. (7))")] = 3.0
-    leader: Annotated[Name | None, Meta(description="left out: every robot that listens to nobody")] = None
+    leader: Annotated[Name | None, Meta(description="left out: every robot without neighbours")] = None
     links: Annotated[
-        dict[str, Positive | Link], Meta(description='"A > B": B listens to A; "A - B": both listen; distance [m]')
+        dict[str, Positive | Link], Meta(description='"A > B": B receives from A; "A - B": both receive; distance [m]')
     ] = {}
     anchors: Annotated[
         dict[Name, Positive | Anchor],
@@ -232,7 +232,7 @@ class Outage(Part, frozen=True):
     from_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
     until_s: Annotated[Positive | None, Meta(description="[s] after it; left out: to the end")] = None
     links: Annotated[
-        list[str], Meta(description='"A > B": what A says to B; "A - B": both ways; left out, and robots too: all')
+        list[str], Meta(description='"A > B": poses from A to B; "A - B": both ways; left out, and robots too: all')
     ] = []
     robots: Annotated[list[Name], Meta(description="all links to and from these")] = []
 
@@ -246,7 +246,7 @@ class Channel(LinkEffects, Part, frozen=True):
 
     outages: Annotated[list[Outage], Meta(description="times in which nothing passes")] = []
     links: Annotated[
-        dict[str, LinkChannel], Meta(description='"A > B": what A says to B; "A - B": both ways; what is otherwise')
+        dict[str, LinkChannel], Meta(description='"A > B": poses from A to B; "A - B": both ways; what is otherwise')
     ] = {}
 
 
@@ -277,7 +277,7 @@ class Network(Part, frozen=True):
         Meta(
             ge=1,
             le=8,
-            description="how many are started, each in a process of its own; who loses one goes on at the next",
+            description="how many are started, each in its own process; a member that loses one goes on at the next",
         ),
     ] = 1
     address: Annotated[
@@ -307,7 +307,7 @@ class Host(Part, frozen=True):
     lab: Annotated[
         str, Meta(description="folder there for the certificates of its robots, in a lab; counts from the home folder")
     ] = "zenpark-lab"
-    robots: Annotated[list[Name], Meta(description="who runs there; robots that no host names run here")] = []
+    robots: Annotated[list[Name], Meta(description="robots there; those that no host names run here")] = []
     tags: Annotated[list[Name], Meta(description="by which `zenpark hosts` chooses among hosts")] = []
 
 
@@ -365,19 +365,19 @@ class Experiment(Part, frozen=True):
             description="distributed: each robot decides for itself; centralised: one process for all; hybrid: for some"
         ),
     ] = "distributed"
-    trigger: Annotated[Choice, Meta(description="a registered trigger: when a robot speaks")] = "periodic"
+    trigger: Annotated[Choice, Meta(description="a registered trigger: when a robot transmits")] = "periodic"
     prediction: Annotated[
         Choice | None,
         Meta(description="where a robot is believed to be between two messages; left out: as the trigger needs it"),
     ] = None
     positioning: Annotated[
-        str | None, Meta(description='who measures `position = "external"`: vicon://HOST[:PORT], or vicon-twin')
+        str | None, Meta(description='source of `position = "external"`: vicon://HOST[:PORT], or vicon-twin')
     ] = None
     disturbance: Annotated[
         dict[str, Disturbance], Meta(description='by kind or by robot; "all" for every one; the narrower wins')
     ] = {}
     avoidance: Annotated[
-        Choice | None, Meta(description="how robots keep clear of what they see and hear; left out: they do not")
+        Choice | None, Meta(description="how robots avoid obstacles and each other; left out: they do not")
     ] = None
     world: World = World()
     channel: Channel = Channel()

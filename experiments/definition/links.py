@@ -13,7 +13,7 @@ from experiments.definition.experiment import Experiment, Link, Target
 
 _LINK: Final = re.compile(r"\s*(\w+)\s*([>-])\s*(\w+)\s*", re.ASCII)
 _ALMOST: Final = re.compile(r"\s*(\w+)\s*([^\w\s]+)\s*(\w+)\s*", re.ASCII)
-FORM: Final = 'a link reads "A > B" (B listens to A) or "A - B" (both listen)'
+FORM: Final = 'a link reads "A > B" (B receives from A) or "A - B" (both receive)'
 UNKNOWN: Final = (math.nan, math.nan, math.nan)
 RELEASE: Final = 1.1  # of the range: what separates coming from going, so that a link does not flicker
 
@@ -134,9 +134,9 @@ def _remedy(text: str) -> str:
         return FORM
     first, sign, second = almost.groups()
     if "<" in sign and ">" in sign:
-        return f'write "{first} - {second}" when both listen'
+        return f'write "{first} - {second}" when both receive'
     if "<" in sign:
-        return f'write "{second} > {first}" when {first} listens to {second}'
+        return f'write "{second} > {first}" when {first} receives from {second}'
     if ">" in sign:
-        return f'write "{first} > {second}" when {second} listens to {first}'
-    return f'write "{first} > {second}" when {second} listens to {first}, "{first} - {second}" when both listen'
+        return f'write "{first} > {second}" when {second} receives from {first}'
+    return f'write "{first} > {second}" when {second} receives from {first}, "{first} - {second}" when both receive'

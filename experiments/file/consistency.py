@@ -217,7 +217,7 @@ def _triggers(experiment: Experiment) -> Iterator[Fault]:
     kind, _ = registry.split(experiment.trigger)
     spoken = registry.struct(registry.TRIGGERS, kind)
     if "communication" not in getattr(spoken, "places", ("communication",)):
-        message = f"'{kind}' tells when the law is computed anew, not when a robot speaks"
+        message = f"'{kind}' decides when the law is computed anew, not when a robot transmits"
         yield Fault(("trigger",), message, f"put it into [formation] as update = '{kind}', and another trigger here")
     needed = getattr(spoken, "prediction", "hold")
     if experiment.prediction is not None and needed != "hold":
@@ -230,7 +230,7 @@ def _triggers(experiment: Experiment) -> Iterator[Fault]:
         return
     kind, given_too = registry.split(experiment.formation.update)
     if "control" not in getattr(registry.struct(registry.TRIGGERS, kind), "places", ("control",)):
-        message = f"'{kind}' tells when a robot speaks, not when the law is computed anew"
+        message = f"'{kind}' decides when a robot transmits, not when the law is computed anew"
         yield Fault(("formation", "update"), message, "take another one, such as send-on-delta or relative-control")
     if given_too.get("smoothing_s"):
         message = "smoothing_s is for what is said; nothing is said where the law is computed"

@@ -56,12 +56,12 @@ def _links(experiment: Experiment) -> Iterator[Fault]:
             if name not in robots:
                 yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, robots), on_key=True)
         if both[0][0] == both[0][1]:
-            yield Fault(path, f"'{both[0][0]}' cannot listen to itself", "name two robots", on_key=True)
+            yield Fault(path, f"'{both[0][0]}' cannot receive from itself", "name two robots", on_key=True)
             continue
         again = [pair for pair in both if pair in said]
         if again:
             listener, speaker = again[0]
-            message = f"that {listener} listens to {speaker} is already said by '{said[again[0]]}'"
+            message = f"the link {speaker} > {listener} is already given by '{said[again[0]]}'"
             yield Fault(path, message, "keep one of the two", on_key=True)
         said.update(dict.fromkeys(both, text))
 

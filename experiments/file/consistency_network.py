@@ -87,14 +87,14 @@ def _network(experiment: Experiment) -> Iterator[Fault]:
         hint = 'add topology = "mesh", or leave addresses out'
         yield Fault(("network", "addresses"), "`addresses` are where robots listen in a mesh", hint, on_key=True)
     if network.routers > 1 and network.connect is not None:
-        message = "`routers` says how many zenpark starts, and with `connect` it starts none"
+        message = "`routers` is the number that zenpark starts, and with `connect` it starts none"
         hint = "leave routers out; link the routers that you start: zenpark router --connect OTHER"
         yield Fault(("network", "routers"), message, hint, on_key=True)
     if network.listen and len(network.listen) % network.routers:
         message = f"{network.routers} routers cannot share {len(network.listen)} endpoints"
         yield Fault(("network", "routers"), message, "give each an endpoint of its own in listen, or leave listen out")
     if network.address is not None and network.listen is None:
-        message = "`address` says where hosts find what `listen` listens on, and that is not given"
+        message = "`address` is where hosts find the endpoints of `listen`, and that is not given"
         hint = 'add listen = ["tls/0.0.0.0:7447"], or leave address out: hosts then use their ssh connection'
         yield Fault(("network", "address"), message, hint, on_key=True)
 
@@ -109,7 +109,7 @@ def _mesh(experiment: Experiment) -> Iterator[Fault]:
     away = {robot: host for host, each in experiment.hosts.items() for robot in each.robots}
     for robot, host in away.items():
         if robot in experiment.robots and robot not in network.addresses:
-            message = f"'{robot}' runs on '{host}', and nobody knows where it listens there"
+            message = f"'{robot}' runs on '{host}', and its endpoint there is not given"
             hint = f'add addresses.{robot} = "tls/ADDRESS:PORT" to [network], with a lab; or leave topology out'
             yield Fault(("network", "topology"), message, hint)
     for robot, endpoint in network.addresses.items():
@@ -123,10 +123,10 @@ def _mesh(experiment: Experiment) -> Iterator[Fault]:
             yield Fault(path, message, hint)
         else:
             if found.is_wildcard:
-                yield Fault(path, "nobody can connect to every address", "give the one at which its neighbours find it")
+                yield Fault(path, "a wildcard is no address to connect", "give the one at which its neighbours find it")
 
 
-FORM: Final = '"A > B" is what A says to B, "A - B" goes both ways'
+FORM: Final = '"A > B" are poses from A to B, "A - B" both ways'
 AT: Final = ("channel", "links")
 ROUNDING: Final = 1e-9
 
@@ -143,7 +143,7 @@ def channel_faults(experiment: Experiment) -> Iterator[Fault]:
         yield from _bursts(link_effects(channel, own), path, own)
         for pair in _pairs(text):
             if pair in said:
-                message = f"what {pair[1]} says to {pair[0]} has its settings by '{said[pair]}' already"
+                message = f"the link {pair[1]} > {pair[0]} has its settings by '{said[pair]}' already"
                 yield Fault(path, message, "keep one of the two", on_key=True)
                 break
             said[pair] = text
@@ -184,8 +184,8 @@ def _link(
     deaf = [pair for pair in both if there is not None and pair not in there]
     if deaf:
         listener, speaker = deaf[0]
-        hint = f"leave it out, or let {listener} listen to {speaker} in [formation.links]; {FORM}"
-        yield Fault(path, f"{listener} does not listen to {speaker}", hint, on_key=on_key)
+        hint = f"leave it out, or add the link to [formation.links]; {FORM}"
+        yield Fault(path, f"there is no link {speaker} > {listener}", hint, on_key=on_key)
 
 
 def _heard(experiment: Experiment) -> set[tuple[str, str]] | None:
@@ -206,9 +206,7 @@ def _bursts(held: LinkEffects, path: Path, own: LinkEffects | LinkChannel) -> It
     at = (*path, "burst" if own.burst is not None else "loss")
     if loss == 0.0:
         if own.burst is not None:
-            yield Fault(
-                at, "burst says how losses come, and nothing is lost here", "give a loss too, or leave burst out"
-            )
+            yield Fault(at, "burst shapes losses, and nothing is lost here", "give a loss too, or leave burst out")
     elif loss < 1.0 and burst * (1.0 - loss) < 1.0 - ROUNDING:
         least = 1.0 / (1.0 - loss)
         message = f"where {100 * loss:g} % is lost by chance, {least:.3g} are lost in a row on average, not {burst:g}"

@@ -176,7 +176,7 @@ def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
                 return [Fault((*path, key), message, hint, on_key=True)]
         likely = _kind_with(group, [key for key in value if key != "kind"])
         hint = f'add kind = "{likely}"' if likely else f'add kind = "..."; known: {", ".join(known)}'
-        return [Fault((*path, "kind"), f"'{_name(path)}' must say its kind, as text", hint)]
+        return [Fault((*path, "kind"), f"'{_name(path)}' needs its kind, as text", hint)]
     kind, given = registry.split(value)
     where = path if isinstance(value, str) else (*path, "kind")
     if kind not in known:

@@ -47,7 +47,7 @@ def content(file: Path, label: str) -> str:
         hint = f"name a file in it: {', '.join(toml)}" if toml else "name an experiment file"
         raise refusal(label, "is a folder", hint) from None
     except (OSError, ValueError) as error:
-        raise refusal(label, f"cannot be read: {reason(error)}", "check the name and who may read it") from error
+        raise refusal(label, f"cannot be read: {reason(error)}", "check the name and the permissions") from error
     if len(found) > LARGEST:
         raise refusal(label, f"is longer than {LARGEST // 1_000_000} MB", "name the experiment file, not a recording")
     return decoded(found, label)

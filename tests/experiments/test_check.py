@@ -278,7 +278,7 @@ def test_gains(gain, code):
             "multiple of 0.02",
         ),
         (PARK, "rates.pose_hz=5", ("warning", "decides-unheard"), "at 5 Hz at most", "pose_hz"),
-        (PARK, "formation.leader=CF03", ("warning", "hears-nobody"), "TB01 hears nobody", "> TB01"),
+        (PARK, "formation.leader=CF03", ("warning", "hears-nobody"), "TB01 has no neighbours", "> TB01"),
         (TRIANGLE, "robots.CF01.start=[0.0,-0.5]", ("warning", "local-minimum"), "another shape", "order"),
         (TRIANGLE, "duration_s=2", ("warning", "not-acquired"), "mm off after 2 s", "duration_s"),
     ],
@@ -311,7 +311,7 @@ def ground(links: dict[str, float], leader: str | None = None, **changes) -> dic
 
 def test_followers_that_cannot_hear_of_the_leader():
     found = ground({"A > B": 1.0, "C - D": 1.0}, leader="A")
-    assert found["leader-unknown"].startswith("C, D cannot hear of the leader (A)")
+    assert found["leader-unknown"].startswith("C, D cannot be reached by the leader (A)")
     assert "2 parts" in found["parts"]
 
 
@@ -361,7 +361,7 @@ def test_landing_on_a_robot():
         "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.8),
     }
     found = ground({"G - H": 0.7}, robots=robots, duration_s=30.0)
-    assert found["lands-on"] == "F ends above G, which it does not hear, and would land on it"
+    assert found["lands-on"] == "F ends above G, from which it receives no poses, and would land on it"
 
 
 def test_a_robot_at_the_wall_is_held_back():

@@ -119,14 +119,14 @@ def test_who_has_no_range_sensors_is_told_what_it_cannot_avoid(said):
 def test_who_hears_nobody_either_avoids_nothing(said):
     blind = ROBOTS.replace('kind = "khepera4"', 'kind = "khepera4"\nsensors = []')
     found = said(AVOIDS, robots=blind)["sees-nothing"]
-    assert found.message == "KH01 hears nobody and has no range sensors: it avoids nothing"
+    assert found.message == "KH01 has neither neighbours nor range sensors: it avoids nothing"
     assert 'hears = "all"' in found.remedy
     assert "sees-nothing" not in said(AVOIDS, 'hears = "all"\n', robots=blind)
 
 
 def test_links_of_avoidance_are_none_of_the_formation(said):
     found = said(AVOIDS, 'hears = "all"\n')
-    assert found["connected"].message == "the network is whole; everybody hears of KH01"
+    assert found["connected"].message == "the network is whole; every robot is reached by KH01"
 
 
 def test_formations_without_links_between_them_may_share_an_arena_if_they_keep_clear(said):

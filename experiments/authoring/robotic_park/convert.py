@@ -196,12 +196,14 @@ def _tools(park: Park, notes: Notes) -> None:
         notes.say(f"{named(gated)}: position controllers that act on events; zenpark's run at every tick")
     roles = Counter(task.role for _, task in tasks(park) if task.role != "consensus")
     if roles:
-        notes.say(f"task.role: {', '.join(roles)}; who leads follows from who listens to nobody")
+        notes.say(f"task.role: {', '.join(roles)}; leaders are the robots without neighbours")
     idle = [robot for robot in park.robots if robot.idle]
     if idle:
         count = sum(robot.idle for robot in idle)
         names = named([robot.name for robot in idle])
-        notes.say(f"task.enable is False for {names}: {count} relations are left out, and these robots hear nobody")
+        notes.say(
+            f"task.enable is False for {names}: {count} relations are left out, and these robots have no neighbours"
+        )
     for remark in park.remarks:
         notes.say(remark)
 

@@ -304,7 +304,7 @@ def _sections(root: Entry) -> Park:
     others, remarks = _others(root)
     if central and architecture != CENTRAL:
         remarks.append(f"Architecture: {architecture}; their launcher starts a centre for '{CENTRAL}' alone, and for"
-                       " this spelling nobody moves there; taken as centralized")  # fmt: skip
+                       " this spelling no robot moves there; taken as centralized")  # fmt: skip
     return Park(
         mode=operation.mode,
         tool=f"{operation.tool} {operation.world}".strip(),
