@@ -141,7 +141,7 @@ def test_formations_without_links_between_them_may_share_an_arena_if_they_keep_c
     [
         ('body = "world"\nranges = "world"\n', "ranges-twice", "adds nothing"),
         ('body = "khepera4-twin"\nsensors = []\nranges = "world"\n', "ranges-of-nothing", "no range sensors"),
-        ('body = "khepera4-twin"\nranges = "world"\n', "ranges-of-nothing", "nobody lives"),
+        ('body = "khepera4-twin"\nranges = "world"\n', "ranges-of-nothing", "without obstacles and robots"),
         ('body = "world"\nshadow = {}\n', "shadow-of-twin", "one twin with another"),
         ("shadow = { restart_s = 2.0 }\n", "shadow-of-twin", "one twin with another"),
     ],

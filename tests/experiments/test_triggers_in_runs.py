@@ -57,7 +57,7 @@ def updating(park, update):
     [
         ({"trigger": "relative-control"}, ("trigger",), "when the law is computed anew", "update = 'relative-control'"),
         ({"trigger": CHOSEN, "prediction": "hold"}, ("prediction",), "neighbours that extrapolate", "leave prediction"),
-        ({"update": "predictive"}, ("formation", "update"), "when a robot speaks", "relative-control"),
+        ({"update": "predictive"}, ("formation", "update"), "when a robot transmits", "relative-control"),
         (
             {"update": {"kind": "mixed", "smoothing_s": 0.1}},
             ("formation", "update", "smoothing_s"),
