@@ -29,8 +29,7 @@ class Clearance:
 
     robots: tuple[Approach | None, ...]  # closest approach of each robot to another one; None where there is no other
     arena: tuple[Approach | None, ...]  # closest approach of each robot to an obstacle or a wall
-    # every maximal time in which two robots, or a robot and a thing, overlapped: when it began, how deep it became,
-    # and who
+    # each longest time in which two robots, or a robot and an obstacle, overlapped: beginning, depth, names
     overlaps: tuple[Collision, ...]
 
     @classmethod

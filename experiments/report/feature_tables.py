@@ -14,7 +14,7 @@ MOST_COLLISIONS: Final = 100
 
 
 def collision_table(cases: Sequence[CaseMetrics]) -> Table:
-    """Everything that touched, case by case."""
+    """Contacts, case by case."""
     several = len({case.seed for case in cases}) > 1
     found = [(case, each) for case in cases for each in case.collisions]
     rows = []
@@ -85,7 +85,7 @@ def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
 
 
 def shadowed(cases: Sequence[CaseMetrics]) -> list[tuple[CaseMetrics, RobotMetrics, ShadowMetrics]]:
-    """Every robot that had a twin beside it."""
+    """Robots with a shadow twin."""
     return [(case, robot, robot.shadow) for case in cases for robot in case.robots if robot.shadow is not None]
 
 
@@ -180,7 +180,7 @@ def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:
 
 
 def architecture_of(case: CaseMetrics) -> str:
-    """Who decides, in words."""
+    """The architecture, in words."""
     if case.guidance is None:
         return "every robot"
     guided = case.guidance.guided
@@ -241,7 +241,7 @@ def _share(heard: int, dropped: int) -> str:
 
 
 def _delay(each: Sequence[Passage]) -> tuple[float | None, float | None]:
-    """Mean and largest delay [s] over all poses heard on some links; None if there are none."""
+    """Mean and largest delay [s] over all poses received on some links; None if there are none."""
     heard = sum(link.heard for link in each)
     if not heard:
         return None, None

@@ -168,7 +168,7 @@ def errors(traces: Sequence[Trace]) -> Figure:
 
 @styled
 def events(traces: Sequence[Trace]) -> Figure:
-    """When each robot transmitted: one row per robot, one panel per case; what would touch in print is one bar."""
+    """Transmissions: one row per robot, one panel per case; marks that would touch in print are one bar."""
     rows = max((len(trace.robots) for trace in traces), default=0)
     height = panel_height(len(traces), min(max(0.6, 0.13 * rows), 3.2))
     figure = Figure(figsize=(WIDTH, height * len(traces) + 0.5 + 0.14 * len(traces)), layout="constrained")

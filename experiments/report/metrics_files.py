@@ -80,5 +80,5 @@ def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:
 
 
 def write_json(path: Path, cases: Sequence[CaseMetrics]) -> None:
-    """Everything that was measured, one object per case."""
+    """All metrics, one object per case."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(cases), indent=2) + b"\n")

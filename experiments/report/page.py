@@ -79,7 +79,7 @@ TEMPLATE: Final = "report.html.jinja"
 
 
 @dataclass(frozen=True)
-class Picture:
+class PageFigure:
     """An SVG drawing to stand in the page, with its number and caption."""
 
     svg: str
@@ -94,7 +94,7 @@ class Section:
     title: str
     prose: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[PageFigure, ...] = ()
     listing: str = ""
     terms: tuple[tuple[str, str], ...] = ()
     folded: str = ""
@@ -125,10 +125,10 @@ def render(
     return target
 
 
-def numbered(drawn: Iterable[tuple[Figure, str]], first: int = 1) -> tuple[Picture, ...]:
+def numbered(drawn: Iterable[tuple[Figure, str]], first: int = 1) -> tuple[PageFigure, ...]:
     """Figures and their captions, to stand in a page."""
     return tuple(
-        Picture(inline(figures.svg(figure), f"f{number}-", caption), number, caption)
+        PageFigure(inline(figures.svg(figure), f"f{number}-", caption), number, caption)
         for number, (figure, caption) in enumerate(drawn, start=first)
     )
 

@@ -25,7 +25,7 @@ from experiments.report.feature_tables import (
     shadow_tables,
 )
 from experiments.report.feature_tables import PROSE as MODELLED
-from experiments.report.page import Finding, Picture, Section, date_of, numbered, render, seeds_in_words
+from experiments.report.page import Finding, PageFigure, Section, date_of, numbered, render, seeds_in_words
 from experiments.report.tables import (
     DEFINITIONS,
     clocks_table,
@@ -60,8 +60,8 @@ MOST_LINKS: Final = 60  # longer tables are folded
 ORIGIN: Final = "run.json"  # how and when a run was made, for when its report is made again
 
 
-class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the numbers come from."""
+class RunOrigin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Origin of a run: command and date."""
 
     command: str  # how to do the run again
     date: str  # when it was
@@ -108,7 +108,7 @@ def write(
     experiment = traces[0].experiment
     seeds = sorted({trace.seed for trace in traces})
     folder.mkdir(parents=True, exist_ok=True)
-    made = _origin(folder if run is None else run, Origin(command, date or date_of(time.time())))
+    made = _origin(folder if run is None else run, RunOrigin(command, date or date_of(time.time())))
     facts = [
         ("Date", made.date),
         ("Clock", _words(trace.clock for trace in traces)),
@@ -221,18 +221,18 @@ def compare(
 
 
 def _modelled(cases: Sequence[CaseMetrics]) -> list[Section]:
-    """What the modelled network did, where there is one."""
+    """Effects of the modelled network, where there is one."""
     tables = network_tables(cases)
     many = any(len(table.rows) > MOST_LINKS for table in tables)
     title, folded = "What the modelled network did", "Show all links" if many else ""
     return [Section(title, (MODELLED,), tables, folded=folded)] if tables else []
 
 
-def _origin(folder: Path, now: Origin) -> Origin:
-    """What is kept of the making of the run in its folder; kept now if nothing was, and there is a command."""
+def _origin(folder: Path, now: RunOrigin) -> RunOrigin:
+    """Origin of the run as its folder keeps it; kept now if the folder has none, and there is a command."""
     file = folder / ORIGIN
     try:
-        return msgspec.json.decode(file.read_bytes(), type=Origin)
+        return msgspec.json.decode(file.read_bytes(), type=RunOrigin)
     except FileNotFoundError:
         if now.command:
             file.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
@@ -241,7 +241,7 @@ def _origin(folder: Path, now: Origin) -> Origin:
         return now
 
 
-def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Picture, ...]:
+def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[PageFigure, ...]:
     legs = any(len(case.starts_s) > 1 for case in cases)
     seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
     shown = [trace.experiment for trace in traces]
@@ -261,20 +261,20 @@ def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Pi
 
 
 def _of_architecture(cases: Sequence[CaseMetrics]) -> list[Section]:
-    """Who decides, if not every robot for itself."""
+    """Architecture, if not each robot decides for itself."""
     table = architecture_table(cases)
     return [] if table is None else [Section("Architecture", (EXPLAINED,), (table,))]
 
 
 def _of_clocks(traces: Sequence[Trace]) -> list[Section]:
-    """How the clocks of other machines lay, where robots ran on any."""
+    """Clock offsets of other machines, where robots ran on any."""
     if not any(trace.clocks for trace in traces):
         return []
     return [Section("Clocks of other machines", (CLOCKS,), (clocks_table(traces),))]
 
 
 def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_before: int) -> list[Section]:
-    """What touched or came near, and the twins beside robots, where there is anything to say."""
+    """Contacts, close approaches and shadow twins, where there are any."""
     sections = []
     if any(case.near or case.near_arena or case.collisions for case in cases):
         touched = (collision_table(cases),) if any(case.collisions for case in cases) else ()

@@ -100,7 +100,7 @@ def in_space(axes: Axes3D, experiment: Experiment, low: Array, high: Array) -> N
 
 
 def around(experiment: Experiment, low: Array, high: Array) -> tuple[Array, Array]:
-    """What a picture of space shows along x and y, when robots are from `low` to `high` (2,) [m].
+    """Limits of a picture along x and y, with robots from `low` to `high` (2,) [m].
 
     All obstacles as far as they stand in the arena, all start boxes, and the arena itself if it is not much larger.
     """
@@ -117,7 +117,7 @@ def around(experiment: Experiment, low: Array, high: Array) -> tuple[Array, Arra
 
 
 def tall(experiment: Experiment, most: float) -> float:
-    """How high the tallest obstacle reaches [m], `most` if it is taller; 0 without any."""
+    """Height of the tallest obstacle [m], at most `most`; 0 without any."""
     return min(float(bodies.scene(experiment).top.max(initial=0.0)), most)
 
 
@@ -142,7 +142,7 @@ def legend(experiments: Sequence[Experiment], *, space: bool = False) -> tuple[l
 
 
 def caption(experiments: Sequence[Experiment], *, space: bool = False) -> str:
-    """What a caption has to say of the arenas, from above or in space; empty if nothing stands there."""
+    """Caption text about the obstacles, from above or in space; empty without any."""
     given = [obstacle for experiment in experiments for obstacle in experiment.arena.obstacles.values()]
     said = []
     if given:

@@ -1,4 +1,4 @@
-"""How the figures look, and how they are saved: one column of 3.5 in, 8 pt, colours for colour-blind readers too.
+"""Style of the figures and their files: one column of 3.5 in, 8 pt, colours for colour-blind readers too.
 
 `Figure` is used without pyplot, so that nothing is global; the style is set around drawing and around saving.
 """
@@ -122,13 +122,13 @@ def plain(name: str) -> str:
 
 
 def thinned(trace: Trace, panels: int) -> slice:
-    """Every how many samples of a trace are drawn, given how many panels there are."""
+    """Step between the drawn samples of a trace, by the number of panels."""
     points = min(POINTS, ALL_POINTS // max(1, panels * len(trace.robots)))
     return slice(None, None, max(1, math.ceil(len(trace.time) / max(points, 100))))
 
 
 def robot_lines(trace: Trace) -> list[Line]:
-    """How each robot's curve looks: a colour of its own if there are few robots, else the colour of its kind."""
+    """Style of each robot's curve: a colour of its own if there are few robots, else the colour of its kind."""
     if len(trace.robots) <= MANY:
         styles = ["-"] * len(ROBOTS) + ["--"] * len(ROBOTS)
         return [{"color": ROBOTS[i % len(ROBOTS)], "linestyle": styles[i]} for i in range(len(trace.robots))]
@@ -150,7 +150,7 @@ def robot_legend(
 
 
 def legend_above(figure: Figure, entries: tuple[Sequence[Any], Sequence[str]], columns: int) -> None:
-    """A legend above all panels; nothing if there is nothing to tell apart."""
+    """A legend above all panels; none for a single entry."""
     if entries[1]:
         figure.legend(*entries, loc="outside upper center", ncols=min(columns, len(entries[1])))
 
@@ -196,7 +196,7 @@ def boxes(begin: Array, end: Array, row: int) -> Outline:
 
 
 def last_known(trace: Trace) -> Array:
-    """Where each robot was last known to be (N, 3)."""
+    """Last known position of each robot (N, 3) [m]."""
     alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
     last = len(alive) - 1 - alive[::-1].argmax(axis=0)
     return np.asarray(trace.true_position[last, np.arange(len(trace.robots))])

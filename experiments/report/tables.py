@@ -92,7 +92,7 @@ def summary_table(cases: Sequence[CaseMetrics]) -> Table:
 
 
 def whole_table(cases: Sequence[CaseMetrics]) -> Table:
-    """What belongs to the formation as a whole."""
+    """Numbers of the formation as a whole."""
     grouped = by_case(cases)
     phases = max(len(case.starts_s) for case in cases)
 
@@ -170,7 +170,7 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
 
 
 def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
-    """Per case: what was sent, recorded, heard, lost, and dropped by a modelled network; seeds are added up."""
+    """Per case: poses sent, recorded, received, lost, and dropped by a modelled network; seeds are added up."""
     tables = []
     for name, runs in by_case(cases).items():
         columns = 6 if runs[0].modelled else 5
@@ -229,7 +229,7 @@ def links_table(cases: Sequence[CaseMetrics]) -> Table:
 
 
 def clocks_table(traces: Sequence[Trace]) -> Table:
-    """How the clocks of other machines lay to the conductor's, and what of it is left in the stamps."""
+    """Clock offsets of other machines from the conductor's, and the error left in the stamps."""
     rows = [
         Row(
             (
@@ -257,7 +257,7 @@ def clocks_table(traces: Sequence[Trace]) -> Table:
 
 
 def events_table(traces: Sequence[Trace]) -> Table:
-    """What the conductor and the robots said, case by case."""
+    """Events of the conductor and the robots, case by case."""
     said = [(trace.case, event) for trace in traces for event in trace.events]
     rows = [
         Row((case, f"{event.stamp:.2f}", event.kind, event.source, event.text)) for case, event in said[:MOST_EVENTS]

@@ -1,4 +1,4 @@
-"""What a run came to, in plain words: the sentences at the top of a report, and what the command line prints."""
+"""Findings of a run in plain words: the sentences at the top of a report, and what the command line prints."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 
 def _formation(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """What became of the formation, where there is one."""
+    """Acquisition of the formation, where there is one."""
     if not any(case.belief for case in cases):
         return []
     return [*_acquired(cases), _worst_link(cases), *_against_the_first(cases)]
@@ -59,7 +59,7 @@ def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 
 def left_out(cases: Sequence[CaseMetrics]) -> str:
-    """Who is not in the means, and why."""
+    """Robots that the means leave out, with the reason."""
     leading = list(dict.fromkeys(name for case in cases for name in case.leaders))
     died = list(dict.fromkeys(name for case in cases for name in case.died))
     words = []
@@ -117,7 +117,7 @@ def _died(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 
 def _guided(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """What deciding in one process took."""
+    """Cost of the central controller."""
     found = []
     for name, runs in by_case(cases).items():
         centres = [run.guidance for run in runs if run.guidance is not None]
@@ -218,7 +218,7 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 
 def contacts(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """What touched; if nothing did, how near it came to that."""
+    """Contacts; without any, the closest approach."""
     found = []
     for name, runs in by_case(cases).items():
         touched = [each for run in runs for each in run.collisions]

@@ -24,8 +24,8 @@ from agents.plugins.registry import did_you_mean
 from experiments.file.document import Document, chosen, load
 from experiments.sweep.plan import FIRST_TUNING, Axis, Cell, arguments, combination, compared, seeds_of, wrong
 from experiments.sweep.store import Store
-from experiments.sweep.sweep import Bench, folder_of, origin
-from experiments.sweep.table import MEANS, RATIOS, Row, words_of
+from experiments.sweep.sweep import SweepRunner, folder_of, origin
+from experiments.sweep.table import MEANS, RATIOS, CellRow, words_of
 from experiments.sweep.workers import SweepError, workers
 
 Progress = Callable[[str, int, int], None]  # case, evaluations done, of at most so many
@@ -56,12 +56,12 @@ class Limit:
 
 @dataclass(frozen=True)
 class Wish:
-    """What is to be least, within which limits."""
+    """An index to be minimised, within limits of others."""
 
     index: str
     limits: tuple[Limit, ...]
 
-    def rank(self, row: Row) -> float:
+    def rank(self, row: CellRow) -> float:
         """The less the better, limits first; more than any other if it cannot be known, or if runs failed."""
         least = row.value(self.index).mean
         if least is None or row.failed:
@@ -74,26 +74,26 @@ class Wish:
             excess += max(0.0, value.mean + (value.ci95 or 0.0) - limit.most) / max(abs(limit.most), 1e-9)
         return BROKEN * (1.0 + min(excess, 1.0)) if excess > 0.0 else least
 
-    def kept(self, row: Row) -> bool:
+    def kept(self, row: CellRow) -> bool:
         """Whether the means of a row keep all limits."""
         values = [(row.value(limit.index).mean, limit.most) for limit in self.limits]
         return all(mean is not None and mean <= most for mean, most in values) and not row.failed
 
 
 @dataclass(frozen=True)
-class Tuned:
-    """What the search came to."""
+class TuningResult:
+    """Result of a search."""
 
-    read: Document  # the experiment
-    wish: Wish  # what was wished
-    tuning: tuple[int, ...]  # seeds on which it was sought
-    seeds: tuple[int, ...]  # seeds on which it is reported
-    rows: tuple[Row, ...]  # the reference, and the best of each case, on `seeds`
-    tried: tuple[Row, ...]  # everything that was tried, in that order, on the first third of `tuning`
+    read: Document
+    wish: Wish
+    tuning: tuple[int, ...]  # seeds of the search
+    seeds: tuple[int, ...]  # seeds of the report
+    rows: tuple[CellRow, ...]  # the reference, and the best of each case, on `seeds`
+    tried: tuple[CellRow, ...]  # in the order of the search, on the first third of `tuning`
     # of each case what was chosen, on the other two thirds; its limits may be broken if nothing kept them
-    chosen: tuple[Row, ...]
-    folder: Path  # where the runs are kept
-    notes: tuple[str, ...]  # what the user should know
+    chosen: tuple[CellRow, ...]
+    folder: Path  # of the runs
+    notes: tuple[str, ...]  # for the user
 
     @property
     def searched(self) -> tuple[int, ...]:
@@ -140,7 +140,7 @@ def tune(
     scheduler: str | None = None,
     processes: int | None = None,
     progress: Progress = lambda _case, _done, _of: None,
-) -> Tuned:
+) -> TuningResult:
     """Seeks the parameters of each case that has any of the axes; what was tried before is not run again.
 
     Args:
@@ -187,30 +187,30 @@ def tune(
         raise wrong(spans[0].argument, f"no case that is looked at has it; the reference '{reference}' is not", hint)
     cma = _library()
     folder = Path(out) if out is not None else folder_of(read, spans, "optimize")
-    tried: list[Row] = []
-    picked: list[Row] = []
+    tried: list[CellRow] = []
+    picked: list[CellRow] = []
     plan: dict[tuple[str, str], Cell] = {}
     with Store(folder) as store:
         notes = store.changed_since(origin(read, [read.cases()[name] for name in (reference, *ranges)]))
         with workers(scheduler, processes) as crew:
-            bench = Bench(store, crew)
+            runner = SweepRunner(store, crew)
             for name, mine in ranges.items():
-                rows = search.run(cma, bench, name, mine, progress)
+                rows = search.run(cma, runner, name, mine, progress)
                 tried += rows
-                best = search.choose(bench, rows, mine)
+                best = search.choose(runner, rows, mine)
                 picked.append(best)
                 for cell in search.again(best, mine):
                     plan.setdefault((cell.case, cell.digest), cell)
             final = sorted(plan.values(), key=lambda cell: cell.case != reference)
-            if not bench.run_missing(final, seeds, lambda _done, _of: None):
+            if not runner.run_missing(final, seeds, lambda _done, _of: None):
                 raise KeyboardInterrupt
-            reported = bench.rows(final, seeds)
-    return Tuned(read, wish, tuning, seeds, tuple(reported), tuple(tried), tuple(picked), folder, tuple(notes))
+            reported = runner.rows(final, seeds)
+    return TuningResult(read, wish, tuning, seeds, tuple(reported), tuple(tried), tuple(picked), folder, tuple(notes))
 
 
 @dataclass(frozen=True)
 class _Search:
-    """What all cases have in common."""
+    """Settings of a search that all cases share."""
 
     read: Document
     file: str
@@ -227,32 +227,32 @@ class _Search:
         """The reference and a case with these values."""
         return list(combination(self.read, self.file, self.settings, values, (case,)))
 
-    def again(self, row: Row, axes: Sequence[Axis]) -> list[Cell]:
+    def again(self, row: CellRow, axes: Sequence[Axis]) -> list[Cell]:
         """The reference and a case with the values of a row."""
         return self.cells({axis: words_of(row.parameters[axis.path]) for axis in axes}, row.case)
 
-    def choose(self, bench: Bench, rows: Sequence[Row], axes: Sequence[Axis]) -> Row:
+    def choose(self, runner: SweepRunner, rows: Sequence[CellRow], axes: Sequence[Axis]) -> CellRow:
         """The best of what was tried, on seeds that the search has not seen; raises KeyboardInterrupt on Ctrl-C."""
         fresh = self.tuning[len(searched(self.tuning)) :]
         ranked = sorted(rows, key=self.wish.rank)
-        looked_at: list[Row] = []
+        looked_at: list[CellRow] = []
         for begin in range(0, min(ROUNDS * ROUND, len(ranked)), ROUND):
             pairs = [self.again(row, axes) for row in ranked[begin : begin + ROUND]]
-            if not bench.run_missing([cell for pair in pairs for cell in pair], fresh, lambda _done, _of: None):
+            if not runner.run_missing([cell for pair in pairs for cell in pair], fresh, lambda _done, _of: None):
                 raise KeyboardInterrupt
-            looked_at += [bench.rows(pair, fresh)[-1] for pair in pairs]
+            looked_at += [runner.rows(pair, fresh)[-1] for pair in pairs]
             if any(self.wish.rank(row) < BROKEN for row in looked_at):
                 break
         return min(looked_at, key=self.wish.rank)
 
-    def run(self, cma: Any, bench: Bench, case: str, axes: Sequence[Axis], progress: Progress) -> list[Row]:  # noqa: ANN401
-        """Everything that is tried for a case, each once; raises KeyboardInterrupt on Ctrl-C."""
+    def run(self, cma: Any, runner: SweepRunner, case: str, axes: Sequence[Axis], progress: Progress) -> list[CellRow]:  # noqa: ANN401
+        """The cells tried for a case, each once; raises KeyboardInterrupt on Ctrl-C."""
         first, more = EVALUATIONS
         most = first + more * len(axes)
         options = {"bounds": [0.0, 1.0], "seed": 1, "tolx": FINE, "maxfevals": most, "verbose": -9, "verb_log": 0}
         # the method is not made for one dimension: a second one, that means nothing, does it no harm
         strategy = cma.CMAEvolutionStrategy([0.5] * max(2, len(axes)), SIGMA, options)
-        known: dict[tuple[str, ...], Row] = {}
+        known: dict[tuple[str, ...], CellRow] = {}
         asked = 0
         progress(case, 0, most)
         while not strategy.stop():
@@ -261,10 +261,10 @@ class _Search:
             fresh = [values for values in dict.fromkeys(wanted) if values not in known]
             cells = {values: self.cells(dict(zip(axes, values, strict=True)), case) for values in fresh}
             plan = [cell for pair in cells.values() for cell in pair]
-            if not bench.run_missing(plan, searched(self.tuning), lambda _done, _of: None):
+            if not runner.run_missing(plan, searched(self.tuning), lambda _done, _of: None):
                 raise KeyboardInterrupt
             for values, pair in cells.items():
-                known[values] = bench.rows(pair, searched(self.tuning))[-1]
+                known[values] = runner.rows(pair, searched(self.tuning))[-1]
             strategy.tell(points, [self.wish.rank(known[values]) for values in wanted])
             asked += len(points)
             progress(case, min(asked, most), most)

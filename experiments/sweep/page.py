@@ -9,12 +9,12 @@ from typing import Final
 
 from experiments.file.document import Document
 from experiments.report import style
-from experiments.report.page import Finding, Picture, Section, Table, date_of, numbered, render, seeds_in_words
+from experiments.report.page import Finding, PageFigure, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.page import Row as Line
-from experiments.sweep.optimise import Tuned
+from experiments.sweep.optimise import TuningResult
 from experiments.sweep.pareto import front, pareto
-from experiments.sweep.sweep import Found
-from experiments.sweep.table import Row, figure, short, with_interval, words_of
+from experiments.sweep.sweep import SweepResult
+from experiments.sweep.table import CellRow, figure, short, with_interval, words_of
 
 PAGE: Final = "sweep.html"
 NONE: Final = "–"
@@ -34,7 +34,7 @@ CAPTIONS: Final = (
 )
 
 
-def write(found: Found, command: str) -> Path:
+def write(found: SweepResult, command: str) -> Path:
     """Writes `sweep.html` and the figure into the folder of a sweep."""
     notes = [Finding("fair", note) for note in found.notes]
     if found.missing:
@@ -60,7 +60,7 @@ def write(found: Found, command: str) -> Path:
     )
 
 
-def write_tuned(tuned: Tuned, command: str) -> Path:
+def write_tuned(tuned: TuningResult, command: str) -> Path:
     """Writes `sweep.html` and the figure of a search into its folder."""
     reference = [row for row in tuned.rows if row.reference]
     words = seeds_in_words
@@ -84,7 +84,7 @@ def write_tuned(tuned: Tuned, command: str) -> Path:
     )
 
 
-def verdict(tuned: Tuned) -> list[Finding]:
+def verdict(tuned: TuningResult) -> list[Finding]:
     """For each case whether the limits were kept on the reporting seeds, and at how many messages."""
     limits = " and ".join(map(str, tuned.wish.limits))
     found = []
@@ -97,7 +97,7 @@ def verdict(tuned: Tuned) -> list[Finding]:
     return found
 
 
-def table(rows: Sequence[Row]) -> Table:
+def table(rows: Sequence[CellRow]) -> Table:
     """The cells for people."""
     paths = list(dict.fromkeys(path for row in rows for path in row.parameters))
     head = ("Case", *map(short, paths), "f [Hz]", "Messages", "IAE", "ITAE", "Acquired", "Gap", "Lost")
@@ -113,7 +113,7 @@ def table(rows: Sequence[Row]) -> Table:
     return Table(head, tuple(lines), note=f"Messages, IAE and ITAE are relative to {reference} with the same seed.")
 
 
-def _pictures(folder: Path, rows: Sequence[Row], *, joined: bool) -> tuple[Picture, ...]:
+def _pictures(folder: Path, rows: Sequence[CellRow], *, joined: bool) -> tuple[PageFigure, ...]:
     """Messages against IAE and against ITAE; also as files."""
     drawn = {index: pareto(rows, index, joined=joined) for index in ("iae", "itae")}
     for index, each in drawn.items():
@@ -121,8 +121,8 @@ def _pictures(folder: Path, rows: Sequence[Row], *, joined: bool) -> tuple[Pictu
     return numbered((each, caption) for each, caption in zip(drawn.values(), CAPTIONS, strict=True))
 
 
-def _fewest(rows: Sequence[Row]) -> list[Finding]:
-    """Who needs the fewest messages within each level of error."""
+def _fewest(rows: Sequence[CellRow]) -> list[Finding]:
+    """The cell with the fewest messages within each level of error."""
     found: dict[str, Finding] = {}
     for level in LEVELS:
         within = [row for row in front(rows) if not row.reference and (row.ratio["iae"].mean or 0.0) <= level]
@@ -132,7 +132,7 @@ def _fewest(rows: Sequence[Row]) -> list[Finding]:
     return list(found.values())
 
 
-def _saved(row: Row) -> str:
+def _saved(row: CellRow) -> str:
     messages = row.ratio["messages"].mean
     less = "?" if messages is None else f"{100.0 * (messages - 1.0):+.1f} %"
     return f"{less} messages, IAE {with_interval(row.ratio['iae'])}, ITAE {with_interval(row.ratio['itae'])}"

@@ -1,4 +1,4 @@
-"""Messages against error: what each trigger makes of its parameters, and where no other does better in both."""
+"""Messages against error for the parameters of each trigger, and the Pareto front."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from agents.arrays import Array
 from experiments.report.style import CASES, INK, PAPER, WIDTH, legend_above, plain, styled
-from experiments.sweep.table import Row, short, words_of
+from experiments.sweep.table import CellRow, short, words_of
 
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
 MOST_CURVES: Final = 9  # a colour and a marker each; more could not be told apart, and are drawn as clouds
@@ -22,7 +22,7 @@ SPAN: Final = 8.0  # a wider range of messages is drawn on a logarithmic axis
 
 
 @styled
-def pareto(rows: Sequence[Row], index: str = "iae", *, joined: bool = True) -> Figure:
+def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True) -> Figure:
     """Messages against an error, both over the reference with the same seeds; one curve for each trigger.
 
     Full markers: no other cell has fewer messages and no more error; these are joined by a grey line. Hollow: another
@@ -62,7 +62,7 @@ def pareto(rows: Sequence[Row], index: str = "iae", *, joined: bool = True) -> F
     return figure
 
 
-def front(rows: Sequence[Row], index: str = "iae") -> list[Row]:
+def front(rows: Sequence[CellRow], index: str = "iae") -> list[CellRow]:
     """Cells than which none has fewer messages and no more error, or less error and no more messages."""
     found, least = [], math.inf
     for row in sorted((row for row in rows if _at(row, index) is not None), key=lambda row: _at(row, index) or ()):
@@ -72,9 +72,9 @@ def front(rows: Sequence[Row], index: str = "iae") -> list[Row]:
     return found
 
 
-def curves(rows: Sequence[Row]) -> dict[str, list[Row]]:
+def curves(rows: Sequence[CellRow]) -> dict[str, list[CellRow]]:
     """Cells that differ only in the first parameter in which their case varies, by the name of case and others."""
-    found: dict[str, list[Row]] = {}
+    found: dict[str, list[CellRow]] = {}
     for row in rows:
         along = _along(rows, row.case)
         others = [path for path in row.parameters if path != along and _varies(rows, row.case, path)]
@@ -83,38 +83,38 @@ def curves(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return found
 
 
-def _along(rows: Sequence[Row], case: str) -> str | None:
+def _along(rows: Sequence[CellRow], case: str) -> str | None:
     paths = dict.fromkeys(path for row in rows if row.case == case for path in row.parameters)
     return next((path for path in paths if _varies(rows, case, path)), None)
 
 
-def _varies(rows: Sequence[Row], case: str, path: str) -> bool:
+def _varies(rows: Sequence[CellRow], case: str, path: str) -> bool:
     return len({str(row.parameters.get(path)) for row in rows if row.case == case}) > 1
 
 
-def _at(row: Row, index: str) -> tuple[float, float] | None:
+def _at(row: CellRow, index: str) -> tuple[float, float] | None:
     messages, error = row.ratio["messages"].mean, row.ratio[index].mean
     return None if messages is None or error is None else (messages, error)
 
 
-def _reference(rows: Sequence[Row]) -> str:
+def _reference(rows: Sequence[CellRow]) -> str:
     return plain(next((row.case for row in rows if row.reference), "the reference"))
 
 
-def _points(rows: Sequence[Row], index: str) -> Array:
+def _points(rows: Sequence[CellRow], index: str) -> Array:
     """Messages, error, and the half-widths of their intervals (n, 4)."""
     pairs = [(row.ratio["messages"], row.ratio[index]) for row in rows]
     found = [(m.mean, e.mean, m.ci95 or 0.0, e.ci95 or 0.0) for m, e in pairs]
     return np.array(found, dtype=float).reshape(-1, 4)
 
 
-def _draw_front(axes: Axes, rows: Sequence[Row], index: str) -> None:
+def _draw_front(axes: Axes, rows: Sequence[CellRow], index: str) -> None:
     points = _points(rows, index)
     x, y = points[points[:, 0].argsort(), :2].T
     axes.plot(x, y, drawstyle="steps-post", color="#9a9a9a", linewidth=2.2, alpha=0.5, zorder=1)
 
 
-def _draw_curve(axes: Axes, rows: Sequence[Row], index: str, best: Sequence[bool], style: dict[str, Any]) -> None:
+def _draw_curve(axes: Axes, rows: Sequence[CellRow], index: str, best: Sequence[bool], style: dict[str, Any]) -> None:
     points = _points(rows, index)
     x, y, dx, dy = points.T
     marker = {"linewidth": 0.8, "markersize": 3.6, "markeredgewidth": 0.8, "zorder": 3, **style}

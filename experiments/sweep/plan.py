@@ -1,4 +1,4 @@
-"""What a sweep is to run: axes and seeds as they stand on the command line, and the cells that they span.
+"""Plan of a sweep: axes and seeds of the command line, and the cells that they span.
 
     zenpark sweep robotic-park trigger.threshold=0.002:0.05:log12 seeds=50
 
@@ -32,7 +32,7 @@ from experiments.sweep.runs import digest
 
 SEEDS: Final = 20  # if no number is given
 FIRST_TUNING: Final = 1001  # the first seed on which parameters are sought, if none is named
-DIGITS: Final = 4  # of a value in a range: nobody sets more
+DIGITS: Final = 4  # of a value in a range
 MOST_CELLS: Final = 20_000
 MOST_SEEDS: Final = 100_000
 HOW: Final = "write PATH=LOW:HIGH:log12 (or lin12), or PATH=A,B,C; for example trigger.threshold=0.002:0.05:log12"
@@ -161,7 +161,7 @@ def cells(read: Document, file: str, settings: Sequence[str], axes: Sequence[Axi
 def combination(
     read: Document, file: str, settings: Sequence[str], values: Mapping[Axis, str], names: Sequence[str]
 ) -> Iterator[Cell]:
-    """What is compared with, then the named cases, with these values.
+    """The reference, then the named cases, with these values.
 
     Raises:
         DocumentError: If a path leads nowhere, or a value is refused.

@@ -1,4 +1,4 @@
-"""What one process of a sweep does: flies a case with some seeds in virtual time, and keeps a few figures of each."""
+"""Work of one process of a sweep: simulates a case with some seeds, and keeps a few numbers of each run."""
 
 from __future__ import annotations
 
@@ -49,16 +49,16 @@ class Figures(msgspec.Struct, frozen=True):
     dropped: int  # samples that the modelled network dropped on all links
 
 
-class Outcome(msgspec.Struct, frozen=True):
-    """What came of some seeds."""
+class WorkResult(msgspec.Struct, frozen=True):
+    """Results of some seeds."""
 
-    runs: list[Figures]  # those that went through
-    failed: dict[int, str] = {}  # seeds of the others, and why
-    stranger: str = ""  # digest of the code, if it is another than was asked for, or what is missing: nothing was run
+    runs: list[Figures]  # that succeeded
+    failed: dict[int, str] = {}  # reason by seed, of the others
+    stranger: str = ""  # other digest of the code, or a missing plug-in: nothing was run
 
 
 def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
-    """Flies a case once for each seed.
+    """Simulates a case once for each seed.
 
     Args:
         case: An experiment as JSON.
@@ -66,18 +66,18 @@ def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
         code: What `code` said where the work was given out; nothing is run with other code.
 
     Returns:
-        An `Outcome` as JSON, runs in the order of the seeds.
+        An `WorkResult` as JSON, runs in the order of the seeds.
     """
     try:
         experiment = msgspec.json.decode(case, type=Experiment)
         mine = code_of(experiment)
     except (msgspec.ValidationError, registry.PluginError) as error:  # on a machine with another version, or no plug-in
-        return msgspec.json.encode(Outcome([], stranger=str(error)))
+        return msgspec.json.encode(WorkResult([], stranger=str(error)))
     if mine != code:
-        return msgspec.json.encode(Outcome([], stranger=f"{mine}, not {code}"))
+        return msgspec.json.encode(WorkResult([], stranger=f"{mine}, not {code}"))
     runs, failed = _flown(without_standby(experiment), tuple(seeds))
     runs.sort(key=lambda run: seeds.index(run.seed))
-    return msgspec.json.encode(Outcome(runs, failed))
+    return msgspec.json.encode(WorkResult(runs, failed))
 
 
 def digest(experiment: Experiment) -> str:

@@ -17,7 +17,7 @@ from typing import Final, Self
 import msgspec
 
 from experiments.file.problems import DocumentError, Problem
-from experiments.sweep.runs import Figures, Outcome
+from experiments.sweep.runs import Figures, WorkResult
 
 RUNS: Final = "runs.jsonl"
 ORIGIN: Final = "origin.json"
@@ -30,8 +30,8 @@ class _Line(msgspec.Struct, frozen=True):
     failed: dict[int, str] = {}
 
 
-class Origin(msgspec.Struct, frozen=True):
-    """What a folder was begun with: the version, digests of code and of file (with its `--set`)."""
+class StoreOrigin(msgspec.Struct, frozen=True):
+    """Origin of a folder: version, digests of code and of file (with its `--set`)."""
 
     version: str
     code: str
@@ -75,11 +75,11 @@ class Store:
     ) -> None:
         self._file.close()
 
-    def changed_since(self, now: Origin) -> list[str]:
-        """What is not as it was when the folder was last used, in words; from now on it is as `now`."""
+    def changed_since(self, now: StoreOrigin) -> list[str]:
+        """Changes since the folder was last used, in words; keeps `now` from then on."""
         path = self._folder / ORIGIN
         try:
-            before = msgspec.json.decode(path.read_bytes(), type=Origin)
+            before = msgspec.json.decode(path.read_bytes(), type=StoreOrigin)
         except (FileNotFoundError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             before = now
         path.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
@@ -93,7 +93,7 @@ class Store:
         return found
 
     def runs(self, cell: str, code: str) -> dict[int, Figures]:
-        """What is done of a cell, by seed."""
+        """Runs of a cell that are done, by seed."""
         return self._runs.get((cell, code), {})
 
     def failed(self, cell: str, code: str) -> dict[int, str]:
@@ -105,7 +105,7 @@ class Store:
         done, failed = self.runs(cell, code), self.failed(cell, code)
         return [seed for seed in seeds if seed not in done and seed not in failed]
 
-    def add(self, cell: str, code: str, outcome: Outcome) -> None:
+    def add(self, cell: str, code: str, outcome: WorkResult) -> None:
         """Keeps what came of some seeds; it is on the disk when this returns.
 
         Raises:

@@ -28,8 +28,8 @@ from experiments.recording.run_folder import RUNS
 from experiments.sweep import table
 from experiments.sweep.plan import Axis, Cell, arguments, cells, seeds_of, wrong
 from experiments.sweep.runs import Figures, code_of
-from experiments.sweep.store import Origin, Store
-from experiments.sweep.table import Row
+from experiments.sweep.store import Store, StoreOrigin
+from experiments.sweep.table import CellRow
 from experiments.sweep.workers import Work, Workers, workers
 
 if TYPE_CHECKING:
@@ -44,17 +44,17 @@ Progress = Callable[[int, int], None]  # runs done, of how many
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a sweep came to."""
+class SweepResult:
+    """Result of a sweep."""
 
-    read: Document  # the experiment
-    axes: tuple[Axis, ...]  # what was changed
+    read: Document
+    axes: tuple[Axis, ...]
     seeds: tuple[int, ...]  # of the runs
-    rows: tuple[Row, ...]  # the table
-    failures: tuple[str, ...]  # why runs failed, each reason once
-    missing: int  # runs that are not done, because the sweep was interrupted
-    folder: Path  # where the runs are kept
-    notes: tuple[str, ...]  # what the user should know
+    rows: tuple[CellRow, ...]  # the table
+    failures: tuple[str, ...]  # reasons, each once
+    missing: int  # runs not done, because the sweep was interrupted
+    folder: Path  # of the runs
+    notes: tuple[str, ...]  # for the user
 
     def __str__(self) -> str:
         """The table, as the command prints it."""
@@ -77,7 +77,7 @@ def sweep(
     scheduler: str | None = None,
     processes: int | None = None,
     progress: Progress = lambda _done, _of: None,
-) -> Found:
+) -> SweepResult:
     """Runs a sweep, or what is missing of it; after Ctrl-C it gives what is done.
 
     Args:
@@ -107,17 +107,17 @@ def sweep(
     with Store(folder) as store:
         notes = store.changed_since(origin(read, [cell.experiment for cell in plan]))
         with workers(scheduler, processes) as crew:
-            bench = Bench(store, crew)
-            whole = bench.run_missing(plan, seeds, progress)
-        rows = bench.rows(plan, seeds)
-        failures = bench.failures(plan, seeds)
-        missing = 0 if whole else sum(len(bench.missing(cell, seeds)) for cell in _distinct(plan))
-    return Found(read, tuple(axes), seeds, tuple(rows), failures, missing, folder, tuple(notes))
+            runner = SweepRunner(store, crew)
+            whole = runner.run_missing(plan, seeds, progress)
+        rows = runner.rows(plan, seeds)
+        failures = runner.failures(plan, seeds)
+        missing = 0 if whole else sum(len(runner.missing(cell, seeds)) for cell in _distinct(plan))
+    return SweepResult(read, tuple(axes), seeds, tuple(rows), failures, missing, folder, tuple(notes))
 
 
 @dataclass
-class Bench:
-    """Runs that are done, and who does others."""
+class SweepRunner:
+    """Runs that are done, and the workers for the missing ones."""
 
     store: Store
     crew: Workers
@@ -155,7 +155,7 @@ class Bench:
         """Seeds of a cell that are still to be done."""
         return self.store.missing(cell.digest, code_of(cell.experiment), seeds)
 
-    def rows(self, plan: Sequence[Cell], seeds: Sequence[int]) -> list[Row]:
+    def rows(self, plan: Sequence[Cell], seeds: Sequence[int]) -> list[CellRow]:
         """The cells of which anything is done."""
         by_digest = {cell.digest: cell for cell in plan}
         found = []
@@ -182,21 +182,21 @@ class Bench:
 
 
 def side_by_side(experiment: Experiment) -> int:
-    """How many seeds of an experiment one process flies at once."""
+    """Seeds of an experiment that one process simulates side by side."""
     samples = (experiment.duration_s + AROUND_S) * experiment.rates.state_hz
     return max(1, min(MOST_SEEDS, int(MOST_BYTES / (48.0 * samples * len(experiment.robots)))))
 
 
 def folder_of(read: Document, axes: Sequence[Axis], what: str) -> Path:
-    """Where the runs of a command go that names no folder: the same for the same file and axes."""
+    """Default folder of the runs: the same for the same file and axes."""
     return RUNS / "-".join([read.path.stem, what, *(axis.path.replace("/", "_") for axis in axes)])[:200]
 
 
-def origin(read: Document, experiments: Iterable[Experiment]) -> Origin:
-    """What this process would fill a folder with."""
+def origin(read: Document, experiments: Iterable[Experiment]) -> StoreOrigin:
+    """Origin of runs of this process."""
     codes = sorted({code_of(experiment) for experiment in experiments})
     text = read.listing + document.write_json(read.experiment).decode()
-    return Origin(version("zenpark"), _digest("".join(codes)), _digest(text))
+    return StoreOrigin(version("zenpark"), _digest("".join(codes)), _digest(text))
 
 
 def _digest(text: str) -> str:

@@ -18,14 +18,14 @@ RATIOS: Final = ("messages", "iae", "itae", "rmse")
 NONE: Final = "-"
 
 
-class Row(msgspec.Struct, frozen=True):
-    """A cell in numbers."""
+class CellRow(msgspec.Struct, frozen=True):
+    """Statistics of a cell."""
 
-    case: str  # name of the case
+    case: str
     parameters: dict[str, Any]  # values of the axes that it has, by path
-    reference: bool  # whether it is what the ratios of others are taken over
-    seeds: int  # runs that went through
-    failed: int  # runs that did not
+    reference: bool  # the ratios of others are taken over it
+    seeds: int  # runs that succeeded
+    failed: int  # runs that failed
     mean: dict[str, Spread]  # over the seeds: each of `MEANS`; `acquired_s` over those in which all acquired
     ratio: dict[str, Spread]  # of each of `RATIOS` over the reference with the same seed, then over the seeds
     acquired: float | None  # share of the seeds in which every robot but the leaders acquired
@@ -46,13 +46,13 @@ class Row(msgspec.Struct, frozen=True):
         return f"{self.case} {self.words}".strip()
 
 
-def row(cell: Cell, runs: Mapping[int, Figures], reference: Mapping[int, Figures], failed: int = 0) -> Row:
+def row(cell: Cell, runs: Mapping[int, Figures], reference: Mapping[int, Figures], failed: int = 0) -> CellRow:
     """A cell's runs, by seed, and those of its reference."""
     mine = [runs[seed] for seed in sorted(runs)]
     paired = [(runs[seed], reference[seed]) for seed in sorted(runs) if seed in reference]
     acquired = [run.acquired_s is not None for run in mine]
     gaps = [run.gap_min_s for run in mine if run.gap_min_s is not None]
-    return Row(
+    return CellRow(
         case=cell.case,
         parameters=dict(cell.parameters),
         reference=cell.digest == cell.reference,
@@ -68,7 +68,7 @@ def row(cell: Cell, runs: Mapping[int, Figures], reference: Mapping[int, Figures
     )
 
 
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
+def write_csv(path: Path, rows: Sequence[CellRow]) -> None:
     """One line for each row; empty where a value is unknown, and where a case has no such parameter."""
     paths = list(dict.fromkeys(path for each in rows for path in each.parameters))
     columns = [part for index in MEANS for part in (index, f"{index}_ci95")]
@@ -86,7 +86,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
             table.writerow({**found, "acquired_share": each.acquired, "gap_min_s": each.gap_min_s})
 
 
-def document(title: str, seeds: Sequence[int], rows: Sequence[Row], **more: object) -> dict[str, Any]:
+def document(title: str, seeds: Sequence[int], rows: Sequence[CellRow], **more: object) -> dict[str, Any]:
     """The table for programs."""
     reference = next((each.case for each in rows if each.reference), None)
     listed = [msgspec.to_builtins(each) for each in rows]
@@ -94,11 +94,11 @@ def document(title: str, seeds: Sequence[int], rows: Sequence[Row], **more: obje
 
 
 def write_json(path: Path, table: Mapping[str, Any]) -> None:
-    """What `document` made."""
+    """Writes a table of `document`."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=2) + b"\n")
 
 
-def text(rows: Sequence[Row]) -> list[str]:
+def text(rows: Sequence[CellRow]) -> list[str]:
     """The main columns, for the terminal."""
     head = (
         "case",
@@ -137,7 +137,7 @@ def with_interval(value: Spread) -> str:
     return f"{value.mean:.3f}" + ("" if value.ci95 is None else f" ±{value.ci95:.3f}")
 
 
-def _cells(each: Row) -> tuple[str, ...]:
+def _cells(each: CellRow) -> tuple[str, ...]:
     acquired = NONE if each.acquired is None else f"{100.0 * each.acquired:.0f} %"
     seeds = str(each.seeds) + (f" ({each.failed} failed)" if each.failed else "")
     return (

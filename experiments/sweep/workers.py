@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import msgspec
 
-from experiments.sweep.runs import Outcome, fly
+from experiments.sweep.runs import WorkResult, fly
 
 ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 ADDRESS: Final = re.compile(r"(tcp|tls)://[^\s/]+:[0-9]{1,5}")
@@ -54,7 +54,7 @@ class Workers:
         """Works that run at once, now."""
         return self.threads()
 
-    def done(self, works: Sequence[Work]) -> Iterator[tuple[Work, Outcome]]:
+    def done(self, works: Sequence[Work]) -> Iterator[tuple[Work, WorkResult]]:
         """Runs all works, and yields each when it is done, in any order.
 
         Raises:
@@ -75,8 +75,8 @@ class Workers:
             for future in waiting:
                 future.cancel()
 
-    def _checked(self, answer: bytes) -> Outcome:
-        outcome = msgspec.json.decode(answer, type=Outcome)
+    def _checked(self, answer: bytes) -> WorkResult:
+        outcome = msgspec.json.decode(answer, type=WorkResult)
         if outcome.stranger:
             raise SweepError(
                 f"{self.place} has another version of zenpark, of a plug-in or of numpy than this process "

@@ -8,7 +8,7 @@ from experiments.definition.experiment import Channel, Start, World
 from experiments.file.document import load
 from experiments.metrics import measure
 from experiments.sweep import runs
-from experiments.sweep.runs import Outcome, code_of, digest, figures_of, fly
+from experiments.sweep.runs import WorkResult, code_of, digest, figures_of, fly
 from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import simulate
 
@@ -45,7 +45,7 @@ def test_a_lean_log_is_small(park):
 
 
 def flown(experiment, seeds):
-    return msgspec.json.decode(fly(msgspec.json.encode(experiment), seeds, code_of(experiment)), type=Outcome)
+    return msgspec.json.decode(fly(msgspec.json.encode(experiment), seeds, code_of(experiment)), type=WorkResult)
 
 
 @pytest.mark.slow
@@ -79,7 +79,7 @@ def test_a_run_that_is_stuck_does_not_take_the_others_with_it(park, monkeypatch)
 
 
 def test_work_for_other_code_is_refused(park):
-    answer = msgspec.json.decode(fly(msgspec.json.encode(park), [1], "of another version"), type=Outcome)
+    answer = msgspec.json.decode(fly(msgspec.json.encode(park), [1], "of another version"), type=WorkResult)
     assert answer.runs == []
     assert answer.stranger.endswith("not of another version")
 

@@ -5,7 +5,7 @@ import pytest
 from experiments.file.problems import DocumentError
 from experiments.metrics.statistics import Spread
 from experiments.sweep.optimise import BROKEN, Limit, Wish, searched, tune, wish_of
-from experiments.sweep.table import MEANS, RATIOS, Row
+from experiments.sweep.table import MEANS, RATIOS, CellRow
 from tools.commands import sweep as commands
 
 SHORT = ["duration_s=4.0"]
@@ -14,7 +14,7 @@ SHORT = ["duration_s=4.0"]
 def row(**ratios):
     found = {index: Spread(ratios.get(index, 1.0), 0.0, 0.01, 9) for index in RATIOS}
     mean = {index: Spread(1.0, 0.0, 0.01, 9) for index in MEANS}
-    return Row("event", {}, False, 9, 0, mean, found, 1.0, 0.02)
+    return CellRow("event", {}, False, 9, 0, mean, found, 1.0, 0.02)
 
 
 def test_a_wish():

@@ -286,7 +286,7 @@ def cdr() -> Iterator[Target]:
 def sweep_runs() -> Iterator[Target]:
     """`runs.jsonl` and `origin.json` of a sweep: lines that cannot be read are counted, not fatal."""
     from experiments.sweep.runs import Figures  # noqa: PLC0415
-    from experiments.sweep.store import ORIGIN, RUNS, Origin, Store  # noqa: PLC0415
+    from experiments.sweep.store import ORIGIN, RUNS, Store, StoreOrigin  # noqa: PLC0415
 
     kinds = {int: 1, float: 0.5, bool: True, str: "x"}
     blank = {
@@ -303,7 +303,7 @@ def sweep_runs() -> Iterator[Target]:
             with Store(file.parent) as store:
                 store.runs("c", "d")
                 store.missing("c", "d", [1, 2, 3])
-                store.changed_since(Origin("1", "2", "3"))
+                store.changed_since(StoreOrigin("1", "2", "3"))
 
         yield Target([line * 2 + b'\0{"version":"1","code":"2","file":"3"}', line + line[:30]], take, (DocumentError,))
 

@@ -14,9 +14,9 @@ import typer
 from tools.commands.options import Anyway, AsJson, Cases, File, OpenReport, Out, Report, Settings
 
 if TYPE_CHECKING:
-    from experiments.sweep.optimise import Tuned
-    from experiments.sweep.sweep import Found
-    from experiments.sweep.table import Row
+    from experiments.sweep.optimise import TuningResult
+    from experiments.sweep.sweep import SweepResult
+    from experiments.sweep.table import CellRow
 
 
 app: Final = typer.Typer()
@@ -180,18 +180,20 @@ def _optimise(request: _Request, wished: str) -> int:
     return 0 if all(row.reference or tuned.wish.kept(row) for row in tuned.rows) else 1
 
 
-def _write_table(folder: Path, rows: Sequence[Row], table: dict[str, Any]) -> None:
+def _write_table(folder: Path, rows: Sequence[CellRow], table: dict[str, Any]) -> None:
     from experiments.sweep import table as sweep_table
 
     sweep_table.write_csv(folder / "sweep.csv", rows)
     sweep_table.write_json(folder / "sweep.json", table)
 
 
-def _page(request: _Request, found: Found | Tuned) -> Path:
+def _page(request: _Request, found: SweepResult | TuningResult) -> Path:
     from experiments.sweep import page as pages
-    from experiments.sweep.sweep import Found
+    from experiments.sweep.sweep import SweepResult
 
-    return pages.write(found, request.line) if isinstance(found, Found) else pages.write_tuned(found, request.line)
+    return (
+        pages.write(found, request.line) if isinstance(found, SweepResult) else pages.write_tuned(found, request.line)
+    )
 
 
 def _print(folder: Path, notes: Sequence[str], page: Path | None) -> None:
