@@ -251,7 +251,7 @@ def gone(processes: Sequence[psutil.Process]) -> bool:
 def transmits_at_50_hz(trace: Trace) -> None:
     """Each robot has transmitted 50 times a second, but for ticks that it counted as missed."""
     wanted = 50.0 * trace.experiment.duration_s
-    sent = np.bincount(trace.sent.robot, minlength=len(trace.robots))
+    sent = np.bincount(trace.sent.link, minlength=len(trace.robots))
     assert (sent <= wanted + 1).all()
     assert (sent >= wanted - trace.missed_deadlines - 3).all()
 
