@@ -5,7 +5,7 @@ import pytest
 from experiments.file.document import load
 from tools.reliability import chaos_round, injection
 from tools.reliability.chaos import ALWAYS, AVOIDANCE, again, defaults
-from tools.reliability.fault_script import KINDS, NATURES, script
+from tools.reliability.fault_script import FAULT_KINDS, KINDS, script
 
 ROBOTS = ("TB01", "KH01", "CF01", "CF02")
 
@@ -30,17 +30,17 @@ def test_every_kind_comes_as_often_as_any_other(count):
 def test_rounds_can_be_flown():
     for each in script(ROBOTS, 90.0, 300, 3):
         kinds = [fault.kind for fault in each.faults]
-        assert all(kinds.count(kind) <= NATURES[kind].most for kind in kinds)
+        assert all(kinds.count(kind) <= FAULT_KINDS[kind].most for kind in kinds)
         assert "conductor" not in kinds[:-1], "nothing comes after the death of the launcher"
-        assert {NATURES[kind].stage for kind in kinds} <= {"plain", each.stage}
+        assert {FAULT_KINDS[kind].stage for kind in kinds} <= {"plain", each.stage}
         assert not (each.stage == "two routers" and "router" in kinds)
         for fault in each.faults:
-            assert bool(fault.victim) == fault.nature.victim
+            assert bool(fault.victim) == fault.properties.victim
             assert fault.victim in ("", *ROBOTS)
             assert fault.after_s > 0.0
-            low, high = fault.nature.size
+            low, high = fault.properties.size
             assert low <= abs(fault.size) <= high
-            assert fault.size >= 0.0 or fault.nature.signed
+            assert fault.size >= 0.0 or fault.properties.signed
 
 
 def test_faults_without_time_get_the_stage_that_they_need():
@@ -48,7 +48,7 @@ def test_faults_without_time_get_the_stage_that_they_need():
     rounds = again(left)
     assert sorted(map(repr, faults(rounds))) == sorted(map(repr, left))
     for each in rounds:
-        assert {fault.nature.stage for fault in each.faults} == {each.stage}
+        assert {fault.properties.stage for fault in each.faults} == {each.stage}
 
 
 def test_only_the_kinds_that_were_asked_for():

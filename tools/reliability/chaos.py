@@ -14,7 +14,7 @@ from tools.commands.options import AsJson, File, Out, Settings
 
 if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment
-    from tools.reliability.chaos_report import Ended, Outcome, Result
+    from tools.reliability.chaos_report import ChaosResult, FaultResult, RoundResult
     from tools.reliability.chaos_round import Say, Setting
     from tools.reliability.fault_script import Fault, Round
 
@@ -25,14 +25,14 @@ BARREN: Final = 3  # rounds without any fault, and it gives up
 
 def run(
     setting: Setting, rounds: Sequence[Round], *, interrupted: Callable[[], bool], say: Say
-) -> tuple[list[Outcome], list[Ended]]:
+) -> tuple[list[FaultResult], list[RoundResult]]:
     """Run all rounds, and more for faults that had no time in theirs."""
     from tools.reliability.chaos_round import ChaosRound
     from tools.reliability.fault_script import Fault
 
     waiting, left = list(rounds), list[Fault]()
-    outcomes: list[Outcome] = []
-    ends: list[Ended] = []
+    outcomes: list[FaultResult] = []
+    ends: list[RoundResult] = []
     barren = 0
     while (waiting or left) and not interrupted() and barren < BARREN:
         if not waiting:
@@ -50,8 +50,8 @@ def again(faults: Sequence[Fault]) -> list[Round]:
     from tools.reliability.fault_script import Round
 
     rounds = []
-    for stage in dict.fromkeys(fault.nature.stage for fault in faults):
-        those = [fault for fault in faults if fault.nature.stage == stage]
+    for stage in dict.fromkeys(fault.properties.stage for fault in faults):
+        those = [fault for fault in faults if fault.properties.stage == stage]
         rounds.append(Round(sorted(those, key=lambda fault: fault.kind == "conductor"), stage))
     return rounds
 
@@ -86,7 +86,7 @@ def chaos(
     from experiments.file.document import chosen, load
     from experiments.recording.run_folder import SOURCE, new_folder
     from tools.reliability import chaos_report
-    from tools.reliability.chaos_report import Result
+    from tools.reliability.chaos_report import ChaosResult
     from tools.reliability.chaos_round import Setting
     from tools.reliability.fault_script import script
 
@@ -106,7 +106,7 @@ def chaos(
     setting = Setting(folder / SOURCE, name, experiment, folder, changes, BODIES, seed)
     with Interrupts() as interrupted:
         outcomes, ends = run(setting, rounds, interrupted=interrupted, say=say)
-    result = Result(read.experiment.title, seed, rounds, outcomes, ends)
+    result = ChaosResult(read.experiment.title, seed, rounds, outcomes, ends)
     words = ["zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
     words += [part for kind in kinds or () for part in ("--kinds", kind)]
     page = chaos_report.write(folder, result, " ".join(words))
@@ -147,7 +147,7 @@ def _kinds(given: Sequence[str]) -> list[str]:
     return words or list(KINDS)
 
 
-def _print(result: Result) -> None:
+def _print(result: ChaosResult) -> None:
     from tools.commands.progress import print_findings
     from tools.reliability import chaos_report
 

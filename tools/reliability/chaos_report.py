@@ -18,11 +18,11 @@ from experiments.recording.reader import RecordingError, recover
 from experiments.report import style
 from experiments.report.page import Finding, Section, Table, date_of, numbered, render
 from experiments.report.page import Row as Line
-from tools.reliability.fault_script import KINDS, NATURES, Fault, Round
+from tools.reliability.fault_script import FAULT_KINDS, KINDS, Fault, Round
 
 
-class Outcome(msgspec.Struct, frozen=True):
-    """Result of one fault."""
+class FaultResult(msgspec.Struct, frozen=True):
+    """ChaosResult of one fault."""
 
     round: int  # counted from 1
     fault: Fault  # as in the script
@@ -36,8 +36,8 @@ class Outcome(msgspec.Struct, frozen=True):
     violations: list[str]  # of the invariants
 
 
-class Ended(msgspec.Struct, frozen=True):
-    """Result of one round."""
+class RoundResult(msgspec.Struct, frozen=True):
+    """ChaosResult of one round."""
 
     round: int  # counted from 1
     left: list[Fault]  # faults that it had no time for
@@ -48,7 +48,7 @@ class Ended(msgspec.Struct, frozen=True):
     recording: str  # its folder, if there is a recording
 
 
-def line(outcome: Outcome) -> str:
+def line(outcome: FaultResult) -> str:
     """An outcome for people."""
     whom = f" {outcome.victim}" if outcome.victim else ""
     how = f"well after {outcome.begin_s:.1f} s" if outcome.recovered else "NOT WELL"
@@ -58,7 +58,7 @@ def line(outcome: Outcome) -> str:
     return f"round {outcome.round}, {outcome.at_s:5.1f} s: {outcome.fault.kind}{whom}{note}: {how}{wrong}"
 
 
-def misrecorded(recording: Path, outcomes: Sequence[Outcome], *, disk_full: bool) -> list[str]:
+def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_full: bool) -> list[str]:
     """What is wrong with the recording of a round: it must open, and say what happened."""
     opened = recording
     try:
@@ -96,14 +96,14 @@ BUSY: Final = 0.05  # share of the ticks that a machine may miss which is to be 
 SMALL: Final = 20  # so many rows stand open
 
 
-class Result(msgspec.Struct, frozen=True):
+class ChaosResult(msgspec.Struct, frozen=True):
     """Everything of a laboratory, as `chaos.json` keeps it."""
 
     experiment: str
     seed: int
     script: list[Round]
-    outcomes: list[Outcome]
-    rounds: list[Ended]
+    outcomes: list[FaultResult]
+    rounds: list[RoundResult]
 
     @property
     def violations(self) -> int:
@@ -111,7 +111,7 @@ class Result(msgspec.Struct, frozen=True):
         return sum(len(each.violations) for each in self.outcomes) + sum(len(each.violations) for each in self.rounds)
 
 
-def table(result: Result) -> Table:
+def table(result: ChaosResult) -> Table:
     """A row for each kind of fault."""
     lines = []
     for kind in KINDS:
@@ -136,7 +136,7 @@ def table(result: Result) -> Table:
     return Table(head, tuple(lines), note="Times count from the begin of the fault.")
 
 
-def findings(result: Result) -> list[Finding]:
+def findings(result: ChaosResult) -> list[Finding]:
     """The verdict."""
     done, rounds = len(result.outcomes), result.rounds
     wanted = sum(len(each.faults) for each in result.script)
@@ -155,7 +155,7 @@ def findings(result: Result) -> list[Finding]:
     return [*found, *(Finding("bad", text) for text in wrong)] if wrong else [*found, Finding("good", "0 violations")]
 
 
-def write(folder: Path, result: Result, command: str) -> Path:
+def write(folder: Path, result: ChaosResult, command: str) -> Path:
     """Write `chaos.json`, `chaos.html` and the figure into a folder."""
     (folder / FILE).write_bytes(msgspec.json.format(msgspec.json.encode(result), indent=1))
     drawn = figure(result)
@@ -175,13 +175,13 @@ def write(folder: Path, result: Result, command: str) -> Path:
                 tables=(Table(("What",), rows, words=True),),
                 folded="Show the list" if len(rows) > SMALL else "",
             ),
-            Section("Definitions", terms=tuple((kind, nature.meant) for kind, nature in NATURES.items())),
+            Section("Definitions", terms=tuple((kind, nature.meant) for kind, nature in FAULT_KINDS.items())),
         ],
     )
 
 
 @style.styled
-def figure(result: Result) -> Figure:
+def figure(result: ChaosResult) -> Figure:
     """Recovery times by kind of fault."""
     kinds = [kind for kind in KINDS if any(each.fault.kind == kind for each in result.outcomes)]
     drawn, axes = plt.subplots(figsize=(6.3, 0.7 + 0.28 * max(1, len(kinds))), layout="constrained")

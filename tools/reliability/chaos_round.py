@@ -30,7 +30,7 @@ from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.real_time.hosts.launcher import Launcher
 from tools.reliability.cables import Cables
-from tools.reliability.chaos_report import Ended, Outcome, line, misrecorded
+from tools.reliability.chaos_report import FaultResult, RoundResult, line, recording_faults
 from tools.reliability.fault_script import Fault, Round
 from tools.reliability.injection import Injector
 from tools.reliability.observer import Observer
@@ -113,7 +113,7 @@ class ChaosRound:
     def __init__(self, setting: Setting, script: Round, number: int, interrupted: Callable[[], bool], say: Say) -> None:
         self._setting, self._script, self._number = setting, script, number
         self._interrupted, self._say = interrupted, say
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[FaultResult] = []
         self._left = list(script.faults)
         self._wrong: list[str] = []
         self._events: list[messages.Event] = []
@@ -129,7 +129,7 @@ class ChaosRound:
         for link in Plan(setting.experiment).one_way_links:
             self._hears[link.receiver].add(link.sender)
 
-    def run(self) -> Ended:
+    def run(self) -> RoundResult:
         """Run the round to its end; no process is left behind."""
         setting = self._setting
         folder = setting.folder / f"round-{self._number:03}"
@@ -180,11 +180,11 @@ class ChaosRound:
             self._injector.release()
             gone_s = self._finish(watched)
         if self._started is not None:
-            self._wrong += misrecorded(recording, self.outcomes, disk_full=self._disk_full)
+            self._wrong += recording_faults(recording, self.outcomes, disk_full=self._disk_full)
         for each in self._wrong:
             self._say(f"round {self._number}: {each}")
         kept = folder.name if recording.exists() else ""
-        return Ended(self._number, self._left, self._wrong, round(nearest, 4), round(gone_s, 1), missed, kept)
+        return RoundResult(self._number, self._left, self._wrong, round(nearest, 4), round(gone_s, 1), missed, kept)
 
     # ------------------------------------------------------------------ the run
 
@@ -220,7 +220,7 @@ class ChaosRound:
         """Whether nothing more can be done in this round."""
         if not self._left or self._interrupted():
             return True
-        nature = self._left[0].nature
+        nature = self._left[0].properties
         return t > duration - nature.lasts_s - max(LATEST_S, nature.heals_s)
 
     def _over(self) -> bool:
@@ -292,7 +292,7 @@ class ChaosRound:
         settled = active.well_since is not None and now - active.well_since >= SETTLED_S
         # who avoids others needs up to 35 s to come up with a leader that drives, without any fault
         driven = max((leg.at_s for leg in self._setting.experiment.timeline if leg.at_s <= t), default=-math.inf)
-        if not settled and (now < active.lifted + HEAL_S + fault.nature.heals_s or t < driven + FORM_S):
+        if not settled and (now < active.lifted + HEAL_S + fault.properties.heals_s or t < driven + FORM_S):
             return
         if not settled:
             active.violations.append(f"not well {now - active.lifted:.0f} s later: {active.why}")
@@ -306,7 +306,7 @@ class ChaosRound:
         left = set() if self._conductor_dead or self._over() else active.there - self._dead.keys()
         down = [name for name in sorted(left) if self._down(name)]
         reasons = [f"{name}: {self._observer.status[name].reason}" for name in down]
-        outcome = Outcome(
+        outcome = FaultResult(
             self._number,
             active.fault,
             active.victim,

@@ -20,7 +20,7 @@ CONDUCTOR_AFTER: Final = 3  # nothing can befall a run after the death of its la
 
 
 @dataclass(frozen=True)
-class Nature:
+class FaultKind:
     """Properties of a kind of fault."""
 
     meant: str  # for the report
@@ -34,47 +34,47 @@ class Nature:
     signed: bool = False  # the size may be negative as well
 
 
-NATURES: Final[Mapping[str, Nature]] = {
-    "kill": Nature("SIGKILL to a robot's process; its body stays in the room and must come down.", most=2),
-    "freeze": Nature("SIGSTOP for 5 s, then SIGCONT.", 5.0),
-    "partition": Nature(
+FAULT_KINDS: Final[Mapping[str, FaultKind]] = {
+    "kill": FaultKind("SIGKILL to a robot's process; its body stays in the room and must come down.", most=2),
+    "freeze": FaultKind("SIGSTOP for 5 s, then SIGCONT.", 5.0),
+    "partition": FaultKind(
         "Nothing passes between a robot and the router for 3 s; what was said meanwhile comes afterwards.", 3.0
     ),
-    "router": Nature(
+    "router": FaultKind(
         "SIGKILL to the only router; the conductor starts it again.", victim=False, most=3, never="two routers"
     ),
-    "failover": Nature("SIGKILL to the first of two routers.", victim=False, most=1, stage="two routers"),
-    "frozen-router": Nature(
+    "failover": FaultKind("SIGKILL to the first of two routers.", victim=False, most=1, stage="two routers"),
+    "frozen-router": FaultKind(
         "SIGSTOP for 5 s to a router whose lease is 60 s: robots must notice by themselves, and hold.",
         5.0,
         victim=False,
         most=2,
         stage="patient router",
     ),
-    "conductor": Nature(
+    "conductor": FaultKind(
         "SIGKILL to the launcher: robots land by themselves, and everything ends.", victim=False, most=1
     ),
-    "loss": Nature(
+    "loss": FaultKind(
         "20 % of the segments of every robot are lost for 3 s and sent again after TCP's timeouts.",
         3.0,
         victim=False,
         size=(0.2, 0.2),
     ),
-    "delay": Nature("50 to 300 ms more in both directions for 3 s, for one robot.", 3.0, size=(0.05, 0.3)),
-    "bits": Nature("One bit is wrong in 5 % of a robot's segments for 1 s: its connection breaks.", 1.0),
-    "clock": Nature(
+    "delay": FaultKind("50 to 300 ms more in both directions for 3 s, for one robot.", 3.0, size=(0.05, 0.3)),
+    "bits": FaultKind("One bit is wrong in 5 % of a robot's segments for 1 s: its connection breaks.", 1.0),
+    "clock": FaultKind(
         "The wall clock of all processes steps by 0.5 to 5 s, forward or back.",
         victim=False,
         size=(0.5, 5.0),
         signed=True,
     ),
-    "clock-behind": Nature(
+    "clock-behind": FaultKind(
         "SIGKILL to a robot's process; it is started again with a clock that is 3 to 4.5 s behind, and must be heard.",
         heals_s=12.0,
         most=2,
         size=(3.0, 4.5),
     ),
-    "mocap-clock": Nature(
+    "mocap-clock": FaultKind(
         "The wall clock of motion capture steps by 0.5 to 4.5 s, and back after 3 s: no robot may lose its position.",
         3.0,
         victim=False,
@@ -83,16 +83,16 @@ NATURES: Final[Mapping[str, Nature]] = {
         size=(0.5, 4.5),
         signed=True,
     ),
-    "double": Nature(
+    "double": FaultKind(
         "A second process of a robot's name is started: it must be refused, and touch nothing.", heals_s=6.0
     ),
-    "read-error": Nature(
+    "read-error": FaultKind(
         "Reading a robot's body raises: it must be told to land or to stop all the same.", heals_s=12.0, most=1
     ),
-    "disk": Nature("The recording can grow no more.", victim=False, most=1),
-    "corrupt": Nature("Payloads of nonsense on every key that a robot believes.", 1.0),
+    "disk": FaultKind("The recording can grow no more.", victim=False, most=1),
+    "corrupt": FaultKind("Payloads of nonsense on every key that a robot believes.", 1.0),
 }
-KINDS: Final = tuple(NATURES)
+KINDS: Final = tuple(FAULT_KINDS)
 
 
 class Fault(msgspec.Struct, frozen=True):
@@ -105,9 +105,9 @@ class Fault(msgspec.Struct, frozen=True):
     size: float = 0.0  # delay or clock step [s], or share of lost segments
 
     @property
-    def nature(self) -> Nature:
+    def properties(self) -> FaultKind:
         """Of its kind."""
-        return NATURES[self.kind]
+        return FAULT_KINDS[self.kind]
 
 
 class Round(msgspec.Struct, frozen=True):
@@ -140,7 +140,7 @@ def script(
 
 def _deal(deck: list[str], robots: Sequence[str], duration_s: float, random: np.random.Generator) -> Round:
     """Take the faults of one round off the deck."""
-    stage = NATURES[deck[0]].stage
+    stage = FAULT_KINDS[deck[0]].stage
     t, faults = FORM_S, list[Fault]()
     dealt: list[str] = []
     while True:
@@ -154,7 +154,7 @@ def _deal(deck: list[str], robots: Sequence[str], duration_s: float, random: np.
         dealt.append(kind)
         gap = round(float(random.uniform(*GAP_S)), 2)
         faults.append(_fault(kind, gap, robots, random))
-        t += gap + NATURES[kind].lasts_s + NATURES[kind].heals_s
+        t += gap + FAULT_KINDS[kind].lasts_s + FAULT_KINDS[kind].heals_s
         if kind == "conductor" or t > duration_s - LAST_S:
             break
     return Round(faults, stage)
@@ -162,14 +162,14 @@ def _deal(deck: list[str], robots: Sequence[str], duration_s: float, random: np.
 
 def _fits(kind: str, dealt: Sequence[str], stage: Stage) -> bool:
     """Whether a kind may come next in a round."""
-    nature = NATURES[kind]
+    nature = FAULT_KINDS[kind]
     if dealt.count(kind) >= nature.most or nature.never == stage or nature.stage not in ("plain", stage):
         return False
     return kind != "conductor" or len(dealt) >= CONDUCTOR_AFTER
 
 
 def _fault(kind: str, after_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:
-    nature = NATURES[kind]
+    nature = FAULT_KINDS[kind]
     victim = str(random.choice(list(robots))) if nature.victim else ""
     size = round(float(random.uniform(*nature.size) * random.choice([-1.0, 1.0] if nature.signed else [1.0])), 3)
     return Fault(kind, after_s, nature.lasts_s, victim, size)

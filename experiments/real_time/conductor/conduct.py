@@ -28,7 +28,7 @@ from experiments.definition.experiment import Experiment
 from experiments.file.document import Document, chosen
 from experiments.file.problems import DocumentError, Problem
 from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.conductor import Conductor, Result
+from experiments.real_time.conductor.conductor import CaseResult, Conductor
 from experiments.real_time.conductor.run_view import Emergency, Shown
 from experiments.real_time.conductor.support import divided
 from experiments.real_time.hosts.hosts import Hosts
@@ -87,7 +87,7 @@ def conduct(
     if staging.bodies == "protocol" and read.experiment.hosts and not staging.here:
         hint = "add --here, which lets all robots run on this machine"
         raise DocumentError([Problem("--bodies protocol", 0, 0, "protocol twins cannot be seen from hosts", hint)])
-    results: dict[str, Result] = {}
+    results: dict[str, CaseResult] = {}
     read.keep(folder / SOURCE)
     embodied = {name: choose_bodies(case, staging.bodies) for name, case in chosen(read, staging.cases).items()}
     if staging.here:

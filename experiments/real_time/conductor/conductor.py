@@ -18,7 +18,7 @@ from agents.network.keys import Keys
 from experiments.definition.plan import Plan
 from experiments.file.document import write_json
 from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.crew import CaseProcesses
+from experiments.real_time.conductor.case_processes import CaseProcesses
 from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
 from experiments.real_time.conductor.orders import start_lead_s
 from experiments.real_time.conductor.run_view import OUTPUT, NetworkView, Progress, RobotView, Show
@@ -42,7 +42,7 @@ class RunFailed(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Result:
+class CaseResult:
     """How a case ended."""
 
     recording: Path
@@ -74,7 +74,7 @@ class Conductor:
         self._starting: set[str] = set()
         self._processes = CaseProcesses(context)
 
-    def run(self) -> Result:
+    def run(self) -> CaseResult:
         """Run the case to its end, or until the user interrupts it; the robots are down in any case.
 
         Raises:
@@ -114,7 +114,7 @@ class Conductor:
         finally:
             self._processes.end()
         lost = tuple(name for name, seen in self._robots.items() if seen.left_because == "lost")
-        return Result(self._context.recording, self._context.ended(), start, ready, lost)
+        return CaseResult(self._context.recording, self._context.ended(), start, ready, lost)
 
     def _adopt(self) -> None:
         """Find robots that were started by hand or at boot, which nobody needs to start.

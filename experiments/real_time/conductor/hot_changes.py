@@ -18,7 +18,7 @@ from agents.network.keys import Keys
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.real_time.conductor import replacement
-from experiments.real_time.conductor.crew import CaseProcesses
+from experiments.real_time.conductor.case_processes import CaseProcesses
 from experiments.real_time.conductor.replacement import Refused, in_the_way
 from experiments.real_time.conductor.run_view import FROZEN_S, NetworkView
 from experiments.real_time.hosts.launcher import LAND_S
@@ -56,9 +56,9 @@ class _Change:
 class HotChanges:
     """Changes of the robots of one case."""
 
-    def __init__(self, experiment: Experiment, crew: CaseProcesses, view: NetworkView, keys: Keys) -> None:
+    def __init__(self, experiment: Experiment, processes: CaseProcesses, view: NetworkView, keys: Keys) -> None:
         """Refuse everything until `begin`."""
-        self._experiment, self._crew, self._view, self._keys = experiment, crew, view, keys
+        self._experiment, self._processes, self._view, self._keys = experiment, processes, view, keys
         self._robots = view.robots
         self._start: float | None = None
         self._changes: list[_Change] = []
@@ -99,7 +99,7 @@ class HotChanges:
         """A robot is lost; what the file says of that is done."""
         self._robots[name].left_because = "lost"
         policy = self._experiment.on_loss
-        names = self._crew.companions(name)
+        names = self._processes.companions(name)
         view = self._robots
         if policy == "none" or self._start is None or not all(view[each].left_because == "lost" for each in names):
             return
@@ -162,7 +162,7 @@ class HotChanges:
             self._pending.append(asked)
         who = asked.order.who[:50] or "somebody"
         while left:
-            names = tuple(name for name in left if name in self._crew.companions(left[0]))
+            names = tuple(name for name in left if name in self._processes.companions(left[0]))
             left = [name for name in left if name not in names]
             for name in names:
                 self._view.report(asked.order.order, name, f"asked by {who if who.isprintable() else 'somebody'}")
@@ -222,24 +222,24 @@ class HotChanges:
 
     def _leave(self, names: Sequence[str]) -> Generator[None]:
         """Robots land, and are gone from the network; their process ends if no other robot needs it."""
-        there = [name for name in names if self._robots[name].alive or self._crew.runs(name)]
+        there = [name for name in names if self._robots[name].alive or self._processes.runs(name)]
         self._leaving |= {*there}
         for name, reply in self._view.order(there, messages.Order("leave")).items():
-            if not reply.ok and name in self._crew.adopted:
+            if not reply.ok and name in self._processes.adopted:
                 raise Refused(f"{name} does not answer, and was not started from here: end its process where it runs")
             if not reply.ok:
                 self._view.report("silent", name, f"does not answer ({reply.reason}): its lifeline is cut")
-                self._crew.release(name)
+                self._processes.release(name)
         began, killed = time.monotonic(), False
         while still := [name for name in there if self._robots[name].alive or self._process_must_end(name, names)]:
             past = time.monotonic() - began
-            if past > LAND_S and any(name in self._crew.adopted for name in still):
+            if past > LAND_S and any(name in self._processes.adopted for name in still):
                 raise Refused(f"{', '.join(still)}: told to land, but is still there after {LAND_S:g} s")
             if not killed and (past > LAND_S or (past > FROZEN_S and all(map(self._frozen, still)))):
                 killed = True
                 for name in still:
                     self._view.report("killed", name, f"still there after {past:.0f} s")
-                    self._crew.kill(name)
+                    self._processes.kill(name)
             if past > LAND_S + FROZEN_S:
                 raise Refused(f"{', '.join(still)}: cannot be ended")
             yield
@@ -250,8 +250,8 @@ class HotChanges:
 
     def _process_must_end(self, name: str, names: Sequence[str]) -> bool:
         """Whether a robot's process is still there although it has no other robots that stay."""
-        others = {*self._crew.companions(name)} - {*names}
-        return self._crew.runs(name) and all(self._robots[other].gone for other in others)
+        others = {*self._processes.companions(name)} - {*names}
+        return self._processes.runs(name) and all(self._robots[other].gone for other in others)
 
     def _frozen(self, name: str) -> bool:
         status = self._robots[name].status
@@ -259,40 +259,42 @@ class HotChanges:
 
     def _let_in(self, names: Sequence[str], order: messages.RunOrder) -> Steps:
         """Restart, or add: who is there by hand is only told to join, everybody else is started."""
-        robots, crew = self._robots, self._crew
+        robots, processes = self._robots, self._processes
         asked = time.monotonic()
-        by_hand = all(robots[name].alive and not crew.runs(name) for name in names)
+        by_hand = all(robots[name].alive and not processes.runs(name) for name in names)
         if order.order == "add" and any(robots[name].reached("airborne") and not robots[name].gone for name in names):
             raise Refused("takes part already; `zenpark robot restart` starts it anew")
         if by_hand and not any(robots[name].reached("airborne") for name in names):
-            crew.adopted |= {*names}
+            processes.adopted |= {*names}
             yield from self._join(names)
             return f"takes part after {time.monotonic() - asked:.1f} s"
-        if foreign := [name for name in names if name in crew.adopted or name in crew.away]:
+        if foreign := [name for name in names if name in processes.adopted or name in processes.away]:
             raise Refused(
                 f"{', '.join(foreign)} was not started from here: end its process and start it again where it runs, "
                 f"then `zenpark robot add {' '.join(foreign)}`"
             )
         self._require_whole(names)
         automatic = order.who == "on_loss"
-        places = {name: tuple(crew.place(name)) for name in names if crew.robot(name).body == replacement.TWIN}
+        places = {
+            name: tuple(processes.place(name)) for name in names if processes.robot(name).body == replacement.TWIN
+        }
         yield from self._room(places, ROOM_S if automatic else 0.0)
         yield from self._leave(names)
-        crew.start_again(names)
+        processes.start_again(names)
         yield from self._join(names)
         return f"takes part again after {time.monotonic() - asked:.1f} s"
 
     def _replace(self, names: Sequence[str], order: messages.RunOrder) -> Steps:
         asked = time.monotonic()
         name = names[0]
-        if len(self._crew.companions(name)) > 1:
+        if len(self._processes.companions(name)) > 1:
             raise Refused(f"{name} shares its process with others: restart them together instead")
-        next_one, whose = self._spares.successor(name, self._crew.robot(name), order)
+        next_one, whose = self._spares.successor(name, self._processes.robot(name), order)
         if next_one.body == replacement.TWIN:
-            places = {name: tuple(self._crew.place(name, next_one))}
+            places = {name: tuple(self._processes.place(name, next_one))}
             yield from self._room(places, ROOM_S if order.who == "on_loss" else 0.0, body_stays=True)
         yield from self._leave(names)
-        self._crew.start_again(names, {name: next_one})
+        self._processes.start_again(names, {name: next_one})
         if whose is not None:
             self._spares.used[whose] = name
         yield from self._join(names)
@@ -316,7 +318,7 @@ class HotChanges:
             self._leaving |= {*names}
             self._view.order(names, messages.Order("leave"))
             for name in names:
-                self._crew.release(name)
+                self._processes.release(name)
                 robots[name].left_because = "removed"
             raise
 
@@ -344,7 +346,7 @@ class HotChanges:
 
     def _require_whole(self, names: Sequence[str]) -> None:
         """A process that others need cannot be started anew for some of its robots."""
-        together = self._crew.companions(names[0])
+        together = self._processes.companions(names[0])
         if others := [name for name in together if name not in names]:
             raise Refused(
                 f"{', '.join(names)} shares a process with {', '.join(others)}: name them all, "
@@ -355,7 +357,7 @@ class HotChanges:
 
     def _here(self, name: str) -> tuple[float, ...]:
         place = self._robots[name].place
-        return tuple(self._crew.place(name)) if place is None else place[:2]
+        return tuple(self._processes.place(name)) if place is None else place[:2]
 
     def _room(
         self, places: dict[str, tuple[float, ...]], patience_s: float, *, body_stays: bool = False
@@ -369,7 +371,7 @@ class HotChanges:
         """
         began = time.monotonic()
         while True:
-            robots = {name: self._crew.robot(name) for name in self._robots}
+            robots = {name: self._processes.robot(name) for name in self._robots}
             found = [in_the_way(*each, robots, self._robots, body_stays=body_stays) for each in places.items()]
             if not any(found):
                 return
