@@ -31,7 +31,7 @@ TRIGGERS: Final[dict[str, dict[str, Any]]] = {
 
 def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[Figures], float, float, float]:
     """Figures of each seed; of a run, on average: messages of the network, deliveries, and the delay of goals [s]."""
-    listeners = np.bincount(Plan(experiment).heard_links.sender, minlength=len(experiment.robots))
+    listeners = np.bincount(Plan(experiment).pose_links.sender, minlength=len(experiment.robots))
     found: list[Figures] = []
     messages, deliveries, delay = [], [], []
     for begin in range(0, len(seeds), BATCH):

@@ -50,7 +50,7 @@ class Analysis:
 
     plan: Plan  # the case, compiled
     assignment: Assignment  # of all its robots; without avoidance, and without the links that only avoidance needs
-    silent: Index  # rows without neighbours
+    without_neighbours: Index  # rows without neighbours
     start: Array  # (N, 3) on the floor [m]
     parts: int  # of the network
     fiedler: float  # algebraic connectivity
@@ -212,7 +212,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     return Analysis(
         plan=plan,
         assignment=assignment,
-        silent=silent,
+        without_neighbours=silent,
         start=start,
         parts=components(links, rows),
         fiedler=algebraic_connectivity(links, rows),

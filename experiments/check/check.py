@@ -61,7 +61,7 @@ def chance(analysis: Analysis) -> Iterator[Claim]:
 
 def telemetry(analysis: Analysis) -> Iterator[Claim]:
     """Warn if the poses received between two samples of telemetry do not fit into one message."""
-    experiment, links = analysis.experiment, analysis.plan.heard_links
+    experiment, links = analysis.experiment, analysis.plan.pose_links
     if not len(links):
         return
     heard = np.bincount(links.receiver)

@@ -110,7 +110,7 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
         yield Claim("warning", "local-minimum", message, remedy, ("formation", "links"))
     elif (
         len(prediction.time) > 1
-        and np.ptp(prediction.position[-2:, analysis.silent], axis=0).max(initial=0.0) > SETTLED
+        and np.ptp(prediction.position[-2:, analysis.without_neighbours], axis=0).max(initial=0.0) > SETTLED
     ):
         message = f"the formation lags behind its leader: {left} {allowed}"
         yield Claim("warning", "lags", message, "lead more slowly, or raise the gain or the clamp", ("timeline",))
@@ -173,7 +173,7 @@ def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:
     off = np.flatnonzero(analysis.error[at] > experiment.tolerance)
     ends = np.union1d(links.receiver[off], links.sender[off])
     stopped = np.intersect1d(analysis.stopped(at), ends)
-    if not len(stopped) or np.setdiff1d(ends, np.union1d(stopped, analysis.silent)).size:
+    if not len(stopped) or np.setdiff1d(ends, np.union1d(stopped, analysis.without_neighbours)).size:
         return None
     near = f"{1e3 * REACHED:g} mm"
     message = (
@@ -254,7 +254,7 @@ def _left(analysis: Analysis, row: int, outside: Mask) -> Claim:
     time, place = _first(analysis, row, outside)
     begun = [k for k, robot, _ in analysis.legs if robot == name and analysis.experiment.timeline[k].at_s <= time]
     message = f"{name} would leave the arena at {time:.1f} s, at {place}"
-    if row in analysis.silent and begun:
+    if row in analysis.without_neighbours and begun:
         remedy = "shorten the plan, start it elsewhere, or enlarge size in [arena]"
         return Claim("error", "leaves-arena", f"{message}, by its plan", remedy, ("timeline", begun[-1], "plan"))
     remedy = "start the formation farther inside, lead it elsewhere, or enlarge size in [arena]"
@@ -266,7 +266,7 @@ def speeds(analysis: Analysis) -> Iterator[Claim]:
     names, timeline, problems = analysis.names, analysis.experiment.timeline, []
     for number, robot, plan in analysis.legs:
         row, asked, path = names.index(robot), plan.speed(), ("timeline", number, "plan")
-        leads = row in analysis.silent
+        leads = row in analysis.without_neighbours
         has = float((analysis.speed if leads else analysis.pull)[row])
         what = f"the leg at {timeline[number].at_s:g} s asks {robot} for {asked:.3g} m/s"
         remedy = f"plan for less than {NEARLY * has:.2g} m/s"

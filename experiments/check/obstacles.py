@@ -105,7 +105,7 @@ def perception(analysis: Analysis) -> Iterator[Claim]:
     avoidance = analysis.plan.avoidance
     if avoidance is None:
         return
-    deaf = set() if avoidance.hears == "all" else {analysis.names[row] for row in analysis.silent}
+    isolated = set() if avoidance.hears == "all" else {analysis.names[row] for row in analysis.without_neighbours}
     height = np.nan_to_num(analysis.assignment.hover)
     low, high = _heights(analysis, height)
     for row, name in enumerate(analysis.names):
@@ -118,7 +118,7 @@ def perception(analysis: Analysis) -> Iterator[Claim]:
         if there:
             message = f"{name} has no range sensors: it cannot avoid {listed(there)}"
             yield Claim("warning", "sees-nothing", message, remedy, ("robots", name))
-        elif name in deaf:
+        elif name in isolated:
             message = f"{name} has neither neighbours nor range sensors: it avoids nothing"
             remedy += ', or hears = "all" in [avoidance]'
             yield Claim("warning", "sees-nothing", message, remedy, ("robots", name))

@@ -44,7 +44,7 @@ def safety(analysis: Analysis) -> Iterator[Claim]:
 def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
     """Check the separation of linked pairs: at the start, at their target, and on their way."""
     names, path = tuple(analysis.experiment.robots), ("safety", "separation")
-    links, heard = analysis.plan.links, analysis.plan.heard_links
+    links, heard = analysis.plan.links, analysis.plan.pose_links
     pairs = sorted({tuple(sorted(pair)) for pair in zip(heard.receiver.tolist(), heard.sender.tolist(), strict=True)})
     wanted = {
         tuple(sorted(pair)): distance

@@ -54,10 +54,10 @@ def network(analysis: Analysis) -> Iterator[Claim]:
     elif parts > 1:
         message = f"the network falls into {parts} parts that know nothing of each other"
         problems.append(Claim("error", "parts", message, "join them by links, or make them separate experiments", path))
-    deaf = [names[row] for row in analysis.silent if names[row] not in leaders]
-    if deaf:
-        message = f"{listed(deaf)} has no neighbours and is no leader: it takes no part in the formation"
-        problems.append(Claim("warning", "hears-nobody", message, f'add "... > {deaf[0]}" to its links', path))
+    isolated = [names[row] for row in analysis.without_neighbours if names[row] not in leaders]
+    if isolated:
+        message = f"{listed(isolated)} has no neighbours and is no leader: it takes no part in the formation"
+        problems.append(Claim("warning", "hears-nobody", message, f'add "... > {isolated[0]}" to its links', path))
     for name in leaders:
         if names.index(name) not in links.sender:
             message, remedy = f"no robot receives from the leader {name}", f'add "{name} > ..." for one of the others'
@@ -141,7 +141,7 @@ def _unmet(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
         at_fault = listed(list(dict.fromkeys(_pair(analysis, k) for k in worst)))
         message = f"{_asked(analysis)} contradict one another around {at_fault}; {off}"
         remedy = f"give {_asked(analysis)[4:]} that one drawing has, or fewer of them"
-        if len(analysis.silent) > 1:
+        if len(analysis.without_neighbours) > 1:
             remedy += "; the leaders' own places count as well"
         yield Claim(severity, "not-realisable", message, remedy, analysis.link_path(worst[0]))
 

@@ -153,7 +153,7 @@ def process_groups(experiment: Experiment) -> list[list[str]]:
 def senders_by_receiver(experiment: Experiment) -> dict[str, set[str]]:
     """Senders of each robot: the poses to which its process subscribes."""
     plan = Plan(experiment)
-    links = plan.heard_links
+    links = plan.pose_links
     found: dict[str, set[str]] = {name: set() for name in plan.names}
     for listener, speaker in zip(links.receiver.tolist(), links.sender.tolist(), strict=True):
         found[plan.names[listener]].add(plan.names[speaker])

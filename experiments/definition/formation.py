@@ -46,24 +46,24 @@ class FormationArrays:
         )
         return cls(links, _changes_of(experiment, there), _presence_of(there))
 
-    def take(self, which: Index) -> FormationArrays:
+    def select(self, which: Index) -> FormationArrays:
         """Some of the links, or the same in another order."""
         changes = tuple(change.select(which) for change in self.changes)
         return FormationArrays(
             self.links.select(which), changes, None if self.presence is None else self.presence.select(which)
         )
 
-    def heard_by(self, rows: Index) -> FormationArrays:
+    def to_receivers(self, rows: Index) -> FormationArrays:
         """Links on which these rows receive, as `Links.of` gives them."""
         at, listener = self.links.indices_to_receivers(rows)
-        mine = self.take(at)
+        mine = self.select(at)
         return replace(mine, links=replace(mine.links, receiver=listener))
 
-    def without_listeners(self, rows: Index) -> FormationArrays:
+    def without_receivers(self, rows: Index) -> FormationArrays:
         """Links on which other rows than these receive."""
-        return self.take(np.flatnonzero(~np.isin(self.links.receiver, rows))) if len(rows) else self
+        return self.select(np.flatnonzero(~np.isin(self.links.receiver, rows))) if len(rows) else self
 
-    def and_then(self, others: Links) -> FormationArrays:
+    def append(self, others: Links) -> FormationArrays:
         """Append links that do not change and are always present."""
         changes = tuple(change.padded(len(others)) for change in self.changes)
         presence = None if self.presence is None else self.presence.padded(len(others))
@@ -71,7 +71,7 @@ class FormationArrays:
 
     def repeated(self, times: int, rows: int) -> FormationArrays:
         """The same in `times` copies of an experiment of `rows` robots, one copy behind the other."""
-        many = self.take(np.tile(np.arange(len(self.links)), times))
+        many = self.select(np.tile(np.arange(len(self.links)), times))
         return replace(many, links=self.links.repeated(times, rows))
 
     def stages(self) -> list[Links]:

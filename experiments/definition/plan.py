@@ -104,7 +104,7 @@ class Plan:
         return self.formation.links
 
     @cached_property
-    def watched_links(self) -> Links:
+    def avoidance_links(self) -> Links:
         """Links that only avoidance needs: between all robots that no law links, if it hears all; else to neighbours.
 
         Robots that the centre guides have no law of their own.
@@ -125,9 +125,9 @@ class Plan:
         return links(pairs, [1.0] * len(pairs), [1.0] * len(pairs)) if pairs else nobody
 
     @cached_property
-    def heard_links(self) -> Links:
+    def pose_links(self) -> Links:
         """Every link on which robots receive poses: those for the formation, then those that only avoidance needs."""
-        return self.formation.without_listeners(self.rows(self.guided)).links.append(self.watched_links)
+        return self.formation.without_receivers(self.rows(self.guided)).links.append(self.avoidance_links)
 
     @cached_property
     def guided(self) -> tuple[str, ...]:
@@ -215,8 +215,8 @@ class Plan:
         rows = self.rows(names)
         others = [name for name in everyone if (name in steered) != centrally]
         mine = [name for name in names if name not in others]
-        formation = self.formation.without_listeners(self.rows(others)).heard_by(rows)
-        watched = links([], [], []) if centrally else self.watched_links.to_receivers(rows)
+        formation = self.formation.without_receivers(self.rows(others)).to_receivers(rows)
+        watched = links([], [], []) if centrally else self.avoidance_links.to_receivers(rows)
         anchors = compile_anchors(experiment, names, only=mine)
         only_watched = np.repeat([False, True], [len(formation.links), len(watched)])
         planned = [
@@ -226,7 +226,7 @@ class Plan:
         ]
         first_rows = np.arange(copies) * len(names)
         if len(watched):
-            formation = formation.and_then(watched)
+            formation = formation.append(watched)
         if copies > 1:
             formation = formation.repeated(copies, len(names))
             anchors = None if anchors is None else anchors.repeated(copies, len(names))

@@ -181,9 +181,9 @@ def _link(
         yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, experiment.robots), on_key=on_key)
     if unknown:
         return
-    deaf = [pair for pair in both if there is not None and pair not in there]
-    if deaf:
-        listener, speaker = deaf[0]
+    isolated = [pair for pair in both if there is not None and pair not in there]
+    if isolated:
+        listener, speaker = isolated[0]
         hint = f"leave it out, or add the link to [formation.links]; {FORM}"
         yield Fault(path, f"there is no link {speaker} > {listener}", hint, on_key=on_key)
 
@@ -191,7 +191,7 @@ def _link(
 def _heard(experiment: Experiment) -> set[tuple[str, str]] | None:
     """The (receiver, sender) pairs of all links, for formation and avoidance; None if other faults hide them."""
     try:
-        links = Plan(experiment).heard_links
+        links = Plan(experiment).pose_links
     except (ValueError, KeyError):
         return None
     names = tuple(experiment.robots)

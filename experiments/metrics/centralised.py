@@ -64,7 +64,7 @@ def goals_to(trace: Trace) -> tuple[Index, Index]:
 def deliveries(trace: Trace, sent: Index) -> int:
     """Messages counted once per receiver, when robots `sent` (N,) poses: to each other, to the central controller, and
     its goals."""
-    listeners = np.bincount(trace.plan.heard_links.sender, minlength=len(sent)) + centre_hears(trace)
+    listeners = np.bincount(trace.plan.pose_links.sender, minlength=len(sent)) + centre_hears(trace)
     return int(sent @ listeners) + (0 if trace.goals is None else len(trace.goals.sent))
 
 

@@ -184,7 +184,7 @@ def _robots(
     linked = np.zeros((rows, rows), dtype=bool)  # what only avoidance listens to does not belong to the formation
     told = centralised.guided_rows(trace)[errors.net.receiver]  # what they would listen to, the centre hears
     linked[errors.net.receiver[~told], errors.net.sender[~told]] = True
-    net, received = trace.plan.heard_links, trace.received.link
+    net, received = trace.plan.pose_links, trace.received.link
     counted = linked[net.receiver, net.sender][received]
     heard = np.bincount(net.sender[received[counted]], minlength=rows)
     listeners = np.bincount(errors.net.sender[~told], minlength=rows) + centralised.centre_hears(trace)

@@ -196,7 +196,7 @@ def beliefs(trace: Trace, net: Links) -> Array:
 
     NaN before the first pose, and after a death.
     """
-    rows, heard, links = len(trace.robots), trace.received, trace.plan.heard_links
+    rows, heard, links = len(trace.robots), trace.received, trace.plan.pose_links
     number = np.full((rows, rows), -1)
     number[net.receiver, net.sender] = np.arange(len(net))
     link = number[links.receiver, links.sender][heard.link]
@@ -251,7 +251,7 @@ def transmissions(trace: Trace) -> tuple[Index, Index]:
 
 def passages(trace: Trace) -> tuple[Passage, ...]:
     """Delivery statistics of every link, those that only avoidance needs included."""
-    links, received = trace.plan.heard_links, trace.received
+    links, received = trace.plan.pose_links, trace.received
     count, link, took = len(links), received.link, received.arrival - received.stamp
     dropped = np.zeros(count, dtype=np.intp) if trace.dropped is None else trace.dropped
     heard = np.bincount(link, minlength=count)

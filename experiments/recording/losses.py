@@ -64,8 +64,8 @@ def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float
 
 
 def dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
-    """(E,) poses that the modelled network dropped on each of `Plan.heard_links`; `statuses` of each robot."""
-    links, robots = plan.heard_links, plan.names
+    """(E,) poses that the modelled network dropped on each of `Plan.pose_links`; `statuses` of each robot."""
+    links, robots = plan.pose_links, plan.names
     found = [_by_speaker(said, run, "dropped") for said in statuses]
     ends = zip(links.receiver.tolist(), links.sender.tolist(), strict=True)
     return np.array([found[i][robots[j]] for i, j in ends], dtype=np.intp)

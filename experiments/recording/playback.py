@@ -321,7 +321,7 @@ def _sent(poses: list[list[SentPose]], start: float, duration: float) -> PoseTab
 
 def _received(states: list[list[State]], plan: Plan, start: float, duration: float) -> PoseTable:
     """On the links of the plan; other poses that a robot received count nowhere."""
-    ends, names = plan.heard_links, plan.names
+    ends, names = plan.pose_links, plan.names
     pairs = zip(ends.receiver.tolist(), ends.sender.tolist(), strict=True)
     links = {(receiver, names[sender]): link for link, (receiver, sender) in enumerate(pairs)}
     rows = [

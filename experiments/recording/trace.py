@@ -154,7 +154,7 @@ class Trace:
     goal: Array  # (T, N, 3) [m]
     setpoint: Array  # (T, N, 4) as sent to the body, see `agents.network.messages.State`
     sent: PoseTable  # by the robots, in order of time; `link` is the row of the sender
-    received: PoseTable  # in order of arrival; `link` is one of `plan.heard_links`
+    received: PoseTable  # in order of arrival; `link` is one of `plan.pose_links`
     lost: Index  # (N,) poses of each robot that by their numbers were sent and never came to a receiver or the recorder
     missed_deadlines: Index  # (N,) ticks that began more than one period late
     ticks: Index  # (N,)
@@ -167,7 +167,7 @@ class Trace:
     attitude: Array | None = None  # (T, N, 4) unit quaternions w, x, y, z from robot to room, NaN where unknown
     shadow_position: Array | None = None  # (T, N, 3) [m] of the twins beside robots, NaN for robots without one
     shadow_yaw: Array | None = None  # (T, N) [rad] of those twins
-    dropped: Index | None = None  # (E,) by the modelled network on each of `plan.heard_links`; None if unknown
+    dropped: Index | None = None  # (E,) by the modelled network on each of `plan.pose_links`; None if unknown
     goals: Goals | None = None  # of the central controller; None if each robot decides for itself
     clocks: tuple[ClockOffset, ...] = ()  # of the other machines; stamps made there are corrected
 

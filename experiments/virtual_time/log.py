@@ -120,7 +120,7 @@ class Logbook:
         self._mine = slice(copy * rows, (copy + 1) * rows)
         self._seed = log.seeds[copy]
         self._scene = bodies.scene(experiment)
-        self._links: Links = Plan(experiment).heard_links
+        self._links: Links = Plan(experiment).pose_links
         self._sent = log.sent.between(copy * rows, (copy + 1) * rows)
         if not log.lean:
             sizes = [len(messages.encode(pose, self._encoding)) for pose in self._poses()]

@@ -136,9 +136,9 @@ def test_robots_that_decide_for_themselves_do_not_feel_that_others_are_guided(ca
     second = simulation.simulate(with_delay(park, 0.0, HYBRID), [1])
     np.testing.assert_array_equal(first.sent.link, second.sent.link)
     names = np.array(first.names)
-    links = Plan(with_delay(park, 0.0, HYBRID)).heard_links
+    links = Plan(with_delay(park, 0.0, HYBRID)).pose_links
     assert not set(names[links.receiver]) & set(HYBRID.robots)
-    assert len(second.received) == len(first.received) * len(links) / len(Plan(park).heard_links)
+    assert len(second.received) == len(first.received) * len(links) / len(Plan(park).pose_links)
 
 
 def test_lost_poses_and_goals_are_counted(cases):
@@ -195,7 +195,7 @@ def test_messages_of_the_whole_network_are_counted_alike(cases):
     assert centralised.network_messages == centralised.deliveries == poses + 7 * 40
     # of 21 links 10 are those of KH02, CF02, CF03; the centre hears all but the leader
     listened = {robot.robot: robot.listeners for robot in hybrid.robots}
-    links = Plan(with_delay(park, 0.0, HYBRID)).heard_links
+    links = Plan(with_delay(park, 0.0, HYBRID)).pose_links
     assert hybrid.deliveries == (len(links) + 6) * 200 + 3 * 40
     assert sum(listened.values()) == len(links) + 6
     assert centralised.guidance.goals_hz == pytest.approx(70.0)

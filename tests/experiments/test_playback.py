@@ -59,7 +59,7 @@ def test_a_run_is_read_back(path):
     np.testing.assert_allclose(trace.sent.yaw, 0.4)
     np.testing.assert_allclose(trace.received.arrival, along[1:] - 0.04, atol=1e-6)
     np.testing.assert_allclose(trace.received.stamp, along[1:] - 0.05, atol=1e-6)
-    net = trace.plan.heard_links
+    net = trace.plan.pose_links
     assert {(net.receiver[link], net.sender[link]) for link in trace.received.link} == {(1, 0)}
     assert trace.received.seq.tolist() == list(range(1, 11))
     np.testing.assert_allclose(trace.received.position[:, 0], along[1:] - 0.05)

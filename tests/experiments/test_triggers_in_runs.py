@@ -111,7 +111,7 @@ def test_what_is_heard_is_what_was_said_velocity_and_all(flown):
         )
     }  # fmt: skip
     heard = trace.received
-    speaker = trace.plan.heard_links.sender[heard.link]
+    speaker = trace.plan.pose_links.sender[heard.link]
     known = [k for k in range(len(heard.seq)) if (speaker[k], heard.seq[k]) in sent]
     assert len(known) > 30
     for k in known:
@@ -133,7 +133,7 @@ def test_belief_error_is_that_of_the_prediction(flown):
     _, trace = flown
     net = signals.links_of(trace)
     found = signals.beliefs(trace, net)
-    listener, speaker, heard, ends = net.receiver, net.sender, trace.received, trace.plan.heard_links
+    listener, speaker, heard, ends = net.receiver, net.sender, trace.received, trace.plan.pose_links
     for link in np.flatnonzero(speaker > 0)[::5]:  # the leader stands, and says nothing after the start
         asked = (ends.receiver == listener[link]) & (ends.sender == speaker[link])
         mine = np.flatnonzero(asked[heard.link])

@@ -66,7 +66,7 @@ def trace(
     who = np.array([i for _, i, _ in sends], dtype=np.intp)
     number = np.array([k for _, _, k in sends], dtype=np.intp)
     place = position[np.clip(np.round(when / step).astype(int), 0, count - 1), who].reshape(-1, 3)
-    speaker = Plan(what).heard_links.sender
+    speaker = Plan(what).pose_links.sender
     pairs = [(k, link) for k, j in enumerate(who) for link in np.flatnonzero(speaker == j)]
     take = np.array([k for k, _ in pairs], dtype=np.intp)
     rows = len(names)

@@ -27,7 +27,7 @@ MARGIN_S = 0.2  # what was said so shortly before the end may still be under way
 def sent_and_heard(trace: Trace, listener: int, speaker: int, end: float) -> tuple[Index, Index]:
     """Running numbers of the run that a robot said, and those of them that another one heard."""
     said = trace.sent.seq[(trace.sent.link == speaker) & (trace.sent.stamp < end - MARGIN_S)]
-    net = trace.plan.heard_links
+    net = trace.plan.pose_links
     mine = trace.received.link == np.flatnonzero((net.receiver == listener) & (net.sender == speaker))
     return said, np.intersect1d(said, trace.received.seq[mine])
 
@@ -51,7 +51,7 @@ def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Pat
     real, other = playback.read(folder / "periodic.mcap").trace, virtual(15.0)
     transmits_at_50_hz(real)
     shares, sent = [], 0
-    net = real.plan.heard_links
+    net = real.plan.pose_links
     pairs = sorted({(int(net.receiver[link]), int(net.sender[link])) for link in real.received.link})
     assert len(pairs) == len(real.dropped if real.dropped is not None else ())
     for listener, speaker in pairs:
