@@ -20,7 +20,7 @@ from agents.decision.assignment import Assignment
 from agents.decision.centralised import Guidance
 from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, BodyCommands, Lifecycle, Phase
-from agents.decision.neighbours import NeighbourPoses, NeighbourStates
+from agents.decision.neighbours import NeighbourStates
 from agents.decision.perception import Perception
 from agents.decision.position_control import PositionController
 from agents.decision.transmission import Transmission, Transmitter
@@ -131,27 +131,6 @@ class Agent:
     def neighbours(self) -> NeighbourStates:
         """Received poses, and the links that enter the law."""
         return self.goal_computer.neighbours
-
-    @property
-    def neighbour_poses(self) -> NeighbourPoses:
-        """Last pose received on each link."""
-        return self.neighbours.poses
-
-    def receive(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
-        """See `NeighbourStates.receive`."""
-        self.neighbours.receive(at, position, velocity, stamp, arrived)
-
-    def mark_lost(self, at: Index, t: float) -> None:
-        """See `NeighbourStates.mark_lost`."""
-        self.neighbours.mark_lost(at, t)
-
-    def mark_alive(self, at: Index) -> None:
-        """See `NeighbourStates.mark_alive`."""
-        self.neighbours.mark_alive(at)
-
-    def discard_poses(self, at: Index) -> None:
-        """See `NeighbourStates.discard_poses`."""
-        self.neighbours.discard_poses(at)
 
     def receive_goal(self, rows: Index, goal: Array, yaw: Array, stamp: Array) -> Mask:
         """See `Guidance.receive`; rows without guidance take no goals."""
@@ -277,7 +256,7 @@ class Agent:
             setpoint = self._controller.setpoint(goal, self.goal_yaw, state.position, state.yaw)
             filtered = self._safety.check(setpoint, state.position, state.yaw, age, where=where)
         else:
-            own, near = self._perception.sense(t, state, self.neighbour_poses)
+            own, near = self._perception.sense(t, state, self.neighbours.poses)
             wanted, goal = goal, self._deviate(avoidance, goal, own, near)
             setpoint = self._controller.setpoint(goal, self.goal_yaw, state.position, state.yaw)
             filtered = self._safety.check(setpoint, state.position, state.yaw, age, avoidance, own, near, where)

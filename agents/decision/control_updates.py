@@ -23,33 +23,19 @@ class ControlView(View):
 
     def __init__(  # noqa: PLR0917 - one caller
         self,
-        t: float,
-        position: Array,
-        velocity: Array,
-        last_event: LastEvent,
-        start: Array,
+        t: float,  # now [s]
+        position: Array,  # (N, 3) own [m]
+        velocity: Array,  # (N, 3) own [m/s]
+        last_event: LastEvent,  # last computation of each row
+        start: Array,  # (N,) start of each row [s]
         links: Links,
-        last: tuple[Array, Array],
-        now: tuple[Array, Array],
-        anchored: Mask,
-        law: Callable[[], Array],
-        errors: Callable[[], tuple[Array, Array]],
+        last: tuple[Array, Array],  # relative positions [m] and their rates [m/s] (L, 3) at the last computation
+        now: tuple[Array, Array],  # the same now
+        anchored: Mask,  # (N,) rows whose law also depends on their own position in the room
+        law: Callable[[], Array],  # computes the offset (N, 3) as it would be now [m]
+        errors: Callable[[], tuple[Array, Array]],  # computes error (N,) [m] and energy (N,) [m²]
     ) -> None:
-        """View of rows (N) with active `links` (L).
-
-        Args:
-            t: Now [s].
-            position: (N, 3) own [m].
-            velocity: (N, 3) own [m/s].
-            last_event: Last computation of each row.
-            start: (N,) start of each row [s].
-            links: Active links.
-            last: Relative positions [m] and their rates [m/s] (L, 3) at the last computation of the law.
-            now: The same now.
-            anchored: (N,) rows whose law also depends on their own position in the room.
-            law: Computes the offset (N, 3) as it would be now [m].
-            errors: Computes error (N,) [m] and energy (N,) [m²].
-        """
+        """View of rows (N) with active `links` (L)."""
         self.t, self.position, self.velocity, self.last_event, self.start = t, position, velocity, last_event, start
         self.predictor, self._anchored = HOLD, anchored
         self.links, self._last, self.now, self._law, self._errors = links, last, now, law, errors

@@ -35,23 +35,14 @@ class Perception:
 
     def __init__(  # noqa: PLR0917
         self,
-        kinds: Sequence[Kind],
-        robot_kinds: Sequence[Kind],
-        links: Links,
-        limits: Limits,
-        clearance: float,
-        avoids: Mask | None = None,
+        kinds: Sequence[Kind],  # of the rows (N)
+        robot_kinds: Sequence[Kind],  # of all robots of the experiment; `links.sender` points here
+        links: Links,  # on which the rows receive, for the formation or only for this (E)
+        limits: Limits,  # of safety
+        clearance: float,  # things farther above or below than this are ignored [m]
+        avoids: Mask | None = None,  # (N,) rows that avoid; None: all
     ) -> None:
-        """Perceive for rows of `kinds` that receive on `links`.
-
-        Args:
-            kinds: Of the rows (N).
-            robot_kinds: Of all robots of the experiment; `links.sender` points here.
-            links: On which the rows receive, for the formation or only for this (E).
-            limits: Of safety.
-            clearance: Things farther above or below than this are ignored [m].
-            avoids: (N,) rows that avoid; None: all.
-        """
+        """Perceive for rows of `kinds` that receive on `links`."""
         self._limits, self._clearance, self._avoids = limits, clearance, avoids
         self._takes = tuple(kind.takes for kind in kinds)
         takes = np.array(self._takes)

@@ -67,14 +67,14 @@ class PositionController:
 
 
 def drive(
-    way: Array,
-    yaw: Array,
-    goal_yaw: Array,
+    way: Array,  # (n, 2) goal less position [m]
+    yaw: Array,  # (n,) [rad]
+    goal_yaw: Array,  # (n,) wanted at the goal [rad], NaN for any
     *,
-    response: Array,
-    turn_response: Array,
-    speed: Array,
-    turn_rate: Array,
+    response: Array,  # (n,) K [1/s]
+    turn_response: Array,  # (n,) K_α [1/s]
+    speed: Array,  # (n,) limit [m/s]
+    turn_rate: Array,  # (n,) limit [rad/s]
 ) -> Array:
     """Linear and angular speed (n, 2) of differential robots toward a point, and there to a yaw.
 
@@ -83,15 +83,6 @@ def drive(
     which drives backward as well as forward, because formation goals lie behind it as often as before it. Toward a goal
     exactly abeam v is 0: wheels that accelerate drive before they turn, which would put the goal behind the end that
     drives ahead: the robot would change ends at each tick and never leave.
-
-    Args:
-        way: (n, 2) goal less position [m].
-        yaw: (n,) [rad].
-        goal_yaw: (n,) wanted at the goal [rad], NaN for any.
-        response: (n,) K [1/s].
-        turn_response: (n,) K_α [1/s].
-        speed: (n,) limit [m/s].
-        turn_rate: (n,) limit [rad/s].
     """
     distance = norm(way)
     cos, sin = np.cos(yaw), np.sin(yaw)

@@ -222,12 +222,12 @@ class PoseInbox:
             for coming in speaker.comings():
                 self.changed = True
                 if coming is TokenChange.APPEARED:
-                    self._agent.mark_alive(speaker.links)
+                    self._agent.neighbours.mark_alive(speaker.links)
                 elif coming is TokenChange.NEW_SESSION:
                     self._begin(speaker)
                 else:
                     self._channel.forget(speaker.links)
-                    self._agent.mark_lost(speaker.links, t)
+                    self._agent.neighbours.mark_lost(speaker.links, t)
         arrived: list[tuple[int, ReceivedPose]] = []
         for speaker in self.speakers:
             behind = speaker.behind
@@ -248,7 +248,7 @@ class PoseInbox:
     def _begin(self, speaker: NeighbourSubscription) -> None:
         """Forgets a neighbour that has a new session."""
         self._channel.forget(speaker.links)
-        self._agent.discard_poses(speaker.links)
+        self._agent.neighbours.discard_poses(speaker.links)
 
     def _send(self, arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> None:
         """Puts poses, each with its link, into the modelled channel, all of a tick at once."""
@@ -278,7 +278,7 @@ class PoseInbox:
     def _believe(self, got: PoseTable, utc: float) -> None:
         """Passes poses that got through to the agent and to telemetry."""
         assert got.extra is not None  # time of measurement; the recorded pose keeps its own stamp
-        self._agent.receive(got.link, got.position, got.velocity, got.extra[:, 0], got.arrival)
+        self._agent.neighbours.receive(got.link, got.position, got.velocity, got.extra[:, 0], got.arrival)
         columns = (got.link, got.seq, got.stamp, got.arrival, got.position, got.velocity)
         for link, seq, stamp, arrival, position, velocity in zip(*(c.tolist() for c in columns), strict=True):
             row, who = self._ends[link]

@@ -55,26 +55,16 @@ class Landing:
 
     def filter_commands(
         self,
-        t: float,
-        commands: BodyCommands | None,
-        state: BodyState,
-        where: PoseValidity,
+        t: float,  # now [s]
+        commands: BodyCommands | None,  # commands of the lifecycle
+        state: BodyState,  # of the bodies
+        where: PoseValidity,  # validity of their poses: a row without a valid one lands in place
         *,
-        neighbours: NeighbourStates,
-        late: bool,
-        phase: Index,
+        neighbours: NeighbourStates,  # of the rows
+        late: bool,  # whether the control loop misses so many ticks that no row should move aside
+        phase: Index,  # (N,) of the rows; one that does not land any more stops moving aside
     ) -> BodyCommands | None:
-        """Commands of this tick without the landings that must wait, and with those that need not any more.
-
-        Args:
-            t: Now [s].
-            commands: Commands of the lifecycle.
-            state: Of the bodies.
-            where: Validity of their poses: a row without a valid one lands in place.
-            neighbours: Of the rows.
-            late: Whether the control loop misses so many ticks that no row should move aside.
-            phase: (N,) of the rows; one that does not land any more stops moving aside.
-        """
+        """Commands of this tick without the landings that must wait, and with those that need not any more."""
         ordered = commands is not None and len(commands.land) > 0
         if not (ordered or self.any_aside):
             return commands

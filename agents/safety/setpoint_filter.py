@@ -81,27 +81,16 @@ class SetpointFilter:
 
     def check(  # noqa: PLR0917 - the four that always are, and those of avoidance
         self,
-        setpoint: Array,
-        position: Array,
-        yaw: Array,
-        age: Array,
-        avoidance: Avoidance | None = None,
-        own: OwnState | None = None,
-        nearby: Nearby | None = None,
-        where: PoseValidity | None = None,
+        setpoint: Array,  # (N, 4) as decided, in the meaning of each row's kind
+        position: Array,  # (N, 3) measured [m]
+        yaw: Array,  # (N,) measured [rad]
+        age: Array,  # (N,) of that measurement [s]
+        avoidance: Avoidance | None = None,  # applied after all limits
+        own: OwnState | None = None,  # for the avoidance
+        nearby: Nearby | None = None,  # for the avoidance
+        where: PoseValidity | None = None,  # validity of the pose, if known already
     ) -> FilteredSetpoint:
-        """Safe setpoints.
-
-        Args:
-            setpoint: (N, 4) as decided, in the meaning of each row's kind.
-            position: (N, 3) measured [m].
-            yaw: (N,) measured [rad].
-            age: (N,) of that measurement [s].
-            avoidance: Applied after all limits.
-            own: For the avoidance.
-            nearby: For the avoidance.
-            where: Validity of the pose, if known already.
-        """
+        """Safe setpoints."""
         where = self.validate_poses(position, yaw, age) if where is None else where
         sane = np.abs(setpoint) < ABSURD
         nobody = self._nobody

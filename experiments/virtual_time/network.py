@@ -222,7 +222,7 @@ class VirtualNetwork:
         self._channel = VirtualChannel(experiment, assignment.links, seeds)
         self._centre = None if assignment.guided is None else VirtualCentre(experiment, seeds)
         self._seq: Index = np.zeros(rows, dtype=np.intp)
-        agent.mark_alive(np.arange(len(assignment.links)))  # all robots are there from the beginning
+        agent.neighbours.mark_alive(np.arange(len(assignment.links)))  # all robots are there from the beginning
         self._sent: list[PoseTable] = []
         self._received: list[PoseTable] = []
 
@@ -262,7 +262,7 @@ class VirtualNetwork:
         """Delivers poses and goals that have arrived."""
         heard = self._channel.due(t)
         if heard is not None:
-            self._agent.receive(heard.link, heard.position, heard.velocity, heard.stamp, heard.arrival)
+            self._agent.neighbours.receive(heard.link, heard.position, heard.velocity, heard.stamp, heard.arrival)
             if not self._lean:
                 self._received.append(heard)
         if self._centre is not None:

@@ -29,7 +29,7 @@ class Group:
         self.assignment = Plan(experiment).assignment(self.names)
         self.agent = Agent(self.assignment)
         self.body = TwinBody(bodies.body_request(experiment, self.names, [experiment.seed]))
-        self.agent.mark_alive(np.arange(len(self.assignment.links)))
+        self.agent.neighbours.mark_alive(np.arange(len(self.assignment.links)))
         self.by_speaker = links_by_sender(self.assignment.links, self.assignment.robots)
         self.state: BodyState
         self.actions: Actions
@@ -39,7 +39,7 @@ class Group:
         links = self.by_speaker.get(speaker)
         if links is not None:
             many = (len(links), 1)
-            self.agent.receive(
+            self.agent.neighbours.receive(
                 links, np.tile(position, many), np.tile(velocity, many), np.full(len(links), stamp),
                 np.full(len(links), arrived),
             )  # fmt: skip

@@ -19,12 +19,14 @@ def bare(**parts):
     """The decision of A alone, ready to be told things; B is on link 0."""
     experiment = pair(**parts)
     agent = Agent(Plan(experiment).assignment(["A"]))
-    agent.mark_alive(np.arange(len(agent.assignment.links)))
+    agent.neighbours.mark_alive(np.arange(len(agent.assignment.links)))
     return agent
 
 
 def say(agent, position, stamp, at=0):
-    agent.receive(np.array([at]), np.array([position]), np.zeros((1, 3)), np.array([stamp]), np.array([stamp + 0.01]))
+    agent.neighbours.receive(
+        np.array([at]), np.array([position]), np.zeros((1, 3)), np.array([stamp]), np.array([stamp + 0.01])
+    )
 
 
 def test_older_samples_than_known_are_left_out():
@@ -32,22 +34,22 @@ def test_older_samples_than_known_are_left_out():
     say(agent, [1.0, 0.0, 0.0], 2.0)
     say(agent, [9.0, 9.0, 9.0], 1.0)
     say(agent, [9.0, 9.0, 9.0], 2.0)
-    np.testing.assert_array_equal(agent.neighbour_poses.position, [[1.0, 0.0, 0.0]])
-    assert agent.neighbour_poses.stamp[0] == 2.0
+    np.testing.assert_array_equal(agent.neighbours.poses.position, [[1.0, 0.0, 0.0]])
+    assert agent.neighbours.poses.stamp[0] == 2.0
     say(agent, [0.5, 0.0, 0.0], 2.5)
-    np.testing.assert_array_equal(agent.neighbour_poses.position, [[0.5, 0.0, 0.0]])
+    np.testing.assert_array_equal(agent.neighbours.poses.position, [[0.5, 0.0, 0.0]])
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 2, 0], [0, 2, 1]])
 def test_of_samples_that_arrive_together_the_newest_stays(order):
     stamps, places = np.array([1.0, 2.0, 3.0])[order], np.array([[1.0, 0, 0], [2.0, 0, 0], [3.0, 0, 0]])[order]
     together, one_by_one = bare(), bare()
-    together.receive(np.zeros(3, dtype=np.intp), places, np.zeros((3, 3)), stamps, np.full(3, 4.0))
+    together.neighbours.receive(np.zeros(3, dtype=np.intp), places, np.zeros((3, 3)), stamps, np.full(3, 4.0))
     for place, stamp in zip(places.tolist(), stamps.tolist(), strict=True):
         say(one_by_one, place, stamp)
     for agent in (together, one_by_one):
-        np.testing.assert_array_equal(agent.neighbour_poses.position, [[3.0, 0.0, 0.0]])
-        assert agent.neighbour_poses.stamp[0] == 3.0
+        np.testing.assert_array_equal(agent.neighbours.poses.position, [[3.0, 0.0, 0.0]])
+        assert agent.neighbours.poses.stamp[0] == 3.0
 
 
 def test_nothing_heard_is_nothing():
@@ -82,7 +84,7 @@ def test_who_misses_a_neighbour_is_not_ready_and_says_whom():
     agent.step(0.71, seen(0.71))
     assert (agent.lifecycle.phase[0], agent.lifecycle.reason[0]) == (READY, "")
     assert agent.missing_neighbours(0) == []
-    agent.mark_lost(np.array([0]), 0.8)
+    agent.neighbours.mark_lost(np.array([0]), 0.8)
     assert agent.missing_neighbours(0) == ["B"]
 
 
@@ -112,7 +114,7 @@ def test_a_neighbour_that_is_gone_is_left_out_after_the_silence_and_back_when_fo
     agent = swarm.agent("A")
     assert live(agent) == [0, 1]
     begin = swarm.t
-    agent.mark_lost(np.array([0]), begin)
+    agent.neighbours.mark_lost(np.array([0]), begin)
     swarm.groups[0].by_speaker.pop("B")  # and A hears nothing of it any more
     swarm.run(1.0)
     assert live(agent) == [0, 1]
@@ -122,7 +124,7 @@ def test_a_neighbour_that_is_gone_is_left_out_after_the_silence_and_back_when_fo
     before = swarm.row("A", "goal")
     swarm.run(0.1)
     assert not np.array_equal(swarm.row("A", "goal"), before)  # it still follows C
-    agent.mark_alive(np.array([0]))
+    agent.neighbours.mark_alive(np.array([0]))
     swarm.step()
     assert live(agent) == [0, 1]
 
@@ -130,19 +132,19 @@ def test_a_neighbour_that_is_gone_is_left_out_after_the_silence_and_back_when_fo
 def test_a_neighbour_that_is_gone_is_not_back_because_it_is_heard_again():
     swarm = Swarm(triangle(), [["A"], ["B"], ["C"]]).running().run(0.5)
     agent = swarm.agent("A")
-    agent.mark_lost(np.array([0]), swarm.t - 5.0)
+    agent.neighbours.mark_lost(np.array([0]), swarm.t - 5.0)
     swarm._flying.clear()
     swarm.step()
     assert live(agent) == [1]
     swarm.run(0.03)
-    assert agent.neighbour_poses.arrival[0] > swarm.t - 0.03
+    assert agent.neighbours.poses.arrival[0] > swarm.t - 0.03
     assert live(agent) == [1]
 
 
 def test_a_neighbour_never_heard_does_not_hide_one_that_is_gone():
     experiment = triangle(start=Start(deadline_s=0.1, missing="go-on"))
     agent = Agent(Plan(experiment).assignment(["A"]))
-    agent.mark_alive(np.array([1]))
+    agent.neighbours.mark_alive(np.array([1]))
     say(agent, [0.0, -0.5, 0.0], 0.1, at=1)  # C is heard, B never
     for tick in range(30):
         agent.step(0.01 * tick, seen(0.01 * tick))
@@ -152,7 +154,7 @@ def test_a_neighbour_never_heard_does_not_hide_one_that_is_gone():
     assert agent.start(0, 0.32) == ""
     agent.step(0.32, seen(0.32))
     assert live(agent) == [1]
-    agent.mark_lost(np.array([1]), 0.33)
+    agent.neighbours.mark_lost(np.array([1]), 0.33)
     for tick in range(33, 200):
         agent.step(0.01 * tick, seen(0.01 * tick))
     assert live(agent) == []
@@ -163,7 +165,7 @@ def test_who_is_alone_holds_where_it_was_then():
     swarm = Swarm(pair(), [["A"], ["B"]]).running().run(0.5)
     moving = swarm.row("A", "goal")
     agent = swarm.agent("A")
-    agent.mark_lost(np.array([0]), swarm.t)
+    agent.neighbours.mark_lost(np.array([0]), swarm.t)
     swarm.groups[0].by_speaker.clear()
     swarm.run(1.2)
     held = swarm.row("A", "goal")
@@ -171,7 +173,7 @@ def test_who_is_alone_holds_where_it_was_then():
     swarm.run(1.0)
     np.testing.assert_array_equal(swarm.row("A", "goal"), held)
     assert np.linalg.norm(swarm.row("A", "truth") - held) < 0.02
-    agent.mark_alive(np.array([0]))
+    agent.neighbours.mark_alive(np.array([0]))
     swarm.run(0.2)
     assert not np.array_equal(swarm.row("A", "goal"), held)
 

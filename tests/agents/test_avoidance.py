@@ -190,8 +190,10 @@ def running_pair(avoidance, gap=1.0, **parts):
     links = agent.assignment.links
     if len(links):
         told = place[links.sender]
-        agent.mark_alive(np.arange(len(links)))
-        agent.receive(np.arange(len(links)), told, still[: len(told)], np.zeros(len(told)), np.zeros(len(told)))
+        agent.neighbours.mark_alive(np.arange(len(links)))
+        agent.neighbours.receive(
+            np.arange(len(links)), told, still[: len(told)], np.zeros(len(told)), np.zeros(len(told))
+        )
     return agent, state
 
 

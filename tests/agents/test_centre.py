@@ -53,7 +53,7 @@ def test_it_decides_what_the_robots_would_to_the_last_bit(park, update):
     desk = Desk(replaced(park, architecture="centralised"))
     agent = Agent(Plan(park).assignment(tuple(park.robots)))
     links, rng = agent.assignment.links, np.random.default_rng(1)
-    agent.mark_alive(np.arange(len(links)))
+    agent.neighbours.mark_alive(np.arange(len(links)))
     agent.lifecycle.phase[:] = AIRBORNE
     agent.lifecycle.start_at[:] = 0.0
     still, place = np.zeros((7, 3)), desk.position.copy()
@@ -63,7 +63,7 @@ def test_it_decides_what_the_robots_would_to_the_last_bit(park, update):
         t = 0.01 * tick
         if tick % 10 == 0:
             place[:, :2] += rng.normal(0.0, 0.02, (7, 2))
-            agent.receive(np.arange(len(links)), place[links.sender], still[links.sender],
+            agent.neighbours.receive(np.arange(len(links)), place[links.sender], still[links.sender],
                        np.full(len(links), t), np.full(len(links), t))  # fmt: skip
             desk.hear(range(7), t, place)
             told = desk.decide(t)

@@ -41,10 +41,12 @@ class Life:
     def __init__(self, place, late_s: float, origin: messages.Setpoint | None = None, *, listens: bool = False) -> None:
         self.agent = Agent(Plan(leader(listens=listens)).assignment(("A",)))
         links = np.arange(len(self.agent.assignment.links))
-        self.agent.mark_alive(links)
+        self.agent.neighbours.mark_alive(links)
         self.t, self.place = 0.0, np.array([[*place, 0.0]])
         if len(links):
-            self.agent.receive(links, np.array([[0.6, 0.6, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+            self.agent.neighbours.receive(
+                links, np.array([[0.6, 0.6, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1)
+            )
         self.step(READY)
         assert self.order(messages.Order("takeoff")) == ""
         self.step(AIRBORNE)

@@ -21,12 +21,12 @@ def eventful(experiment, groups):
     swarm = Swarm(experiment, groups).running()
     swarm.run(1.5)
     for agent, links in swarm.speaker_links("CF03"):  # its token is gone, then back
-        agent.mark_lost(links, swarm.t)
+        agent.neighbours.mark_lost(links, swarm.t)
     group, row = swarm.where["KH02"]
     assert group.agent.hold(row) == ""
     swarm.run(1.53)
     for agent, links in swarm.speaker_links("CF03"):
-        agent.mark_alive(links)
+        agent.neighbours.mark_alive(links)
     assert group.agent.start(row, 0.0) == ""
     swarm.run(0.5)
     group, row = swarm.where["CF02"]

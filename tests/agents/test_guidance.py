@@ -34,7 +34,7 @@ class Bench:
 
     def __init__(self, experiment, names=("A", "B")):
         self.agent = Agent(Plan(experiment).assignment(names))
-        self.agent.mark_alive(np.arange(len(self.agent.assignment.links)))
+        self.agent.neighbours.mark_alive(np.arange(len(self.agent.assignment.links)))
         self.position = np.array([[-0.4, 0.0, 0.0], [0.4, 0.1, 0.8]])[: len(names)]
         self.t = 0.0
 

@@ -273,7 +273,9 @@ def test_two_that_come_too_near_hold_and_go_on_when_one_is_taken_away():
     assert len(told["A"]) == len(told["B"]) == 1
     agent = swarm.agent("A")
     for k in range(80):  # B is somewhere else now
-        agent.receive(np.array([0]), np.array([[1.5, 0.0, 0.0]]), np.zeros((1, 3)), *np.full((2, 1), 99.0 + k))
+        agent.neighbours.receive(
+            np.array([0]), np.array([[1.5, 0.0, 0.0]]), np.zeros((1, 3)), *np.full((2, 1), 99.0 + k)
+        )
         swarm.groups[0].by_speaker.clear()
         swarm.step()
     assert swarm.row("A", "setpoint").any()
@@ -283,7 +285,7 @@ def test_two_that_nearly_touch_land():
     experiment = pair(safety=Safety(separation=0.3))
     swarm = Swarm(experiment, [["A"], ["B"]]).running().run(0.5)
     here = swarm.row("A", "position") + np.array([0.14, 0.0, 0.0])
-    swarm.agent("A").receive(np.array([0]), here[None], np.zeros((1, 3)), np.array([99.0]), np.array([99.0]))
+    swarm.agent("A").neighbours.receive(np.array([0]), here[None], np.zeros((1, 3)), np.array([99.0]), np.array([99.0]))
     swarm.step()
     swarm.step()
     assert swarm.phase("A") >= LANDING
@@ -297,7 +299,7 @@ def test_two_that_nearly_touch_land():
 def test_a_neighbour_that_is_lost(choice, phase, moves):
     experiment = triangle(safety=Safety(lost_neighbour=choice))
     swarm = Swarm(experiment, [["A"], ["B"], ["C"]]).running().run(0.5)
-    swarm.agent("A").mark_lost(np.array([0]), swarm.t)
+    swarm.agent("A").neighbours.mark_lost(np.array([0]), swarm.t)
     swarm.groups[0].by_speaker.pop("B")
     swarm.run(1.0)
     assert happened(swarm)["A"] == []
@@ -308,7 +310,7 @@ def test_a_neighbour_that_is_lost(choice, phase, moves):
     assert min(swarm.phase("A"), LANDING) == phase
     assert (np.linalg.norm(swarm.row("A", "truth") - before) > 0.01) == moves
     if choice == "hold":
-        swarm.agent("A").mark_alive(np.array([0]))
+        swarm.agent("A").neighbours.mark_alive(np.array([0]))
         swarm.run(1.2)
         assert happened(swarm)["A"][-1].startswith("over: a neighbour is lost, after ")
 
@@ -406,9 +408,9 @@ def occur(agent, event, t):
     outside = agent.health
     match event:
         case "lose":
-            agent.mark_lost(np.arange(2), t)
+            agent.neighbours.mark_lost(np.arange(2), t)
         case "find":
-            agent.mark_alive(np.arange(2))
+            agent.neighbours.mark_alive(np.arange(2))
         case "offline" | "online":
             outside.offline_since = t if event == "offline" else np.inf
         case "unattended":
@@ -502,7 +504,7 @@ def test_who_is_silent_after_a_standstill_has_nothing_new_to_say(slept):
 
 def test_who_is_gone_is_not_waited_for_after_a_standstill():
     swarm = woken(trigger={"kind": "send-on-delta", "threshold": 1.0}, safety=Safety(lost_neighbour="drop"))
-    swarm.agent("A").mark_lost(np.array([0]), swarm.t)
+    swarm.agent("A").neighbours.mark_lost(np.array([0]), swarm.t)
     assert held(swarm, 0.5) == 0
 
 

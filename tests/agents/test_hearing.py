@@ -74,7 +74,7 @@ class Robot:
 
     @property
     def x(self) -> float:
-        return float(self.agent.neighbour_poses.position[0, 0])
+        return float(self.agent.neighbours.poses.position[0, 0])
 
 
 @pytest.fixture
@@ -181,7 +181,7 @@ def hazards(robot: Robot) -> list[str]:
     agent = robot.agent
     seen: list = []
     if agent.neighbours.clock_lag is not None:
-        agent._detector._behind(agent.neighbours, agent.neighbours.clock_lag, seen)
+        agent._detector._lagging(agent.neighbours, agent.neighbours.clock_lag, seen)
     return [f"{each.cause.name}: {each.detail(0)}" for each in seen if each.rows[0]]
 
 
@@ -210,7 +210,7 @@ def test_what_waited_while_the_listener_stood_still_is_no_proof_of_a_slow_clock(
 
 def believed(robot: Robot) -> float:
     """Where B is believed to be now by a predictor without a horizon, x [m]."""
-    heard, predictor = robot.agent.neighbour_poses, ConstantVelocity()
+    heard, predictor = robot.agent.neighbours.poses, ConstantVelocity()
     place = heard.extrapolate_position(predictor, robot.t, np.array([0]))
     np.testing.assert_array_equal(robot.agent.neighbours.extrapolate_all(predictor, robot.t), place)
     return float(place[0, 0])
@@ -287,7 +287,7 @@ def test_a_pose_that_is_stamped_ahead_was_measured_when_it_arrived(robot, ahead)
     robot.t = 7.0
     robot.pose(1, 0.4, session="one", age=-ahead, speed=0.1)
     robot.after(0.0)
-    heard = robot.agent.neighbour_poses
+    heard = robot.agent.neighbours.poses
     assert (heard.stamp[0], heard.arrival[0]) == pytest.approx((7.0, 7.0), abs=1e-5)
     robot.t += 2.0
     assert believed(robot) == pytest.approx(0.6, abs=1e-5), "two seconds old, not younger"

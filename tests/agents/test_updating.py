@@ -77,7 +77,7 @@ def test_who_loses_a_neighbour_computes_at_once():
     swarm = Swarm(triangle({"kind": "periodic", "period_s": 30.0}), [["A"], ["B"], ["C"]]).running().run(0.55)
     agent = swarm.agent("A")
     before = int(agent.updates[0])
-    agent.mark_lost(np.array([0]), swarm.t - 5.0)
+    agent.neighbours.mark_lost(np.array([0]), swarm.t - 5.0)
     swarm.groups[0].by_speaker.pop("B")
     swarm.run(0.2)
     assert int(agent.updates[0]) == before + 1
@@ -99,7 +99,7 @@ def test_what_moved_is_the_largest_change_on_a_link(trigger):
     agent, state = group.agent, group.state
     view = agent.goal_computer.control_view(swarm.t, state.position, state.velocity, agent.lifecycle.start_at)
     links = Plan(swarm.experiment).links
-    apart = state.position[links.receiver] - agent.neighbour_poses.position
+    apart = state.position[links.receiver] - agent.neighbours.poses.position
     moved = np.linalg.norm(apart - agent.goal_computer._updating._apart, axis=1)
     for row in range(2):
         assert view.deviation[row] == pytest.approx(moved[links.receiver == row].max(), abs=1e-15)

@@ -103,8 +103,8 @@ def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     assert agent.missing_neighbours(0) == ["B", "C"]
     link = np.array([told.robots[j] for j in told.links.sender]) == "B"
     at = np.flatnonzero(link)
-    agent.mark_alive(at)
-    agent.receive(at, np.array([[0.5, 0.0, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+    agent.neighbours.mark_alive(at)
+    agent.neighbours.receive(at, np.array([[0.5, 0.0, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
     state = BodyState(
         time=np.zeros(1), position=np.zeros((1, 3)), yaw=np.zeros(1), velocity=np.zeros((1, 3)),
         flying=np.zeros(1, dtype=bool), battery=np.ones(1), true_position=np.zeros((1, 3)), true_yaw=np.zeros(1),
