@@ -1,7 +1,7 @@
-"""Exclusive use of a device on this machine: a lock on the device's address, held as long as a body is open.
+"""Exclusive use of a device on this machine: a lock on its address, held while a body is open.
 
 The locks are files of the user's runtime folder (`agents.runtime.run_registry`) and end with their process. Other
-machines and other users are not seen.
+machines and other users are not excluded.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import Final
 from agents.body.interface import BodyError
 from agents.user_folder import runtime_folder
 
-LONGEST: Final = 200  # [bytes] of what a holder says of itself
+LONGEST: Final = 200  # [bytes] of the description of a holder
 
 
 def numeric(host: str) -> str:
-    """The IPv4 address of a host, so that two names of it are one; the name itself if it cannot be resolved."""
+    """The IPv4 address of a host, equal for all its names; the name itself if it cannot be resolved."""
     try:
         return socket.gethostbyname(host)
     except (OSError, UnicodeError):
@@ -30,15 +30,15 @@ def numeric(host: str) -> str:
 
 
 class Claims:
-    """The devices of a body, of which this process is the only driver between `take` and `release`."""
+    """Locks on the devices of a body, held between `take` and `release`."""
 
     def __init__(self, names: Sequence[str], addresses: Sequence[str]) -> None:
-        """`addresses` are spelled in one way for each device: what is equal is the same device."""
+        """`addresses` are canonical: equal ones are the same device."""
         self._wanted = list(zip(names, addresses, strict=True))
         self._locks: dict[Path, int] = {}  # open files
 
     def take(self) -> None:
-        """Takes all of them, or none; before the first byte goes to a device.
+        """Locks all devices, or none; before the first byte goes to a device.
 
         Raises:
             BodyError: If a process has one of them, with the address and that process; or if the folder cannot be had.
@@ -58,7 +58,7 @@ class Claims:
             raise
 
     def release(self) -> None:
-        """Lets go of all."""
+        """Releases all locks."""
         while self._locks:
             path, lock = self._locks.popitem()
             with suppress(OSError):
@@ -94,7 +94,7 @@ def _lock(path: Path, name: str, address: str) -> int:
 
 
 def _is(path: Path, file: int) -> bool:
-    """Whether that is still the file of this path; its last holder may have removed it meanwhile."""
+    """Whether an open file still has this path; its last holder may have removed it meanwhile."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(file))
     except FileNotFoundError:

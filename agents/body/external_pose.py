@@ -1,4 +1,4 @@
-"""Velocities that follow from measured positions, and the positions that are measured outside of the robots."""
+"""External poses (motion capture), and the estimate of velocity from measured positions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from agents.arrays import Array, Index
 from agents.body.interface import BodyState
 
 SMOOTHING_S: Final = 0.1  # time constant of the velocity estimate
-FASTEST: Final = 5.0  # [m/s] a jump that would need more is a mistaken marker, not a motion
-FARTHEST: Final = 1e6  # [m] nothing is measured beyond
-PATIENCE_S: Final = 0.5  # after this silence any position is believed again
+FASTEST: Final = 5.0  # [m/s] a faster jump results from a mistaken marker
+FARTHEST: Final = 1e6  # [m] largest coordinate
+PATIENCE_S: Final = 0.5  # after this silence any position is accepted
 
 Number = TypeVar("Number", float, Array)
 
@@ -20,8 +20,7 @@ Number = TypeVar("Number", float, Array)
 def velocity_after(velocity: Number, moved: Number, since: float) -> Number:
     """The velocity estimate after one more measured position: a low-pass with `SMOOTHING_S` on the difference quotient.
 
-    The one estimate of this project: motion capture and odometry measure positions, and a velocity is what is left
-    of their differences. White noise σ of the positions makes σ / `SMOOTHING_S` of noise, whatever the rate is.
+    Used for motion capture and odometry. White noise σ of the positions makes σ / `SMOOTHING_S` of noise, at any rate.
 
     Args:
         velocity: The estimate before, any shape [m/s].
@@ -33,15 +32,13 @@ def velocity_after(velocity: Number, moved: Number, since: float) -> Number:
 
 
 class External:
-    """The last external pose of each row, and a filtered derivative of it.
+    """The last external pose of each row, and a filtered derivative of it."""
 
-    Attributes:
-        time: (n,) [s], minus infinity before the first.
-        position: (n, 3) [m], NaN before the first.
-        velocity: (n, 3) [m/s].
-        yaw: (n,) [rad].
-        refused: Poses that were no motion of a robot.
-    """
+    time: Array  # (n,) [s], minus infinity before the first pose
+    position: Array  # (n, 3) [m], NaN before the first pose
+    velocity: Array  # (n, 3) [m/s]
+    yaw: Array  # (n,) [rad]
+    refused: int  # poses that jumped farther than a robot can move
 
     def __init__(self, rows: int) -> None:
         self.time = np.full(rows, -np.inf)
@@ -51,9 +48,9 @@ class External:
         self.refused = 0
 
     def update(self, row: int, t: float, position: Array, yaw: float) -> bool:
-        """Takes a pose in; False if it is old, or jumps farther than any robot moves."""
+        """Stores a pose; returns False if it is old, or jumps farther than a robot can move."""
         since = t - self.time[row]
-        if not (since > 0.0 and (np.abs(position) <= FARTHEST).all()):  # NaN is not nearer either
+        if not (since > 0.0 and (np.abs(position) <= FARTHEST).all()):  # NaN fails as well
             return False
         if since < PATIENCE_S:
             moved = position - self.position[row]
@@ -69,7 +66,7 @@ class External:
         return True
 
     def fill(self, state: BodyState, rows: Index) -> None:
-        """Puts what is known of `rows` in place of what their bodies say; a yaw never measured is left alone."""
+        """Replaces the poses of `rows` in a state of their bodies; a yaw that was never measured stays."""
         state.time[rows], state.position[rows] = self.time[rows], self.position[rows]
         state.velocity[rows] = self.velocity[rows]
         state.yaw[rows] = np.where(np.isfinite(self.yaw[rows]), self.yaw[rows], state.yaw[rows])

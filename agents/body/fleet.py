@@ -47,7 +47,7 @@ class Fleet:
         return BodyState(**merged)
 
     def _merged(self, name: str, parts: Sequence[tuple[Index, Any]]) -> Any:  # noqa: ANN401 - the type of that field
-        """One field of the whole from the bodies, of which some may say nothing on it."""
+        """One field of the state of all rows, from bodies of which some may lack it."""
         if name == "rays":
             return Rays.joined(parts)
         if name == "notes":
@@ -94,13 +94,13 @@ class Fleet:
         call_all(body.close for _, body in self._parts)
 
     def _split(self, rows: Index) -> list[tuple[Body, Index]]:
-        """Each body with those entries of `rows` that it carries."""
+        """Each body with its entries of `rows`."""
         found = [(body, np.flatnonzero(np.isin(rows, group))) for group, body in self._parts]
         return [(body, which) for body, which in found if len(which)]
 
 
 def assemble(request: BodyRequest) -> Body:
-    """The bodies that the addresses of a request ask for; one that carries all rows stands by itself.
+    """The bodies for the addresses of a request; without a fleet if one body carries all rows.
 
     Raises:
         plugins.UnknownPlugin: If no body of that name is installed.
@@ -110,5 +110,5 @@ def assemble(request: BodyRequest) -> Body:
     parts = []
     for name in dict.fromkeys(names):
         group = np.array([row for row, other in enumerate(names) if other == name], dtype=np.intp)
-        parts.append((group, registry.load(registry.BODIES, name)(request.of(group))))
+        parts.append((group, registry.load(registry.BODIES, name)(request.select(group))))
     return Fleet(len(names), parts) if len(parts) > 1 else parts[0][1]

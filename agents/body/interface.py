@@ -1,4 +1,4 @@
-"""The one seam between a robot and what it is made of: hardware or a twin, chosen by one word.
+"""Interface between the decision for a robot and its body: hardware or a twin, chosen by one word.
 
 A body has rows as everything has: a bridge that serves three Crazyflies on one radio is one body of three rows.
 The runtime finds bodies by the entry-point group `zenpark.bodies`: the word before `://` (or the whole word) names one.
@@ -20,7 +20,7 @@ from agents.network.keys import Keys
 
 
 class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Wobble about the place that a flying robot holds: an Ornstein-Uhlenbeck process on each horizontal axis."""
+    """Drift of a hovering robot: an Ornstein-Uhlenbeck process on each horizontal axis."""
 
     sigma: float  # [m] standard deviation
     correlation_s: float = 0.5  # [s] correlation time
@@ -31,7 +31,7 @@ class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """What nature adds to a simulated body; a field left out means: nothing of it."""
+    """Disturbances of a simulated body; a field left out adds none."""
 
     hover_jitter: Jitter | None = None
     position_sigma: float | None = None  # [m] white noise of the measured position, per axis (planar for ground robots)
@@ -42,29 +42,24 @@ class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
 @dataclass(frozen=True)
 class BodyRequest:
-    """What a body is opened with; every sequence has one entry per row.
-
-    `external` rows get their position from outside, through `Body.locate`. `device` holds each row's settings for its
-    hardware, as they stand in the experiment file; the body checks them. `endpoints` and `keys` are for bodies that
-    live on the network, and so is `clock`, which makes the stamps there.
-    """
+    """Request for a body; every sequence has one entry per row."""
 
     names: tuple[str, ...]
     kinds: tuple[Kind, ...]
     addresses: tuple[str, ...]  # the `body` of the experiment file: "twin", "radio://0/80/2M/E7E7E7E701", ...
     start: Array  # (n, 3) [m]
     yaw: Array  # (n,) [rad]
-    rate_hz: float  # how often it will be read and commanded
+    rate_hz: float  # [1/s] of readings and commands
     seeds: tuple[int, ...]
     disturbance: tuple[Disturbance, ...]
-    external: tuple[bool, ...]
-    device: tuple[Mapping[str, Any], ...]
-    endpoints: tuple[str, ...]
+    external: tuple[bool, ...]  # rows with a position from outside, through `Body.locate`
+    device: tuple[Mapping[str, Any], ...]  # settings of the hardware in the experiment file; the body checks them
+    endpoints: tuple[str, ...]  # for bodies on the network
     keys: Keys
-    clock: Clock = field(default_factory=Clock)
+    clock: Clock = field(default_factory=Clock)  # of stamps on the network
 
-    def of(self, rows: Index) -> BodyRequest:
-        """The same for some of the rows."""
+    def select(self, rows: Index) -> BodyRequest:
+        """The request for some of the rows."""
         return BodyRequest(
             tuple(self.names[row] for row in rows),
             tuple(self.kinds[row] for row in rows),
@@ -86,7 +81,7 @@ class BodyRequest:
 class RangeScan:
     """One sweep of a robot's range sensors."""
 
-    time: float  # when, on the clock of `Body.read` [s]; a newer scan has a newer time
+    time: float  # [s] of the measurement, on the clock of `Body.read`
     bearing: Array  # (m,) from the robot's nose, to the left [rad]
     elevation: Array  # (m,) up [rad]
     distance: Array  # (m,) from the robot's centre [m]; NaN where nothing is in reach
@@ -119,7 +114,7 @@ class Rays:
 
     @classmethod
     def joined(cls, parts: Sequence[tuple[Index, Rays | None]]) -> Rays | None:
-        """Those of several bodies, whose rows are rows `group` of the whole; None if none has any."""
+        """The rays of several bodies, whose rows are rows `group` of the whole; None without any."""
         there = [(group, rays) for group, rays in parts if rays is not None]
         if not there:
             return None
@@ -129,8 +124,8 @@ class Rays:
             *(np.concatenate([getattr(rays, column) for _, rays in there]) for column in columns),
         )
 
-    def of(self, row: int) -> RangeScan | None:
-        """What one row sees; None if it has no rays."""
+    def scan_of(self, row: int) -> RangeScan | None:
+        """The scan of one row; None if it has no rays."""
         mine = self.row == row
         if not mine.any():
             return None
@@ -140,7 +135,7 @@ class Rays:
 
 @dataclass
 class BodyState:
-    """What a body knows of its rows. Unknown numbers are NaN."""
+    """State of a body. Unknown numbers are NaN."""
 
     time: Array  # (n,) when the pose was measured, on the clock of `read` [s]
     position: Array  # (n, 3) measured [m]
@@ -150,33 +145,32 @@ class BodyState:
     true_yaw: Array  # (n,) the truth of a twin [rad]
     battery: Array  # (n,) charge, 0 to 1
     flying: Mask  # (n,) motors on, off the ground or about to be
-    # what each row's hardware says of itself (supervisor, link), for people; empty if nothing
+    # report of the hardware of each row (supervisor, link), for people; empty if none
     notes: tuple[str, ...] = ()
-    rays: Rays | None = None  # what the rows' range sensors see; None if they have none
-    # (n, 4) unit quaternion w, x, y, z from the robot to the room, where a body knows more than yaw
+    rays: Rays | None = None  # readings of range sensors; None without sensors
+    # (n, 4) unit quaternion w, x, y, z from the robot to the room, of bodies that measure more than yaw
     attitude: Array | None = None
     # (n, 3) of the twin that runs beside each row [m], NaN for rows without one; None if there is none at all (see
     # `agents.body.shadow_twin`)
     shadow_position: Array | None = None
     shadow_yaw: Array | None = None  # (n,) of that twin [rad]
-    # (n,) how far ahead of its arrival the last position was stamped that something outside measured [s], negative
-    # where behind; None if there is none
+    # (n,) [s] stamp of the last external position less the time of its arrival; None without external positions
     ahead: Array | None = None
 
 
 class Body(Protocol):
-    """What the runtime drives. `takes` of each row's kind says how a row of `command` is read.
+    """Hardware or a twin of n robots. The `takes` of the kind of a row tells how its row of `command` is read.
 
     Calls come from one thread, but for `land` and `stop`: these come from others too, more than once, and while another
     call runs or hangs (`agents.runtime.watchdog`, emergency stops). They must neither block nor need the loop to go on.
-    A body of several rows tells all of them, even if one of them fails (`call_all`).
+    A body of several rows commands all of them, even if one of them fails (`call_all`).
     """
 
     def open(self) -> None:
         """Connects; returns when poses arrive.
 
         Raises:
-            BodyError: If it cannot, saying what to plug in or to change.
+            BodyError: If that fails, with the remedy.
         """
         ...
 
@@ -199,8 +193,8 @@ class Body(Protocol):
     def stop(self, rows: Index) -> None:
         """Motors off, at once, wherever the rows are: the emergency stop.
 
-        A device that may not have heard it is told again until it says that its motors stand, or must be taken for
-        gone; `flying` says until then that a flying row flies, and its note that the stop is not answered.
+        The order is repeated until the device confirms that its motors are off, or counts as gone; until then `flying`
+        stays set for a flying row, and its note is `UNANSWERED`.
         """
         ...
 
@@ -209,7 +203,7 @@ class Body(Protocol):
         ...
 
     def close(self) -> None:
-        """Lets go of the device. Rows still in the air must have been landed before."""
+        """Releases the device. Flying rows must have landed before."""
         ...
 
 
@@ -217,11 +211,11 @@ class BodyError(RuntimeError):
     """A body that cannot be opened or driven, with the remedy."""
 
 
-FRESH_S: Final = 0.5  # a setpoint that is older is none: wheels stop, sticks are at rest
+FRESH_S: Final = 0.5  # an older setpoint is dropped: wheels stop, sticks are at rest
 
-UNANSWERED: Final = "the emergency stop is not answered"  # in the notes of a robot that was stopped and goes on
+UNANSWERED: Final = "the emergency stop is not answered"  # note of a robot that was stopped and still moves
 
-# what a body that fails may raise, a plug-in too
+# errors of a body that fails, a plug-in too
 TROUBLE: Final = (
     AttributeError,
     TypeError,
@@ -235,9 +229,9 @@ TROUBLE: Final = (
 
 
 def call_all(calls: Iterable[Callable[[], object]]) -> None:
-    """Makes every call in the given order, whatever the others raise; the last error is raised afterwards.
+    """Makes every call in the given order, even if others raise; the last error is raised afterwards.
 
-    For everything that stops robots: a body that fails must not keep the next one from being stopped.
+    Used to stop robots: a body that fails must not keep the next one from being stopped.
     """
     left = iter(calls)
     for call in left:

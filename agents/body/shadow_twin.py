@@ -1,4 +1,4 @@
-"""A twin beside a robot: it gets the same commands, and how far it goes astray says how far it can be believed.
+"""Shadow twin: a twin beside a robot that gets the same commands; its deviation measures the quality of the model.
 
 The twin is put onto the robot, with its measured pose and velocity, when the robot is first driven (a flying one: when
 it is in the air and gets its first setpoint), and again every `restart_s`. In between it runs by itself. Right after
@@ -25,7 +25,7 @@ FRESH_S: Final = 0.25  # a pose older than this is not where the robot is
 
 
 class Placeable(Body, Protocol):
-    """A body that can be put somewhere, as a twin can."""
+    """A body whose rows can be placed, such as a twin."""
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask, velocity: Array | None = None) -> None:
         """Puts rows at (len(rows), 3) [m] with yaw (len(rows),) [rad], in the air or not, moving or at rest."""
@@ -33,7 +33,7 @@ class Placeable(Body, Protocol):
 
 
 class Shadowed:
-    """A body with twins beside some of its rows; implements `agents.body.interface.Body`. The robots never notice.
+    """A body with twins beside some of its rows; implements `agents.body.interface.Body`, without effect on the robots.
 
     A twin that fails is left alone from then on, and the notes of its rows say so.
     """
@@ -90,7 +90,7 @@ class Shadowed:
         self._try(lambda twin: twin.stop(mine))
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        """See `Body.locate`; the twin knows by itself where it is."""
+        """See `Body.locate`; the twin needs no external pose."""
         self._body.locate(row, t, position, yaw)
 
     def close(self) -> None:
@@ -101,7 +101,7 @@ class Shadowed:
             self._try(lambda twin: twin.close())
 
     def _follow(self, twin: Placeable, t: float, state: BodyState, position: Array, yaw: Array) -> None:
-        """Moves the twin on, and puts it onto the robot where that is due; fills in where it is."""
+        """Simulates the twin, restarts rows at the pose of their robot when due, and stores its pose in the state."""
         shadow = twin.read(t)
         rows = self._rows
         known = np.isfinite(state.position[rows]).all(axis=1) & np.isfinite(state.yaw[rows])
@@ -139,7 +139,7 @@ class Shadowed:
 
 
 def shadowed(body: Body, request: BodyRequest, restart_s: Array) -> Body:
-    """The body with twins beside it, free of all that nature adds; the body itself if nobody has one.
+    """The body with undisturbed twins beside it; the body itself without any.
 
     Args:
         body: Of the rows of `request`.
@@ -155,7 +155,7 @@ def shadowed(body: Body, request: BodyRequest, restart_s: Array) -> Body:
         return body
     count = len(rows)
     ideal = replace(
-        request.of(rows),
+        request.select(rows),
         addresses=(TWIN,) * count,
         disturbance=(Disturbance(),) * count,
         external=(False,) * count,

@@ -1,1 +1,1 @@
-"""What hardware and its protocol twins say to each other: ports, words, packing, units. No sockets here."""
+"""Protocols between hardware, or its protocol twins, and bridges: ports, words, packing, units. No sockets here."""

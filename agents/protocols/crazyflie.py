@@ -33,7 +33,7 @@ class Lighthouse(Part, frozen=True, tag_field="system", tag="lighthouse"):
 
     # geometry and calibration as the Crazyflie client saves them; None: what is stored on board
     file: str | None = None
-    base_stations: Annotated[int, Meta(ge=1, le=16)] = 4  # how many the firmware knows
+    base_stations: Annotated[int, Meta(ge=1, le=16)] = 4  # that the firmware knows
 
 
 class Loco(Part, frozen=True, tag_field="system", tag="loco"):
@@ -47,31 +47,31 @@ class Loco(Part, frozen=True, tag_field="system", tag="loco"):
 class Outside(Part, frozen=True, tag_field="system", tag="external"):
     """Positions from outside (motion capture), passed on to the Crazyflie's own estimator."""
 
-    rate_hz: Rate = 50.0  # at most so many are passed on per second
+    rate_hz: Rate = 50.0  # largest rate at which they are forwarded
     position_sigma: Positive = 0.01  # their standard deviation [m]
-    attitude: bool = False  # pass the yaw on as well; a marker set that is seen in two ways upsets the estimator
+    attitude: bool = False  # forward the yaw as well; an ambiguous marker set disturbs the estimator
     attitude_sigma: Positive = 0.05  # standard deviation of the attitude [rad]
 
 
 class Settings(Part, frozen=True):
-    """How one Crazyflie is driven."""
+    """Settings of one Crazyflie."""
 
     # `position` and `velocity` stream setpoints, `high-level` sends the planner on board to each new goal
     control: Literal["position", "velocity", "high-level"] = "position"
     stream_hz: Rate = 20.0  # rate of streamed setpoints
     log_hz: Rate = 50.0  # rate of the pose; a log period is a multiple of 10 ms
     status_hz: Rate = 10.0  # rate of battery and supervisor
-    multiranger: bool = False  # it carries a Multi-ranger deck
+    multiranger: bool = False  # has a Multi-ranger deck
     ranges_hz: Rate = 10.0  # rate of its ranges
-    # which system tells it where it is; None: what it carries is set up already
+    # its positioning system; None: set up on board already
     positioning: Lighthouse | Loco | Outside | None = None
     # on board; None: Kalman if a positioning system is named, else as it is
     estimator: Literal["auto", "complementary", "kalman", "ukf"] | None = None
     parameters: dict[str, float] = {}  # firmware parameters to set on connecting
     arm: bool = True  # arm it before taking off, where the platform asks for that
     platform: Literal["crazyflie", "brushless"] = "crazyflie"  # for the twin only: a `brushless` one must be armed
-    connect_s: Wait = 15.0  # it must be connected after this [s]
-    converge_s: Wait = 10.0  # its position estimate must have settled after this [s]
+    connect_s: Wait = 15.0  # [s] limit for connecting
+    converge_s: Wait = 10.0  # [s] limit for the position estimate to settle
 
     @property
     def packets_hz(self) -> float:
@@ -80,7 +80,7 @@ class Settings(Part, frozen=True):
 
 
 def address(name: str, given: str) -> str:
-    """The address of the robot `name`, if it is one that cflib understands.
+    """The address of the robot `name`, if cflib accepts it.
 
     Raises:
         BodyError: If not.
@@ -120,7 +120,7 @@ def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> Settings:
 
 
 def crowded(addresses: Sequence[str], each: Sequence[Settings]) -> dict[str, str]:
-    """What is to be said of radios that would have to carry more packets than they can, by address."""
+    """Warnings about radios with more packets than they can carry, by address."""
     radios = [address.split("/")[2] if address.startswith("radio://") else "" for address in addresses]
     said: dict[str, str] = {}
     for radio in set(radios) - {""}:

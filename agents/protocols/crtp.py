@@ -1,4 +1,4 @@
-"""CRTP, the protocol of the Crazyflie, version 12: ports, commands, answers, flags. Nobody else spells a number of it.
+"""CRTP, the protocol of the Crazyflie, version 12: ports, commands, answers, flags. No other module has a number of it.
 
 One packet is a header byte (port, two set bits, channel) and up to 30 bytes; over UDP one datagram is one packet.
 Source: the protocol pages of Bitcraze's documentation, and what cflib 0.1.34 puts on the wire.
@@ -22,7 +22,7 @@ LOG_VARIABLES: Final = 128
 
 
 class Port(IntEnum):
-    """Which part of the firmware a packet is for."""
+    """Part of the firmware that a packet addresses."""
 
     CONSOLE = 0
     PARAM = 2
@@ -52,7 +52,7 @@ class Status(IntEnum):
 
 
 class Info(IntFlag):
-    """What the supervisor says of itself: its answer on port 9, and the log variable supervisor.info."""
+    """State of the supervisor: its answer on port 9, and the log variable supervisor.info."""
 
     CAN_BE_ARMED = 1 << 0
     ARMED = 1 << 1
@@ -140,7 +140,7 @@ class Safety(IntEnum):
 
 
 class Location(IntEnum):
-    """What comes over the localization port, channel 1."""
+    """Messages of the localization port, channel 1."""
 
     LPP = 2
     STOP = 3

@@ -46,7 +46,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @property
     def stops_alone(self) -> bool:
-        """Whether the server stops the wheels when its client has gone: park's newest, which says x,y,θ, alone does."""
+        """Whether the server stops the wheels without a client: only the newest park server does (x,y,θ)."""
         return self.protocol == "park" and self.odometry == "pose"
 
     def __post_init__(self) -> None:
@@ -82,7 +82,7 @@ def rolled(left: float, right: float) -> tuple[float, float]:
 
 
 def numbers(text: str) -> list[float]:
-    """The comma separated numbers of an answer; those that are none end it."""
+    """The comma separated numbers of an answer, up to the first that is none."""
     found = []
     for word in text.split(","):
         try:

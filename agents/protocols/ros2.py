@@ -44,7 +44,7 @@ _ATTACHMENT: Final = struct.Struct("<qqB16s")
 
 
 class UnknownMessage(ValueError):
-    """Bytes that are not the message that their topic promises."""
+    """A payload that is no message of the type of its topic."""
 
 
 class Types:
@@ -85,7 +85,7 @@ class Types:
             raise UnknownMessage(f"not a {kind}: {error}") from None
 
     def hash(self, kind: str) -> str:
-        """RIHS01 hash of a type (REP 2016), or what stands in for it on Humble."""
+        """RIHS01 hash of a type (REP 2016), or its substitute on Humble."""
         if self.distro == "humble":
             return NO_HASH
         if kind not in self._hashes:
@@ -110,7 +110,7 @@ class Types:
 
 @cache
 def types(distro: Distro) -> Types:
-    """The types of a distribution; made once, for it takes 0.1 s.
+    """The types of a distribution; cached, since that takes 0.1 s.
 
     Raises:
         BodyError: As `Types`.
@@ -187,7 +187,7 @@ def dds_token(zid: str, role: Role, topic: str, kind: str) -> str:
 
 
 def endpoints(style: Style, role: Role, topic: str, *, domain: int | None = None) -> str:
-    """Key expression of the tokens of whoever publishes or subscribes to a topic.
+    """Key expression of the tokens of the publishers or subscribers of a topic.
 
     Args:
         style: Whose tokens.
@@ -201,7 +201,7 @@ def endpoints(style: Style, role: Role, topic: str, *, domain: int | None = None
 
 
 class Endpoint(NamedTuple):
-    """What the token of a publisher or subscriber tells; ros2dds knows neither type hashes nor domains."""
+    """Publisher or subscriber by its token; ros2dds knows neither type hashes nor domains."""
 
     topic: str  # full name, "/tb3_0/odom"
     kind: str  # "nav_msgs/msg/Odometry"
@@ -238,7 +238,7 @@ def gid(token: str) -> bytes:
 
 
 def attachment(sequence: int, stamp_ns: int, source: bytes) -> bytes:
-    """What rmw_zenoh attaches to a sample: running number from 1 on, UTC [ns], and the gid of its publisher."""
+    """Attachment of rmw_zenoh to a sample: running number from 1 on, UTC [ns], and the gid of its publisher."""
     return _ATTACHMENT.pack(sequence, stamp_ns, 16, source)
 
 

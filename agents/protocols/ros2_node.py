@@ -34,7 +34,7 @@ class Participant:
         self._entities = 0
 
     def number(self) -> int:
-        """The next entity's."""
+        """The number of the next entity."""
         self._entities += 1
         return self._entities - 1
 
@@ -61,7 +61,7 @@ class Node:
         return Publisher(self, kind, key, token)
 
     def subscriber(self, topic: str, kind: str, quality: str = ros2.RELIABLE, depth: int = 16) -> Subscriber:
-        """Hears a topic likewise; the newest `depth` samples wait."""
+        """Subscribes to such a topic; the newest `depth` samples wait."""
         token, key = self.announce("MS", topic, kind, quality)
         return Subscriber(self, kind, key, token, depth)
 
@@ -77,13 +77,13 @@ class Node:
         return ros2.endpoint_token(it.domain, it.zid, self._number, entity, role, self.namespace, self.name, rest), key
 
     def close(self) -> None:
-        """Takes the node's token back; its endpoints are closed by themselves."""
+        """Undeclares the token of the node; its endpoints are closed on their own."""
         if self._token is not None:
             self._token.undeclare()  # type: ignore[no-untyped-call]
 
 
 class Publisher:
-    """One end of a topic."""
+    """Publisher of a topic."""
 
     def __init__(self, node: Node, kind: str, key: str, token: str) -> None:
         participant = node.participant
@@ -122,7 +122,7 @@ class Publisher:
 
 
 class Subscriber:
-    """The other end of a topic.
+    """Subscriber of a topic.
 
     Attributes:
         malformed: Samples that were no message of the topic's type; they were left out.

@@ -59,7 +59,7 @@ def endpoint(robot: str, address: str) -> tuple[str, int]:
 
 
 def sticks(velocity: tuple[float, float, float], yaw_rate: float, yaw: float) -> tuple[int, int, int, int]:
-    """What `rc` takes (right, forward, up, clockwise) for a velocity in the world [m/s] and a yaw rate [rad/s]."""
+    """Arguments of `rc` (right, forward, up, clockwise) for a velocity in the world [m/s] and a yaw rate [rad/s]."""
     x, y, z = velocity
     cos, sin = math.cos(yaw), math.sin(yaw)
     forward, left = cos * x + sin * y, cos * y - sin * x
@@ -72,7 +72,7 @@ def sticks(velocity: tuple[float, float, float], yaw_rate: float, yaw: float) ->
 
 
 def motion(rc: tuple[int, int, int, int], yaw: float) -> tuple[float, float, float, float]:
-    """Velocity in the world [m/s] and yaw rate [rad/s] that sticks ask for at `yaw`: the inverse of `sticks`."""
+    """Velocity in the world [m/s] and yaw rate [rad/s] of sticks at `yaw`: the inverse of `sticks`."""
     right, forward, up, clockwise = (value / STICK for value in rc)
     cos, sin = math.cos(yaw), math.sin(yaw)
     return (

@@ -43,21 +43,20 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     domain: Annotated[int, Meta(ge=0, le=ros2.MAX_DOMAIN)] = 0  # ROS_DOMAIN_ID, for style "rmw"; likewise
     # whether cmd_vel is a TwistStamped (`enable_stamped_cmd_vel`); by distribution when left out
     stamped: bool | None = None
-    # where it takes commands: cmd_vel, or what a watchdog in front of it listens to
+    # topic of commands: cmd_vel, or that of a watchdog in front of it
     command_topic: Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = COMMAND
     endpoint: str | None = None  # Zenoh router by which the robot is reached, where it is not that of the experiment
-    # what stands at the robot's start pose: the robot when its body is opened, or the origin of its odometry, which is
+    # at the start pose of the experiment: the robot when its body is opened, or the origin of its odometry, which is
     # where its node was started
     origin: Literal["open", "boot"] = "open"
     style: Style = "ros2dds"  # of the twin
-    # the twin stops when it hears no command for so long [s]. A TurtleBot3 as it is sold has no such watchdog, hence
-    # None.
+    # [s] without a command after which the twin stops; None as in a TurtleBot3 as sold, which has no such watchdog
     watchdog_s: Annotated[float, Meta(gt=0)] | None = None
 
 
 @dataclass(frozen=True)
 class Address:
-    """How a robot is reached: `ros2dds://tb3_0?distro=humble`, `rmw://tb3_0?domain=0&distro=jazzy`."""
+    """Address of a robot: `ros2dds://tb3_0?distro=humble`, `rmw://tb3_0?domain=0&distro=jazzy`."""
 
     style: Style
     namespace: str
@@ -107,7 +106,7 @@ def command_type(distro: Distro, stamped: bool | None) -> str:
 
 
 def cut(speed: float) -> float:
-    """What the node makes of a speed [m/s or rad/s]: C truncates to whole hundredths."""
+    """The speed that the node sets [m/s or rad/s]: C truncates to whole hundredths."""
     return int(speed * 100.0) / 100.0
 
 

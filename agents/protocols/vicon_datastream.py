@@ -51,7 +51,7 @@ _SEGMENT = struct.Struct("<I3d9d")
 
 
 class Malformed(ValueError):
-    """Bytes that are no DataStream."""
+    """Bytes that are not in the DataStream format."""
 
 
 class Subject(NamedTuple):
@@ -63,7 +63,7 @@ class Subject(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Where a segment of a subject is: position (3,) [m], rotation to the room (9,), row by row."""
+    """Pose of a segment of a subject: position (3,) [m], rotation to the room (9,), row by row."""
 
     number: int
     position: tuple[float, float, float]
@@ -90,12 +90,12 @@ def pack_kinds(kinds: Iterable[int]) -> bytes:
 
 
 def pack_stream_info(rate_hz: float) -> bytes:
-    """The block that says how often frames come."""
+    """The block with the frame rate."""
     return block(Kind.STREAM_INFO, struct.pack("<q", round(CLOCK_HZ / rate_hz)))
 
 
 def pack_axes(up: int = Z_UP) -> bytes:
-    """The block that says which axis points up."""
+    """The block with the upward axis."""
     return block(Kind.APPLICATION_INFO, bytes([up]))
 
 
@@ -113,13 +113,13 @@ def pack_frame_number(number: int) -> bytes:
 
 
 def pack_latency(parts: Iterable[tuple[str, float]]) -> bytes:
-    """The block that says how old a frame is: stages and what each took [s]."""
+    """The block with the latency of a frame: stages and their durations [s]."""
     stages = [_text(name) + struct.pack("<d", seconds) for name, seconds in parts]
     return block(Kind.LATENCY_INFO, _WORD.pack(len(stages)) + b"".join(stages))
 
 
 def pack_segments(subject: int, segments: Iterable[Segment]) -> bytes:
-    """The block that says where the segments of a subject are; none of them: it is occluded."""
+    """The block with the poses of the segments of a subject; without any it is occluded."""
     packed = [_SEGMENT.pack(s.number, *(MM * x for x in s.position), *s.rotation) for s in segments]
     return block(Kind.GLOBAL_SEGMENTS, _HEAD.pack(subject, len(packed)) + b"".join(packed))
 

@@ -388,7 +388,7 @@ class Runtime:
 
     def _loop(self, stopping: Callable[[], str | None]) -> None:
         gc.collect()
-        gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
+        gc.freeze()  # imported objects live as long as the process: a collection need not visit them
         zero = time.monotonic()
         # one reading: a step of the wall clock in mid-run does not move the experiment
         self._utc = self._telemetry.utc = self._setup.clock.utc()

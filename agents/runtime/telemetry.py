@@ -146,7 +146,7 @@ class Telemetry:
             return
         for row in np.unique(state.rays.row).tolist():
             publisher = self._ranges[row]
-            scan = state.rays.of(row) if publisher is not None else None
+            scan = state.rays.scan_of(row) if publisher is not None else None
             if publisher is not None and scan is not None and scan.time > self._scanned[row]:
                 self._scanned[row] = scan.time
                 ranges = range_inbox.message(self._names[row], self.utc, scan)

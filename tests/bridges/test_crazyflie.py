@@ -208,7 +208,7 @@ def test_ranges():
     device = {"multiranger": True, "ranges_hz": 20.0}
     with flown(device=device, start=[[0.5, 0.0, 0.0]]) as (_, process):
         process.until(lambda: process.state.rays is not None, "scan")
-        scan = process.state.rays.of(0)
+        scan = process.state.rays.scan_of(0)
         assert scan.distance == pytest.approx([1.5, 2.5, 2.0, 2.0, 2.5], abs=2e-3)
         assert scan.bearing == pytest.approx(np.radians([0.0, 180.0, 90.0, -90.0, 0.0]))
         assert scan.elevation[4] == pytest.approx(np.pi / 2)

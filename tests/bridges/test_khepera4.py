@@ -197,7 +197,7 @@ def test_robots_drive_to_their_goals(served, speaks):
         drive.until(lambda: np.abs(drive.state.velocity).max() < 0.01)
         state, (position, yaw) = drive.state, twins.truth()
         drive.until(lambda: drive.state.rays is not None)
-        bearings = len(drive.state.rays.of(0).bearing)
+        bearings = len(drive.state.rays.scan_of(0).bearing)
     assert state.position == pytest.approx(position, abs=0.004)
     assert state.yaw == pytest.approx(yaw, abs=0.01)
     assert not state.flying.any()
@@ -205,7 +205,7 @@ def test_robots_drive_to_their_goals(served, speaks):
     park = PARK.items() <= speaks[0].items()
     assert np.isnan(state.battery).all() if park else (state.battery > 0.98).all()
     assert bearings == (5 if park else 13)
-    assert np.isnan(drive.state.rays.of(0).distance).all()
+    assert np.isnan(drive.state.rays.scan_of(0).distance).all()
     assert (np.abs(twins.truth()[0] - position) < 1e-3).all()
 
 
@@ -348,7 +348,7 @@ def test_park_never_gets_two_commands_at_once():
         with opened(open_khepera4(request("khepera4", [f"khepera4://127.0.0.1:{listener.getsockname()[1]}"]))) as body:
             drive = Drive(body, np.array([[1.0, 0.0]]))
             drive.until(lambda: len(reads) > 60)
-            scan = drive.state.rays.of(0)
+            scan = drive.state.rays.scan_of(0)
         server.join(2.0)
     assert {text.split()[0] for text in reads} == {"d", "p", "get_data", "stop"}
     assert all(len(text.split()) == 3 for text in reads if text[0] == "d")

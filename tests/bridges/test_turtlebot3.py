@@ -157,7 +157,7 @@ def test_drives_to_goals(hub, style, distro):
         assert (stage.t - state.time < 0.2).all()
         assert (state.battery > 0.99).all()
         assert np.bincount(state.rays.row).tolist() == [360, 360]
-        assert np.isnan(state.rays.of(0).distance).all()
+        assert np.isnan(state.rays.scan_of(0).distance).all()
 
 
 @pytest.mark.system

@@ -289,11 +289,11 @@ def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
     desk.until(lambda: desk.world and len(desk.world.robots) == 3, "it is gone")
     desk.tell("CF01", "takeoff", height=0.5)
     desk.tell("CF01", "takeoff", height=0.5)
-    desk.until(lambda: any("CF01 is told" in event.text for event in desk.events), "whoever calls it is told")
-    told = [event.text for event in desk.events if "CF01 is told" in event.text]
+    desk.until(lambda: any("CF01 gets commands" in event.text for event in desk.events), "whoever calls it is told")
+    told = [event.text for event in desk.events if "CF01 gets commands" in event.text]
     assert told == [
-        "CF01 is told what to do, but is not in this world: start the world with the experiment that has it, or put it "
-        "in with `zenpark world-order spawn CF01`"
+        "CF01 gets commands, but is not in this world: start the world with the experiment that has it, or add it with "
+        "`zenpark world-order spawn CF01`"
     ]
     assert desk.give("spawn", name="CF01").ok
     desk.until(lambda: desk.world and "CF01" in desk.world.robots, "it is back")

@@ -147,13 +147,13 @@ def test_rays_of_a_row_stand_together_in_the_order_of_its_sensors():
     np.testing.assert_array_equal(rays.bearing[:13], np.concatenate([sound, light]))
     np.testing.assert_array_equal(rays.bearing[-8:], light)
     assert not rays.elevation.any()
-    scan = rays.of(0)
+    scan = rays.scan_of(0)
     ahead = scan.bearing == 0.0
     # the landed Crazyflie is too near for sound, and hides what is behind it; all TurtleBots' rays pass over both
     np.testing.assert_allclose(scan.distance[ahead], [np.nan, 0.135], atol=1e-12)
-    assert rays.of(3).distance[light == np.pi] == pytest.approx(0.1, abs=1e-12)
+    assert rays.scan_of(3).distance[light == np.pi] == pytest.approx(0.1, abs=1e-12)
     np.testing.assert_allclose(seen[0, 13 + 180], np.nan)
-    assert rays.of(1) is None
+    assert rays.scan_of(1) is None
 
 
 def test_a_multiranger_looks_ahead_and_up():
@@ -180,7 +180,7 @@ def test_sensors_measure_at_their_own_rates(dt):
     for k in range(1, round(20.0 / dt) + 1):
         ranges.sweep(k * dt, engine)
         for row, seen in times.items():
-            scan = ranges.rays.of(row)
+            scan = ranges.rays.scan_of(row)
             if not seen or scan.time > seen[-1]:
                 assert scan.time == k * dt
                 seen.append(scan.time)
@@ -270,7 +270,7 @@ def test_a_robot_s_readings_do_not_depend_on_who_shares_its_process():
     request = asked(kinds, start)
     together, ranges = swept(request, placed(kinds, carried, copy=[0, 1, 2, 3], noise=1.0), times)
     for row in range(4):
-        one = request.of(np.array([row]))
+        one = request.select(np.array([row]))
         alone, _ = swept(one, placed([kinds[row]], [carried[row]], noise=1.0), times)
         np.testing.assert_array_equal(together[:, ranges.rays.row == row], alone)
     reseeded = replace(request, seeds=(0, 9, 2, 3))
@@ -291,7 +291,7 @@ def test_mirrored_rows_are_seen_where_they_are_and_see_from_there():
     engine.advance(0.01, np.zeros((3, 2)))
     ranges.sweep(0.1, engine)
     for row in (0, 1):
-        scan = ranges.rays.of(row)
+        scan = ranges.rays.scan_of(row)
         np.testing.assert_allclose(scan.distance[scan.bearing == 0.0], 0.23, atol=1e-12)
         assert np.isfinite(scan.distance).sum() == 1
 

@@ -1,10 +1,9 @@
-"""The centre as a process: `python -m experiments.real_time.processes.centre FILE`. It decides for the robots that the
-file says.
+"""The process of the central controller: `python -m experiments.real_time.processes.centre FILE`.
 
-It hears the poses of those robots, and of whom they listen to, as any neighbour would, and sends each its goal. What is
-decided is `agents.decision.centralised`; here are the clock and the network. It keeps nothing that it would miss after
-a death: it is started again, hears the last poses, learns from the robots' statuses when and where each began, and goes
-on. It runs where the conductor does, on the clock of the experiment: what robots elsewhere stamp is set right there.
+It receives the poses of the guided robots and of their neighbours, as any neighbour would, and sends each robot its
+goal. `agents.decision.centralised` decides; here are the clock and the network. It needs no memory: after a restart it
+receives the last poses, and by the robots' statuses when and where each began. It runs on the machine of the conductor,
+whose clock is that of the experiment.
 """
 
 from __future__ import annotations
@@ -43,26 +42,26 @@ from experiments.file.problems import DocumentError, Problem
 from experiments.real_time.processes.joining import Launch, joined
 
 REPORT_S: Final = 1.0
-DEPTH: Final = 64  # poses of a robot that may wait for the next decision
+DEPTH: Final = 64  # queued poses of a robot
 ROUNDING_S: Final = 1e-5  # stamps are rounded
 PHASES: Final = {phase.word: int(phase) for phase in Phase}
 EXPLAINED: Final = (DocumentError, registry.PluginError, EndpointError, NameTaken, network.Unreachable)
 
 
 class CentreProcess:
-    """Paces a centre, and carries its words."""
+    """Clock and network of a central controller."""
 
     def __init__(
         self, experiment: Experiment, session: zenoh.Session, keys: Keys, endpoints: Sequence[str] = ()
     ) -> None:
-        """Declares everything but the token: whoever sees that is listened to. `endpoints` are those of the session."""
+        """Declares all but the token, which tells that orders are received. `endpoints` are those of the session."""
         assignment = Plan(experiment).centre_assignment()
         self.centre = centre = Centre(assignment)
         self._names, self._session, self._keys = assignment.names, session, keys
         self._router = network.RouterWatch(session, keys.centre_alive, endpoints)
         self._encoding: messages.Encoding = experiment.network.encoding
         self._period = assignment.decide_every / assignment.body_hz
-        # what robots say on the tick of a decision is on its way then: half a tick more, and it counts
+        # poses that are sent on the tick of a decision arrive within half a tick, and still count
         self._patience = 0.5 / assignment.body_hz
         names, rows = self._names, centre.needed.tolist()
         reach, rate = reach_of(assignment.limits.low, assignment.limits.high), experiment.rates.pose_hz
@@ -84,14 +83,14 @@ class CentreProcess:
         self._begun = np.inf
         self._next = self._utc = 0.0
         self._clock = Clock()
-        self._seq = round(self._clock.utc() * 1e3)  # beyond whatever a centre before this one had reached
+        self._seq = round(self._clock.utc() * 1e3)  # beyond any number of a former central controller
         self._sent = self._missed = 0
         self._late_s, self._reported, self._cpu_s = 0.0, 0.0, time.process_time()
 
     def run(self, over: threading.Event) -> None:
-        """Until told to end."""
+        """Decides until `over` is set."""
         gc.collect()
-        gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
+        gc.freeze()  # imported objects live as long as the process: a collection need not visit them
         zero = time.monotonic()
         self._utc = self._clock.at(zero)
         token = pubsub.alive_token(self._session, self._keys.centre_alive)
@@ -110,7 +109,7 @@ class CentreProcess:
         token.undeclare()  # type: ignore[no-untyped-call]
 
     def _listen(self, t: float) -> None:
-        """Takes in what has arrived since the last decision."""
+        """Receives all since the last decision."""
         self._router.silent_since(t)
         for row, inbox in self._statuses.items():
             for status in inbox.read(_check_status):
@@ -137,12 +136,12 @@ class CentreProcess:
             self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
 
     def _begin(self, speaker: NeighbourSubscription) -> None:
-        """A robot begins a new life."""
+        """Forgets a robot that has a new session."""
         self._channel.forget(speaker.links)
         self.centre.discard_poses(self.centre.needed[speaker.links])
 
     def _send(self, speaker: NeighbourSubscription, said: ReceivedPose, t: float) -> None:
-        """One pose has come: it is given to the modelled network."""
+        """Puts a pose into the modelled channel."""
         pose = said.pose
         start = float(self._start[self._guided].min())
         if self._within(pose.stamp - self._utc, start):
@@ -160,8 +159,8 @@ class CentreProcess:
         )
 
     def _believe(self, got: PoseTable) -> None:
-        """Poses have got through."""
-        assert got.extra is not None  # all bring along their yaw, and when they were measured
+        """Passes poses that got through to the controller."""
+        assert got.extra is not None  # yaw and time of measurement
         rows = self.centre.needed[got.link]
         yaw, measured = got.extra.T
         self.centre.receive(rows, got.position, got.velocity, yaw, measured, got.arrival)
@@ -170,7 +169,7 @@ class CentreProcess:
             self._heard[link] += self._within(stamp, start)
 
     def _within(self, taken: float, start: float) -> bool:
-        """Whether a pose was taken in the run that began at `start` [s]."""
+        """Whether a pose was measured in the run that began at `start` [s]."""
         return 0.0 <= taken - start + ROUNDING_S < self.centre.assignment.duration
 
     def _update_status(self, row: int, status: messages.Status) -> None:

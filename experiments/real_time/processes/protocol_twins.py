@@ -1,8 +1,7 @@
 """The process of protocol twins: `python -m experiments.real_time.processes.protocol_twins FILE NAME ...`.
 
-It stands where the hardware would stand: it knows the experiment only for where its robots start and what nature does
-to them. It says on standard output at which address each robot is, and tells recorder and simulated motion capture,
-never a robot, where they really are.
+It replaces the hardware: of the experiment it uses only starts and disturbances. It prints the address of each robot,
+and publishes true poses for recorder and simulated motion capture, never for robots.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ EXPLAINED: Final = (
 
 
 class DeviceProcess:
-    """Runs a device: waits on its sockets, moves it on, publishes the truth."""
+    """Runs a device: serves its sockets, simulates it, publishes true poses."""
 
     def __init__(
         self,
@@ -59,7 +58,7 @@ class DeviceProcess:
         rate_hz: float,
         lost: threading.Event,
     ) -> None:
-        """Without a session nobody is told the truth; `lost` is set when the launcher is gone."""
+        """Without a session no true pose is published; `lost` is set when the launcher is gone."""
         self._device, self._names, self._dt = device, names, 1.0 / rate_hz
         known = names if session is not None else ()
         self._truths = [pubsub.publisher(session, keys.truth(name), messages.JSON) for name in known if session]
@@ -67,7 +66,7 @@ class DeviceProcess:
         self._farewell = Farewell(session, keys, names, lost) if session is not None else None
 
     def run(self, over: threading.Event) -> None:
-        """Until told to end, or until the launcher and then the robots are gone."""
+        """Runs until `over` is set, or until launcher and then robots are gone."""
         zero, clock = time.monotonic(), Clock()
         due = 0.0
         with selectors.DefaultSelector() as waiting:
@@ -80,7 +79,7 @@ class DeviceProcess:
                 if now >= due:
                     self._device.advance(now)
                     self._tell(clock.at(zero + now))
-                    due = max(due + self._dt, now - 10.0 * self._dt)  # after a long stop it does not hurry
+                    due = max(due + self._dt, now - 10.0 * self._dt)  # after a suspension lost time is not caught up
                     if self._farewell.over() if self._farewell is not None else self._lost.is_set():
                         return
 
@@ -144,10 +143,10 @@ def by_hand(
     Args:
         kind: Of robot.
         count: How many.
-        faults: What goes wrong on purpose.
+        faults: Injected faults.
         device: Settings of the device.
-        connect: Routers at which the truth is told, and at which twins that live on Zenoh are reached; may be none.
-        identity: Whose certificate is shown, in a lab.
+        connect: Routers for true poses, and for twins that are reached by Zenoh; may be none.
+        identity: Name in the certificate, in a lab.
 
     Raises:
         DocumentError: If there is no such protocol twin.
@@ -179,7 +178,7 @@ def _serve(
     lifeline: bool,
     identity: str = "twin",
 ) -> int:
-    """Runs a device until it is told to end, or its lifeline is lost and the robots are gone."""
+    """Runs a device until a signal, or until its lifeline is lost and the robots are gone."""
     names = request.body.names
     over, lost = threading.Event(), threading.Event()
     if lifeline:

@@ -1,6 +1,6 @@
 """The recorder process: `python -m experiments.real_time.processes.recorder EXPERIMENT.json TARGET ...`.
 
-A process of its own, so that the death of the conductor costs no recording: it goes on until every robot is gone.
+A process of its own, so that a recording survives the conductor: it goes on until every robot is gone.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from experiments.recording.writer import Recording
 EXPLAINED: Final = (DocumentError, RecordingError, EndpointError, network.Unreachable, OSError)
 POLL_S: Final = 0.02
 FLUSH_S: Final = 1.0
-FRESH_S: Final = 0.05  # a truth that is farther away in time does not belong to a state
-PATIENCE_S: Final = 0.2  # a state waits so long for the truth that follows it
-TRUTHS: Final = 256  # that are kept of each robot
-NAMED: Final = 100  # keys of which is told that something could not be read
+FRESH_S: Final = 0.05  # largest time between a state and a true pose that belongs to it
+PATIENCE_S: Final = 0.2  # longest wait of a state for the true pose after it
+TRUTHS: Final = 256  # kept, of each robot
+NAMED: Final = 100  # reported keys with unreadable messages
 
 
 class Recorder:
-    """Takes down what robots and conductor say."""
+    """Records the messages of robots, world, central controller and conductor."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, recording: Recording) -> None:
         self._keys, self._recording = keys, recording
@@ -64,7 +64,7 @@ class Recorder:
         return not self._alive
 
     def receive(self, *, last: bool = False) -> None:
-        """Writes what has arrived; states of protocol twins wait for the truth behind them, but for the `last` time.
+        """Writes received messages; states of protocol twins wait for the next true pose, except the `last` time.
 
         Raises:
             RecordingError: If it cannot be written.
@@ -84,11 +84,11 @@ class Recorder:
 
     @property
     def malformed(self) -> int:
-        """Messages that could not be read."""
+        """Number of unreadable messages."""
         return sum(count for count, _ in self._unread.values())
 
     def report_malformed(self, *, last: bool = False) -> None:
-        """Says in the recording what could not be read: of each key at once, and at the `last` how much it was.
+        """Records unreadable messages as events: of each key the first, and their number the `last` time.
 
         Raises:
             RecordingError: If it cannot be written.
@@ -146,9 +146,9 @@ def _finite(value: object) -> bool:
 
 
 def with_truth(state: messages.State, truths: Sequence[messages.Position]) -> messages.State:
-    """A state with where its robot really was then: on the line between the truths (in order of time) before and after.
+    """A state with the true pose of its robot: interpolated between the true poses (in order of time) before and after.
 
-    Where only one is known, that one if it is fresh; unchanged if there is none.
+    With only one, that one if it is fresh; unchanged without any.
     """
     after = next((truth for truth in truths if truth.stamp >= state.stamp), None)
     before = next((truth for truth in reversed(truths) if truth.stamp <= state.stamp), None)

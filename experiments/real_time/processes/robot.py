@@ -1,7 +1,6 @@
-"""A robot's process: `python -m experiments.real_time.processes.robot FILE NAME ...`. Light to start, for an experiment
-starts many.
+"""The process of robots: `python -m experiments.real_time.processes.robot FILE NAME ...`; light to start.
 
-`zenpark agent` is the same for people; launchers start this, which needs neither typer nor what typer needs.
+`zenpark agent` is the same for people; launchers start this, which imports no typer.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ from experiments.real_time.processes.joining import Launch
 
 STDIN: Final = "-"
 JOIN: Final = "join"
-FAR: Final = ("external", "world")  # bodies that live in another process, their range sensors too
+FAR: Final = ("external", "world")  # bodies in another process, with their range sensors
 EXPERIMENT_S: Final = 15.0  # how long an experiment may take to arrive on standard input
 EXPLAINED: Final = (DocumentError, BodyError, NameTaken, registry.PluginError, EndpointError, LabError, Unreachable)
 
@@ -148,7 +147,7 @@ def read_experiment(fd: int = 0, limit_s: float = EXPERIMENT_S) -> str:
 
 
 def _ranging(robot: Robot) -> Ranging:
-    """Where a robot's range readings come from: bodies in other processes hear them by themselves."""
+    """Source of the range readings of a robot: bodies in other processes receive them by themselves."""
     if registry.body_name(robot.body) in FAR:
         return "far"
     return robot.ranges

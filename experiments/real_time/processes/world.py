@@ -1,10 +1,7 @@
-"""The twin service: `python -m experiments.real_time.processes.world FILE`. One world that carries any number of twins,
-in real time.
+"""The world process: `python -m experiments.real_time.processes.world FILE` simulates any number of twins in real time.
 
-Robots reach it by keys only (`docs/external-simulators.md`). What it hears and says is
-`experiments.real_time.processes.world_network`, who is in it and where
-`experiments.real_time.processes.world_population`; this is the clock, the orders, and the process, which is light to
-start.
+Robots reach it by keys only (`docs/external-simulators.md`). Here are clock, orders and process; beside it
+`experiments.real_time.processes.world_network` and `experiments.real_time.processes.world_population`.
 """
 
 from __future__ import annotations
@@ -36,14 +33,14 @@ from experiments.real_time.processes.world_network import Exchange
 from experiments.real_time.processes.world_population import Population, Refused
 
 REPORT_S: Final = 1.0
-SLIP_S: Final = 0.05  # what it makes up for when it was late; the rest of the time is lost, and the factor says so
+SLIP_S: Final = 0.05  # lateness that is caught up; the rest of the time is lost, which shows in the factor
 MOST_STEPS: Final = 1_000_000
 EXPLAINED: Final = (DocumentError, BodyError, registry.PluginError, EndpointError, NameTaken, network.Unreachable)
 
 
 @dataclass
 class Pace:
-    """How fast it goes: simulated over real time, and the share of it that was worked, over the last second."""
+    """Pace over the last second: simulated over real time, and the share of real time that was worked."""
 
     factor: float = 1.0
     load: float = 0.0
@@ -52,7 +49,7 @@ class Pace:
     worked: float = 0.0
 
     def update(self, now: float, dt: float) -> bool:
-        """Whether a second is over at `now` [s]; the figures are then those of that second."""
+        """Updates the figures when a second is over at `now` [s]; returns whether it is."""
         span = now - self.since
         if span < REPORT_S:
             return False
@@ -62,7 +59,7 @@ class Pace:
 
 
 class WorldProcess:
-    """Paces a population, and obeys."""
+    """Runs a population in real time, and obeys orders."""
 
     def __init__(
         self,
@@ -72,7 +69,7 @@ class WorldProcess:
         lost: threading.Event,
         endpoints: Sequence[str] = (),
     ) -> None:
-        """`lost` is set when it shall end as soon as its robots are down; `endpoints` are those of the session."""
+        """`lost` is set to end as soon as the robots have landed; `endpoints` are those of the session."""
         self._population, self._session, self._lost = population, session, lost
         self._keys = Keys(experiment.network.realm)
         self._engine = registry.split(experiment.world.engine)[0]
@@ -86,14 +83,14 @@ class WorldProcess:
         self._enter()
 
     def find(self, there: Set[str]) -> list[str]:
-        """Puts carried robots of those that are on the network where they say that they are; their names."""
+        """Places simulated robots that are on the network at the poses of their states; returns their names."""
         return self._exchange.restore_positions(there)
 
     def run(self, over: threading.Event) -> None:
-        """Until told to end at once, or until its starter and then its robots are gone."""
+        """Runs until `over` is set, or until launcher and then robots are gone."""
         exchange, pace, dt = self._exchange, self._pace, self._dt
         gc.collect()
-        gc.freeze()  # what was imported lives as long as the process: a collection need not look at it
+        gc.freeze()  # imported objects live as long as the process: a collection need not visit them
         zero = time.monotonic()
         exchange.begin(zero)
         token = pubsub.alive_token(self._session, self._keys.world_alive)
@@ -121,7 +118,7 @@ class WorldProcess:
         for query, order in self._orders.read():
             changed |= self._obey(query, order)
         if self._lost.is_set() and self.paused:
-            self.paused, changed = False, True  # who must land cannot wait
+            self.paused, changed = False, True  # robots that must land cannot wait
         self._exchange.receive(t)
         if not self.paused or self._steps:
             self._exchange.apply_commands(t)
@@ -135,7 +132,7 @@ class WorldProcess:
             self._report(t)
 
     def _enter(self) -> None:
-        """After somebody came or went."""
+        """Follows a change of the rows."""
         self._exchange.update_rows()
         population = self._population
         carried = [name for name, here in zip(population.names, population.carried.tolist(), strict=True) if here]
@@ -264,7 +261,7 @@ def _ready(experiment: Experiment, population: Population, endpoints: Sequence[s
 
 
 def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
-    """Robots that are on the network already: another world may have carried them."""
+    """Robots that are on the network already: a former world may have simulated them."""
     replies = session.liveliness().get(keys.alive("*"), timeout=1.0)
     found = {keys.whose(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
     return {name for name in found if name is not None}

@@ -1,7 +1,6 @@
-"""What a world hears and says: commands in, positions, truths and range readings out, and where mirrored robots are.
+"""Network of a world: receives commands and mirrored robots, publishes positions, true poses and range readings.
 
-One wildcard subscription for all commands; a key is looked up before a payload is decoded. What is heard is checked
-before it is believed.
+One wildcard subscription for all commands; a key is looked up before a payload is decoded.
 """
 
 from __future__ import annotations
@@ -28,35 +27,33 @@ from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.world_population import Population
 
-DEPTH: Final = 16_384  # commands that may wait: of two hundred robots, those of 0.8 s
+DEPTH: Final = 16_384  # queued commands: those of two hundred robots in 0.8 s
 TRUTH_HZ: Final = 50.0
-HOLD_S: Final = 0.5  # a robot that is not told anything for this long holds its place,
+HOLD_S: Final = 0.5  # without a command for this long a robot holds its position,
 LAND_S: Final = 3.0  # and lands after this
-CLIMB_S: Final = 15.0  # one that climbs, or was found in the air, is given this long until it is first told where to
-GONE_S: Final = 1.0  # a mirrored robot that was not heard of for this long is taken out
-HANG_S: Final = 0.3  # whoever was stopped for longer could not hear: nobody was silent
-ANSWER_S: Final = 1.0  # to say where one is
-STRANGERS: Final = 100  # that are told apart
+CLIMB_S: Final = 15.0  # limit for the first setpoint after a climb, or after a restart of the world
+GONE_S: Final = 1.0  # without a state for this long a mirrored robot is removed
+HANG_S: Final = 0.3  # after a longer suspension of the world silence proves nothing
+ANSWER_S: Final = 1.0  # limit for robots to send their state
+STRANGERS: Final = 100  # distinct unknown robots that are reported
 IN_AIR_M: Final = 0.05
 UP: Final = ("ready", "airborne", "running", "landing")  # phases in which a robot may be in the air
 UNDER_WAY: Final = ("airborne", "running")
 
 
 class Exchange:
-    """The network of a world. Times `t` are on the world's clock [s].
+    """The network of a world. Times `t` are on the clock of the world [s]."""
 
-    Attributes:
-        utc: UTC time at which the world's clock was 0 [s].
-        contacts: That have begun.
-        refused: Commands to robots that are not here, and orders that could not be carried out.
-        malformed: Payloads that were not what their key promises.
-        trouble: The last thing that was wrong; empty if nothing was.
-    """
+    utc: float  # [s] UTC at which the clock of the world was 0
+    contacts: int  # that have begun
+    refused: int  # commands to unknown robots, and orders that could not be carried out
+    malformed: int  # refused payloads
+    trouble: str  # last refusal; empty if there was none
 
     def __init__(
         self, experiment: Experiment, population: Population, session: zenoh.Session, endpoints: Sequence[str] = ()
     ) -> None:
-        """Listens; `enter` declares the rest. `endpoints` are those of the session."""
+        """Subscribes; `update_rows` declares the rest. `endpoints` are those of the session."""
         self._population, self._session = population, session
         keys = self._keys = Keys(experiment.network.realm)
         self._encoding = experiment.network.encoding
@@ -64,7 +61,7 @@ class Exchange:
         x, y, z = experiment.arena.size
         self._reach = validation.reach_of((-0.5 * x, -0.5 * y, 0.0), (0.5 * x, 0.5 * y, z))
         self._truth_every = max(1, round(experiment.rates.body_hz / TRUTH_HZ))
-        # robots with another body have another simulator, or none, to tell things to
+        # commands to robots with another body are for another simulator
         self._elsewhere = {keys.setpoint(name) for name, robot in experiment.robots.items() if robot.body != WORLD}
         self._measured = frozenset(Plan(experiment).externally_measured)
         self._clock = Clock()
@@ -85,8 +82,10 @@ class Exchange:
         self._events = pubsub.publisher(session, keys.event, messages.JSON)
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._mirrors: dict[str, tuple[int, pubsub.Inbox[messages.State]]] = {}
-        self._done: dict[str, int] = {}  # number of the last command that was carried out
-        self._lives: dict[str, str] = {}  # session that owns the name of a robot: a new one counts its commands anew
+        self._done: dict[str, int] = {}  # number of the last executed command
+        self._lives: dict[
+            str, str
+        ] = {}  # session that owns the name of a robot: a new one numbers its commands from anew
         self._owners = pubsub.AliveWatch(session, keys.lives(keys.alive("*")))
         self._strangers: set[str] = set()
         self._met: set[frozenset[str]] = set()
@@ -99,19 +98,19 @@ class Exchange:
         self.update_rows()
 
     def begin(self, monotonic: float) -> None:
-        """The world's clock is 0 at this time of the monotonic one [s]."""
+        """Sets the clock of the world to 0 at this time of the monotonic clock [s]."""
         self.utc = self._clock.at(monotonic)
 
     def update_rows(self) -> None:
-        """The rows of the population, as they are now."""
+        """Follows a change of the rows of the population."""
         population, keys, session = self._population, self._keys, self._session
         names, rows = population.names, len(population.names)
         old = {name: row for row, name in enumerate(self._names)}
         kept = [(row, old[name]) for row, name in enumerate(names) if name in old]
         now, was = (np.array([pair[k] for pair in kept], dtype=np.intp) for k in (0, 1))
-        # since when each row is told nothing; infinity: nothing needs to be told
+        # begin of the silence of each row; infinity: it needs no command
         self._quiet, quiet = np.full(rows, inf), self._quiet
-        # when each mirrored row was heard of last, and where it was
+        # time and pose of the last state of each mirrored row
         self._heard, heard = np.full(rows, -inf), self._heard
         self._place, place = np.full((rows, 3), np.nan), self._place
         self._velocity, velocity = np.zeros((rows, 3)), self._velocity
@@ -120,7 +119,7 @@ class Exchange:
         self._place[now], self._velocity[now], self._yaw[now] = place[was], velocity[was], yaw[was]
         self._names = names
         self._held = np.zeros(rows, dtype=bool)
-        self._given = np.full((rows, 4), np.nan)  # setpoints that have come since the last step
+        self._given = np.full((rows, 4), np.nan)  # setpoints since the last step
         self._carried = np.flatnonzero(population.carried)
         self._row = {keys.setpoint(names[row]): row for row in self._carried.tolist()}
         for name in old.keys() - set(names):
@@ -153,7 +152,7 @@ class Exchange:
             self._update_mirrors()
 
     def restore_positions(self, there: Set[str]) -> list[str]:
-        """Puts carried robots of those that are on the network where they say that they are; their names."""
+        """Places simulated robots that are on the network at the poses of their states; returns their names."""
         waiting = {
             name: self._states_of(name)
             for name in (self._names[row] for row in self._carried.tolist())
@@ -178,13 +177,13 @@ class Exchange:
         return found
 
     def mirrored(self) -> list[str]:
-        """Names of the mirrored robots that are seen now."""
+        """Names of the mirrored robots with a known pose."""
         return [self._names[row] for row in self._mirrored.tolist() if np.isfinite(self._place[row, 0])]
 
-    # ------------------------------------------------------------------ what is heard
+    # ------------------------------------------------------------------ receive
 
     def receive(self, t: float) -> None:
-        """Takes in what has arrived."""
+        """Receives all until `t`."""
         for token, there in self._owners.changes():
             if there:
                 self._note_owner(token)
@@ -199,14 +198,14 @@ class Exchange:
             self._update_start(status, t)
 
     def slept(self, seconds: float, t: float) -> None:
-        """The world itself stood still for so long, until `t`."""
+        """Forgives silence after the world stood still for so long, until `t`."""
         if seconds > HANG_S:
             self._quiet = np.where(np.isfinite(self._quiet), np.maximum(self._quiet, t), self._quiet)
 
     def apply_commands(self, t: float) -> None:
-        """Passes on what robots were told; those that are told nothing hold, and land after a while."""
+        """Applies the commands; robots without commands hold, and land after `LAND_S`."""
         population = self._population
-        if self._router.silent_since(t) < inf:  # nobody can be heard: they hold, but need not land for that
+        if self._router.silent_since(t) < inf:  # without a router no command arrives: robots hold, but need not land
             self._quiet = np.maximum(self._quiet, t - HOLD_S - 1e-3)
         silent = t - self._quiet > HOLD_S
         if some(silent):
@@ -219,7 +218,7 @@ class Exchange:
                 population.land(tired)
                 self._quiet[tired] = inf
                 for row in tired.tolist():
-                    self.publish_event("silent", self._names[row], f"lands: it was told nothing for {LAND_S:g} s")
+                    self.publish_event("silent", self._names[row], f"lands: no command for {LAND_S:g} s")
         given = np.isfinite(self._given[:, 0])
         if some(given):
             population.drive(self._given, np.flatnonzero(given))
@@ -267,12 +266,12 @@ class Exchange:
             self.publish_event(
                 "refused",
                 "world",
-                f"{name} is told what to do, but is not in this world: start the world with the experiment that has "
-                f"it, or put it in with `zenpark world-order spawn {name}`",
+                f"{name} gets commands, but is not in this world: start the world with the experiment that has "
+                f"it, or add it with `zenpark world-order spawn {name}`",
             )
 
     def _look_around(self, t: float) -> None:
-        """Where the mirrored robots are."""
+        """Updates the poses of mirrored robots."""
         changed = False
         for row, inbox in self._mirrors.values():
             state = self._newest(inbox)
@@ -319,10 +318,10 @@ class Exchange:
         self.malformed += 1
         self.trouble = reason
 
-    # ------------------------------------------------------------------ what is said
+    # ------------------------------------------------------------------ publish
 
     def publish(self, t: float) -> None:
-        """Where everybody is, what touched and what sensors see."""
+        """Publishes positions, true poses, range readings and contacts."""
         state, rows = self._population.state, self._carried
         stamp = round(self.utc + t, 6)
         self._publish(self._positions, state.position[self._placed], state.yaw[self._placed], stamp)
@@ -343,12 +342,12 @@ class Exchange:
                 self.publish_event("contact", meeting.first, f"touches {meeting.second} ({meeting.impulse:.3g} N s)")
 
     def publish_event(self, kind: str, source: str, text: str) -> None:
-        """An event, for recorder and viewers."""
+        """Publishes an event, for recorder and viewers."""
         print(f"{kind} {source}: {text}", flush=True)
         self._events.put(messages.encode(messages.Event(self._clock.utc(), kind, source, text)))
 
     def refuse(self, source: str, reason: str) -> None:
-        """Counts and says what was refused."""
+        """Counts and publishes a refusal."""
         self.refused += 1
         self.trouble = reason
         self.publish_event("refused", source, reason)
@@ -363,7 +362,7 @@ class Exchange:
             publisher.put(messages.encode(messages.position(name, stamp, place, heading), encoding))
 
     def _sweep(self, rays: Rays, stamp: float) -> None:
-        """The readings of rows that measured since they were told last."""
+        """Publishes the readings of rows that have new ones."""
         begin = np.flatnonzero(np.diff(rays.row, prepend=-1))  # rays of one row follow one another
         end = np.append(begin[1:], len(rays.row))
         time = np.maximum.reduceat(rays.time, begin)

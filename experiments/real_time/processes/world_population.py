@@ -1,7 +1,6 @@
-"""Who is in a world and where: robots that it carries, mirrors of others, obstacles; all as the rows of one twin body.
+"""Robots, mirrors of robots and obstacles of a world, as the rows of one twin body; without a network.
 
-Nothing here knows of a network. Whoever comes or goes changes the rows: the body is then made anew, and everything is
-put back where it was.
+A change of the rows makes the body anew and restores the poses.
 """
 
 from __future__ import annotations
@@ -26,96 +25,94 @@ from twins import scene
 from twins.body import TwinBody
 from twins.scene import Obstacle, Scene
 
-WALL: Final = "wall"  # what the arena's own walls are called
-TAKEN: Final = (WALL, "world", "all", "run", "estop", *KINDS)  # they mean something in keys and in the experiment file
+WALL: Final = "wall"  # name of the walls of the arena in contacts
+TAKEN: Final = (WALL, "world", "all", "run", "estop", *KINDS)  # words of keys and of the experiment file
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 ROUNDING: Final = 1e-9  # [m]
 
 
 class Refused(ValueError):
-    """What a world cannot do, with why and what to do instead."""
+    """An order that a world cannot carry out, with reason and remedy."""
 
 
 @dataclass(frozen=True)
 class Meeting:
-    """The beginning of a contact, by names."""
+    """Begin of a contact, by names."""
 
     first: str
     second: str
-    impulse: float
-    overlap: float
+    impulse: float  # [N s]
+    overlap: float  # [m]
 
 
 class Population:
-    """The rows of a world, and all that may happen to them.
+    """The rows of a world, and all that may happen to them."""
 
-    Attributes:
-        names: Of the rows (n), those of the experiment first.
-        carried: (n,) rows that move here; the others are mirrors.
-        seen: (n,) rows whose range sensors are simulated for somebody: carried ones, and those that ask for it.
-        body: The twin body of these rows.
-        time: Simulated since it was made [s].
-        state: What the body said last.
-    """
+    names: tuple[str, ...]  # of the n rows, those of the experiment first
+    carried: Mask  # (n,) rows that are simulated here; the others are mirrors
+    seen: Mask  # (n,) rows with simulated range sensors: carried ones, and those that ask for them
+    body: TwinBody  # of these rows
+    time: float  # [s] simulated since the start
+    state: BodyState  # last reading of the body
 
     def __init__(self, experiment: Experiment) -> None:
-        """Everybody at the start.
+        """All robots at their starts.
 
         Raises:
             BodyError, plugins.PluginError: If the engine cannot be had.
         """
         self._experiment = experiment
-        self._obstacles = dict(experiment.arena.obstacles)  # as they were given
+        self._obstacles = dict(experiment.arena.obstacles)  # as in the experiment
         everyone = tuple(experiment.robots)
         position, yaw = bodies.scattered_poses(experiment, everyone, experiment.seed)
         self._home = {name: (position[row], float(yaw[row])) for row, name in enumerate(everyone)}
-        self._under_way: dict[str, float | None] = {}  # climbs with their height, landings with None
+        self._under_way: dict[str, float | None] = {}  # height of those that climb [m]; None of those that land
         self._dt = 1.0 / experiment.rates.body_hz
         self._begun = math.nan
         self.time = 0.0
         self._make(everyone)
 
-    # ------------------------------------------------------------------ what moves
+    # ------------------------------------------------------------------ motion
 
     def advance(self) -> BodyState:
-        """One tick."""
+        """Simulates one tick."""
         self._ticks += 1
         self.time += self._dt
         self.state = self.body.read(self._ticks * self._dt)
         return self.state
 
     def begin(self, at: float) -> None:
-        """The common start is, or was, at `at` [s] of `time`: what moves by a plan begins then."""
+        """Sets the common start to `at` [s] of `time`: obstacles with a plan begin to move then."""
         self._begun = at
         self.body.begun_at = at - self._made_at
 
     def takeoff(self, row: int, height: float) -> None:
-        """A row climbs; ground robots have nothing to do."""
+        """Lets a row climb; ground robots ignore it."""
         if self.flies[row]:
             self._under_way[self.names[row]] = height
             self.body.takeoff(np.array([row]), np.array([height]))
 
     def land(self, rows: Index) -> None:
-        """Rows come down."""
+        """Lands rows."""
         self._under_way.update({self.names[row]: None for row in rows.tolist() if self.flies[row]})
         self.body.land(rows)
 
     def stop(self, rows: Index) -> None:
-        """Motors off."""
+        """Cuts the motors of rows."""
         for row in rows.tolist():
             self._under_way.pop(self.names[row], None)
         self.body.stop(rows)
 
     def drive(self, setpoint: Array, rows: Index) -> None:
-        """Setpoints (n, 4), NaN but for `rows`."""
+        """Commands setpoints (n, 4), NaN but for `rows`."""
         if self._under_way:
             for row in rows.tolist():
-                if self._under_way.get(self.names[row]) is not None:  # a landing is not ended by being driven
+                if self._under_way.get(self.names[row]) is not None:  # a setpoint does not end a landing
                     del self._under_way[self.names[row]]
         self.body.command(setpoint)
 
     def holding(self, rows: Index) -> Array:
-        """Setpoints (n, 4) with which `rows` stay where they are; NaN for the others."""
+        """Setpoints (n, 4) that hold `rows` in place; NaN for the others."""
         setpoint = np.full((len(self.names), 4), np.nan)
         setpoint[rows] = 0.0
         stay = rows[self.takes_position[rows]]
@@ -123,7 +120,7 @@ class Population:
         return setpoint
 
     def put(self, name: str, position: Sequence[float], yaw: float, *, flying: bool) -> None:
-        """Puts a robot somewhere, at rest: (3) [m], [rad]; one that flies holds that place."""
+        """Places a robot at rest: (3) [m], [rad]; a flying one holds that position."""
         row = self._row(name)
         place = np.array([position], dtype=float)
         if not self.flies[row]:
@@ -133,7 +130,7 @@ class Population:
         self.state = self.body.read(self._ticks * self._dt)
 
     def meetings(self) -> list[Meeting]:
-        """Contacts that began since this was asked last."""
+        """Contacts that have begun since the last call."""
         obstacles = (*self._scene.names, WALL)
         found = []
         for touch in self.body.touches():
@@ -142,14 +139,14 @@ class Population:
         return found
 
     def obstacles(self) -> dict[str, tuple[float, float, float]]:
-        """Where each obstacle is: x, y [m], yaw [rad]."""
+        """Pose of each obstacle: x, y [m], yaw [rad]."""
         pose = self.body.engine.obstacles[0].round(6).tolist()
         return {name: (x, y, yaw) for name, (x, y, yaw) in zip(self._scene.names, pose, strict=True)}
 
-    # ------------------------------------------------------------------ who comes and goes
+    # ------------------------------------------------------------------ adding and removing
 
     def reset(self, name: str | None) -> None:
-        """A robot back to its start, or all of them and all that was pushed; one that flies stays at its height.
+        """Puts a robot back to its start, or all robots and pushed obstacles; a flying robot keeps its height.
 
         Raises:
             Refused: If there is no such robot, or something else stands at its start.
@@ -170,7 +167,7 @@ class Population:
             self.put(self.names[row], (*place[:2], height if flying else 0.0), yaw, flying=flying)
 
     def remove(self, name: str) -> None:
-        """Takes a robot or an obstacle out.
+        """Removes a robot or an obstacle.
 
         Raises:
             Refused: If there is none of that name, or it is the last robot.
@@ -185,7 +182,7 @@ class Population:
         self._change(names=[other for other in self.names if other != name])
 
     def spawn_robot(self, name: str, kind: str | None, at: tuple[float, float] | None, yaw: float) -> None:
-        """Puts a robot in: one of the file that is not there, at its start unless told where, or a new one.
+        """Adds a robot: one of the file that is absent, by default at its start, or a new one.
 
         Raises:
             Refused: If it is there already, its kind is not known, or there is no room.
@@ -216,7 +213,7 @@ class Population:
         self._change(names=[*self.names, name])
 
     def spawn_obstacle(self, name: str, given: Mapping[str, object]) -> None:
-        """Puts an obstacle in, written as in the experiment file.
+        """Adds an obstacle, given as in the experiment file.
 
         Raises:
             Refused: If the name is taken, it is no obstacle, a robot stands there, or it reaches out of the arena.
@@ -254,14 +251,14 @@ class Population:
         self._kinds = bodies.kinds(experiment, self.names)
         self.flies = np.array([kind.flies for kind in self._kinds])
         self.takes_position = np.array([kind.takes == "position" for kind in self._kinds])
-        self.carried: Mask = np.array([robot.body == bodies.WORLD for robot in robots])
-        self.seen: Mask = self.carried | np.array([robot.ranges == "world" for robot in robots])
+        self.carried = np.array([robot.body == bodies.WORLD for robot in robots])
+        self.seen = self.carried | np.array([robot.ranges == "world" for robot in robots])
         home = [self._home[name] for name in self.names]
         request = replace(
             bodies.body_request(experiment, self.names, [experiment.seed]),
             start=np.array([position for position, _ in home]),
             yaw=np.array([yaw for _, yaw in home]),
-            external=(False,) * len(self.names),  # what is published is what is measured from outside
+            external=(False,) * len(self.names),  # published positions are those measured from outside
         )
         world = bodies.shared_world(experiment, self.names, sensing=True)
         sensors = tuple(own if seen else () for own, seen in zip(world.sensors, self.seen.tolist(), strict=True))
@@ -272,7 +269,7 @@ class Population:
         self.state = self.body.read(0.0)
 
     def _change(self, *, names: Sequence[str] | None = None, obstacles: Mapping[str, Obstacle] | None = None) -> None:
-        """Other rows, or other obstacles; everything else stays where it is and goes on with what it does."""
+        """Changes the rows, or the obstacles; all others keep their poses and go on."""
         before, old = self.body.engine, {name: row for row, name in enumerate(self.names)}
         standing = self._standing() if obstacles is None else dict(obstacles)
         arena = msgspec.structs.replace(self._experiment.arena, obstacles=standing)
@@ -293,7 +290,7 @@ class Population:
         self.state = self.body.read(0.0)
 
     def _standing(self) -> dict[str, Obstacle]:
-        """The obstacles, what was pushed where it is now."""
+        """The obstacles, pushed ones at their present poses."""
         found = dict(self._experiment.arena.obstacles)
         for name, (x, y, yaw) in self.obstacles().items():
             if found[name].mass is not None:
