@@ -48,7 +48,7 @@ class Actions(msgspec.Struct, frozen=True):
     velocity: Array  # (N, 3) likewise [m/s]
 
 
-NOBODY: Index = np.zeros(0, dtype=np.intp)
+NO_ROWS: Index = np.zeros(0, dtype=np.intp)
 CENTRE = "centre"  # missing neighbour of guided rows without guidance
 
 
@@ -104,9 +104,9 @@ class Agent:
         self._perception = _perception(assignment)
         self._landing = Landing(assignment)
         self.origins = {}
-        self._nobody: Mask = np.zeros(rows, dtype=bool)
-        self._everybody: Mask = np.ones(rows, dtype=bool)
-        self._not_finite = self._nobody
+        self._no_row: Mask = np.zeros(rows, dtype=bool)
+        self._every_row: Mask = np.ones(rows, dtype=bool)
+        self._not_finite = self._no_row
         self._where: PoseValidity
         self._age: Array
 
@@ -225,7 +225,7 @@ class Agent:
         decision, question = self.tick // assignment.decide_every, self.tick // assignment.pose_every
         self.decision_due, self._decided = decision != self._decided, decision
         if question == self._asked:
-            return Transmission(NOBODY, state.position, state.velocity)
+            return Transmission(NO_ROWS, state.position, state.velocity)
         self._asked = question
         self.error, energy = self.goal_computer.errors(t, state.position)
         return self._transmitter.transmit(
@@ -246,7 +246,7 @@ class Agent:
             self._stay(self._holding.held | held | (self.lifecycle.phase == AIRBORNE), state.position)
         if self.guidance is not None:
             self._follow(self.guidance, state.position)
-        goal, avoided = self.goal, self._nobody
+        goal, avoided = self.goal, self._no_row
         aside = self._landing.aside
         if self._landing.any_aside:
             goal = np.where(aside[:, None], self._landing.place, goal)
@@ -277,7 +277,7 @@ class Agent:
     def _ready(self, t: float, state: BodyState) -> Mask:
         life, assignment = self.lifecycle, self.assignment
         if not life.waiting:
-            return self._nobody  # all rows have taken off
+            return self._no_row  # all rows have taken off
         lacks = np.zeros(len(life.phase), dtype=bool)
         if assignment.patience_s is None or t <= assignment.patience_s:
             lacks[assignment.links.receiver[assignment.unreceived(self.neighbours.stamp_once_alive)]] = True
@@ -303,8 +303,8 @@ class Agent:
         """Detect hazards and apply their outcomes: rows hold, land, or have their motors cut."""
         life, neighbours, guidance = self.lifecycle, self.neighbours, self.guidance
         if life.all_running:
-            active = cruising = running = self._everybody
-            landing = self._nobody
+            active = cruising = running = self._every_row
+            landing = self._no_row
         else:
             running, landing, active = life.phase == RUNNING, life.phase == LANDING, life.active
             cruising = running | (life.phase == AIRBORNE)

@@ -191,8 +191,8 @@ class _Points:
 
     @classmethod
     def nothing(cls) -> _Points:
-        none, nobody = np.zeros(0), np.zeros(0, dtype=np.intp)
-        return cls(nobody, nobody, none, none, np.zeros((0, 2)), none)
+        none, no_row = np.zeros(0), np.zeros(0, dtype=np.intp)
+        return cls(no_row, no_row, none, none, np.zeros((0, 2)), none)
 
     def of(self, which: Mask | Index) -> _Points:
         return _Points(*(getattr(self, field.name)[which] for field in fields(_Points)))

@@ -1,7 +1,7 @@
 """Formations that change: targets that move smoothly from one shape to another, and links that come and go.
 
 A robot subscribes to every possible neighbour; these functions decide which are neighbours now, from the robot's own
-clock and the poses that it received, so that its decisions need nobody else.
+clock and the poses that it received, so that all decisions stay its own.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ class Detector:
     def __init__(self, assignment: Assignment) -> None:
         self._assignment, self._limits = assignment, assignment.limits
         self._flies = np.array([kind.flies for kind in assignment.kinds])
-        self._everybody: Mask = np.ones(len(self._flies), dtype=bool)
+        self._every_row: Mask = np.ones(len(self._flies), dtype=bool)
         speed = np.array([kind.speed for kind in assignment.kinds])
         # the speed of flying kinds is per axis
         self._fastest = assignment.limits.overspeed * np.where(self._flies, np.sqrt(3.0), 1.0) * speed
@@ -307,15 +307,15 @@ class Detector:
 
     def _surroundings(self, t: float, health: ProcessHealth, seen: list[Observation]) -> None:
         """Router, conductor and control loop."""
-        everybody = self._everybody
+        every_row = self._every_row
         if health.offline_since < np.inf:
             gone = t - health.offline_since
-            seen.append(Observation(Cause.ROUTER, everybody, lambda _: f"for {gone:.1f} s"))
+            seen.append(Observation(Cause.ROUTER, every_row, lambda _: f"for {gone:.1f} s"))
         elif health.conductor_lost_since < np.inf:
             since = t - health.conductor_lost_since
-            seen.append(Observation(Cause.CONDUCTOR, everybody, lambda _: f"for {since:.1f} s"))
+            seen.append(Observation(Cause.CONDUCTOR, every_row, lambda _: f"for {since:.1f} s"))
         if health.loop_failing:
-            seen.append(Observation(Cause.LATE, everybody, lambda _: f"{health.missed_share:.0%} of the last second's"))
+            seen.append(Observation(Cause.LATE, every_row, lambda _: f"{health.missed_share:.0%} of the last second's"))
 
 
 def clock_off(ahead: Array, silence_s: float) -> Mask:

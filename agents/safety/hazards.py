@@ -183,7 +183,7 @@ class Hazards:
         self._texts: list[dict[int, str]] = [{} for _ in flies]
         self._quiet = True
         self.held = np.zeros(len(flies), dtype=bool)
-        self._nobody = self.held
+        self._no_row = self.held
         self.incidents = []
 
     def update(self, t: float, seen: Sequence[Observation], active: Mask, landing: Mask) -> list[Incident]:

@@ -47,8 +47,8 @@ class Landing:
         self._their_radius = np.array([kind.radius for kind in senders])
         self._their_height = np.array([kind.height for kind in senders])
         self._flies = np.array([kind.flies for kind in assignment.kinds])
-        self._nobody: Mask = np.zeros(rows, dtype=bool)
-        self.aside, self.any_aside = self._nobody, False
+        self._no_row: Mask = np.zeros(rows, dtype=bool)
+        self.aside, self.any_aside = self._no_row, False
         self.place = np.full((rows, 3), np.nan)
         self._until = np.full(rows, -np.inf)
         self._apart = np.full(len(links), np.inf)
@@ -83,13 +83,13 @@ class Landing:
             self._choose(row, state.position[row], place, lost)
         lands = np.flatnonzero(due & ~self.aside)
         if commands is None:
-            nobody = lands[:0]
-            return BodyCommands(nobody, lands, nobody) if len(lands) else None
+            no_row = lands[:0]
+            return BodyCommands(no_row, lands, no_row) if len(lands) else None
         return replace(commands, land=lands)
 
     def land_in_place(self) -> None:
         """Rows on their way aside land in place."""
-        self.aside, self.any_aside = self._nobody, False
+        self.aside, self.any_aside = self._no_row, False
 
     def robot_below(self, row: int) -> str:
         """Robot below a row that moves aside, in words."""

@@ -63,8 +63,8 @@ class SetpointFilter:
         self._high = limits.high - inside - np.where(flies, ceiling, -floor)
         self._centre = 0.5 * (limits.low + limits.high)
         self._half = 0.5 * (limits.high - limits.low)
-        self._nobody: Mask = np.zeros(len(kinds), dtype=bool)
-        self._sure = PoseValidity(True, *(self._nobody,) * 4, np.zeros(len(kinds)))
+        self._no_row: Mask = np.zeros(len(kinds), dtype=bool)
+        self._sure = PoseValidity(True, *(self._no_row,) * 4, np.zeros(len(kinds)))
 
     def validate_poses(self, position: Array, yaw: Array, age: Array) -> PoseValidity:
         """Validity of poses: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s]."""
@@ -93,8 +93,8 @@ class SetpointFilter:
         """Safe setpoints."""
         where = self.validate_poses(position, yaw, age) if where is None else where
         sane = np.abs(setpoint) < ABSURD
-        nobody = self._nobody
-        invalid, not_finite = where.invalid, nobody
+        no_row = self._no_row
+        invalid, not_finite = where.invalid, no_row
         safe, here = setpoint.copy(), position
         troubled = not (where.all_valid and every(sane))
         if troubled:
@@ -105,7 +105,7 @@ class SetpointFilter:
             safe[stay, :3] = here[stay]
         late = np.where(invalid, 0.0, np.maximum(age, 0.0)) if troubled else np.maximum(age, 0.0)
         self._limit(safe, here, yaw, late)
-        avoided = nobody
+        avoided = no_row
         if avoidance is not None and own is not None and nearby is not None:
             limited = safe
             wished = _wished(avoidance, limited, own, nearby)
@@ -113,7 +113,7 @@ class SetpointFilter:
             if safe is not limited:
                 avoided = np.asarray((np.abs(safe - limited) > ROUNDING).any(axis=1))
         other = np.abs(safe - setpoint) > ROUNDING
-        changed = np.asarray(other.any(axis=1)) if some(other) else nobody
+        changed = np.asarray(other.any(axis=1)) if some(other) else no_row
         if troubled:
             changed = (changed | not_finite) & ~invalid
             # a body that controls its position on board keeps its last setpoint while the position is not known here
