@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from experiments.recording import playback
-from experiments.recording.reader import recover
+from experiments.recording.reader import RecordingError, recover
 from tests.system.lab import NEAR_TRIANGLE, Flight, Watcher, gone, typed, until
 
 pytestmark = pytest.mark.system
@@ -177,7 +178,15 @@ def test_a_killed_conductor_leaves_no_orphan_and_a_recording_that_opens(tmp_path
 def test_a_killed_recorder_costs_the_rest_of_the_recording_only(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", "--json", *SHORT)
-    flight.until_said(r"event: +\d+\.\d s, formation")
+    flight.until_said(r"event: phase conductor: formation")
+
+    def recorded() -> bool:
+        """Poses of the last robot in the run are in the file."""
+        with contextlib.suppress(RecordingError):
+            return len(playback.read(folder / "event.mcap").trace.sent_by(2)) > 0
+        return False
+
+    until(recorded, "poses are recorded")
     flight.children()["recorder"].kill()
     code, out = flight.finish()
     assert code == 0
