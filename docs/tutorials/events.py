@@ -98,7 +98,7 @@ def waits(trace: Trace, robot: str) -> Array:
 
 
 event = run.traces["event"]
-leader = event.sent.time[event.sent.robot == event.robots.index("TB01")]
+leader = event.sent.stamp[event.sent.link == event.robots.index("TB01")]
 first = waits(event, "TB01")
 print(f"the leader speaks {len(leader)} times, from {leader[0]:.1f} s on, {np.median(first):.2f} s apart")
 assert leader[0] > 21.0
