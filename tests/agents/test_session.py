@@ -74,7 +74,7 @@ def test_refuses_what_is_no_endpoint(endpoint):
 
 @pytest.mark.parametrize(
     ("endpoint", "why"),
-    [("udp/127.0.0.1:1", "loses"), ("ws/127.0.0.1:1", "certificates"), ("serial//dev/ttyUSB0", "no network"),
+    [("udp/127.0.0.1:1", "lost messages"), ("ws/127.0.0.1:1", "certificates"), ("serial//dev/ttyUSB0", "no network"),
      ("http/127.0.0.1:1", "no such protocol")],
 )  # fmt: skip
 def test_transports_that_are_not_used_are_refused(endpoint, why):

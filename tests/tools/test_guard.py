@@ -40,7 +40,9 @@ def test_names_the_package_in_the_way_and_the_remedy(tmp_path):
     for name in ("agents", "twins"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('must not be imported')")
-    done = start(ROOT.parent, tmp_path, ROOT)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    done = start(elsewhere, tmp_path, ROOT)
     assert (done.returncode, done.stdout) == (2, "")
     first, agents, twins, remedy = done.stderr.splitlines()
     assert first == "zenpark: another package is in the way of ours"

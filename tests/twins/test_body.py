@@ -58,7 +58,7 @@ def up(twin, height=0.5):
 def exercise(groups):
     """Six robots driven through a take-off, a flight, an emergency stop and a landing, in these groups: all states."""
     whole = request(MIXED, NATURE)
-    parts = [(np.array(group), TwinBody(whole.of(np.array(group)))) for group in groups]
+    parts = [(np.array(group), TwinBody(whole.select(np.array(group)))) for group in groups]
     rng = np.random.default_rng(5)
     fields = ("position", "velocity", "yaw", "true_position", "true_yaw", "battery", "flying")
     history = {field: [] for field in fields}
