@@ -19,6 +19,7 @@ from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.sweep.runs import Figures, figures_of
 from experiments.virtual_time import simulation
+from experiments.virtual_time.log import goals_of
 
 SEEDS: Final = 20
 BATCH: Final = 10  # seeds side by side: more take more memory, not less time
@@ -37,14 +38,14 @@ def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[Figures], 
     for begin in range(0, len(seeds), BATCH):
         log = simulation.simulate(experiment, seeds[begin : begin + BATCH], lean=True)
         found += figures_of(log, experiment)
-        rows, (time, row, *_) = len(log.names), log.sent
+        rows, time = len(log.names), log.sent.stamp
         within = (time >= -1e-9) & (time < experiment.duration_s - 1e-9)
-        poses = np.bincount(row[within], minlength=rows * len(log.seeds)).reshape(-1, rows)
+        poses = np.bincount(log.sent.link[within], minlength=rows * len(log.seeds)).reshape(-1, rows)
         for copy, sent in enumerate(poses):
             told, heard = 0, 0
             if log.steered is not None:
-                seen = log.of_log(log.steered, log.names, copy * rows, experiment.duration_s, "json")
-                told, heard = len(seen.time), int(seen.heard.sum())
+                seen = goals_of(log.steered, log.names, copy * rows, experiment.duration_s, "json")
+                told, heard = len(seen.sent), int(seen.received.sum())
                 delay.append(float(seen.delay.mean()))
             messages.append(int(sent.sum()) + told)
             deliveries.append(int(sent @ listeners) + heard + told)

@@ -59,7 +59,7 @@ def measured(name: str, experiment: Experiment) -> Row:
         position = log.true_position[late, copy * rows : (copy + 1) * rows]
         rate.append(1e3 * (net_rotation(position[:, follow], time) or 0.0))
         error.append(1e3 * float(errors_over_time(law, pattern, time, position).mean()))
-    return Row(name, rate, float(np.mean(error)), len(log.sent[0]) / len(SEEDS))
+    return Row(name, rate, float(np.mean(error)), len(log.sent) / len(SEEDS))
 
 
 def disagreeing(experiment: Experiment, by: float) -> Experiment:
