@@ -13,9 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any, Final
 
 from experiments.definition import standby
 from experiments.definition.experiment import Experiment
@@ -27,9 +25,12 @@ from experiments.metrics.results import CaseMetrics
 from experiments.recording import playback
 from experiments.recording.run_folder import SOURCE
 from experiments.recording.trace import Trace
-from experiments.report import metrics_files, style
+from experiments.report import metrics_files
 from experiments.virtual_time import simulation
 from experiments.virtual_time.log import Logbook
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CHECKOUT: Final = Path(__file__).resolve().parents[1]
 
@@ -43,6 +44,8 @@ class Picture:
 
     def _repr_svg_(self) -> str:
         """SVG for notebooks; figures are drawn without pyplot, by which notebooks would find them."""
+        from experiments.report import style  # noqa: PLC0415 - matplotlib takes 0.6 s
+
         return style.svg(self.figure)
 
 
@@ -53,6 +56,8 @@ def show(figure: Figure, file: str | Path | None = None) -> Picture:
         figure: Any of matplotlib's.
         file: Where to keep it, as SVG and PDF; without a suffix.
     """
+    from experiments.report import style  # noqa: PLC0415 - matplotlib takes 0.6 s
+
     if file is None:
         return Picture(figure)
     return Picture(figure, style.save(figure, Path(file).parent, Path(file).name))

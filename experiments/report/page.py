@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, Literal
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from experiments.metrics.statistics import Spread
@@ -111,6 +110,8 @@ def render(
     sections: Sequence[Section],
 ) -> Path:
     """Writes a page that needs nothing else: facts and findings on top, then the sections."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415 - for pages alone
+
     pages = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
