@@ -8,12 +8,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, Literal
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Final, Literal
 
 from experiments.metrics.statistics import Spread
-from experiments.report import figures
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 NONE: Final = "–"
 
@@ -128,6 +128,8 @@ def render(
 
 def numbered(drawn: Iterable[tuple[Figure, str]], first: int = 1) -> tuple[PageFigure, ...]:
     """Figures and their captions, to stand in a page."""
+    from experiments.report import figures  # noqa: PLC0415 - matplotlib takes 0.6 s
+
     return tuple(
         PageFigure(inline(figures.svg(figure), f"f{number}-", caption), number, caption)
         for number, (figure, caption) in enumerate(drawn, start=first)
