@@ -27,7 +27,7 @@ from experiments.recording.reader import RecordingError
 from tests.fuzz.messages import KEYS, good, of_all
 from tests.fuzz.target import Place, Target
 
-MALFORMED = Path(__file__).parents[1] / "experiments" / "malformed"
+MALFORMED = Path(__file__).parents[1] / "experiments" / "file" / "malformed"
 
 
 @contextmanager

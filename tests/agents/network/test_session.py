@@ -1,0 +1,546 @@
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from math import inf
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from agents.network.endpoints import EndpointError, free_endpoint
+from agents.network.messages import JSON, MSGPACK, Order, Stop
+from agents.network.pubsub import (
+    NO_ORDER,
+    AliveWatch,
+    CallbackQueue,
+    ImmediateSubscriber,
+    LastValue,
+    Orders,
+    alive_token,
+    pose_publisher,
+    pose_subscriber,
+    publisher,
+    subscriber,
+)
+from agents.network.session import (
+    ANSWER_S,
+    ASK_EVERY_S,
+    RouterWatch,
+    Unreachable,
+    connected,
+    count_links,
+    open_session,
+    received,
+)
+from agents.network.zenoh_config import LEASE_S, config, settings
+from agents.runtime.router import serve_router
+from tests.conftest import RouterProcess
+from tests.fuzz.loopnet import Net
+
+ROOT = Path(__file__).resolve().parents[3]
+POSE = "park/CF01/pose"
+
+
+def payloads(handler):
+    return [sample.payload.to_bytes() for sample in received(handler)]
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp/0.0.0.0:7447",
+        "tcp/[::]:7447",
+        "tcp/192.168.1.2:7447",
+        "tcp/host.example:7447",
+        "tcp/:1",
+    ],
+)
+def test_refuses_to_listen_beyond_loopback(endpoint):
+    with pytest.raises(EndpointError, match="SSH tunnel"):
+        config(settings("router", listen=[endpoint]))
+
+
+@pytest.mark.parametrize("endpoint", ["127.0.0.1:7447", "tcp/", "/127.0.0.1:7447", ""])
+def test_refuses_what_is_no_endpoint(endpoint):
+    with pytest.raises(EndpointError, match=r"write it like tcp/127\.0\.0\.1:7447"):
+        config(settings("client", connect=[endpoint]))
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "why"),
+    [("udp/127.0.0.1:1", "lost messages"), ("ws/127.0.0.1:1", "certificates"), ("serial//dev/ttyUSB0", "no network"),
+     ("http/127.0.0.1:1", "no such protocol")],
+)  # fmt: skip
+def test_transports_that_are_not_used_are_refused(endpoint, why):
+    for ends in ({"listen": [endpoint]}, {"connect": [endpoint]}):
+        with pytest.raises(EndpointError, match=rf"{why}.*; write it like tcp/127.* unixsock-stream/PATH"):
+            config(settings("router", **ends))
+
+
+@pytest.mark.parametrize("endpoint", ["t#tcp/localhost:1", "tcp/127.0.0.1:7447\n", "tcp?/x/y"])
+def test_what_zenoh_would_not_understand_is_refused_by_name(endpoint):
+    with pytest.raises(EndpointError, match=r"write .*tcp/127\.0\.0\.1:7447"):
+        config(settings("client", connect=[endpoint]))
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:0", "tcp/127.3.2.1:7447", "tcp/[::1]:7447", "tcp/localhost:7447"])
+def test_listens_on_loopback(endpoint):
+    made = config(settings("router", listen=[endpoint], name="router", lease_s=1.5))
+    assert made.get_json("listen/endpoints") == f'["{endpoint}"]'
+    assert made.get_json("scouting/multicast/enabled") == "false"
+    assert made.get_json("scouting/gossip/enabled") == "false"
+    assert made.get_json("transport/shared_memory/enabled") == "false"
+    assert made.get_json("transport/link/tx/lease") == "1500"
+
+
+def test_free_endpoint_avoids_a_taken_port():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert free_endpoint(port) != f"tcp/127.0.0.1:{port}"
+    assert free_endpoint(port) == f"tcp/127.0.0.1:{port}"
+
+
+def test_unreachable_names_endpoints_and_remedy():
+    endpoint = free_endpoint(preferred_port=0)
+    with pytest.raises(Unreachable, match=rf"{endpoint}.*`zenpark router`"):
+        open_session([endpoint], name="test", wait_s=0.0)
+
+
+def test_stop_ends_the_wait_for_a_router():
+    stop = threading.Event()
+    stop.set()
+    with pytest.raises(Unreachable):
+        open_session([free_endpoint(preferred_port=0)], name="test", wait_s=1e6, stop=stop)
+
+
+@pytest.mark.system
+def test_router_says_when_its_port_is_taken(router):
+    with pytest.raises(EndpointError, match=rf"{router.endpoint}.*in use"):
+        serve_router([router.endpoint], threading.Event())
+
+
+@pytest.mark.mechanism("last pose for a late joiner")
+@pytest.mark.system
+def test_late_joiner_hears_the_last_pose(router, eventually):
+    with open_session([router.endpoint], name="CF01") as speaker:
+        pose = pose_publisher(speaker, POSE, JSON)
+        for value in (b"1", b"2", b"3"):
+            pose.put(value)
+        with open_session([router.endpoint], name="CF02") as listener:
+            poses = pose_subscriber(listener, "park/*/pose")
+            heard = []
+            eventually(lambda: heard.extend(payloads(poses.handler)) or heard)
+            pose.put(b"4")
+            eventually(lambda: heard.extend(payloads(poses.handler)) or len(heard) == 2)
+            assert heard == [b"3", b"4"]
+
+
+@pytest.mark.mechanism("transmission while the router is down")
+@pytest.mark.system
+def test_pose_said_while_the_router_was_down_arrives(router, eventually):
+    with (
+        open_session([router.endpoint], name="CF01") as speaker,
+        open_session([router.endpoint], name="CF02") as listener,
+    ):
+        pose, poses = pose_publisher(speaker, POSE, JSON), pose_subscriber(listener, POSE)
+        heard = []
+        pose.put(b"before")
+        eventually(lambda: heard.extend(payloads(poses.handler)) or heard == [b"before"])
+        router.kill()
+        eventually(lambda: not connected(speaker) and not connected(listener))
+        pose.put(b"while down")
+        router.start()
+        eventually(lambda: heard.extend(payloads(poses.handler)) or b"while down" in heard)
+        assert connected(speaker)
+        assert heard[-1] == b"while down"
+
+
+@pytest.mark.mechanism("client at a second router")
+@pytest.mark.system
+def test_client_fails_over_to_the_second_router(router, eventually):
+    second = type(router)()
+    with open_session([router.endpoint, second.endpoint], name="CF01") as session:
+        first = session.info.routers_zid()
+        router.kill()
+        eventually(lambda: connected(session) and session.info.routers_zid() != first)
+    assert second.stop() == 0
+
+
+@pytest.mark.system
+def test_a_frozen_router_is_silent_whatever_its_lease(patient_router, eventually):
+    with open_session([patient_router.endpoint], name="CF01") as session:
+        watch, begun = RouterWatch(session, "park/CF01/alive"), time.monotonic()
+
+        def silent_since() -> float:
+            return watch.silent_since(time.monotonic() - begun)
+
+        eventually(lambda: silent_since() == inf and time.monotonic() - begun > 4 * ASK_EVERY_S)
+        for _ in range(2):
+            with patient_router.frozen():
+                stopped = time.monotonic() - begun
+                eventually(lambda: silent_since() < inf)
+                assert stopped - ANSWER_S < silent_since() < stopped + ASK_EVERY_S + 0.1
+                assert connected(session), "Zenoh notices nothing"
+                since = silent_since()
+                eventually(lambda since=since: time.monotonic() - begun > since + 10 * ASK_EVERY_S)
+                assert silent_since() == since
+            eventually(lambda: silent_since() == inf)
+        patient_router.kill()
+        eventually(lambda: silent_since() < inf)
+        patient_router.start()
+        eventually(lambda: silent_since() == inf)
+
+
+@pytest.mark.system
+def test_a_router_that_waits_for_another_is_not_silent(patient_router):
+    linked = zenoh.open(
+        config(settings("router", listen=[near := free_endpoint(0)], connect=[patient_router.endpoint]))
+    )
+    with linked, open_session([near], name="CF01") as session, patient_router.frozen():
+        watch, begun = RouterWatch(session, "park/CF01/alive"), time.monotonic()
+        while (t := time.monotonic() - begun) < 4 * ASK_EVERY_S:
+            assert watch.silent_since(t) == inf
+
+
+class Asked:
+    """What `RouterWatch` needs of a session: who is linked, and questions that are answered by hand."""
+
+    def __init__(self) -> None:
+        self.info = self
+        self.routers, self.peers = ["router"], []
+        self.questions: list[Question] = []
+
+    def routers_zid(self) -> list[str]:
+        return self.routers
+
+    def peers_zid(self) -> list[str]:
+        return self.peers
+
+    def liveliness(self) -> Asked:
+        return self
+
+    def get(self, *_: object, **__: object) -> Question:
+        self.questions.append(Question())
+        return self.questions[-1]
+
+
+class Question:
+    answered = False
+
+    def try_recv(self) -> None:
+        if self.answered:
+            raise zenoh.ZError("the answer is complete")
+
+
+def looks(watch: RouterWatch, begin: float, end: float) -> float:
+    """What a watch says at last that is looked at 50 times a second."""
+    ticks = range(round(begin * 50), round(end * 50) + 1)
+    return [watch.silent_since(tick / 50) for tick in ticks][-1]
+
+
+def test_one_answer_after_a_silence_may_be_a_link_that_closes():
+    session = Asked()
+    watch = RouterWatch(session, "park/CF01/alive")
+    assert looks(watch, 0.0, ANSWER_S) == inf
+    silent = pytest.approx(0.0)
+    assert looks(watch, 0.32, 0.46) == silent
+    assert len(session.questions) == 2
+    for question in session.questions:
+        question.answered = True
+    assert watch.silent_since(0.5) == silent
+    session.routers = []
+    assert watch.silent_since(0.52) == silent, "it goes on, and does not begin anew"
+    session.routers = ["another"]
+    for t in (0.54, 0.56):
+        assert watch.silent_since(t) == silent
+        session.questions[-1].answered = True
+    assert watch.silent_since(0.58) == inf
+
+
+def test_a_process_that_gets_no_processor_does_not_blame_the_router():
+    session = Asked()
+    watch = RouterWatch(session, "park/CF01/alive")
+    stalls = [0.0, 5.0, 5.5]
+    assert [watch.silent_since(t) for t in stalls] == [inf] * len(stalls)
+    assert looks(watch, 5.52, 5.56) == inf
+    assert looks(watch, 5.58, 5.7) == pytest.approx(5.3, abs=0.03)
+
+
+def test_a_router_by_which_samples_come_is_not_asked():
+    session = Asked()
+    watch = RouterWatch(session, "park/CF01/alive")
+    ticks = [tick / 20 for tick in range(40)]
+    assert [watch.silent_since(t, arrived) for arrived, t in enumerate(ticks, 1)] == [inf] * len(ticks)
+    assert not session.questions
+    last = ticks[-1]
+    looked = [(t, watch.silent_since(t, len(ticks))) for t in (last + tick / 50 for tick in range(1, 40))]
+    asked = last + ASK_EVERY_S
+    assert next(t for t, since in looked if since < inf) == pytest.approx(asked + ANSWER_S, abs=0.05)
+    assert looked[-1][1] == pytest.approx(asked, abs=0.05)
+    assert watch.silent_since(looked[-1][0] + 0.02, len(ticks) + 1) < inf, "what was on its way is no answer"
+
+
+def test_a_router_that_stays_silent_is_left_only_where_there_is_another(monkeypatch):
+    left = []
+    monkeypatch.setattr("agents.network.session.hang_up", left.append)
+    for endpoints, times in ((["one"], 0), (["one", "other"], 1)):
+        session = Asked()
+        watch = RouterWatch(session, "park/CF01/alive", endpoints)
+        looks(watch, 0.0, LEASE_S)
+        assert not left, "as long as one of ours would be waited for"
+        looks(watch, LEASE_S + 0.02, LEASE_S + 0.1)
+        assert len(left) == times
+    session.routers = []
+    looks(watch, LEASE_S + 0.12, 2.0 * LEASE_S + 0.5)
+    session.routers = ["other"]
+    looks(watch, 2.0 * LEASE_S + 0.52, 2.0 * LEASE_S + 0.54)
+    assert len(left) == 1, "the next one has as much time"
+
+
+@pytest.mark.system
+def test_at_a_frozen_first_router_with_a_long_lease_all_goes_on_at_the_second(patient_router, eventually):
+    second = RouterProcess(lease_s=60.0)
+    ends = [patient_router.endpoint, second.endpoint]
+    with open_session(ends, name="CF01") as robot, open_session(ends, name="CF02") as listener:
+        begun = time.monotonic()
+        watches = [RouterWatch(each, "park/CF01/alive", ends) for each in (robot, listener)]
+        token = alive_token(robot, "park/CF01/alive")
+        poses, heard = pose_publisher(robot, POSE, JSON), pose_subscriber(listener, POSE)
+        alive, here = AliveWatch(listener, "park/*/alive"), [zenoh.SampleKind.DELETE]
+        got: list[int] = []
+        said = 0
+
+        def goes_round() -> None:
+            nonlocal said
+            for watch in watches:
+                watch.silent_since(time.monotonic() - begun, len(got) if watch is watches[1] else 0)
+            said += 1
+            poses.put(str(said).encode())
+            got.extend(int(payload) for payload in payloads(heard.handler))
+            here[:] = [*here, *(sample.kind for sample in received(alive.handler))][-1:]
+
+        def until(true: Callable[[], object]) -> None:
+            eventually(lambda: (goes_round(), true())[1])
+
+        def arrived() -> None:
+            mark = said
+            until(lambda: got and got[-1] > mark)
+            assert got == sorted(set(got)), "each once, in order"
+            until(lambda: here == [zenoh.SampleKind.PUT])
+
+        arrived()
+        old = {str(zid) for zid in robot.info.routers_zid()}
+        with patient_router.frozen():
+            os.waitpid(patient_router.process.pid, os.WUNTRACED)
+            until(lambda: {str(zid) for zid in robot.info.routers_zid()} not in (old, set()))
+            arrived()
+            assert count_links(robot) == count_links(listener) == 1
+        arrived()
+        token.undeclare()
+        until(lambda: here == [zenoh.SampleKind.DELETE])
+    assert second.stop() == 0
+
+
+def test_members_of_a_mesh_are_not_asked():
+    session = Asked()
+    session.routers, session.peers = [], ["KH01"]
+    watch = RouterWatch(session, "park/CF01/alive")
+    assert [watch.silent_since(t) for t in (0.0, 1.0, 2.0)] == [inf] * 3
+    session.peers = []
+    assert [watch.silent_since(t) for t in (3.0, 4.0)] == [3.0] * 2
+    assert not session.questions
+
+
+@pytest.mark.system
+def test_last_value_answers_a_plain_get(router, eventually):
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
+        asker = ui.declare_querier(POSE, timeout=5.0)  # a wildcard is never told that it matches
+        with LastValue(robot, POSE, JSON) as last:
+            eventually(lambda: asker.matching_status.matching)
+            empty = ui.get("park/*/pose", timeout=5.0)
+            eventually(last.answer)
+            assert list(empty) == []
+            last.hold(b"1")
+            last.hold(b"2")
+            asked = ui.get("park/*/pose", timeout=5.0)
+            eventually(last.answer)
+            replies = [reply.ok for reply in asked]
+            assert [(str(reply.key_expr), reply.payload.to_bytes(), str(reply.encoding)) for reply in replies] == [
+                (POSE, b"2", JSON)
+            ]
+        eventually(lambda: not asker.matching_status.matching)
+
+
+@pytest.mark.system
+def test_orders_wait_until_they_are_polled(router, eventually):
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
+        taken = Orders(robot, "park/CF01/order", Order)
+        asker = ui.declare_querier("park/CF01/order")
+        eventually(lambda: asker.matching_status.matching)
+        asked = ui.get("park/*/order", payload=b'{"order": "land"}', timeout=5.0)
+        waiting = []
+        eventually(lambda: waiting.extend(taken.read()) or waiting)
+        ((query, order),) = waiting
+        with query:
+            assert order == Order("land")
+            query.reply("park/CF01/order", b"ok")
+        assert [reply.ok.payload.to_bytes() for reply in asked] == [b"ok"]
+
+
+@pytest.mark.system
+def test_a_query_without_payload_is_no_order(router, eventually):
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
+        taken = Orders(robot, "park/CF01/order", Order)
+        asker = ui.declare_querier("park/CF01/order")
+        eventually(lambda: asker.matching_status.matching)
+        for key, told in (("park/**", []), ("park/*/order", []), ("park/CF01/order", [NO_ORDER])):
+            asked, waiting, replies = ui.get(key, timeout=5.0), [], []
+            ended = threading.Thread(target=lambda asked=asked, replies=replies: replies.extend(asked))
+            ended.start()
+            eventually(lambda w=waiting, e=ended: w.extend(taken.read()) or not e.is_alive())
+            assert [reply.err.payload.to_string() for reply in replies] == told
+            assert not waiting
+
+
+@pytest.mark.system
+def test_telemetry_keeps_the_newest(router, eventually):
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="recorder") as ui:
+        states, control = subscriber(ui, "park/*/state", depth=3), subscriber(ui, "park/control")
+        state = publisher(robot, "park/CF01/state", JSON)
+        eventually(lambda: state.matching_status.matching)
+        for value in range(10):
+            state.put(str(value))
+        publisher(robot, "park/control", JSON).put(b"behind")
+        eventually(lambda: payloads(control.handler))
+        assert payloads(states.handler) == [b"7", b"8", b"9"]
+
+
+ROBOT = """
+import sys
+from agents.network.messages import Order
+from agents.network.pubsub import Orders, alive_token, pose_publisher, pose_subscriber
+from agents.network.session import open_session
+session = open_session([sys.argv[1]], name="CF01")
+held = [
+    alive_token(session, "park/CF01/alive"),
+    pose_publisher(session, "park/CF01/pose", "application/json"),
+    pose_subscriber(session, "park/CF02/pose"),
+    Orders(session, "park/CF01/order", Order),
+]
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.mechanism("exit with an open session")
+@pytest.mark.system
+def test_interpreter_exits_although_a_session_was_left_open(router):
+    done = subprocess.run(
+        [sys.executable, "-c", ROBOT, router.endpoint],
+        cwd=ROOT,
+        input="",
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "ready\n", "")
+
+
+@pytest.mark.system
+def test_an_inbox_keeps_the_newest_wanted_items(router, eventually):
+    inbox = CallbackQueue[zenoh.Sample](2, lambda sample: sample.payload.to_bytes() != b"1")
+    assert list(received(inbox)) == []
+    with open_session([router.endpoint], name="CF01") as session:
+        session.declare_subscriber(POSE, inbox.callback)
+        for number in (b"0", b"1", b"2", b"3"):
+            session.put(POSE, number)
+        got = []
+        eventually(lambda: got.extend(payloads(inbox)) or got)
+        assert got == [b"2", b"3"]
+        assert list(received(inbox)) == []
+
+
+@pytest.mark.mechanism("liveliness")
+@pytest.mark.system
+def test_a_killed_robot_is_noticed(router, eventually):
+    robot = subprocess.Popen(
+        [sys.executable, "-c", ROBOT, router.endpoint], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    with robot, open_session([router.endpoint], name="CF02") as session:
+        assert robot.stdout.readline() == b"ready\n"
+        own = alive_token(session, "park/CF02/alive")
+        watch = AliveWatch(session, "park/*/alive")
+        seen = []
+        eventually(lambda: seen.extend(received(watch.handler)) or len(seen) == 2)
+        assert {str(sample.key_expr) for sample in seen} == {"park/CF01/alive", "park/CF02/alive"}
+        assert all(sample.kind == zenoh.SampleKind.PUT for sample in seen)
+        for key in ("park/**", "park/*/alive"):  # on the keys of everybody: nobody's life, and nobody's death
+            alive_token(session, key).undeclare()
+        robot.kill()
+        seen.clear()
+        eventually(lambda: seen.extend(received(watch.handler)) or seen)
+        assert [str(sample.key_expr) for sample in seen] == ["park/CF01/alive"]
+        assert seen[0].kind == zenoh.SampleKind.DELETE
+        assert connected(session)
+        own.undeclare()
+
+
+@pytest.mark.mechanism("emergency stop before everything else that came")
+@pytest.mark.system
+def test_an_alarm_is_obeyed_at_once_and_keeps_what_came(router, eventually):
+    whole = b'{"who": "ana", "reason": "fire"}'
+    said = [  # by zenpark; by z_put and zenoh-cli; by `curl -X PUT -d`, with a header, with --json; by anything at all
+        (whole, JSON, "by ana: fire"),
+        (whole, "zenoh/bytes", "by ana: fire"),
+        (whole, "application/x-www-form-urlencoded", "by ana: fire"),
+        (b"stop", "application/x-www-form-urlencoded", "by an unknown sender: stop"),
+        (b"stop it", "text/plain", "by an unknown sender: stop it"),
+        (b'"stop"', JSON, "by an unknown sender: stop"),
+        (b'{"who": "ana"}', JSON, "by ana"),
+        (b"{}", JSON, "by an unknown sender: {}"),
+        (b"", "zenoh/bytes", "by an unknown sender"),
+        (b"\x81\xa3who\xa3ana", MSGPACK, "by ana"),
+        (b"\xff\x00\x1b[2J", "image/png", "by an unknown sender: \N{REPLACEMENT CHARACTER}  [2J"),
+    ]
+    with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
+        obeyed = []
+        alarm = ImmediateSubscriber(robot, "park/estop", obeyed.append, depth=2)
+        speaker = publisher(ui, "park/estop", JSON)
+        eventually(lambda: speaker.matching_status.matching)
+        ui.delete("park/estop")  # no stop
+        ui.delete("park/**")
+        for payload, encoding, _ in said:
+            ui.put("park/estop", payload, encoding=encoding)
+        ui.put("park/**", b"everybody", encoding="text/plain")
+        eventually(lambda: len(obeyed) > len(said))
+        words = [f"emergency stop {text}" for *_, text in said]
+        assert [stop.words for stop in obeyed] == [*words, "emergency stop by an unknown sender: everybody"]
+        kept = []
+        eventually(lambda: kept.extend(received(alarm)) or kept[-2:] == obeyed[-2:])
+        assert len(kept) <= 3  # the newest two, and one that came while they were polled
+        assert alarm.try_recv() is None
+
+
+def test_a_stop_waits_for_the_loop_only_after_it_was_obeyed():
+    """A loop that polls in between would think that its motors are off, and then they are cut for ever."""
+    seen = []
+    net = Net()
+    alarm = ImmediateSubscriber(net.session, "park/estop", lambda _stop: seen.append(alarm.try_recv()))
+    net.deliver(b"park/estop\0text/plain\0stop")
+    assert seen == [None]
+    assert alarm.try_recv() == Stop("an unknown sender", "stop")
+
+    def fails(_stop):
+        raise OSError("a body that cannot be told")
+
+    alarm = ImmediateSubscriber(net.session, "park/estop", fails)
+    with pytest.raises(OSError, match="cannot be told"):
+        net.deliver(b"park/estop\0text/plain\0stop")
+    assert alarm.try_recv() == Stop("an unknown sender", "stop")

@@ -1,0 +1,187 @@
+"""A recording is read also when its recorder was killed or the file is damaged, and can be made whole."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from experiments.recording.playback import read
+from experiments.recording.reader import RecordingError, Recovered, recover
+from tests.experiments.recordings import DOCUMENT, begun, scattered, whole_run, write
+from tools.commands import run as commands
+
+KILLED = """
+from pathlib import Path
+from experiments.recording.writer import Recording
+from tests.experiments.recordings import *
+recording = Recording(Path({path!r}), PAIR, DOCUMENT, case="only", seed=4, clock="real")
+put(recording, whole_run())
+recording.flush()
+print("flushed", flush=True)
+k = 0
+while True:
+    k += 1
+    recording.write(state("CF01", 100 + k, 5.0 + k / 1000, k * 0.37))
+"""
+
+
+@pytest.mark.mechanism("recovery of an unfinished recording")
+@pytest.mark.system
+def test_a_killed_recorder_leaves_a_recording(path, tmp_path, recorded):
+    code = KILLED.format(path=str(path))
+    root = Path(__file__).parents[3]
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=root) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "flushed\n"
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    before = path.read_bytes()
+    playback = read(path)
+    assert not playback.complete
+    assert playback.messages >= 60
+
+    target = tmp_path / "whole.mcap"
+    assert recover(path, target) == Recovered(playback.messages, ("TB01", "CF01"), complete=False)
+    assert path.read_bytes() == before
+    again = read(target)
+    assert again.complete
+    assert again.messages == playback.messages
+    whole = tmp_path / "finished.mcap"
+    whole.write_bytes(recorded)
+    wanted = read(whole).trace
+    for trace in (playback.trace, again.trace):
+        np.testing.assert_array_equal(trace.position[:, 0], wanted.position[:, 0])
+        np.testing.assert_array_equal(trace.sent.stamp, wanted.sent.stamp)
+        assert trace.lost.tolist() == wanted.lost.tolist()
+
+
+def test_recovery_keeps_everything(path, tmp_path):
+    write(path, *whole_run())
+    path.write_bytes(path.read_bytes()[:-1])
+    target = tmp_path / "whole.mcap"
+    assert recover(path, target) == Recovered(60, ("TB01", "CF01"), complete=False)
+    with target.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert (reader.get_header().profile, reader.get_header().library) == ("ros2", "zenpark")
+        assert {one.name: one.data for one in reader.iter_attachments()}["experiment.toml"].decode() == DOCUMENT
+        assert [one.metadata["case"] for one in reader.iter_metadata()] == ["only"]
+        summary = reader.get_summary()
+        assert {channel.topic for channel in summary.channels.values()} == {
+            "/events",
+            *(f"/{robot}/{what}" for robot in ("TB01", "CF01") for what in ("state", "true_pose", "status")),
+            "/TB01/pose",
+        }
+        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+        assert summary.statistics.message_count == 60
+    with AnyReader([target]) as reader:
+        assert len(list(reader.messages())) == 60
+
+
+def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
+    write(path, *whole_run())
+    target = tmp_path / "whole.mcap"
+    assert recover(path, target) == Recovered(60, ("TB01", "CF01"), complete=True)
+    commands.recover(str(path), None)
+    assert capsys.readouterr().out == f"{path} is whole already: 60 messages of TB01, CF01\n"
+    assert sorted(tmp_path.iterdir()) == [path]
+
+
+def test_the_command_writes_beside_the_source(path, capsys):
+    write(path, *whole_run())
+    path.write_bytes(path.read_bytes()[:-1])
+    commands.recover(str(path), None)
+    target = path.with_name("run-recovered.mcap")
+    assert capsys.readouterr().out == f"{target}: 60 messages of TB01, CF01\n"
+    assert read(target).complete
+
+
+def test_recovery_overwrites_nothing(path, tmp_path):
+    write(path, *whole_run())
+    path.write_bytes(path.read_bytes()[:-1])
+    target = tmp_path / "precious"
+    target.write_text("mine")
+    with pytest.raises(RecordingError, match="precious: exists already"):
+        recover(path, target)
+    with pytest.raises(RecordingError, match="exists already"):
+        recover(path, path)
+    assert target.read_text() == "mine"
+    assert not read(path).complete
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(b"", "nothing was recorded"), (b"\x89MCAP", "nothing was recorded"), (b"title = 'pair'", "not an MCAP file")],
+)
+def test_what_is_no_recording(path, tmp_path, content, says):
+    path.write_bytes(content)
+    for act in (read, lambda source: recover(source, tmp_path / "target.mcap")):
+        with pytest.raises(RecordingError, match=rf"run\.mcap: {says}"):
+            act(path)
+    assert not (tmp_path / "target.mcap").exists()
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    for wrong in (tmp_path / "none.mcap", tmp_path):
+        with pytest.raises(RecordingError, match="cannot be read"):
+            read(wrong)
+
+
+def survives(path, target):
+    """Reads and recovers; whatever the damage, the only error is the named one."""
+    target.unlink(missing_ok=True)
+    try:
+        found = recover(path, target)
+    except RecordingError:
+        return None
+    if not found.complete:
+        assert read_or_refuse(target) == read_or_refuse(path)
+    return read_or_refuse(path)
+
+
+def read_or_refuse(path):
+    try:
+        return read(path).messages
+    except RecordingError:
+        return None
+
+
+@pytest.mark.slow
+def test_a_file_cut_anywhere(path, tmp_path, recorded):
+    found = []
+    for size in range(0, len(recorded), 61):
+        path.write_bytes(recorded[:size])
+        found.append(survives(path, tmp_path / "target.mcap") or 0)
+    assert found == sorted(found)
+    assert found[0] == 0
+    assert found[-1] == 60
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_a_file_damaged_anywhere(tmp_path_factory, recorded, data):
+    folder = tmp_path_factory.mktemp("damaged")
+    damaged = bytearray(recorded)
+    for _ in range(data.draw(st.integers(1, 3))):
+        damaged[data.draw(st.integers(0, len(recorded) - 1))] = data.draw(st.integers(0, 255))
+    (folder / "run.mcap").write_bytes(damaged)
+    survives(folder / "run.mcap", folder / "target.mcap")
+
+
+def test_a_damaged_chunk_costs_only_itself(path):
+    write(path, begun(), *scattered(2000))
+    whole = read(path)
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    content = bytearray(path.read_bytes())
+    content[chunks[2].chunk_start_offset + chunks[2].chunk_length // 2] ^= 0xFF
+    path.write_bytes(content)
+    playback = read(path)
+    assert not playback.complete
+    assert whole.messages - 200 < playback.messages < whole.messages
