@@ -2,7 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+
+
+class _RealmKey:
+    """A key that a realm has once."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    def __get__(self, keys: Keys, owner: type[Keys]) -> str:
+        return f"{keys.realm}/{self._path}"
+
+
+def _robot_key(word: str) -> Callable[[Keys, str], str]:
+    """A key that each robot has."""
+
+    def key(keys: Keys, robot: str) -> str:
+        return f"{keys.realm}/{robot}/{word}"
+
+    return key
 
 
 @dataclass(frozen=True)
@@ -11,25 +31,36 @@ class Keys:
 
     realm: str = "park"
 
-    def pose(self, robot: str) -> str:
-        """Pose for the neighbours, sent when the trigger says so."""
-        return f"{self.realm}/{robot}/pose"
+    # of each robot, by its name
+    pose = _robot_key("pose")  # for the neighbours, sent when the trigger says so
+    state = _robot_key("state")  # telemetry for recorder and viewers
+    status = _robot_key("status")  # lifecycle and counters, at 1 Hz and on every change
+    order = _robot_key("order")  # queryable that takes orders and always replies
+    alive = _robot_key("alive")  # liveliness token
+    position = _robot_key("position")  # pose measured from outside (motion capture, a twin service)
+    goal = _robot_key("goal")  # from the central controller, or from outside
+    setpoint = _robot_key("setpoint")  # commands for a body that lives in another process
+    ranges = _robot_key("ranges")  # readings of the range sensors
+    truth = _robot_key("truth")  # true pose of a protocol twin: for recorder and motion capture, never for robots
+    below = _robot_key("**")  # all keys of a robot, or of `world`, `run` or `centre`
 
-    def state(self, robot: str) -> str:
-        """Telemetry for recorder and viewers."""
-        return f"{self.realm}/{robot}/state"
+    # of the world and the central controller; `state` and `alive` belong to robots only
+    world = _RealmKey("world/report")  # pace, pauses, contacts
+    world_order = _RealmKey("world/order")  # queryable: pause, step, reset, spawn, remove
+    contact = _RealmKey("world/contact")  # every contact in the world, when it begins
+    world_alive = _RealmKey("world/here")  # liveliness token
+    centre = _RealmKey("centre/report")  # guided robots, load, counters
+    centre_alive = _RealmKey("centre/here")  # liveliness token
 
-    def status(self, robot: str) -> str:
-        """Lifecycle and counters, at 1 Hz and on every change."""
-        return f"{self.realm}/{robot}/status"
-
-    def order(self, robot: str) -> str:
-        """Queryable that takes orders and always replies."""
-        return f"{self.realm}/{robot}/order"
-
-    def alive(self, robot: str) -> str:
-        """Liveliness token."""
-        return f"{self.realm}/{robot}/alive"
+    # of the run
+    estop = _RealmKey("estop")  # emergency stop for all robots
+    event = _RealmKey("run/event")  # phases, losses, orders
+    experiment = _RealmKey("run/experiment")  # as it runs, late joiners included
+    conductor = _RealmKey("run/conductor")  # liveliness token
+    run_order = _RealmKey("run/order")  # queryable: pause, resume, remove, restart, replace, add robots
+    clock = _RealmKey("run/clock")  # clock offsets of other machines from the conductor's
+    recorder = _RealmKey("run/recorder")  # liveliness token
+    everything = _RealmKey("**")  # all keys of the realm
 
     @staticmethod
     def lives(alive: str) -> str:
@@ -62,100 +93,6 @@ class Keys:
         """The session in the token of an owner; None for any other token."""
         before, _, session = token.rpartition("/")
         return session if before.endswith("/life") else None
-
-    def position(self, robot: str) -> str:
-        """Pose of this robot, measured from outside (motion capture, a twin service)."""
-        return f"{self.realm}/{robot}/position"
-
-    def goal(self, robot: str) -> str:
-        """Goal from the central controller, or from outside."""
-        return f"{self.realm}/{robot}/goal"
-
-    def setpoint(self, robot: str) -> str:
-        """Commands for a body that lives in another process."""
-        return f"{self.realm}/{robot}/setpoint"
-
-    def ranges(self, robot: str) -> str:
-        """Readings of the range sensors."""
-        return f"{self.realm}/{robot}/ranges"
-
-    def truth(self, robot: str) -> str:
-        """True pose of a protocol twin: for recorder and simulated motion capture, never for robots."""
-        return f"{self.realm}/{robot}/truth"
-
-    @property
-    def world(self) -> str:
-        """Report of the world: pace, pauses, contacts. Not `state`, which only robots have."""
-        return f"{self.realm}/world/report"
-
-    @property
-    def world_order(self) -> str:
-        """Queryable of the world: pause, step, reset, spawn, remove."""
-        return f"{self.realm}/world/order"
-
-    @property
-    def contact(self) -> str:
-        """Every contact in the world, when it begins."""
-        return f"{self.realm}/world/contact"
-
-    @property
-    def world_alive(self) -> str:
-        """Liveliness token of the world. Not `alive`, which is counted as a robot."""
-        return f"{self.realm}/world/here"
-
-    @property
-    def centre(self) -> str:
-        """Report of the central controller: guided robots, load, counters. Not `state`, which only robots have."""
-        return f"{self.realm}/centre/report"
-
-    @property
-    def centre_alive(self) -> str:
-        """Liveliness token of the central controller. Not `alive`, as that of the world."""
-        return f"{self.realm}/centre/here"
-
-    @property
-    def estop(self) -> str:
-        """Emergency stop for all robots."""
-        return f"{self.realm}/estop"
-
-    @property
-    def event(self) -> str:
-        """Events of the run: phases, losses, orders."""
-        return f"{self.realm}/run/event"
-
-    @property
-    def experiment(self) -> str:
-        """The experiment as it runs, late joiners included."""
-        return f"{self.realm}/run/experiment"
-
-    @property
-    def conductor(self) -> str:
-        """Liveliness token of the conductor."""
-        return f"{self.realm}/run/conductor"
-
-    @property
-    def run_order(self) -> str:
-        """Queryable of the conductor: pause, resume, remove, restart, replace, add robots of a run under way."""
-        return f"{self.realm}/run/order"
-
-    @property
-    def clock(self) -> str:
-        """Clock offsets of other machines from the conductor's."""
-        return f"{self.realm}/run/clock"
-
-    @property
-    def recorder(self) -> str:
-        """Liveliness token of the recorder."""
-        return f"{self.realm}/run/recorder"
-
-    def below(self, name: str) -> str:
-        """All keys of a robot, or of `world`, `run` or `centre`."""
-        return f"{self.realm}/{name}/**"
-
-    @property
-    def everything(self) -> str:
-        """All keys of the realm."""
-        return f"{self.realm}/**"
 
     def robot(self, key: str) -> str:
         """The robot that a key of this realm belongs to.

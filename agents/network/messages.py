@@ -36,7 +36,11 @@ class Malformed(ValueError):
     """A payload that is no valid message of its kind."""
 
 
-class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of everything that is sent by itself."""
+
+
+class Pose(Message, frozen=True, omit_defaults=True):
     """Pose of a robot for its neighbours."""
 
     robot: str
@@ -67,7 +71,7 @@ class GoalReceipt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     acted: float  # [s] UTC from which it was used
 
 
-class State(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class State(Message, frozen=True, omit_defaults=True):
     """Telemetry of a body and its decision, for recorder and viewers; unknown numbers are left out.
 
     Several states of one `seq` are one sample: `payloads` splits those whose `heard` or `followed` is too long for one
@@ -103,7 +107,7 @@ class Incident(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     text: str
 
 
-class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Status(Message, frozen=True):
     """Condition of a robot, and its counters since the start of its process."""
 
     robot: str
@@ -130,14 +134,13 @@ class Status(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cpu_s: float
     rss_mb: float
     origin: Setpoint | None = None  # start of the robot, or of its plan: x, y, z [m], yaw [rad]
-    hazard: str = (
-        ""  # worst present hazard and its outcome: "hold: minimum separation: 0.18 m from CF03 (limit 0.25 m)"
-    )
+    # worst present hazard and its outcome: "hold: minimum separation: 0.18 m from CF03 (limit 0.25 m)"
+    hazard: str = ""
     incidents: list[Incident] = []  # the last ones, repeated in each status so that a lost status loses none
     stale: dict[str, int] = {}  # by neighbour, if any: samples older than a known one, or of a former process
 
 
-class Position(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class Position(Message, frozen=True, omit_defaults=True):
     """Pose of a robot, measured or known from outside of it."""
 
     robot: str
@@ -146,7 +149,7 @@ class Position(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     yaw: float | None = None  # [rad]
 
 
-class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Goal(Message, frozen=True):
     """Goal for a robot that does not decide for itself."""
 
     robot: str
@@ -158,7 +161,7 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pose: float  # [s] UTC of the measurement of the robot's pose from which the goal was computed
 
 
-class CentreState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class CentreState(Message, frozen=True):
     """Report of the central controller, at 1 Hz; counters since the start of its process.
 
     Poses count that were measured in the run, by robot.
@@ -181,7 +184,7 @@ class CentreState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rss_mb: float
 
 
-class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Command(Message, frozen=True):
     """Command to a body in another process."""
 
     robot: str
@@ -192,7 +195,7 @@ class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     height: float | None = None  # [m] of `takeoff`
 
 
-class Ranges(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Ranges(Message, frozen=True):
     """One sweep of the range sensors of a robot."""
 
     robot: str
@@ -202,7 +205,7 @@ class Ranges(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distance: list[float | None]  # [m]; None: nothing in reach
 
 
-class Contact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Contact(Message, frozen=True):
     """Begin of a contact in the world."""
 
     stamp: float  # [s] UTC
@@ -219,7 +222,7 @@ class ObstaclePose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pose: Vector  # x, y [m], yaw [rad]
 
 
-class WorldState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class WorldState(Message, frozen=True):
     """Report of the world, at 1 Hz and on every change."""
 
     stamp: float  # [s] UTC
@@ -237,7 +240,7 @@ class WorldState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     trouble: str = ""
 
 
-class WorldOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class WorldOrder(Message, frozen=True):
     """Order of an operator to a world."""
 
     order: Literal["pause", "resume", "step", "reset", "spawn", "remove"]
@@ -249,7 +252,7 @@ class WorldOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     obstacle: dict[str, object] | None = None  # to spawn, as in the experiment file
 
 
-class WorldReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class WorldReply(Message, frozen=True):
     """Reply of a world to an order."""
 
     ok: bool
@@ -258,7 +261,7 @@ class WorldReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     reason: str = ""
 
 
-class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Order(Message, frozen=True):
     """Order of an operator to a robot.
 
     "leave" lands a robot and undeclares its token; its process ends with the last of its robots.
@@ -268,12 +271,11 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     at: float | None = None  # [s] UTC of a start
     name: str | None = None  # of the parameter to get or set
     value: float | None = None  # of the parameter to set
-    origin: Setpoint | None = (
-        None  # of a start: `Status.origin` of the robot's former process; its plan goes on from there
-    )
+    # of a start: `Status.origin` of the robot's former process; its plan goes on from there
+    origin: Setpoint | None = None
 
 
-class Reply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Reply(Message, frozen=True):
     """Reply of a robot to an order."""
 
     robot: str
@@ -283,7 +285,7 @@ class Reply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     value: float | None = None
 
 
-class RunOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RunOrder(Message, frozen=True):
     """Order of an operator to the conductor of a run."""
 
     order: ChangeKind
@@ -295,7 +297,7 @@ class RunOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     yaw: float = 0.0  # [rad] of its start
 
 
-class RunReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RunReply(Message, frozen=True):
     """Reply of a conductor when all is done."""
 
     done: dict[str, str] = {}  # by robot
@@ -303,7 +305,7 @@ class RunReply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     reason: str = ""  # for which the whole order is refused
 
 
-class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Stop(Message, frozen=True):
     """Emergency stop for all robots; see `read_stop`."""
 
     who: str  # sender
@@ -315,7 +317,7 @@ class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return f"{EMERGENCY} by {self.who}" + (f": {self.reason}" if self.reason else "")
 
 
-class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Event(Message, frozen=True):
     """Event of a run."""
 
     stamp: float  # [s] UTC
@@ -324,7 +326,7 @@ class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     text: str
 
 
-class HostClock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class HostClock(Message, frozen=True):
     """Offset of the clock of a host from that of the conductor."""
 
     host: str
@@ -337,27 +339,6 @@ class HostClock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     applied: float | None = None
 
 
-Message = (
-    Pose
-    | State
-    | Status
-    | Position
-    | Goal
-    | CentreState
-    | Command
-    | Ranges
-    | Order
-    | Reply
-    | Stop
-    | Event
-    | Contact
-    | HostClock
-    | WorldState
-    | WorldOrder
-    | WorldReply
-    | RunOrder
-    | RunReply
-)
 M = TypeVar("M", bound=Message)
 
 _json = msgspec.json.Encoder()

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack, redirect_stdout, suppress
 from pathlib import Path
 from threading import Event
-from typing import get_args
 
 import msgspec
 import numpy as np
@@ -32,7 +31,7 @@ RUBBISH = io.StringIO()  # where processes say what they would say on a terminal
 
 def messages() -> Iterator[Target]:
     """Every struct, both encodings: what is decoded can be encoded again."""
-    kinds = {kind.__name__: kind for kind in get_args(wire.Message)}
+    kinds = {kind.__name__: kind for kind in wire.Message.__subclasses__()}
     examples = []
     for said in [*good("KH01").values(), *of_all().values()]:
         for message in said:
