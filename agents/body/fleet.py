@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from agents.arrays import Array, Index
-from agents.body.interface import Body, BodyRequest, BodyState, Rays, call_all
+from agents.body.interface import Body, BodyRequest, BodyState, Rays, call_all, inspect
+from agents.network.messages import Inspection
 from agents.plugins import registry
 
 
@@ -88,6 +89,11 @@ class Fleet:
         for group, body in self._parts:
             if row in group:
                 body.locate(int(self._place[row]), t, position, yaw)
+
+    def inspect(self, row: int) -> Inspection:
+        """See `Inspectable.inspect`."""
+        body = next(body for group, body in self._parts if row in group)
+        return inspect(body, int(self._place[row]))
 
     def close(self) -> None:
         """Closes every body."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Final, Protocol, TypeVar
+from typing import Annotated, Any, Final, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -17,6 +17,7 @@ from agents.arrays import Array, Index, Mask
 from agents.body.kinds import Kind
 from agents.clock import Clock
 from agents.network.keys import Keys
+from agents.network.messages import Inspection
 
 
 class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -205,6 +206,20 @@ class Body(Protocol):
     def close(self) -> None:
         """Releases the device. Flying rows must have landed before."""
         ...
+
+
+@runtime_checkable
+class Inspectable(Protocol):
+    """A body that knows more of its devices than their state; the method is optional for bodies."""
+
+    def inspect(self, row: int) -> Inspection:
+        """What is known of the device of a row: firmware, volts, load of its radio. Never blocks, moves nothing."""
+        ...
+
+
+def inspect(body: Body, row: int) -> Inspection:
+    """What a body knows of the device of a row; nothing of one that cannot be inspected."""
+    return body.inspect(row) if isinstance(body, Inspectable) else Inspection()
 
 
 class BodyError(RuntimeError):

@@ -53,6 +53,10 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     ] = 1.2
     battery_low: Annotated[Share, Meta(description="with less charge than this a robot lands; 0: never")] = 0.1
     battery_min: Annotated[Share, Meta(description="with less charge than this it does not take off; 0: always")] = 0.2
+    start_within: Annotated[
+        NotNegative,
+        Meta(description="a robot that is farther from its `start` than this does not take off [m]; 0: anywhere"),
+    ] = 0.3
     landing_s: Annotated[
         Positive, Meta(description="a drone that takes longer than this to land has its motors cut [s]")
     ] = 20.0

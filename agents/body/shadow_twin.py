@@ -17,7 +17,8 @@ from typing import Final, Protocol
 import numpy as np
 
 from agents.arrays import Array, Index, Mask
-from agents.body.interface import TROUBLE, Body, BodyRequest, BodyState, Disturbance
+from agents.body.interface import TROUBLE, Body, BodyRequest, BodyState, Disturbance, inspect
+from agents.network.messages import Inspection
 from agents.plugins import registry
 
 TWIN: Final = "twin"
@@ -92,6 +93,10 @@ class Shadowed:
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
         """See `Body.locate`; the twin needs no external pose."""
         self._body.locate(row, t, position, yaw)
+
+    def inspect(self, row: int) -> Inspection:
+        """See `Inspectable.inspect`: of the robot, not of the twin."""
+        return inspect(self._body, row)
 
     def close(self) -> None:
         """See `Body.close`."""

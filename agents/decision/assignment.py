@@ -49,6 +49,8 @@ class Assignment:
     anchors: Anchors | None = None  # distances to fixed points, lines, planes
     changes: tuple[Change, ...] = ()  # of the targets of all links
     presence: Presence | None = None  # times of all links; None: always
+    start: Array | None = None  # (N, 2) where the rows begin [m]; None: anywhere
+    start_within: float = 0.0  # farthest from there that a row may take off [m]
     # (N,) rows that the central controller guides; links of the law, anchors and legs are those of the other rows, and
     # in the assignment of a central controller those of these rows
     guided: Mask | None = None

@@ -18,7 +18,7 @@ import msgspec
 Vector = tuple[float, float, float]
 Setpoint = tuple[float, float, float, float]
 Encoding = Literal["json", "msgpack"]
-OrderKind = Literal["takeoff", "start", "hold", "resume", "leave", "land", "stop", "get", "set"]
+OrderKind = Literal["takeoff", "start", "hold", "resume", "leave", "land", "stop", "get", "set", "inspect"]
 ChangeKind = Literal["pause", "resume", "remove", "restart", "replace", "add"]
 
 JSON: Final = "application/json"  # plain, without a schema suffix: REST and command-line tools then print it
@@ -275,6 +275,18 @@ class Order(Message, frozen=True):
     origin: Setpoint | None = None
 
 
+class Inspection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What a robot's process knows of its device before a run; None: this kind of body does not tell."""
+
+    firmware: str | None = None  # version as the device reports it, such as "2025.02"
+    volts: float | None = None  # [V] of the battery now
+    packets_hz: float | None = None  # [1/s] that the robots of this process ask of the radio that carries this one
+    capacity_hz: float | None = None  # [1/s] that this radio carries
+    flying: bool = False  # motors of a drone on
+    age_s: float | None = None  # [s] of its position
+    ahead_s: float | None = None  # [s] stamp of the last external position less the time of its arrival
+
+
 class Reply(Message, frozen=True):
     """Reply of a robot to an order."""
 
@@ -283,6 +295,7 @@ class Reply(Message, frozen=True):
     phase: str
     reason: str = ""
     value: float | None = None
+    inspection: Inspection | None = None  # of "inspect"
 
 
 class RunOrder(Message, frozen=True):

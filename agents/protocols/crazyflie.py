@@ -119,17 +119,24 @@ def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> Settings:
     return read
 
 
+def radio_loads(addresses: Sequence[str], each: Sequence[Settings]) -> list[float | None]:
+    """Packets per second of all robots on the radio of each address; None without a radio."""
+    radios = [address.split("/")[2] if address.startswith("radio://") else None for address in addresses]
+    load: dict[str | None, float] = {}
+    for radio, settings_ in zip(radios, each, strict=True):
+        load[radio] = load.get(radio, 0.0) + settings_.packets_hz
+    return [None if radio is None else load[radio] for radio in radios]
+
+
 def crowded(addresses: Sequence[str], each: Sequence[Settings]) -> dict[str, str]:
     """Warnings about radios with more packets than they can carry, by address."""
-    radios = [address.split("/")[2] if address.startswith("radio://") else "" for address in addresses]
     said: dict[str, str] = {}
-    for radio in set(radios) - {""}:
-        on_it = [row for row, other in enumerate(radios) if other == radio]
-        packets = sum(each[row].packets_hz for row in on_it)
-        if packets > PACKETS_PER_RADIO:
-            text = (
-                f"radio {radio}: {len(on_it)} robots log {packets:.0f} packets/s, "
+    for address, packets in zip(addresses, radio_loads(addresses, each), strict=True):
+        if packets is not None and packets > PACKETS_PER_RADIO:
+            radio = address.split("/")[2]
+            robots = sum(other.startswith(f"radio://{radio}/") for other in addresses)
+            said[address] = (
+                f"radio {radio}: {robots} robots log {packets:.0f} packets/s, "
                 f"it carries about {PACKETS_PER_RADIO:.0f}: lower log_hz, or plug in another radio"
             )
-            said |= {addresses[row]: text for row in on_it}
     return said

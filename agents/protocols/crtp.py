@@ -13,6 +13,8 @@ from struct import Struct
 from typing import Final
 
 VERSION: Final = 12  # the first with a supervisor port
+VERSIONS: Final = 1  # channel of `Port.PLATFORM` on which a drone says its versions,
+FIRMWARE: Final = 1  # and the question for that of its firmware, which is a text such as "2025.02"
 MTU: Final = 30  # [bytes] of payload
 GREETING: Final = b"Bitcraze Crazyflie".ljust(MTU, b"\0")  # how a Crazyflie is told from a boot loader
 SCAN: Final = 0xFF  # the header with which cflib asks whether anybody is there

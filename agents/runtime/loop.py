@@ -16,12 +16,13 @@ from functools import partial
 from math import ceil, floor
 from typing import Final
 
+import msgspec
 import numpy as np
 import zenoh
 
 from agents.agent import Actions, Agent
 from agents.arrays import Index, some
-from agents.body.interface import Body, call_all
+from agents.body.interface import Body, BodyState, call_all, inspect
 from agents.body.measured_positions import MeasuredPositions
 from agents.decision.assignment import Assignment
 from agents.decision.lifecycle import Phase
@@ -65,6 +66,7 @@ class Runtime:
         self._leaving: set[int] = set()  # rows that were ordered to leave the run
         self._retired: set[int] = set()  # rows that land, or have landed, while the run goes on
         self._cut_off = False  # motors were cut by a stop that the loop has not polled yet
+        self._state: BodyState | None = None  # last reading of the body
         self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._joined = False
         self._utc = self._now = self._next = 0.0
@@ -377,8 +379,21 @@ class Runtime:
                 self._align(order.at - self._utc)
                 self._telemetry.due = t  # the central controller must know the start in time
             phase = Phase(self.agent.lifecycle.phase[row]).word
-            reply = messages.Reply(self._names[row], not refusal, phase, refusal, value)
+            found = self._inspect(row, t) if order.order == "inspect" else None
+            reply = messages.Reply(self._names[row], not refusal, phase, refusal, value, found)
             query.reply(key, messages.encode(reply, self._setup.encoding), encoding=self._mime)
+
+    def _inspect(self, row: int, t: float) -> messages.Inspection:
+        """What is known of the device of a row, with its last state."""
+        known, state = inspect(self._body, row), self._state
+        if state is None:
+            return known
+        return msgspec.structs.replace(
+            known,
+            flying=bool(state.flying[row]),
+            age_s=messages.number(t - float(state.time[row])),
+            ahead_s=None if state.ahead is None else messages.number(float(state.ahead[row])),
+        )
 
     # ------------------------------------------------------------------ the loop
 
@@ -447,6 +462,7 @@ class Runtime:
         if (located := self._located) is not None:
             known = np.isfinite(located.ahead)
             state.ahead = located.ahead if state.ahead is None else np.where(known, located.ahead, state.ahead)
+        self._state = state
         if self._ranges is not None:
             state = replace(state, rays=replace_rows(state.rays, self._ranges.read(self._utc, t), self._from_world))
         transmission = self.agent.transmit(t, state)

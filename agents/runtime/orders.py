@@ -47,6 +47,8 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
             agent.lifecycle.land(row, LAND)
         case "stop":
             agent.lifecycle.stop(row, STOP)
+        case "inspect":
+            pass  # the loop adds the inspection to the reply: it has the body
         case "get" | "set":
             return _parameter(agent, order)
     return "", None

@@ -48,7 +48,7 @@ class Preflight:
         `lacking`: (N,) rows without a pose of a neighbour, and the names of the missing ones of a row.
         """
         failing: dict[int, str] = {}
-        checks = [self._situation(t, state, where, health, lacking), self._at_rest(state)]
+        checks = [self._situation(t, state, where, health, lacking), self._at_start(state), self._at_rest(state)]
         if self._limits.separation is not None:
             checks.append(self._near(t, state.position, neighbours, self._limits.separation))
         for rows, reason in chain.from_iterable(checks):
@@ -89,6 +89,14 @@ class Preflight:
             yield np.ones(len(self._flies), dtype=bool), lambda _: "no connection to a router"
         if not where.all_valid:
             yield where.excess > WALL_M, lambda row: f"it is {where.excess[row]:.2f} m outside the arena"
+
+    def _at_start(self, state: BodyState) -> Iterator[Failing]:
+        """Body where the experiment begins: swapped addresses or markers, and a wrong origin, show here."""
+        start, limit = self._assignment.start, self._assignment.start_within
+        if start is not None:
+            away = np.hypot(*(state.position[:, :2] - start).T)  # NaN without a position, which has failed already
+            text = "it is {:.2f} m from its start ({:g}, {:g}), more than {:g} m"
+            yield away > limit, lambda row: text.format(away[row], *start[row], limit)
 
     def _at_rest(self, state: BodyState) -> Iterator[Failing]:
         """Body at rest on the floor."""

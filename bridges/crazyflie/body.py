@@ -12,7 +12,16 @@ from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import BodyError, BodyRequest, BodyState, RangeScan, Rays
-from agents.protocols.crazyflie import Lighthouse, address, chosen, crowded, device_of
+from agents.network.messages import Inspection, number
+from agents.protocols.crazyflie import (
+    PACKETS_PER_RADIO,
+    Lighthouse,
+    address,
+    chosen,
+    crowded,
+    device_of,
+    radio_loads,
+)
 from bridges.crazyflie.link import prepare
 from bridges.crazyflie.pilot import Pilot
 from bridges.crazyflie.telemetry import BEARING, ELEVATION, Board, Telemetry
@@ -40,6 +49,7 @@ class CrazyflieBody:
             for name, device, outside in zip(request.names, request.device, request.external, strict=True)
         ]
         self._congestion = [crowded(addresses, settings).get(each, "") for each in addresses]
+        self._loads = radio_loads(addresses, settings)
         rows = len(addresses)
         self._board = Board(rows)
         self._open_timeout = max(each.connect_s + each.converge_s for each in settings) + 5.0
@@ -130,6 +140,16 @@ class CrazyflieBody:
         """See `Body.locate`."""
         if self._external.update(row, t, position, yaw):
             self._pilots[row].locate(self._zero + t, position, yaw)
+
+    def inspect(self, row: int) -> Inspection:
+        """See `agents.body.interface.Inspectable`."""
+        load = self._loads[row]
+        return Inspection(
+            firmware=self._pilots[row].firmware,
+            volts=number(float(self._board.volts[row])),
+            packets_hz=load,
+            capacity_hz=None if load is None else PACKETS_PER_RADIO,
+        )
 
     def close(self) -> None:
         """See `Body.close`. Drones in the air are landed first."""

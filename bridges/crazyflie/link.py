@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from agents.body.interface import BodyError
+from agents.protocols import crtp
 from agents.protocols.crtp import Port
 
 FIRST_S: Final = 0.6  # to the first packet; cflib never repeats its first two requests
@@ -68,6 +69,7 @@ class Link:
 
         self.address = address
         self.last_packet = time.monotonic()  # [s]
+        self.firmware: str | None = None  # version, as the drone says it
         self.replies: dict[int, tuple[int, int]] = {}  # of the planner, by command: number of replies, last code
         self._full = threading.Event()
         self._error: str | None = None
@@ -81,6 +83,7 @@ class Link:
         cf.connection_failed.add_callback(lambda _uri, text: self._fail(text))
         cf.connection_lost.add_callback(lambda _uri, text: self._fail(text))
         cf.add_port_callback(int(Port.HIGH_LEVEL), self._reply)
+        cf.add_port_callback(int(Port.PLATFORM), self._note_firmware)
 
     @property
     def answered(self) -> bool:
@@ -199,6 +202,15 @@ class Link:
         """Number of replies to a high-level command so far, and the code of the last."""
         return self.replies.get(command, (0, 0))
 
+    def ask_firmware(self) -> None:
+        """Ask for the version of the firmware; `firmware` has it when the answer has come."""
+        from cflib.crtp.crtpstack import CRTPPacket  # noqa: PLC0415
+
+        packet = CRTPPacket()
+        packet.set_header(int(Port.PLATFORM), crtp.VERSIONS)
+        packet.data = (crtp.FIRMWARE,)
+        self.cf.send_packet(packet)
+
     def close(self) -> None:
         """End the connection and its threads.
 
@@ -226,6 +238,10 @@ class Link:
     def _note_packet(self, _packet: object) -> None:
         self.last_packet = time.monotonic()
         self._answered = True
+
+    def _note_firmware(self, packet: Packet) -> None:
+        if packet.data and packet.data[0] == crtp.FIRMWARE:
+            self.firmware = bytes(packet.data[1:]).partition(b"\0")[0].decode(errors="replace")
 
     def _reply(self, packet: Packet) -> None:
         if len(packet.data) >= 4:

@@ -89,6 +89,11 @@ class Pilot:
             part for part in (self._connection_note, self._flight.trouble, self._telemetry.status_text()) if part
         )
 
+    @property
+    def firmware(self) -> str | None:
+        """Version of the firmware; None before the drone has said it."""
+        return None if self._link is None else self._link.firmware
+
     def close(self) -> None:
         """Land the drone if it flies, then end the thread."""
         self._ending.set()
@@ -189,6 +194,7 @@ class Pilot:
         telemetry.reset_status()
         ranges_hz = settings.ranges_hz if settings.multiranger else None
         telemetry.start_logging(link, log_hz=settings.log_hz, status_hz=settings.status_hz, ranges_hz=ranges_hz)
+        link.ask_firmware()
         deadline = time.monotonic() + STATUS_S
         while telemetry.status_time == -inf:
             self._check(link)

@@ -49,6 +49,7 @@ class Board:
         self.info = np.zeros(rows, dtype=np.intp)  # flags of the supervisor
         self.power = np.full(rows, int(Power.BATTERY))  # state of power management
         self.battery = np.full(rows, np.nan)  # charge, 0 to 1
+        self.volts = np.full(rows, np.nan)  # of the battery [V]
         self.stations = np.full(rows, -1)  # lighthouse.status, or -1
         self.ranges = np.full((rows, 5), np.nan)  # front, back, left, right, up [m]; NaN: nothing in reach
         self.airborne = np.zeros(rows, dtype=bool)  # motors on, as far as the bridge knows
@@ -121,6 +122,7 @@ class Telemetry:
         level = values.get("pm.batteryLevel")
         volts = values.get("pm.vbat", nan)
         board.battery[row] = (volts - EMPTY_V) / (FULL_V - EMPTY_V) if level is None else 0.01 * level
+        board.volts[row] = volts
         board.stations[row] = int(values.get("lighthouse.status", -1))
         board.status_time[row] = t
 

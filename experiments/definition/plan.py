@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +21,7 @@ from agents.plugins.laws import Law
 from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
-from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, hover_heights, kinds
+from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, hover_heights, kinds, start_poses
 from experiments.definition.experiment import Experiment, Hybrid
 from experiments.definition.formation import FormationArrays, compile_anchors
 from experiments.definition.links import OneWay, one_way_links
@@ -230,7 +231,7 @@ class Plan:
         if copies > 1:
             formation = formation.repeated(copies, len(names))
             anchors = None if anchors is None else anchors.repeated(copies, len(names))
-        rates = experiment.rates
+        rates, within = experiment.rates, experiment.safety.start_within
         return Assignment(
             names=tuple(names) * copies,
             kinds=kinds(experiment, names) * copies,
@@ -259,6 +260,8 @@ class Plan:
             patience_s=experiment.start.deadline_s if experiment.start.missing == "go-on" else None,
             guided=np.array([name in steered for name in names] * copies) if steered else None,
             awaited=self._waited_for(formation.links, copies),
+            start=np.tile(start_poses(experiment, names)[0][:, :2], (copies, 1)) if within else None,
+            start_within=within + math.sqrt(2.0) * experiment.start.scatter,
         )
 
     def _waited_for(self, links: Links, copies: int) -> Mask | None:

@@ -110,7 +110,8 @@ class CaseProcesses:
         self._groups = {group: members for group, members in self._groups.items() if members}
         self._reached = msgspec.structs.replace(self._reached, robots=robots)
         begin = msgspec.structs.replace(self._reached.start, missing="go-on", deadline_s=ALONE_S)
-        told = msgspec.structs.replace(self._reached, start=begin)
+        safety = msgspec.structs.replace(self._reached.safety, start_within=0.0)  # it begins where it came down
+        told = msgspec.structs.replace(self._reached, start=begin, safety=safety)
         fresh = self._joining.with_suffix(".new")  # who is just being started reads the one or the other
         fresh.write_bytes(write_json(told))
         fresh.replace(self._joining)

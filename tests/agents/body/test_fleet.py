@@ -7,7 +7,8 @@ import pytest
 
 from agents.body import fleet
 from agents.body.fleet import Fleet, assemble
-from agents.body.interface import BodyError, BodyState
+from agents.body.interface import BodyError, BodyState, inspect
+from agents.network.messages import Inspection
 from agents.plugins import registry
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Robot
@@ -147,3 +148,15 @@ def test_twins_share_one_body():
 def test_an_unknown_body_is_named():
     with pytest.raises(registry.UnknownPlugin, match="hovercraft"):
         assemble(request("hovercraft://1"))
+
+
+class Told(Recorded):
+    """A body that knows the firmware of its rows."""
+
+    def inspect(self, row):
+        return Inspection(firmware=f"{self.label:g}.{row}")
+
+
+def test_each_row_is_inspected_by_its_own_body_and_a_body_that_cannot_says_nothing():
+    both = Fleet(3, [(np.array([0, 2]), Told(7.0, 2)), (np.array([1]), Recorded(1.0, 1))])
+    assert [inspect(both, row) for row in range(3)] == [Inspection("7.0"), Inspection(), Inspection("7.1")]

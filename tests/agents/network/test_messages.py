@@ -43,7 +43,11 @@ messages = st.one_of(
         st.lists(heard, max_size=3),
     ),
     st.builds(Goal, word, count, number, vector, st.none() | number, number),
-    st.builds(Order, st.sampled_from(["takeoff", "start", "hold", "land", "stop", "get", "set"]), st.none() | number),
+    st.builds(
+        Order,
+        st.sampled_from(["takeoff", "start", "hold", "land", "stop", "get", "set", "inspect"]),
+        st.none() | number,
+    ),
     st.builds(Reply, word, st.booleans(), word, word, st.none() | number),
     st.builds(Stop, word, word),
     st.builds(Event, number, word, word, word),

@@ -9,6 +9,7 @@ import pytest
 
 from agents.agent import Agent
 from agents.body.interface import BodyState
+from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
 from agents.network import messages
 from agents.network.keys import Keys
@@ -32,6 +33,7 @@ def leader(*, listens: bool = False):
         robots={"A": Robot(kind="turtlebot3", start=list(START)), "B": Robot(kind="khepera4", start=[0.6, 0.6])},
         formation=Formation(links={"B > A": 0.5} if listens else {"A > B": 0.5}),
         timeline=[Leg(robot="A", at_s=BEGINS_S, plan={"kind": "line", "move_by": [WAY, 0.0], "speed": SPEED})],
+        safety=Safety(start_within=0.0),  # as processes get it that are started in mid-run
     )
 
 

@@ -46,6 +46,9 @@ def test_flight_and_next_session():
     with flown() as (twin, process):
         print(f"connected, all parameters read: {time.monotonic() - begin:.2f} s")
         assert time.monotonic() - begin < 5.0
+        process.until(lambda: process.body.inspect(0).firmware == "twin", "version of the firmware")
+        assert 3.0 < process.body.inspect(0).volts < 4.3
+        assert process.body.inspect(0).capacity_hz is None  # no radio carries it
         process.takeoff()
         process.setpoint = [(0.4, 0.3, 0.6, 0.5)]
         process.until(lambda: np.abs(truth(twin) - [0.4, 0.3, 0.6]).max() < 0.02, "goal")
