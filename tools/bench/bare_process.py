@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Lifeline(over).start()
     with network.open_session(chosen.connect, name=chosen.name, lease_s=network.ROBOT_LEASE_S) as session:
         poses = pubsub.pose_publisher(session, keys.pose(chosen.name), mime)
-        heard = [pubsub.pose_subscriber(session, keys.pose(name)) for name in chosen.neighbours]
+        subscribers = [pubsub.pose_subscriber(session, keys.pose(name)) for name in chosen.neighbours]
         due, period, seq = time.monotonic(), 1.0 / chosen.hz, 0
         while not over.is_set():
             due += period  # a late pose is sent all the same: the rate holds on a busy machine
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             poses.put(
                 messages.encode(messages.pose(chosen.name, seq, time.time(), place, [0.01, 0.02, 0.0], 0.1), "json")
             )
-            for subscriber in heard:
+            for subscriber in subscribers:
                 for sample in network.received(subscriber.handler):
                     messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Pose)
     return 0

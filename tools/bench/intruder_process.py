@@ -1,8 +1,8 @@
-"""What an intruder does, as a process: `python -m tools.bench.intruder_process KIND ENDPOINT IDENTITY KEY`, until
+"""An intruder as a process: `python -m tools.bench.intruder_process KIND ENDPOINT IDENTITY KEY`, until
 SIGTERM.
 
-For `zenpark bench intruders`, which measures what robots notice of it. At the end it prints how often it did it per
-second. It yields the processor to everybody else: a real intruder has a machine of its own.
+For `zenpark bench intruders`. At the end it prints its rate per second. It yields the processor to all other
+processes: a real intruder has a machine of its own.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def flood(
 
         begin = time.monotonic()
         done = _at(rate_hz, once, over)
-        _tell(done, begin)
+        _report(done, begin)
         os._exit(0)  # a session takes its time to close when the other end is in no hurry to read
 
 
@@ -67,12 +67,12 @@ def half_open(endpoint: str, over: threading.Event) -> int:
     while not over.wait(0.05):
         for one in list(held):
             try:
-                gone = not one.recv(64)
+                closed = not one.recv(64)
             except BlockingIOError:
                 continue
             except OSError:
-                gone = True
-            if gone:
+                closed = True
+            if closed:
                 one.close()
                 held.remove(one)
         while len(held) < HALF_OPEN:
@@ -115,24 +115,24 @@ def main() -> int:
     begin = time.monotonic()
     robot = key.split("/")[1]
     old = messages.encode(messages.pose(robot, 1, time.time() - 10.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
-    said: dict[str, Callable[[int], bytes]] = {
+    payloads: dict[str, Callable[[int], bytes]] = {
         "nonsense": lambda count: NONSENSE[count % len(NONSENSE)],
         "large": lambda _: b" " * LARGE,
         "replay": lambda _: old,
         "denied": lambda _: old,
     }
     try:
-        if kind in said:
+        if kind in payloads:
             rate_hz = LARGE_HZ if kind == "large" else RATE_HZ
-            flood(endpoint, identity, key, said[kind], rate_hz=rate_hz, over=over)
-        _tell({"half-open": half_open, "garbage": garbage}[kind](endpoint, over), begin)
+            flood(endpoint, identity, key, payloads[kind], rate_hz=rate_hz, over=over)
+        _report({"half-open": half_open, "garbage": garbage}[kind](endpoint, over), begin)
     except (network.Unreachable, zenoh.ZError) as error:
         print(error, file=sys.stderr)
         return 1
     return 0
 
 
-def _tell(done: int, begin: float) -> None:
+def _report(done: int, begin: float) -> None:
     print(json.dumps({"rate": done / (time.monotonic() - begin)}), flush=True)
 
 

@@ -1,4 +1,4 @@
-"""What robots in flight notice of intruders: the lateness of their control loops, against quiet times of the same run.
+"""Effect of intruders on robots in flight: lateness of their control loops, against quiet times of the same run.
 
 Intruder and robots share this machine here, which they do not in a laboratory. So each flood is measured twice: first
 against a decoy, a second router of the same lab to which nobody else is connected, which shows what the flood costs the
@@ -17,20 +17,28 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from tools.bench.bench_figure import Figure
+import msgspec
 
-if TYPE_CHECKING:
-    from agents.network.lab import Role
-    from experiments.real_time.conductor.run_view import Progress
+from agents.network import lab
+from agents.network.endpoints import free_endpoint
+from agents.network.lab import Role
+from agents.network.session import Unreachable, open_session
+from experiments.definition import access_rights
+from experiments.file.document import load
+from experiments.real_time.conductor.run_view import Progress
+from experiments.real_time.conductor.support import start_router
+from experiments.real_time.hosts.launcher import Launcher
+from tools.bench.measuring import Figure, fly
+from tools.commands.authority import SERVICES, create
 
 SPAN_S: Final = 6.0
 SETTLE_S: Final = 1.5  # a status speaks of the second before it
 JOIN_S: Final = 15.0
 EFFECT_S: Final = 12.0  # half-open handshakes are dropped after 10 s
 ATTACKS: Final = (
-    # kind, whose certificate, key
+    # kind, identity whose certificate is shown, key
     ("denied", "observer", "park/CF01/pose"),
     ("large", "KH01", "park/KH01/pose"),
     ("replay", "KH01", "park/KH01/pose"),
@@ -43,7 +51,7 @@ ATTACKS: Final = (
 
 @dataclass
 class Phase:
-    """A part of the run: who attacks what, and what the robots said of their loops meanwhile."""
+    """A part of the run: the attack, and the lateness of the robots' loops meanwhile."""
 
     name: str
     attack: tuple[str, ...] = ()
@@ -63,10 +71,10 @@ class Siege:
         self.phases = phases
         self._now = -1
         self._process: subprocess.Popen[str] | None = None
-        self._seen: dict[str, float] = {}
+        self._stamps: dict[str, float] = {}
 
     def look(self, progress: Progress) -> None:
-        """Called some ten times a second."""
+        """Begin and end attacks, and collect lateness; called some ten times a second."""
         elapsed = progress.elapsed if progress.elapsed is not None else -1.0
         number = int((elapsed - 1.0) // SPAN_S) if elapsed > 1.0 else -1
         if number != self._now:
@@ -81,11 +89,11 @@ class Siege:
         if not 0 <= number < len(self.phases):
             return
         fresh = elapsed - 1.0 - number * SPAN_S > SETTLE_S
-        for name, seen in progress.robots.items():
-            status = seen.status
-            if status is None or status.phase != "running" or self._seen.get(name) == status.stamp:
+        for name, view in progress.robots.items():
+            status = view.status
+            if status is None or status.phase != "running" or self._stamps.get(name) == status.stamp:
                 continue
-            self._seen[name] = status.stamp
+            self._stamps[name] = status.stamp
             if fresh:
                 self.phases[number].late.append(status.late_s)
 
@@ -111,15 +119,6 @@ def intruders() -> Iterator[Figure]:
 
 
 def _siege(protocol: str) -> Iterator[Figure]:
-    from agents.network import lab  # noqa: PLC0415
-    from agents.network.endpoints import free_endpoint  # noqa: PLC0415
-    from experiments.file.document import load  # noqa: PLC0415
-    from experiments.real_time.conductor.case_context import CaseContext  # noqa: PLC0415
-    from experiments.real_time.conductor.conductor import Conductor  # noqa: PLC0415
-    from experiments.real_time.conductor.support import start_router  # noqa: PLC0415
-    from experiments.real_time.hosts.hosts import Hosts  # noqa: PLC0415
-    from experiments.real_time.hosts.launcher import Launcher  # noqa: PLC0415
-    from experiments.recording.run_folder import SOURCE  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -135,21 +134,13 @@ def _siege(protocol: str) -> Iterator[Figure]:
             for target, where in ((decoy, "elsewhere"), (real, "here")):
                 phases.append(Phase(f"{kind}, {where}", (kind, target, identity, key)))
         phases.append(Phase("quiet"))
-        span = 1.0 + SPAN_S * len(phases) + 1.0
-        read = load("robotic-park", f"duration_s={span}", "timeline=[]", "trigger.period_s=0.02")
-        (folder / SOURCE).write_text(read.text, encoding="utf-8")
-        experiment = read.cases()["periodic"]
         siege = Siege(phases)
         with Launcher(folder / "logs") as launcher:
             start_router(launcher, [real], rights)
             listen = ("--listen", decoy, "--rights", str(rights), "--lifeline")
             launcher.start("decoy", "agents.runtime.router", *listen)
             try:
-                hosts = Hosts(launcher, [real])
-                context = CaseContext(
-                    experiment, "periodic", folder, folder / SOURCE, [real], launcher, hosts, rights=rights
-                )
-                Conductor(context, siege.look).run()
+                fly(launcher, folder, [real], siege.look, duration_s=1.0 + SPAN_S * len(phases) + 1.0, rights=rights)
             finally:
                 siege.end()
     for number, phase in enumerate(phases):
@@ -163,7 +154,7 @@ def _siege(protocol: str) -> Iterator[Figure]:
 
 
 def _joining(protocol: str) -> Iterator[Figure]:
-    """How long somebody with a good certificate needs to be let in."""
+    """Time to join with a good certificate."""
     kinds = ("garbage", "half-open") if protocol == "tls" else ("garbage",)
     for kind in kinds:
         quiet, taken = _joined(protocol, kind)
@@ -172,13 +163,7 @@ def _joining(protocol: str) -> Iterator[Figure]:
 
 
 def _joined(protocol: str, kind: str) -> tuple[float, float]:
-    """How long it takes [s], in quiet and under an attack."""
-    from agents.network import lab  # noqa: PLC0415
-    from agents.network.endpoints import free_endpoint  # noqa: PLC0415
-    from agents.network.session import Unreachable, open_session  # noqa: PLC0415
-    from experiments.real_time.conductor.support import start_router  # noqa: PLC0415
-    from experiments.real_time.hosts.launcher import Launcher  # noqa: PLC0415
-
+    """Time to join [s], in quiet and under an attack."""
     with tempfile.TemporaryDirectory() as name, Launcher(Path(name) / "logs") as launcher:
         rights, founded = _lab(Path(name))
         (endpoint,) = lab.secured([free_endpoint(preferred_port=0, protocol=protocol)], founded)
@@ -204,11 +189,6 @@ def _joined(protocol: str, kind: str) -> tuple[float, float]:
 
 def _lab(folder: Path) -> tuple[Path, Path]:
     """The rights of the reference experiment as a file, and a lab for it."""
-    import msgspec  # noqa: PLC0415
-
-    from experiments.definition import access_rights  # noqa: PLC0415
-    from experiments.file.document import load  # noqa: PLC0415
-    from tools.commands.authority import SERVICES, create  # noqa: PLC0415
 
     cases = load("robotic-park").cases().values()
     rights = folder / "rights.json"

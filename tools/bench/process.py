@@ -13,12 +13,17 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
-from tools.bench.bench_figure import Figure
-
-if TYPE_CHECKING:
-    from experiments.real_time.conductor.run_view import Progress
+from agents.agent import links_by_sender
+from agents.network import messages
+from agents.network.endpoints import free_endpoint
+from experiments.definition.plan import Plan
+from experiments.file.document import load
+from experiments.real_time.conductor.run_view import Progress
+from experiments.real_time.conductor.support import start_router
+from experiments.real_time.hosts.launcher import Launcher
+from tools.bench.measuring import Figure, fly
 
 FLIGHT_S: Final = 20.0
 
@@ -39,13 +44,13 @@ class Spent(NamedTuple):
 
 
 class Meter:
-    """Measures processes, by the names of their robots, from the first `look` to the last."""
+    """Measures processes, by the names of their robots, from the first measurement to the last."""
 
     def __init__(self) -> None:
         self.first: dict[str, Spent] = {}
         self.last: dict[str, Spent] = {}
 
-    def look(self, pids: Mapping[str, int]) -> None:
+    def measure(self, pids: Mapping[str, int]) -> None:
         """Measure now; processes that have ended are left out."""
         for name, pid in pids.items():
             try:
@@ -63,54 +68,34 @@ class Meter:
 
 def process() -> Iterator[Figure]:
     """Robot processes of the reference experiment in flight, each beside a bare process: CPU and memory of both."""
-    from agents.agent import links_by_sender  # noqa: PLC0415
-    from agents.network import messages  # noqa: PLC0415
-    from agents.network.endpoints import free_endpoint  # noqa: PLC0415
-    from experiments.definition.plan import Plan  # noqa: PLC0415
-    from experiments.file import document  # noqa: PLC0415
-    from experiments.real_time.conductor.case_context import CaseContext  # noqa: PLC0415
-    from experiments.real_time.conductor.conductor import Conductor  # noqa: PLC0415
-    from experiments.real_time.conductor.support import start_router  # noqa: PLC0415
-    from experiments.real_time.hosts.hosts import Hosts  # noqa: PLC0415
-    from experiments.real_time.hosts.launcher import Launcher  # noqa: PLC0415
-    from experiments.recording.run_folder import SOURCE  # noqa: PLC0415
-
-    read = document.load("robotic-park", f"duration_s={FLIGHT_S}", "timeline=[]", "trigger.period_s=0.02")
-    experiment = read.cases()["periodic"]
+    experiment = load("robotic-park").experiment
+    plan = Plan(experiment)
     robots, bare = Meter(), Meter()
     first, last = dict[str, messages.Status](), dict[str, messages.Status]()
     beside: dict[str, int] = {}
 
     def look(progress: Progress) -> None:
-        running = {
-            name: seen.status
-            for name, seen in progress.robots.items()
-            if seen.status is not None and seen.status.phase == "running"
-        }
+        statuses = {name: view.status for name, view in progress.robots.items()}
+        running = {name: status for name, status in statuses.items() if status and status.phase == "running"}
         for name, status in running.items():
             first.setdefault(name, status)
             last[name] = status
-        robots.look({name: status.pid for name, status in running.items()})
-        bare.look({name: beside[name] for name in running})
+        robots.measure({name: status.pid for name, status in running.items()})
+        bare.measure({name: beside[name] for name in running})
 
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / SOURCE).write_text(read.text, encoding="utf-8")
+        folder, endpoints = Path(name), [free_endpoint()]
         with Launcher(folder / "logs") as launcher:
-            endpoints = [free_endpoint()]
             start_router(launcher, endpoints)
             for robot in experiment.robots:
-                mine = Plan(experiment).assignment([robot])
-                speakers = links_by_sender(mine.links, mine.robots)
+                mine = plan.assignment([robot])
+                senders = links_by_sender(mine.links, mine.robots)
                 rate = f"{experiment.rates.pose_hz:g}"
                 started = launcher.start(
-                    f"bare-{robot}", "tools.bench.bare_process", robot, rate, *speakers, "--connect", endpoints[0]
+                    f"bare-{robot}", "tools.bench.bare_process", robot, rate, *senders, "--connect", endpoints[0]
                 )
                 beside[robot] = started.handle.pid
-            context = CaseContext(
-                experiment, "periodic", folder, folder / SOURCE, endpoints, launcher, Hosts(launcher, endpoints)
-            )
-            result = Conductor(context, look).run()
+            result = fly(launcher, folder, endpoints, look, duration_s=FLIGHT_S)
     assert result.ready_s is not None
     yield Figure("process", "seven robots ready after", result.ready_s, "s", result.ready_s / 3.0, "× 3 s")
     of_robots, of_bare = robots.shares(), bare.shares()

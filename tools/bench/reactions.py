@@ -1,12 +1,12 @@
-"""How soon robots react: to an emergency stop, to a neighbour that was killed, to one that hangs.
+"""Reaction times of robots: to an emergency stop, to a neighbour that was killed, to one that hangs.
 
 Twenty robots run as processes of their own. The command to cut the motors is stamped where the body obeys it, by the
 monotonic clock by which the stop was sent: in the robot's own process for twins (`tools.bench.reactions_robot`), as for
-a device that is driven from there; here for external bodies, of which the bench is the far end. That a robot knows of a
-death is stamped when its status, which names who is missing, arrives here: one way over the router more than the robot
-itself needs.
+a device that is driven from there; here for external bodies, of which the bench is the far end. The knowledge of a
+death is stamped when a status, which names the missing neighbours, arrives here: one way over the router more than the
+robot itself needs.
 
-What arrives is stamped in callbacks of Zenoh's own threads, not when a loop gets round to it.
+Messages are stamped in callbacks of Zenoh's own threads, not in a loop.
 """
 
 from __future__ import annotations
@@ -20,32 +20,38 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from math import cos, pi, sin
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from tools.bench.bench_figure import Figure
+import zenoh
+from zenoh.handlers import Callback
 
-if TYPE_CHECKING:
-    import zenoh
-
-    from agents.network.keys import Keys
-    from experiments.definition.experiment import Experiment
-    from experiments.real_time.hosts.launcher import Launcher
+from agents.network import messages, pubsub
+from agents.network import session as network
+from agents.network.endpoints import free_endpoint
+from agents.network.keys import Keys
+from experiments.definition.experiment import Arena, Experiment, Formation, Rates, Robot
+from experiments.file.document import write_json
+from experiments.real_time.conductor import orders
+from experiments.real_time.conductor.support import start_router
+from experiments.real_time.hosts.launcher import Launcher
+from tools.bench.measuring import Figure
 
 ROBOTS: Final = 20
 BODIES: Final = ("twin", "external")
 STOPS: Final = 5  # emergency stops of each kind of body; each ends its run, so that there is one fresh run for each
 DEATHS: Final = 3  # runs in which robots die
-KILLED, FROZEN = 7, 3  # of each of those; those next to them in the ring stay, to tell
+KILLED, FROZEN = 7, 3  # robots of each such run; their neighbours in the ring stay, to notice
 SETTLE_S: Final = 2.0  # robots run for so long before anything happens
 PATIENCE_S: Final = 60.0
-MISSED_S: Final = 10.0  # who has not noticed by then never will
+MISSED_S: Final = 10.0  # a reaction that has not come by then never will
 SPACING: Final = 0.8  # [m] around the ring
 POSITION_HZ: Final = 50.0
 PINGS: Final = 20  # round trips of nothing, before each measurement
 
-STOP_S, KILL_S, FREEZE_S = 0.020, 0.1, 1.5  # what is wanted
+STOP_S, KILL_S, FREEZE_S = 0.020, 0.1, 1.5  # limits
 
 
 def safety() -> Iterator[Figure]:
@@ -65,7 +71,7 @@ def safety() -> Iterator[Figure]:
     for _ in range(DEATHS):
         with _Park(ROBOTS) as park:
             pings += park.pings()
-            # every second robot at most, so that each who dies leaves both of its neighbours to notice
+            # every second robot at most: both neighbours of each dead robot must live to notice
             for number, row in enumerate(range(0, 2 * (KILLED + FROZEN), 2)):
                 cause = signal.SIGKILL if number < KILLED else signal.SIGSTOP
                 found, lost = park.lose(row, cause)
@@ -98,10 +104,6 @@ def _figures(what: str, taken: Sequence[float], empty: float, wanted: float, of:
 
 def ring(count: int, body: str) -> Experiment:
     """Robots on wheels in a ring, each listening to the one before and the one behind, all with such a body."""
-    from math import cos, pi, sin  # noqa: PLC0415
-
-    from experiments.definition.experiment import Arena, Experiment, Formation, Rates, Robot  # noqa: PLC0415
-
     names = [f"R{k:03}" for k in range(count)]
     radius = 0.5 * SPACING / sin(pi / count)
     turns = [2.0 * pi * k / count for k in range(count)]
@@ -121,11 +123,7 @@ def ring(count: int, body: str) -> Experiment:
 
 
 def places(endpoint: str, realm: str, starts: Mapping[str, Sequence[float]]) -> None:
-    """Publish the start places of all robots, x, y [m], until it is ended."""
-    from agents.network import messages, pubsub  # noqa: PLC0415
-    from agents.network import session as network  # noqa: PLC0415
-    from agents.network.keys import Keys  # noqa: PLC0415
-
+    """Publish the start places of all robots, x, y [m], until the process is ended."""
     keys, pause = Keys(realm), threading.Event()
     with network.open_session([endpoint], name="places") as session:
         publishers = {name: pubsub.publisher(session, keys.position(name), messages.JSON) for name in starts}
@@ -136,37 +134,32 @@ def places(endpoint: str, realm: str, starts: Mapping[str, Sequence[float]]) -> 
 
 
 @dataclass
-class _Ears:
-    """What has arrived, stamped as it did; filled by callbacks."""
+class _Arrivals:
+    """Messages with their times of arrival; filled by callbacks."""
 
     phase: dict[str, str] = field(default_factory=dict)
-    missing: dict[tuple[str, str], float] = field(default_factory=dict)  # (who, whom) -> since when [monotonic s]
-    stopped: dict[str, float] = field(default_factory=dict)  # when [monotonic s]
-    strange: int = 0
+    missing: dict[tuple[str, str], float] = field(
+        default_factory=dict
+    )  # (robot, its missing neighbour) -> since [monotonic s]
+    stopped: dict[str, float] = field(default_factory=dict)  # time of the first stop by robot [monotonic s]
 
     def status(self, sample: zenoh.Sample) -> None:
-        """A robot says how it is."""
-        from agents.network import messages  # noqa: PLC0415
+        """Take a robot's status."""
 
         now = time.monotonic()
-        try:
-            said = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
-        except messages.Malformed:
-            self.strange += 1
-            return
-        self.phase[said.robot] = said.phase
-        for name in said.missing:
-            self.missing.setdefault((said.robot, name), now)
+        status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
+        self.phase[status.robot] = status.phase
+        for name in status.missing:
+            self.missing.setdefault((status.robot, name), now)
 
     def command(self, sample: zenoh.Sample) -> None:
-        """A body is told something."""
-        from agents.network import messages  # noqa: PLC0415
+        """Take a command to a body."""
 
         now = time.monotonic()
         payload = sample.payload.to_bytes()
         if b'"action":"stop"' in payload:  # the others come two thousand times a second
-            told = messages.decode(payload, str(sample.encoding), messages.Command)
-            self.stopped.setdefault(told.robot, now)
+            command = messages.decode(payload, str(sample.encoding), messages.Command)
+            self.stopped.setdefault(command.robot, now)
 
 
 class _Park:
@@ -175,7 +168,7 @@ class _Park:
     def __init__(self, count: int, body: str = BODIES[0]) -> None:
         self._experiment, self._body = ring(count, body), body
         self._names = list(self._experiment.robots)
-        self._ears = _Ears()
+        self._arrivals = _Arrivals()
         self._over = threading.Event()
         self._stack = ExitStack()
         self._ended: set[str] = set()
@@ -184,12 +177,12 @@ class _Park:
         try:
             self._open()
             self._until(lambda: self._all("ready"), "ready")
-            self._order("takeoff")
-            self._until(lambda: self._all("airborne"), "told to go")
-            self._order("start", at=time.time() + 0.5)
+            self._order(messages.Order("takeoff"))
+            self._until(lambda: self._all("airborne"), "airborne")
+            self._order(messages.Order("start", at=time.time() + 0.5))
             self._until(lambda: self._all("running"), "running")
             self._over.wait(SETTLE_S)
-            self._ears.missing.clear()  # when the run began nobody had been heard
+            self._arrivals.missing.clear()  # at the begin of the run no pose had been received
         except BaseException:
             self._over.set()
             self._stack.close()
@@ -197,7 +190,7 @@ class _Park:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for name in self._names:  # what hangs cannot land
+        for name in self._names:  # a frozen process cannot land
             process = self._launcher.get(name)
             if process.alive:
                 os.kill(process.handle.pid, signal.SIGKILL)
@@ -205,7 +198,7 @@ class _Park:
         self._stack.close()
 
     def pings(self) -> list[float]:
-        """What an empty message takes from one session to a callback of the other [s]."""
+        """Times of empty messages from one session to a callback of the other [s]."""
         taken = []
         for number in range(PINGS):
             self._pong.clear()
@@ -217,22 +210,21 @@ class _Park:
         return taken
 
     def stop(self) -> tuple[list[float], int]:
-        """From an emergency stop to the command at each body [s], and how many never came."""
-        from agents.network import messages  # noqa: PLC0415
+        """Times from an emergency stop to the command at each body [s], and the number of commands that never came."""
 
         payload = messages.encode(messages.Stop("bench", "to see how long it takes"))
-        self._ears.stopped.clear()
+        self._arrivals.stopped.clear()
         self._stamps.write_bytes(b"")  # a body that is opened has its motors cut
         began = time.monotonic()
         self._session.put(self._keys.estop, payload, encoding=messages.JSON, priority=self._urgent, express=True)
         self._wait(lambda: len(self._stopped()) == len(self._names))
-        heard = [at - began for at in self._stopped().values()]
-        return heard, len(self._names) - len(heard)
+        taken = [at - began for at in self._stopped().values()]
+        return taken, len(self._names) - len(taken)
 
     def _stopped(self) -> dict[str, float]:
-        """Which bodies were told to cut their motors, and when first [monotonic s]."""
+        """Time of the first command to cut the motors, by robot [monotonic s]."""
         if self._body == "external":
-            return self._ears.stopped
+            return self._arrivals.stopped
         first: dict[str, float] = {}
         for line in self._stamps.read_text().splitlines():
             name, at = line.split()
@@ -240,34 +232,24 @@ class _Park:
         return first
 
     def lose(self, row: int, cause: signal.Signals) -> tuple[list[float], int]:
-        """From the end of a robot until each of its two neighbours knows [s], and how many never did."""
+        """Times from the end of a robot until each of its two neighbours knows [s], and the number that never did."""
         name = self._names[row]
         around = [(self._names[(row + step) % len(self._names)], name) for step in (-1, 1)]
         self._ended.add(name)
         began = time.monotonic()
         os.kill(self._launcher.get(name).handle.pid, cause)
-        self._wait(lambda: all(pair in self._ears.missing for pair in around))
-        self._over.wait(0.3)  # the next one begins in peace
-        known = [self._ears.missing[pair] - began for pair in around if pair in self._ears.missing]
+        self._wait(lambda: all(pair in self._arrivals.missing for pair in around))
+        self._over.wait(0.3)  # the next measurement begins undisturbed
+        known = [self._arrivals.missing[pair] - began for pair in around if pair in self._arrivals.missing]
         return known, len(around) - len(known)
 
     def wrong(self) -> int:
-        """How often somebody was said to be missing who was there."""
-        return sum(name not in self._ended for _, name in self._ears.missing)
+        """Number of reports that a robot is missing which is there."""
+        return sum(name not in self._ended for _, name in self._arrivals.missing)
 
-    # ------------------------------------------------------------------ how it comes about
+    # ------------------------------------------------------------------ processes and sessions
 
     def _open(self) -> None:
-        import zenoh  # noqa: PLC0415
-        from zenoh.handlers import Callback  # noqa: PLC0415
-
-        from agents.network import session as network  # noqa: PLC0415
-        from agents.network.endpoints import free_endpoint  # noqa: PLC0415
-        from agents.network.keys import Keys  # noqa: PLC0415
-        from experiments.file.document import write_json  # noqa: PLC0415
-        from experiments.real_time.conductor.support import start_router  # noqa: PLC0415
-        from experiments.real_time.hosts.launcher import Launcher  # noqa: PLC0415
-
         self._urgent = zenoh.Priority.REAL_TIME
         self._keys: Keys = Keys(self._experiment.network.realm)
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
@@ -281,15 +263,17 @@ class _Park:
         self._session = self._stack.enter_context(network.open_session(endpoints, name="bench"))
         listener = self._stack.enter_context(network.open_session(endpoints, name="bench listens"))
         self._pong, self._pinged = threading.Event(), 0.0
-        heard: dict[str, Callable[[zenoh.Sample], None]] = {
-            self._keys.status("*"): self._ears.status,
-            self._keys.setpoint("*"): self._ears.command,
-            f"{self._keys.realm}/bench/ping": self._heard,
+        callbacks: dict[str, Callable[[zenoh.Sample], None]] = {
+            self._keys.status("*"): self._arrivals.status,
+            self._keys.setpoint("*"): self._arrivals.command,
+            f"{self._keys.realm}/bench/ping": self._pong_arrived,
         }
-        self._held = [listener.declare_subscriber(key, Callback(take, indirect=False)) for key, take in heard.items()]
+        self._held = [
+            listener.declare_subscriber(key, Callback(take, indirect=False)) for key, take in callbacks.items()
+        ]
         external = self._body == "external"
         if external:
-            # in a process of its own, or what arrives would wait for the interpreter that is busy with this
+            # in a process of its own: arriving messages would wait for an interpreter that is busy with this
             starts = {name: tuple(robot.start) for name, robot in self._experiment.robots.items()}
             far_end = get_context("spawn").Process(
                 target=places, args=(endpoints[0], self._keys.realm, starts), daemon=True
@@ -305,29 +289,23 @@ class _Park:
         for name in self._names:
             self._launcher.start(name, *start, str(file), name, "--connect", endpoints[0], "--lifeline")
 
-    def _heard(self, _sample: zenoh.Sample) -> None:
+    def _pong_arrived(self, _sample: zenoh.Sample) -> None:
         self._pinged = time.monotonic()
         self._pong.set()
 
     def _all(self, phase: str) -> bool:
-        return all(self._ears.phase.get(name) == phase for name in self._names)
+        return all(self._arrivals.phase.get(name) == phase for name in self._names)
 
-    def _order(self, what: str, at: float | None = None) -> None:
-        from agents.network import messages  # noqa: PLC0415
-        from experiments.real_time.conductor import orders  # noqa: PLC0415
-
-        kinds: dict[str, messages.OrderKind] = {"takeoff": "takeoff", "start": "start"}
-        for name, reply in orders.send_order(
-            self._session, self._keys, self._names, messages.Order(kinds[what], at=at)
-        ).items():
+    def _order(self, order: messages.Order) -> None:
+        for name, reply in orders.send_order(self._session, self._keys, self._names, order).items():
             if not reply.ok:
-                raise RuntimeError(f"{name} does not {what}: {reply.reason}")
+                raise RuntimeError(f"{name} refuses {order.order}: {reply.reason}")
 
     def _until(self, true: Callable[[], bool], what: str) -> None:
         deadline = time.monotonic() + PATIENCE_S
         while not true():
             if time.monotonic() > deadline:
-                raise RuntimeError(f"after {PATIENCE_S:g} s not all robots were {what}: {self._ears.phase}")
+                raise RuntimeError(f"after {PATIENCE_S:g} s not all robots were {what}: {self._arrivals.phase}")
             self._over.wait(0.02)
 
     def _wait(self, true: Callable[[], bool]) -> None:

@@ -1,7 +1,7 @@
 """A robot's process for `zenpark bench safety`: `python -m tools.bench.reactions_robot STAMPS FILE NAME ...`.
 
-It is the process of every robot, and its twin the usual one; only that the moment at which the twin is told to cut its
-motors is written down, by the monotonic clock of the machine.
+The usual robot process with the usual twin; the moment of the twin's motors-off is written down by the monotonic clock
+of the machine.
 """
 
 from __future__ import annotations

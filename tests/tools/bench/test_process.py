@@ -25,5 +25,5 @@ def test_a_process_that_has_ended_is_left_out() -> None:
     over.wait()
     meter = Meter()
     for _ in range(2):
-        meter.look({"CF01": os.getpid(), "CF02": over.pid})
+        meter.measure({"CF01": os.getpid(), "CF02": over.pid})
     assert set(meter.shares()) == {"CF01"}
