@@ -12,6 +12,7 @@ from typing import Annotated, Any, Final, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from agents.arrays import Array, Index, Mask
 from agents.body.kinds import Kind
@@ -23,22 +24,24 @@ from agents.network.messages import Inspection
 class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Drift of a hovering robot: an Ornstein-Uhlenbeck process on each horizontal axis."""
 
-    sigma: float  # [m] standard deviation
-    correlation_s: float = 0.5  # [s] correlation time
-
-    def __post_init__(self) -> None:
-        if not (0.0 <= self.sigma < 1.0 and 0.0 < self.correlation_s < 1e3):
-            raise ValueError("hover_jitter needs 0 <= sigma < 1 m and correlation_s > 0")
+    sigma: Annotated[float, Meta(description="standard deviation on each axis [m]", ge=0, lt=1)]
+    correlation_s: Annotated[float, Meta(description="correlation time [s]", gt=0, lt=1000)] = 0.5
 
 
 class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Disturbances of a simulated body; a field left out adds none."""
 
-    hover_jitter: Jitter | None = None
-    position_sigma: float | None = None  # [m] white noise of the measured position, per axis (planar for ground robots)
-    yaw_sigma: float | None = None  # [rad] white noise of the measured yaw
-    latency_s: Annotated[float, msgspec.Meta(ge=0, le=10)] | None = None  # [s] from command to effect
-    odometry_drift: float | None = None  # [m per square root of m] random walk of the measured position with the way
+    hover_jitter: Annotated[Jitter | None, Meta(description="drift of a hovering robot")] = None
+    position_sigma: Annotated[
+        float | None, Meta(description="white noise of the measured position, per axis; planar for ground robots [m]")
+    ] = None
+    yaw_sigma: Annotated[float | None, Meta(description="white noise of the measured yaw [rad]")] = None
+    latency_s: Annotated[Annotated[float, Meta(ge=0, le=10)] | None, Meta(description="from command to effect [s]")] = (
+        None
+    )
+    odometry_drift: Annotated[
+        float | None, Meta(description="random walk of the measured position with the way [m per square root of m]")
+    ] = None
 
 
 @dataclass(frozen=True)

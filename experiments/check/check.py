@@ -19,7 +19,7 @@ from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse, link_errors
 from experiments.check.findings import FORGIVEN, Claim, Severity, first_of_each_code
 from experiments.check.ideal_run import Prediction, message_rate, predict, undisturbed
-from experiments.definition import bodies, standby
+from experiments.definition import standby
 from experiments.definition.experiment import Channel, Experiment, Network
 from experiments.definition.plan import Plan
 from experiments.file.document import Document
@@ -254,17 +254,6 @@ def _figures(analysis: Analysis) -> Figures:
     spare = analysis.spare
     assignment, prediction, limits = analysis.assignment, analysis.prediction, analysis.assignment.limits
     end, fastest, follower = prediction.position[-1], analysis.fastest, analysis.follower
-    rate = message_rate(
-        assignment.trigger,
-        assignment.law,
-        assignment.links,
-        prediction,
-        [bodies.disturbance(experiment, name) for name in analysis.names],
-        kinds=assignment.kinds,
-        predictor=assignment.predictor,
-        hz=experiment.rates.pose_hz,
-        rng=np.random.default_rng(experiment.seed),
-    )
     last = float(prediction.time[-1])
     return Figures(
         robots=len(analysis.names),
@@ -295,6 +284,6 @@ def _figures(analysis: Analysis) -> Figures:
         end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape else None,
         end={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(analysis.names, end, strict=True)},
         end_inside=bool(((end >= limits.low - FORGIVEN) & (end <= limits.high + FORGIVEN)).all()),
-        messages_hz=rate,
+        messages_hz=message_rate(experiment),
         predicted_s=last,
     )

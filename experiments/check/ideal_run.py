@@ -16,25 +16,18 @@ import msgspec
 import numpy as np
 
 from agents.arrays import Array, norm
-from agents.body.external_pose import velocity_after
-from agents.body.interface import Disturbance
 from agents.body.kinds import Kind
-from agents.decision.transmission import Transmitter
-from agents.formation.graph import Links
-from agents.plugins.laws import Law
-from agents.plugins.predictors import Predictor
-from agents.plugins.triggers import Trigger
 from agents.safety.hazards import Incident, Outcome
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, World
-from experiments.recording.trace import ROUNDING_S
+from experiments.recording.trace import ROUNDING_S, sent_in_run
 from experiments.virtual_time import conductor, simulation
 
 FAR: Final = 1e6  # [m] walls that nobody meets
 TICK_COST: Final = 200.0  # robots whose arithmetic takes as long as what a tick costs in any case
 WORK: Final = 6e6  # robot ticks, with that added, that are flown: 290 s of seven robots, 50 s of a thousand
 REPETITIONS: Final = 5  # flights with noise, each with another seed
-QUESTIONS: Final = 6000  # as often the trigger is asked
+QUESTIONS: Final = 6000  # to the trigger, from which the rate of transmissions is estimated
 PAIRS: Final = 1_000_000  # distances that are held in memory at once
 
 
@@ -151,82 +144,15 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
     return [Approach(int(i[k]), int(j[k]), float(nearest[k]), float(when[k])) for k in np.flatnonzero(nearest < apart)]
 
 
-def message_rate(
-    trigger: Trigger,
-    law: Law,
-    links: Links,
-    prediction: Prediction,
-    nature: Sequence[Disturbance],
-    *,
-    kinds: Sequence[Kind],
-    predictor: Predictor,
-    hz: float,
-    rng: np.random.Generator,
-) -> float:
-    """Estimated rate of transmissions of all robots together [1/s].
+def message_rate(experiment: Experiment) -> float:
+    """Transmissions of all robots together in a flight with the noise of the experiment [1/s].
 
-    Args:
-        trigger: Asked along the predicted motion.
-        law: For triggers that look at the formation error.
-        links: Of the whole experiment.
-        prediction: The motion.
-        nature: Of each row; its hover jitter and its position noise count, because they make robots speak.
-        kinds: Of each row.
-        predictor: Where neighbours believe each other to be.
-        hz: How often the trigger is asked.
-        rng: Of the jitter and the noise.
+    The flight lasts as many questions to the trigger as `QUESTIONS`, for noise makes robots transmit.
     """
-    span = float(prediction.time[-1])
-    count = max(1, min(QUESTIONS, round(span * hz)))
-    time = np.arange(count) / hz
-    position = _between(prediction, time)
-    rows = position.shape[1]
-    setpoint = np.zeros((count, rows, 4))
-    setpoint[..., :3] = _asked(position, time, kinds)
-    position[..., :2] += _wobble(nature, (count, rows, 2), 1.0 / hz, rng)
-    velocity, still = np.zeros((rows, 3)), np.zeros((rows, 3))
-    voice = Transmitter(trigger, rows, predictor, kinds=kinds)
-    heard = position[:, links.sender]
-    spoken = 0
-    for tick in range(count):
-        link_error = law.error(position[tick], heard[tick], links)
-        error, energy = links.sum_by_receiver(np.stack([link_error, 0.5 * link_error**2], axis=1), rows).T
-        t = float(time[tick])
-        if tick:
-            velocity = velocity_after(velocity, position[tick] - position[tick - 1], 1.0 / hz)
-        said = voice.transmit(
-            t, position[tick], velocity,
-            error=error, energy=energy, start=np.zeros(rows), offset=still, setpoint=setpoint[tick],
-        )  # fmt: skip
-        spoken += len(said.rows)
-    return spoken * hz / count
-
-
-def _asked(position: Array, time: Array, kinds: Sequence[Kind]) -> Array:
-    """Setpoints (K, N, 3) under which robots would move like this (K, N, 3) [m]: places ahead, or velocities."""
-    velocity = np.gradient(position, time, axis=0) if len(time) > 1 else np.zeros_like(position)
-    response = np.array([kind.response for kind in kinds])[:, None]
-    by_place = np.array([kind.takes == "position" for kind in kinds])[:, None]
-    return np.where(by_place, position + velocity / response, velocity)
-
-
-def _between(prediction: Prediction, time: Array) -> Array:
-    """Positions (K, N, 3) at other times (K,), on straight lines between the decisions."""
-    last = len(prediction.time) - 1
-    at = np.minimum(time * last / max(float(prediction.time[-1]), 1e-12), last)
-    before = np.minimum(at.astype(np.intp), max(last - 1, 0))
-    share = (at - before)[:, None, None]
-    after = np.minimum(before + 1, last)
-    return np.asarray(prediction.position[before] * (1.0 - share) + prediction.position[after] * share)
-
-
-def _wobble(nature: Sequence[Disturbance], shape: tuple[int, int, int], dt: float, rng: np.random.Generator) -> Array:
-    """Hover jitter and measurement noise of x and y (K, N, 2) [m]."""
-    jitter = [each.hover_jitter for each in nature]
-    sigma = np.array([0.0 if each is None else each.sigma for each in jitter])[:, None]
-    keep = np.array([0.0 if each is None else math.exp(-dt / each.correlation_s) for each in jitter])[:, None]
-    white = np.array([each.position_sigma or 0.0 for each in nature])[:, None]
-    wobble = rng.normal(size=shape) * sigma
-    for k in range(1, len(wobble)):
-        wobble[k] = keep * wobble[k - 1] + np.sqrt(1.0 - keep**2) * wobble[k]
-    return np.asarray(wobble + white * rng.normal(size=shape))
+    duration = min(experiment.duration_s, QUESTIONS / experiment.rates.pose_hz)
+    bare = isolated(msgspec.structs.replace(experiment, duration_s=duration))
+    try:
+        log = simulation.simulate(bare, [bare.seed], lean=True, landing=False)
+    except conductor.Stuck:
+        return 0.0
+    return len(sent_in_run(log.sent, bare.duration_s)) / bare.duration_s

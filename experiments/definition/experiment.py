@@ -211,7 +211,7 @@ class Leg(Part, frozen=True):
     """Plan that a robot follows from `at_s` on."""
 
     at_s: Annotated[NotNegative, Meta(description="[s] after the common start")]
-    robot: Name
+    robot: Annotated[Name, Meta(description="name of the robot")]
     plan: Annotated[Choice, Meta(description="a registered planner")]
 
 
@@ -342,8 +342,8 @@ class Hybrid(Part, frozen=True):
 class Experiment(Part, frozen=True):
     """One experiment, or one case of it after `document.cases`."""
 
-    title: str
-    robots: Annotated[dict[Name, Robot], Meta(min_length=1)]
+    title: Annotated[str, Meta(description="what the experiment shows, for people")]
+    robots: Annotated[dict[Name, Robot], Meta(description="robots by name", min_length=1)]
     duration_s: Annotated[Positive, Meta(description="from the common start [s]", le=86400)]
     spares: Annotated[
         dict[Name, Robot], Meta(description="robots that wait to take over the name of another one of their kind")
@@ -353,12 +353,12 @@ class Experiment(Part, frozen=True):
         Meta(description="when a robot is lost in mid-run: go on without it, start it again, or let a spare take over"),
     ] = "none"
     source: Annotated[str, Meta(description="where it was published")] = ""
-    seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 1
+    seed: Annotated[int, Meta(description="of all random numbers: noise, starts, network", ge=0, le=2**32 - 1)] = 1
     tolerance: Annotated[Positive, Meta(description="a link is acquired when its error stays below [m]")] = 0.05
-    arena: Arena = Arena()
-    rates: Rates = Rates()
-    formation: Formation = Formation()
-    timeline: list[Leg] = []
+    arena: Annotated[Arena, Meta(description="size, obstacles and start boxes")] = Arena()
+    rates: Annotated[Rates, Meta(description="rates of body, poses, decisions and telemetry [Hz]")] = Rates()
+    formation: Annotated[Formation, Meta(description="links with their targets, anchors, and the law")] = Formation()
+    timeline: Annotated[list[Leg], Meta(description="plans of robots, for each robot in order of time")] = []
     architecture: Annotated[
         Literal["distributed", "centralised"] | Hybrid,
         Meta(
@@ -379,12 +379,12 @@ class Experiment(Part, frozen=True):
     avoidance: Annotated[
         Choice | None, Meta(description="how robots avoid obstacles and each other; left out: they do not")
     ] = None
-    world: World = World()
-    channel: Channel = Channel()
-    network: Network = Network()
+    world: Annotated[World, Meta(description="simulated world of the twins")] = World()
+    channel: Annotated[Channel, Meta(description="modelled delays and losses of poses")] = Channel()
+    network: Annotated[Network, Meta(description="routers and certificates of a run in real time")] = Network()
     hosts: Annotated[dict[Name, Host], Meta(description="other machines, and which robots run there")] = {}
-    safety: Safety = Safety()
-    start: Start = Start()
+    safety: Annotated[Safety, Meta(description="limits at which robots hold, land or stop")] = Safety()
+    start: Annotated[Start, Meta(description="start of a run: its deadline and the scatter of the robots")] = Start()
     cases: Annotated[
         dict[Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], dict[str, Any]],
         Meta(description="each may override any field; the first is the reference of every ratio"),

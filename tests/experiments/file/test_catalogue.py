@@ -111,3 +111,17 @@ def test_the_schema_is_draft_7_and_knows_the_plugins():
     case = schema["properties"]["cases"]["additionalProperties"]["$ref"].rpartition("/")[2]
     assert "required" not in schema["definitions"][case]
     assert "cases" not in schema["definitions"][case]["properties"]
+
+
+def test_every_field_of_the_schema_is_described():
+    def undescribed(node, path):
+        if isinstance(node, dict):
+            fields = node.get("properties", {})
+            yield from (f"{path}.{name}" for name, each in fields.items() if not {"description", "const"} & set(each))
+            for key, each in node.items():
+                yield from undescribed(each, f"{path}.{key}")
+        elif isinstance(node, list):
+            for number, each in enumerate(node):
+                yield from undescribed(each, f"{path}[{number}]")
+
+    assert list(undescribed(json_schema.schema(), "")) == []

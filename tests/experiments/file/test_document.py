@@ -33,7 +33,7 @@ EXPECTED = [
     ("case-key", 9, 1, "unknown key 'gian' in 'formation'", "did you mean 'gain'?"),
     ("case-parameter", 12, 37, "unknown parameter 'treshold' of 'send-on-delta'", "did you mean 'threshold'?"),
     ("disturbance-of-nobody", 8, 14, "'kephera4' is neither a robot nor a kind", "did you mean 'khepera4'?"),
-    ("disturbance-own-check", 14, 26, "hover_jitter needs 0 <= sigma < 1 m", ""),
+    ("disturbance-limit", 14, 26, "'sigma' must be a number >= 0, not -0.01", "standard deviation"),
     ("empty", 0, 0, "is empty", "zenpark new"),
     ("engine-parameter", 10, 1, "unknown parameter 'frction' of 'pymunk'", "did you mean 'friction'?"),
     ("hover-above-arena", 11, 9, "'CF01' cannot hover at 2.6 m: the arena is 2.5 m high", "a hover of at most 2.45"),
