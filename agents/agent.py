@@ -9,8 +9,6 @@ A tick has two halves, `transmit` and `act`; the caller may deliver the new tran
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import msgspec
 import numpy as np
 
@@ -24,7 +22,6 @@ from agents.decision.neighbours import NeighbourStates
 from agents.decision.perception import Perception
 from agents.decision.position_control import PositionController
 from agents.decision.transmission import Transmission, Transmitter
-from agents.formation.graph import Links
 from agents.network.messages import Setpoint
 from agents.plugins.avoidance import Avoidance, Nearby, OwnState
 from agents.plugins.registry import FAILURES, PluginError
@@ -114,12 +111,11 @@ class Agent:
 
     @property
     def trigger(self) -> Trigger:
-        """Who speaks when; may be replaced by one of the same kind."""
+        """Trigger of transmissions; may be replaced by one of the same kind."""
         return self._transmitter.trigger
 
     @trigger.setter
     def trigger(self, trigger: Trigger) -> None:
-        """Trigger of transmissions; may be replaced by one of the same kind."""
         self._transmitter.trigger = trigger
 
     @property
@@ -131,12 +127,6 @@ class Agent:
     def neighbours(self) -> NeighbourStates:
         """Received poses, and the links that enter the law."""
         return self.goal_computer.neighbours
-
-    def receive_goal(self, rows: Index, goal: Array, yaw: Array, stamp: Array) -> Mask:
-        """See `Guidance.receive`; rows without guidance take no goals."""
-        return (
-            np.zeros(len(rows), dtype=bool) if self.guidance is None else self.guidance.receive(rows, goal, yaw, stamp)
-        )
 
     def hold(self, row: int) -> str:
         """Order to stay in place; returns the reason of a refusal, empty when accepted."""
@@ -393,8 +383,3 @@ def _perception(assignment: Assignment) -> Perception | None:
         return None
     kinds, speakers, limits = assignment.kinds, assignment.robot_kinds, assignment.limits
     return Perception(kinds, speakers, assignment.links, limits, avoidance.clearance, assignment.avoids)
-
-
-def links_by_sender(links: Links, speakers: Sequence[str]) -> dict[str, Index]:
-    """Links of each sender, by its name."""
-    return {speakers[s]: np.flatnonzero(links.sender == s) for s in np.unique(links.sender)}

@@ -45,7 +45,26 @@ def span(rows: Index) -> Rows:
     return rows
 
 
-class PoseTable(msgspec.Struct, frozen=True):
+class Columns(msgspec.Struct, frozen=True):
+    """Base of tables: arrays with a first axis of the same length; a column may be None."""
+
+    @classmethod
+    def joined(cls, tables: Sequence[Self]) -> Self:
+        """All rows of `tables`, which have the same columns."""
+        columns: Any = zip(*map(msgspec.structs.astuple, tables), strict=True)
+        joined: list[Any] = [None if column[0] is None else np.concatenate(column) for column in columns]
+        return cls(*joined)
+
+    def __len__(self) -> int:
+        return len(msgspec.structs.astuple(self)[0])
+
+    def take(self, which: Index | Mask) -> Self:
+        """Some of the rows."""
+        kept: list[Any] = [None if column is None else column[which] for column in msgspec.structs.astuple(self)]
+        return type(self)(*kept)
+
+
+class PoseTable(Columns, frozen=True):
     """Poses (M) of many robots: as they were sent, on their way, or as they were received.
 
     In memory alone an array may have no columns, (M, 0), where its values are not kept.
@@ -60,21 +79,6 @@ class PoseTable(msgspec.Struct, frozen=True):
     yaw: Array | None = None  # [rad]
     bytes: Index | None = None  # of the payload
     extra: Array | None = None  # (M, k) transmitted with the pose
-
-    @classmethod
-    def joined(cls, tables: Sequence[Self]) -> Self:
-        """All rows of `tables`, which have the same columns."""
-        columns: Any = zip(*map(msgspec.structs.astuple, tables), strict=True)
-        joined: list[Any] = [None if column[0] is None else np.concatenate(column) for column in columns]
-        return cls(*joined)
-
-    def __len__(self) -> int:
-        return len(self.link)
-
-    def take(self, which: Index | Mask) -> Self:
-        """Some of the rows."""
-        kept: list[Any] = [None if column is None else column[which] for column in msgspec.structs.astuple(self)]
-        return type(self)(*kept)
 
     def since(self, begin: float) -> Self:
         """The same with times that count from `begin` [s]."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, some
+from agents.arrays import Array, Index, Mask, PoseTable, some
 from agents.decision.assignment import Assignment
 from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, RUNNING
@@ -55,20 +55,15 @@ class Centre:
         sends[assignment.links.sender] = True
         self.needed = np.flatnonzero(self.guided | sends)
 
-    def receive(  # noqa: PLR0917 - as `NeighbourStates.receive`
-        self, rows: Index, position: Array, velocity: Array, yaw: Array, stamp: Array, arrived: Array
-    ) -> None:
-        """Store poses of `rows` (H,) in order of arrival; samples older than the stored ones are dropped."""
-        poses = self.poses
-        order = np.argsort(stamp, kind="stable")  # of several of one robot the newest stays, in any order of arrival
-        order = order[stamp[order] > poses.stamp[rows[order]]]
-        mine = rows[order]
-        poses.position[mine], poses.velocity[mine], self.yaw[mine] = position[order], velocity[order], yaw[order]
-        poses.stamp[mine], poses.arrival[mine] = stamp[order], arrived[order]
-        links = self._links(mine)
-        sender = self.assignment.links.sender[links]
+    def receive(self, received: PoseTable) -> None:
+        """Store poses, whose `link` is the row of the robot, in order of arrival; outdated ones are dropped."""
+        assert received.yaw is not None
+        poses, new = self.poses, self.poses.receive(received)
+        self.yaw[new.link] = new.yaw
+        links = self._links(new.link)
+        at = self.assignment.links.sender[links]
         self.goal_computer.neighbours.receive(
-            links, poses.position[sender], poses.velocity[sender], poses.stamp[sender], poses.arrival[sender]
+            PoseTable(links, links, poses.stamp[at], poses.arrival[at], poses.position[at], poses.velocity[at])
         )
 
     def begin_plan(self, row: int, origin: tuple[float, float, float, float]) -> None:
@@ -78,19 +73,17 @@ class Centre:
 
     def mark_lost(self, rows: Index, t: float) -> None:
         """Liveliness tokens of these robots lost at `t` [s]."""
-        self.poses.lost_since[rows] = np.minimum(self.poses.lost_since[rows], t)
+        self.poses.mark_lost(rows, t)
         self.goal_computer.neighbours.mark_lost(self._links(rows), t)
 
     def mark_alive(self, rows: Index) -> None:
         """Liveliness tokens of these robots seen, whether or not poses follow."""
-        self.poses.lost_since[rows] = np.inf
+        self.poses.mark_alive(rows)
         self.goal_computer.neighbours.mark_alive(self._links(rows))
 
     def discard_poses(self, rows: Index) -> None:
         """Discard the poses of these robots, which were restarted."""
-        poses = self.poses
-        poses.position[rows], poses.velocity[rows] = np.nan, 0.0
-        poses.stamp[rows] = poses.arrival[rows] = -np.inf
+        self.poses.discard(rows)
         self.goal_computer.neighbours.discard_poses(self._links(rows))
 
     def missing_robots(self) -> Index:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, every, some
+from agents.arrays import Array, Index, Mask, PoseTable, every, some
 from agents.formation.graph import Links
 from agents.plugins.predictors import HOLD, Predictor
 
@@ -27,6 +27,31 @@ class NeighbourPoses:
         """State before any pose or token."""
         never = np.full(count, -np.inf)
         return cls(np.full((count, 3), np.nan), np.zeros((count, 3)), never, never.copy(), never.copy())
+
+    def receive(self, received: PoseTable) -> PoseTable:
+        """Store poses received on links (H), in order of arrival; returns those that are newer than the known ones."""
+        if some(received.stamp[1:] < received.stamp[:-1]):  # of several on one link the newest stays
+            received = received.take(np.argsort(received.stamp, kind="stable"))
+        newer = received.stamp > self.stamp[received.link]
+        if not every(newer):
+            received = received.take(newer)
+        at = received.link
+        self.position[at], self.velocity[at] = received.position, received.velocity
+        self.stamp[at], self.arrival[at] = received.stamp, received.arrival
+        return received
+
+    def mark_lost(self, at: Index, t: float) -> None:
+        """Liveliness tokens of the senders of links `at` lost at `t` [s]."""
+        self.lost_since[at] = np.minimum(self.lost_since[at], t)
+
+    def mark_alive(self, at: Index) -> None:
+        """Liveliness tokens of the senders of links `at` seen, whether or not poses follow."""
+        self.lost_since[at] = np.inf
+
+    def discard(self, at: Index) -> None:
+        """Discard the poses of the senders of links `at`, which were restarted."""
+        self.position[at], self.velocity[at] = np.nan, 0.0
+        self.stamp[at] = self.arrival[at] = -np.inf
 
     def extrapolate_position(self, predictor: Predictor, t: float, which: Index) -> Array:
         """Positions (K, 3) [m] at `t` [s] of the senders of links `which` (K,), each received at least once."""
@@ -66,35 +91,23 @@ class NeighbourStates:
         self.active = np.zeros(0, dtype=np.intp)
         self.links = links.select(self.active)
 
-    def receive(self, at: Index, position: Array, velocity: Array, stamp: Array, arrived: Array) -> None:
-        """Store poses received on links `at` (H,), in order of arrival; outdated samples are dropped."""
-        poses = self.poses
-        if some(stamp[1:] < stamp[:-1]):  # of several on one link the newest stays, in any order of arrival
-            order = np.argsort(stamp, kind="stable")
-            at, position, velocity = at[order], position[order], velocity[order]
-            stamp, arrived = stamp[order], arrived[order]
-        newer = stamp > poses.stamp[at]
-        if not every(newer):
-            at, position, velocity = at[newer], position[newer], velocity[newer]
-            stamp, arrived = stamp[newer], arrived[newer]
-        poses.position[at], poses.velocity[at] = position, velocity
-        poses.stamp[at], poses.arrival[at] = stamp, arrived
+    def receive(self, received: PoseTable) -> None:
+        """See `NeighbourPoses.receive`."""
+        self.poses.receive(received)
 
     def mark_lost(self, at: Index, t: float) -> None:
-        """Liveliness tokens of the senders of links `at` lost at `t` [s]."""
-        self.poses.lost_since[at] = np.minimum(self.poses.lost_since[at], t)
+        """See `NeighbourPoses.mark_lost`."""
+        self.poses.mark_lost(at, t)
         self.incomplete = True
 
     def mark_alive(self, at: Index) -> None:
-        """Liveliness tokens of the senders of links `at` seen, whether or not poses follow."""
-        self.poses.lost_since[at] = np.inf
+        """See `NeighbourPoses.mark_alive`."""
+        self.poses.mark_alive(at)
         self.incomplete = True
 
     def discard_poses(self, at: Index) -> None:
-        """Discard the poses of the senders of links `at`, which were restarted."""
-        poses = self.poses
-        poses.position[at], poses.velocity[at] = np.nan, 0.0
-        poses.stamp[at] = poses.arrival[at] = -np.inf
+        """See `NeighbourPoses.discard`."""
+        self.poses.discard(at)
         self.incomplete = True
 
     def mark_clock_lag(self, at: Index, lag: float) -> None:

@@ -52,6 +52,10 @@ class Links:
             total[self._heads] = np.add.reduceat(per_link, self._starts, axis=0)
         return total
 
+    def by_sender(self, names: Sequence[str]) -> dict[str, Index]:
+        """Indices of the links of each sender, by its name among those of all robots."""
+        return {names[sender]: np.flatnonzero(self.sender == sender) for sender in np.unique(self.sender)}
+
     def select(self, which: Index | Mask) -> Links:
         """Subset of the links, or another order of them."""
         return Links(*(None if column is None else column[which] for column in self._columns()))  # type: ignore[arg-type]

@@ -1,9 +1,8 @@
 """A modelled network: delay, jitter, loss in bursts or alone, limited bandwidth and outages, on each link by itself.
 
-The virtual clock sends through it, and so does the listener of a real network: what has arrived waits here until the
-model lets it through. What becomes of a sample follows from the seed, the names at the two ends of its link and its
-running number (see `agents.network.channel_model`), so that both lose the same samples. docs/networks.md has the
-formulas.
+The virtual clock sends through it, and so does the receiver of a real network: samples that have arrived wait here
+until the model lets them through. The fate of a sample follows from the seed, the names at the two ends of its link and
+its running number, so that both lose the same samples. docs/networks.md has the formulas.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ class LinkEffects(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     delay_s: Annotated[
         Delay,
-        Meta(description="from speaker to listener [s]; in real time what the network itself takes counts towards it"),
+        Meta(description="from sender to receiver [s]; in real time what the network itself takes counts towards it"),
     ] = 0.001
     jitter_s: Annotated[Delay, Meta(description="mean of an exponential addition [s]")] = 0.0
     loss: Annotated[Share, Meta(description="share of samples that never arrive")] = 0.0
@@ -149,18 +148,16 @@ class Conditions:
 
 
 class Channel:
-    """Carries samples over links (E).
+    """Carries samples over links (E)."""
 
-    Attributes:
-        dropped: (E,) samples that were lost.
-        limited: Some link has a bandwidth: sizes must be given.
-        instant: Nothing takes time on any link: what is said is known at once, or lost.
-        ideal: Nothing is lost or takes time on any link: whoever wants to save time need not send.
-    """
+    dropped: Index  # (E,) samples that were lost
+    limited: bool  # some link has a bandwidth: sizes must be given
+    instant: bool  # nothing takes time on any link: a sample is received at once, or lost
+    ideal: bool  # nothing is lost or takes time on any link: there is no need to send
 
     def __init__(self, conditions: Conditions) -> None:
         self._conditions = conditions
-        self.dropped: Index = np.zeros(len(conditions), dtype=np.intp)
+        self.dropped = np.zeros(len(conditions), dtype=np.intp)
         delay = conditions.delay
         self._delay: Array | float = delay
         if len(delay) and (delay == delay[0]).all():
@@ -176,52 +173,32 @@ class Channel:
         self._free = np.full(len(conditions), -np.inf)  # when each link has sent all that it has taken
         self._flying: list[PoseTable] = []
 
-    def send(
-        self,
-        link: Index,
-        seq: Index,
-        stamp: Array,
-        position: Array,
-        velocity: Array,
-        *,
-        start: Array | float = np.inf,
-        size: Index | None = None,
-        now: float = -np.inf,
-        extra: Array | None = None,
-    ) -> None:
-        """PoseTable set out, on each link at most one.
+    def send(self, poses: PoseTable, *, start: Array | float = np.inf, now: float = -np.inf) -> None:
+        """Poses (M) set out, on each link at most one, at their `stamp`; their arrival follows.
 
-        Before the common start nothing is lost and no link is too slow: no run begins before everybody has heard his
-        neighbours, and the real network repeats a first pose until it arrives. Nor is anything after the end.
+        Before the common start nothing is lost and no link is too slow: no run begins before all robots have received
+        their neighbours, and the real network repeats a first pose until it arrives. Nor is anything after the end.
 
         Args:
-            link: (M,) on which.
-            seq: (M,) their running numbers.
-            stamp: (M,) when they were said [s], on a clock on which `start` is the common start; infinity or NaN while
-                that is not known.
-            position: (M, 3) what they say [m].
-            velocity: (M, 3) and [m/s].
-            start: See `stamp`; (M,), or for all of them.
-            size: (M,) of their payloads [bytes]; needed on links of limited bandwidth.
-            now: At the listener of a real network, where they have arrived by now [s]: the time that it took counts
-                towards the delay.
-            extra: (M, k) that goes along.
+            poses: On links of limited bandwidth with their sizes, `bytes`.
+            start: Common start [s] on the clock of the stamps, (M,) or for all; infinity or NaN while it is not known.
+            now: At the receiver of a real network, time of reception [s]: the time that it took counts towards the
+                delay.
         """
+        link, stamp = poses.link, poses.stamp
         delay = self._delay if isinstance(self._delay, float) else self._delay[link]
         if self._plain:
             arrival = stamp + delay
         else:
-            passes, took = self._fates(link, seq, stamp, stamp - start, size)
+            passes, took = self._fates(poses, stamp - start)
             arrival = stamp + (delay + took)
             if not every(passes):
                 self.dropped[link[~passes]] += 1
-                link, seq, stamp, arrival = link[passes], seq[passes], stamp[passes], arrival[passes]
-                position, velocity = position[passes], velocity[passes]
-                extra = None if extra is None else extra[passes]
+                poses, arrival = poses.take(passes), arrival[passes]
         if now > -np.inf:
-            arrival, self._in_order = np.maximum(arrival, now), False  # speakers are asked one after the other
-        if len(link):
-            self._flying.append(PoseTable(link, seq, stamp, arrival, position, velocity, extra=extra))
+            arrival, self._in_order = np.maximum(arrival, now), False  # senders are asked one after the other
+        if len(arrival):
+            self._flying.append(msgspec.structs.replace(poses, arrival=arrival))
 
     def due(self, t: float) -> PoseTable | None:
         """What gets through by `t` [s], in order of arrival."""
@@ -239,12 +216,12 @@ class Channel:
         return arrived.take(np.argsort(arrived.arrival, kind="stable"))
 
     def forget(self, link: Index) -> None:
-        """What is under way on links whose speaker is gone never arrives: that would sound as if it were back."""
+        """Samples under way on links whose sender is gone never arrive: they would look like its return."""
         if not self._flying:
             return
         pool = self._pool()
-        gone = np.isin(pool.link, link)
-        self._flying = [] if every(gone) else [pool.take(~gone)]
+        forgotten = np.isin(pool.link, link)
+        self._flying = [] if every(forgotten) else [pool.take(~forgotten)]
 
     def lost(self, link: Index, seq: Index) -> Mask:
         """Which samples (M,) the links lose, by their numbers alone.
@@ -273,13 +250,13 @@ class Channel:
             asked, back = asked[~decides[row, one]], back + SPAN
         return bad
 
-    def _fates(self, link: Index, seq: Index, stamp: Array, since: Array, size: Index | None) -> tuple[Mask, Array]:
-        """Which samples pass (M,), and what their way takes beyond the delay if they do (M,) [s]."""
-        conditions = self._conditions
+    def _fates(self, poses: PoseTable, since: Array) -> tuple[Mask, Array]:
+        """Which poses pass (M,), and what their way takes beyond the delay if they do (M,) [s]."""
+        conditions, link, seq = self._conditions, poses.link, poses.seq
         begun: Mask = (since >= -ROUNDING_S) & (since < conditions.duration - ROUNDING_S)
         passes, took = np.ones(len(link), dtype=bool), np.zeros(len(link))
         if self.limited:
-            took, passes = self._queued(link, stamp, size, begun)
+            took, passes = self._queued(poses, begun)
         if self._jitters:
             took = took - conditions.jitter[link] * np.log1p(-uniform(conditions.key[link], seq * USES + JITTER))
         if self._loses:
@@ -291,20 +268,20 @@ class Channel:
                 passes &= ~(begun & inside & outage.links[link])
         return passes, took
 
-    def _queued(self, link: Index, stamp: Array, size: Index | None, begun: Mask) -> tuple[Array, Mask]:
-        """How long samples wait for those before them and are being sent (M,) [s]; which of them are taken (M,).
+    def _queued(self, poses: PoseTable, begun: Mask) -> tuple[Array, Mask]:
+        """How long poses wait for those before them and are being sent (M,) [s]; which of them are taken (M,).
 
         Raises:
             ValueError: If their sizes are not given.
         """
-        if size is None:
+        if poses.bytes is None:
             raise ValueError("links of limited bandwidth need the sizes of their samples")
-        conditions = self._conditions
-        waits = np.where(begun, np.maximum(self._free[link] - stamp, 0.0), 0.0)
+        conditions, link = self._conditions, poses.link
+        waits = np.where(begun, np.maximum(self._free[link] - poses.stamp, 0.0), 0.0)
         taken: Mask = waits <= conditions.queue[link] + ROUNDING_S
-        waits = waits + np.where(begun, 8.0 * size / conditions.bandwidth[link], 0.0)
+        waits = waits + np.where(begun, 8.0 * poses.bytes / conditions.bandwidth[link], 0.0)
         occupies = begun & taken
-        self._free[link[occupies]] = (stamp + waits)[occupies]
+        self._free[link[occupies]] = (poses.stamp + waits)[occupies]
         return waits, taken
 
     def _pool(self) -> PoseTable:

@@ -11,6 +11,7 @@ import numpy as np
 import zenoh
 
 from agents.agent import Agent
+from agents.arrays import PoseTable
 from agents.decision.centralised import Guidance
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
@@ -69,13 +70,15 @@ class GoalInbox:
         for link, (row, inbox) in enumerate(zip(self._rows.tolist(), self._inboxes, strict=True)):
             for goal, sample in inbox.read_samples(partial(self._check, row, utc + t)):
                 self._receive(link, goal, len(sample.payload), t, utc)
-        if (got := self._channel.due(t)) is not None and got.extra is not None:
-            columns = (got.link.tolist(), got.seq.tolist(), got.stamp.tolist(), got.position, got.extra.tolist())
-            for link, seq, stamp, position, (toward, sent, pose) in zip(*columns, strict=True):
-                which = self._rows[[link]]
-                news = self._agent.receive_goal(which, position[None], np.array([toward]), np.array([stamp]))
-                if news.any():
-                    self.news[which[0]].append(messages.GoalReceipt(seq, utc + sent, utc + pose, utc + t))
+        if (got := self._channel.due(t)) is None:
+            return
+        assert got.yaw is not None
+        assert got.extra is not None
+        for at, (sent, pose) in enumerate(got.extra.tolist()):
+            row, one = self._rows[got.link[at : at + 1]], slice(at, at + 1)
+            if self._guidance.receive(row, got.position[one], got.yaw[one], got.stamp[one]).any():
+                receipt = messages.GoalReceipt(int(got.seq[at]), utc + sent, utc + pose, utc + t)
+                self.news[int(row[0])].append(receipt)
 
     def _begin(self, life: str | None, *, there: bool) -> None:
         """Resets the numbers for a new central controller: its clock may be behind that of the former one."""
@@ -97,15 +100,9 @@ class GoalInbox:
         row = int(self._rows[link])
         self._seq[row] = goal.seq
         stamp, sent = validation.taken(goal.stamp - utc, t), goal.stamp - utc
-        start = self._agent.lifecycle.start_at[[row]]
-        self._channel.send(
-            np.array([link]),
-            np.array([goal.seq]),
-            np.array([stamp]),
-            np.array([goal.position]),
-            np.zeros((1, 3)),
-            start=start,
-            size=np.array([size]),
-            now=t,
-            extra=np.array([[nan if goal.yaw is None else goal.yaw, sent, goal.pose - utc]]),
-        )
+        table = PoseTable(
+            np.array([link]), np.array([goal.seq]), np.array([stamp]), np.array([t]), np.array([goal.position]),
+            np.zeros((1, 3)), np.array([nan if goal.yaw is None else goal.yaw]), np.array([size]),
+            np.array([[sent, goal.pose - utc]]),
+        )  # fmt: skip
+        self._channel.send(table, start=self._agent.lifecycle.start_at[[row]], now=t)

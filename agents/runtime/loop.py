@@ -315,7 +315,7 @@ class Runtime:
         outside.offline_since = self._cut_off_since(t)
         for _, there in self._conductor.changes():
             outside.conductor_lost_since = np.inf if there else min(outside.conductor_lost_since, t)
-        self._neighbours.listen(t, self._utc)
+        self._neighbours.deliver(t, self._utc)
         if self._goals is not None:
             self._goals.receive(t, self._utc)
         self._apply_stops()

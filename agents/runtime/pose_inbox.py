@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import Enum
 from functools import partial
-from math import inf
-from typing import Final, NamedTuple
+from math import inf, nan
+from typing import Final, NamedTuple, Protocol
 
+import msgspec
 import numpy as np
 import zenoh
 
-from agents.agent import Agent, links_by_sender
-from agents.arrays import Index, PoseTable
+from agents.agent import Agent
+from agents.arrays import Array, Index, PoseTable
 from agents.network import messages, pubsub, validation
 from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
@@ -64,16 +65,10 @@ class NeighbourSubscription:
         rate: float,
         depth: int = pubsub.POSES,
     ) -> None:
-        """Subscribes to the robot `name`.
+        """Subscribes to the robot `name`, the sender on `links` (K,).
 
-        Args:
-            session: Of the process.
-            keys: Of the realm.
-            name: Of the robot.
-            links: (K,) links with this sender.
-            reach: Largest |x|, |y|, |z| of a valid pose [m].
-            rate: Largest rate of its poses [1/s].
-            depth: Poses that may wait.
+        `reach` has the largest |x|, |y|, |z| of a valid pose [m], `rate` is the largest rate of its poses [1/s], and
+        `depth` of them may wait.
         """
         self.name, self.links, self._reach, self._rate = name, links, reach, rate
         self._poses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.pose(name), depth), messages.Pose, keys=keys)
@@ -82,9 +77,9 @@ class NeighbourSubscription:
         self._seq, self._stamp = 0, 0.0
         self._life: str | None = None  # session of the robot's process, as far as it is known
         self._past: set[str] = set()
-        self._owned = False  # the token of that session is there: no other one speaks for the robot
-        self._gone = False
-        self._heard_at = -inf  # when news came last (UTC [s])
+        self._owned = False  # the token of that session is there: no other session is the robot
+        self._vanished = False
+        self._received_at = -inf  # last new pose (UTC [s])
         self._old, self._old_at = 0, 0.0  # how often in succession poses were old on arrival, and when last
         self.lost = self.stale = 0
         self.behind = 0.0
@@ -94,25 +89,25 @@ class NeighbourSubscription:
         """Samples that were refused."""
         return self._poses.malformed
 
-    def news(self, now: float) -> Iterator[ReceivedPose]:
+    def new_poses(self, now: float) -> Iterator[ReceivedPose]:
         """Poses received until `now` (UTC [s]), oldest first, without invalid and known ones.
 
         A new session of the robot resets the order of poses, as does a clock that was set back in one session.
         """
-        before = self._heard_at  # poses that waited while this process stood still count as one reception
+        before = self._received_at  # poses that waited while this process stood still count as one reception
         check = partial(validation.check_pose, now=now, reach=self._reach)
         for pose, sample in self._poses.read_samples(check):
             life = _session_of(sample)
             if life in self._past or (self._owned and life not in (None, self._life)):
                 self.stale += 1
                 continue
-            anew = life is not None and self._live(life)
+            anew = life is not None and self._note_session(life)
             if pose.stamp <= self._stamp and pose.seq > self._seq:  # its clock was set back
                 self._seq, self._stamp, anew = 0, 0.0, True
             if pose.stamp <= self._stamp:  # equal: repeated after a reconnection
                 self.stale += pose.stamp < self._stamp
                 continue
-            self._weigh(now, now - pose.stamp)
+            self._detect_lag(now, now - pose.stamp)
             since = pose.stamp - self._stamp
             missed = validation.missed(self._seq, pose.seq, since, self._rate) if self._seq else 0
             self._seq, self._stamp = pose.seq, pose.stamp
@@ -120,24 +115,24 @@ class NeighbourSubscription:
             # reception, too late for a network, proves it at once; the first pose ever may be that of a silent robot.
             slow = self.behind or (pose.stamp < before and now - pose.stamp > LATE_S)
             measured = now - LATE_S if slow else validation.taken(pose.stamp, now)
-            self._heard_at = now
+            self._received_at = now
             yield ReceivedPose(pose, len(sample.payload), missed, measured, anew)
 
-    def comings(self) -> Iterator[TokenChange]:
+    def token_changes(self) -> Iterator[TokenChange]:
         """Changes of the liveliness of the robot, oldest first."""
         for token, there in self._alive.changes():
             if token == self._token:
-                if there and self._gone and self._life is None and self._stamp:  # no token names its session
+                if there and self._vanished and self._life is None and self._stamp:  # no token names its session
                     self._seq, self._stamp = 0, 0.0
                     yield TokenChange.NEW_SESSION
-                self._gone = not there
+                self._vanished = not there
                 yield TokenChange.APPEARED if there else TokenChange.VANISHED
             elif (life := Keys.life_of(token)) is not None and life not in self._past:
-                if there and self._live(life):
+                if there and self._note_session(life):
                     yield TokenChange.NEW_SESSION
                 self._owned = there if life == self._life else self._owned
 
-    def _live(self, life: str) -> bool:
+    def _note_session(self, life: str) -> bool:
         """Stores the session of the robot's process; returns whether it follows another one."""
         if life == self._life:
             return False
@@ -147,7 +142,7 @@ class NeighbourSubscription:
             self._seq, self._stamp = 0, 0.0
         return before is not None
 
-    def _weigh(self, now: float, age: float) -> None:
+    def _detect_lag(self, now: float, age: float) -> None:
         """Detects a clock that is behind, from the `age` [s] of poses on arrival."""
         if age <= LATE_S:
             self._old, self.behind = 0, 0.0
@@ -165,15 +160,114 @@ def _session_of(sample: zenoh.Sample) -> str | None:
 NEWS: Final = 20_000  # poses that wait for telemetry, which empties them several times a second: 10 MB
 
 
-class PoseInbox:
-    """Poses of all neighbours of the rows of a process, through the modelled channel; polled."""
+class SenderStates(Protocol):
+    """Receiver of liveliness of senders, by links."""
 
-    speakers: list[NeighbourSubscription]  # one for each sender
-    news: list[deque[messages.Heard]]  # (n) newest received poses of each row, for telemetry, which empties them
-    heard: list[int]  # (n) received poses of each row
+    def mark_alive(self, at: Index) -> None: ...
+
+    def mark_lost(self, at: Index, t: float) -> None: ...
+
+    def discard_poses(self, at: Index) -> None: ...
+
+
+class ModelledInbox:
+    """Poses of several robots through the modelled channel, and their liveliness; polled."""
+
+    senders: list[NeighbourSubscription]
     dropped: Index  # (E,) samples that the modelled channel dropped
-    arrived: int  # poses of other processes before the modelled channel, each counted once
-    changed: bool  # a neighbour appeared or vanished since the caller reset this
+    arrived: int  # poses before the modelled channel, without those of robots of this process
+    changed: bool  # a sender appeared or vanished since the caller reset this
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        links: Mapping[str, Index],  # links of each sender
+        conditions: Conditions,  # effects of the modelled channel on each link (E)
+        states: SenderStates,
+        *,
+        reach: messages.Vector,
+        rate: float,
+        depth: int = pubsub.POSES,
+        counted: Callable[[float], bool] = lambda _: True,
+    ) -> None:
+        """Subscribes to all senders; see `NeighbourSubscription`.
+
+        `counted` tells whether a pose of that stamp [s] matters, so that those lost before it count.
+        """
+        self._states, self._channel, self._counted = states, Channel(conditions), counted
+        self.senders = [
+            NeighbourSubscription(session, keys, name, mine, reach=reach, rate=rate, depth=depth)
+            for name, mine in links.items()
+        ]
+        self.dropped, self.arrived, self.changed = self._channel.dropped, 0, False
+
+    @property
+    def malformed(self) -> int:
+        """Samples that were refused."""
+        return sum(sender.malformed for sender in self.senders)
+
+    def receive(self, t: float, utc: float, start: Array, own: Collection[str] = ()) -> PoseTable | None:
+        """Poses that got through until `t` [s] of a clock that was 0 at `utc` [s]; None without any.
+
+        `start` (E,) is the common start [s], `own` are robots of this process. `extra` of the poses is the time of
+        measurement, see `ReceivedPose.measured`, on that clock.
+        """
+        for sender in self.senders:
+            for change in sender.token_changes():
+                self.changed = True
+                if change is TokenChange.APPEARED:
+                    self._states.mark_alive(sender.links)
+                elif change is TokenChange.NEW_SESSION:
+                    self._begin(sender)
+                else:
+                    self._channel.forget(sender.links)
+                    self._states.mark_lost(sender.links, t)
+        arrived: list[tuple[int, ReceivedPose]] = []
+        for sender in self.senders:
+            for received in sender.new_poses(utc + t):
+                sender.lost += received.missed if self._counted(received.pose.stamp - utc) else 0
+                self.arrived += sender.name not in own
+                if received.anew:
+                    self._begin(sender)
+                    arrived = [(link, before) for link, before in arrived if link not in sender.links]
+                arrived += [(link, received) for link in sender.links.tolist()]
+        if arrived:
+            poses = _table(arrived, t, utc)
+            if self._channel.ideal:
+                return poses
+            for at in range(len(arrived)):  # the queue of a link counts one sample after the other
+                one = poses.take(np.array([at]))
+                self._channel.send(one, start=start[one.link], now=t)
+        return self._channel.due(t)
+
+    def _begin(self, sender: NeighbourSubscription) -> None:
+        """Forgets a sender that has a new session."""
+        self._channel.forget(sender.links)
+        self._states.discard_poses(sender.links)
+
+
+def _table(arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> PoseTable:
+    """Poses that arrived at `t` [s], each with its link; times on the clock that was 0 at `utc` [s]."""
+    poses = [received.pose for _, received in arrived]
+    return PoseTable(
+        np.array([link for link, _ in arrived]),
+        np.array([pose.seq for pose in poses]),
+        np.array([pose.stamp - utc for pose in poses]),
+        np.full(len(poses), t),
+        np.array([pose.position for pose in poses]),
+        np.array([pose.velocity or messages.STILL for pose in poses]),
+        np.array([nan if pose.yaw is None else pose.yaw for pose in poses]),
+        np.array([received.size for _, received in arrived]),
+        np.array([[received.measured - utc] for _, received in arrived]),
+    )
+
+
+class PoseInbox(ModelledInbox):
+    """Poses of all neighbours of the rows of a process."""
+
+    news: list[deque[messages.Heard]]  # (n) newest received poses of each row, for telemetry, which empties them
+    received: list[int]  # (n) received poses of each row
 
     def __init__(
         self,
@@ -184,105 +278,38 @@ class PoseInbox:
         reach: messages.Vector,
         conditions: Conditions | None = None,
     ) -> None:
-        """Subscribes to the neighbours of the rows of `agent`.
+        """Subscribes to the neighbours of the rows of `agent`, which gets poses and losses.
 
-        Args:
-            session: Of the process.
-            keys: Of the realm.
-            agent: Gets received poses and the loss of neighbours.
-            reach: Largest |x|, |y|, |z| of a valid pose [m].
-            conditions: Effects of the modelled channel on each link; None: none.
+        `reach` as of `NeighbourSubscription`; `conditions` of each link, None: an ideal network.
         """
-        assignment = agent.assignment
-        self._agent = agent
-        self._links = assignment.links
-        names = [assignment.robots[speaker] for speaker in assignment.links.sender.tolist()]
-        self._ends = list(zip(assignment.links.receiver.tolist(), names, strict=True))
-        self._channel = Channel(conditions or Conditions.ideal(len(assignment.links)))
-        by_speaker = links_by_sender(assignment.links, assignment.robots)
-        rate = assignment.body_hz / assignment.pose_every
-        self.speakers = [
-            NeighbourSubscription(session, keys, name, links, reach=reach, rate=rate)
-            for name, links in by_speaker.items()
-        ]
-        self.news = [deque[messages.Heard](maxlen=NEWS) for _ in assignment.names]
-        self.heard = [0] * len(assignment.names)
-        self.arrived = 0
-        self.dropped = self._channel.dropped
-        self.changed = False
+        self._assignment, self._neighbours, self._lifecycle = agent.assignment, agent.neighbours, agent.lifecycle
+        links, names = agent.assignment.links, agent.assignment.robots
+        senders = [names[sender] for sender in links.sender.tolist()]
+        self._ends = list(zip(links.receiver.tolist(), senders, strict=True))
+        super().__init__(
+            session, keys, links.by_sender(names),
+            conditions or Conditions.ideal(len(links)), agent.neighbours,
+            reach=reach, rate=agent.assignment.body_hz / agent.assignment.pose_every,
+        )  # fmt: skip
+        self.news = [deque[messages.Heard](maxlen=NEWS) for _ in agent.assignment.names]
+        self.received = [0] * len(agent.assignment.names)
 
-    @property
-    def malformed(self) -> int:
-        """Samples that were refused."""
-        return sum(speaker.malformed for speaker in self.speakers)
-
-    def listen(self, t: float, utc: float) -> None:
-        """Receives all until `t` [s] of a clock that was 0 at `utc` [s]."""
-        for speaker in self.speakers:
-            for coming in speaker.comings():
-                self.changed = True
-                if coming is TokenChange.APPEARED:
-                    self._agent.neighbours.mark_alive(speaker.links)
-                elif coming is TokenChange.NEW_SESSION:
-                    self._begin(speaker)
-                else:
-                    self._channel.forget(speaker.links)
-                    self._agent.neighbours.mark_lost(speaker.links, t)
-        arrived: list[tuple[int, ReceivedPose]] = []
-        for speaker in self.speakers:
-            behind = speaker.behind
-            for said in speaker.news(utc + t):
-                speaker.lost += said.missed
-                self.arrived += speaker.name not in self._agent.assignment.names
-                if said.anew:
-                    self._begin(speaker)
-                    arrived = [(link, before) for link, before in arrived if link not in speaker.links]
-                arrived += [(link, said) for link in speaker.links.tolist()]
-            if speaker.behind != behind:
-                self._agent.neighbours.mark_clock_lag(speaker.links, speaker.behind)
-        if arrived:
-            self._send(arrived, t, utc)
-        if (got := self._channel.due(t)) is not None:
-            self._believe(got, utc)
-
-    def _begin(self, speaker: NeighbourSubscription) -> None:
-        """Forgets a neighbour that has a new session."""
-        self._channel.forget(speaker.links)
-        self._agent.neighbours.discard_poses(speaker.links)
-
-    def _send(self, arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> None:
-        """Puts poses, each with its link, into the modelled channel, all of a tick at once."""
-        poses = [heard.pose for _, heard in arrived]
-        measured = np.array([[heard.measured - utc] for _, heard in arrived])
-        got = PoseTable(
-            np.array([link for link, _ in arrived]),
-            np.array([pose.seq for pose in poses]),
-            np.array([pose.stamp - utc for pose in poses]),
-            np.array([t] * len(arrived)),
-            np.array([pose.position for pose in poses]),
-            np.array([pose.velocity or messages.STILL for pose in poses]),
-            extra=measured,
-        )
-        if self._channel.ideal:
-            self._believe(got, utc)
+    def deliver(self, t: float, utc: float) -> None:
+        """Passes all poses until `t` [s] of a clock that was 0 at `utc` [s] to the agent and to telemetry."""
+        behind = [sender.behind for sender in self.senders]
+        start = self._lifecycle.start_at[self._assignment.links.receiver]
+        got = self.receive(t, utc, start, self._assignment.names)
+        for sender, before in zip(self.senders, behind, strict=True):
+            if sender.behind != before:
+                self._neighbours.mark_clock_lag(sender.links, sender.behind)
+        if got is None:
             return
-        start = self._agent.lifecycle.start_at[self._links.receiver[got.link]]
-        sizes = np.array([heard.size for _, heard in arrived])
-        for at in range(len(arrived)):  # the queue of a link counts one sample after the other
-            one = slice(at, at + 1)
-            self._channel.send(
-                got.link[one], got.seq[one], got.stamp[one], got.position[one], got.velocity[one],
-                start=start[one], size=sizes[one], now=t, extra=measured[one],
-            )  # fmt: skip
-
-    def _believe(self, got: PoseTable, utc: float) -> None:
-        """Passes poses that got through to the agent and to telemetry."""
-        assert got.extra is not None  # time of measurement; the recorded pose keeps its own stamp
-        self._agent.neighbours.receive(got.link, got.position, got.velocity, got.extra[:, 0], got.arrival)
+        assert got.extra is not None  # the recorded pose keeps its own stamp
+        self._neighbours.receive(msgspec.structs.replace(got, stamp=got.extra[:, 0]))
         columns = (got.link, got.seq, got.stamp, got.arrival, got.position, got.velocity)
         for link, seq, stamp, arrival, position, velocity in zip(*(c.tolist() for c in columns), strict=True):
-            row, who = self._ends[link]
+            row, name = self._ends[link]
             self.news[row].append(
-                messages.Heard(who, seq, utc + stamp, utc + arrival, tuple(position), tuple(velocity))
+                messages.Heard(name, seq, utc + stamp, utc + arrival, tuple(position), tuple(velocity))
             )
-            self.heard[row] += 1
+            self.received[row] += 1

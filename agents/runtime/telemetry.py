@@ -166,7 +166,7 @@ class Telemetry:
         if everything:
             self.due = t + STATUS_S
         life = agent.lifecycle
-        listener = agent.assignment.links.receiver
+        receiver = agent.assignment.links.receiver
         for row, name in enumerate(self._names):
             missing = agent.missing_neighbours(row)
             news = (life.phase[row], life.reason[row], tuple(missing), self._numbers[row])
@@ -175,7 +175,7 @@ class Telemetry:
             if news[:2] != self._reported[row][:2]:
                 print(f"{name}: {Phase(life.phase[row]).word}" + (f" ({news[1]})" if news[1] else ""), flush=True)
             self._reported[row] = news
-            mine = [speaker for speaker in self._neighbours.speakers if (listener[speaker.links] == row).any()]
+            mine = [sender for sender in self._neighbours.senders if (receiver[sender.links] == row).any()]
             battery = float(state.battery[row]) if state is not None else float("nan")
             if self._origin[row] is None and state is not None and life.phase[row] == Phase.RUNNING:
                 x, y, z = state.position[row].tolist()
@@ -189,10 +189,10 @@ class Telemetry:
                 body=state.notes[row] if state is not None and state.notes else "",
                 battery=battery if isfinite(battery) else None,
                 sent=counts.sent[row],
-                heard=self._neighbours.heard[row],
-                lost={speaker.name: speaker.lost for speaker in mine},
+                heard=self._neighbours.received[row],
+                lost={sender.name: sender.lost for sender in mine},
                 dropped=self._dropped_of(row),
-                stale={speaker.name: speaker.stale for speaker in mine if speaker.stale},
+                stale={sender.name: sender.stale for sender in mine if sender.stale},
                 malformed=self._malformed() + self._neighbours.malformed,
                 refused=counts.refused,
                 ticks=counts.ticks,
@@ -240,8 +240,8 @@ class Telemetry:
         assignment = self._agent.assignment
         dropped = self._neighbours.dropped
         at = np.flatnonzero((dropped > 0) & (assignment.links.receiver == row))
-        speakers = assignment.links.sender[at].tolist()
-        return {assignment.robots[j]: int(n) for j, n in zip(speakers, dropped[at].tolist(), strict=True)}
+        senders = assignment.links.sender[at].tolist()
+        return {assignment.robots[j]: int(n) for j, n in zip(senders, dropped[at].tolist(), strict=True)}
 
 
 def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it

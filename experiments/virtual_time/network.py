@@ -35,7 +35,7 @@ class VirtualChannel:
             link_conditions.virtual_conditions(experiment, links, seeds, stream=stream)
         )
         self.instant = self._channel.instant
-        self._speaker = links.sender
+        self._sender, self._rows = links.sender, len(experiment.robots) * len(seeds)
         self._names = tuple(experiment.robots)
         self._encoding: messages.Encoding = experiment.network.encoding
 
@@ -44,54 +44,34 @@ class VirtualChannel:
         """(E,) samples that did not get through; none before the common start."""
         return self._channel.dropped
 
-    def send(
-        self,
-        t: float,
-        rows: Index,
-        seq: Index,
-        position: Array,
-        velocity: Array,
-        *,
-        yaw: Array,
-        start: float,
-        extra: Array | None = None,
-    ) -> None:
-        """Transmits poses: pose, `seq` and `extra` of all rows (N, ...), of which `rows` transmit.
+    def send(self, t: float, poses: PoseTable, start: float) -> None:
+        """Transmits poses at `t` [s], whose `link` is the row of the sender.
 
         `start` is the common start [s]; NaN or infinity as long as it is not known: nothing is lost before.
         """
-        spoke = np.zeros(len(position), dtype=bool)
-        spoke[rows] = True
-        at = np.flatnonzero(spoke[self._speaker])
+        place = np.full(self._rows, -1)
+        place[poses.link] = np.arange(len(poses.link))
+        which = place[self._sender]
+        at = np.flatnonzero(which >= 0)
         if not len(at):
             return
-        who = self._speaker[at]
-        size = None
         if self._channel.limited:
-            size = self._sizes(EPOCH + (t - start if t >= start else 0.0), rows, (seq, position, velocity, yaw))[who]
-        self._channel.send(
-            at,
-            seq[who],
-            np.full(len(at), t),
-            position[who],
-            velocity[who],
-            start=start,
-            size=size,
-            extra=None if extra is None else extra[who],
-        )
+            poses = replace(poses, bytes=self._sizes(EPOCH + (t - start if t >= start else 0.0), poses))
+        self._channel.send(replace(poses.take(which[at]), link=at), start=start)
 
     def due(self, t: float) -> PoseTable | None:
         """Poses that have arrived by `t` [s], in order of arrival."""
         return self._channel.due(t)
 
-    def _sizes(self, stamp: float, rows: Index, said: tuple[Index, Array, Array, Array]) -> Index:
-        """(N,) bytes of the payloads of `rows`, as a real network carries them."""
-        found = np.zeros(len(said[0]), dtype=np.intp)
-        columns = zip(*(each[rows].tolist() for each in said), strict=True)
-        for row, (number, place, moves, turned) in zip(rows.tolist(), columns, strict=True):
-            pose = messages.pose(self._names[row % len(self._names)], number, stamp, place, moves, turned)
-            found[row] = len(messages.encode(pose, self._encoding))
-        return found
+    def _sizes(self, stamp: float, poses: PoseTable) -> Index:
+        """(K,) bytes of the payloads of poses, as a real network carries them."""
+        assert poses.yaw is not None
+        columns = (poses.link, poses.seq, poses.position, poses.velocity, poses.yaw)
+        found = []
+        for row, seq, position, velocity, yaw in zip(*(column.tolist() for column in columns), strict=True):
+            pose = messages.pose(self._names[row % len(self._names)], seq, stamp, position, velocity, yaw)
+            found.append(len(messages.encode(pose, self._encoding)))
+        return np.array(found, dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -133,56 +113,49 @@ class VirtualCentre:
         )
         self._poses_of, self._goals_of = (np.array([row for row, _ in pairs], dtype=np.intp) for pairs in ends)
         self._seq: Index = np.zeros(rows, dtype=np.intp)
-        self._goal, self._still = np.full((rows, 3), np.nan), np.zeros((rows, 3))
-        self._extra = np.full((rows, 2), np.nan)
 
     def _counted(self, channel: VirtualChannel, rows: Index) -> Index:
         counts = np.zeros(len(self._seq), dtype=np.intp)
         counts[rows] = channel.lost
         return counts
 
-    def transmit(  # noqa: PLR0917 - as `VirtualChannel.send`
-        self, t: float, rows: Index, seq: Index, position: Array, velocity: Array, yaw: Array, *, start: float
-    ) -> None:
-        """Robots say where they are, to whoever listens; see `VirtualChannel.send`."""
-        self._poses.send(t, rows, seq, position, velocity, yaw=yaw, start=start, extra=yaw[:, None])
+    def transmit(self, t: float, poses: PoseTable, start: float) -> None:
+        """Robots transmit their poses to the central controller; see `VirtualChannel.send`."""
+        self._poses.send(t, poses, start)
 
     def deliver(self, t: float, agent: Agent) -> None:
         """Delivers at `t` [s]: poses to the central controller, goals to the robots."""
-        arrived = self._poses.due(t)
-        if arrived is not None and arrived.extra is not None:
+        if (arrived := self._poses.due(t)) is not None:
             rows = self._poses_of[arrived.link]
-            self.centre.receive(
-                rows, arrived.position, arrived.velocity, arrived.extra[:, 0], arrived.stamp, arrived.arrival
-            )
+            self.centre.receive(replace(arrived, link=rows))
             self._received.append(_bare(rows, arrived.seq, arrived.stamp, arrived.arrival))
-        arrived = self._goals.due(t)
-        if arrived is not None and arrived.extra is not None:
+        if (arrived := self._goals.due(t)) is not None:
             # of several for one robot the newest counts
             arrived = arrived.take(np.argsort(arrived.stamp, kind="stable"))
             _, last = np.unique(arrived.link[::-1], return_index=True)
             arrived = arrived.take(len(arrived.link) - 1 - last)
             rows = self._goals_of[arrived.link]
-            assert arrived.extra is not None
-            toward, rests = arrived.extra.T
-            news = agent.receive_goal(rows, arrived.position, toward, arrived.stamp)
+            assert agent.guidance is not None
+            assert arrived.yaw is not None
+            news = agent.guidance.receive(rows, arrived.position, arrived.yaw, arrived.stamp)
             if news.any():
-                accepted = _bare(rows, arrived.seq, arrived.stamp, np.full(len(rows), t), rests[:, None])
+                accepted = _bare(rows, arrived.seq, arrived.stamp, np.full(len(rows), t), arrived.extra)
                 self._followed.append(accepted.take(news))
 
     def decide(self, t: float, agent: Agent) -> None:
         """On a tick on which goals are decided: those of the robots that are guided."""
-        told = self.centre.decide(t, agent.lifecycle.phase, agent.lifecycle.start_at)
-        rows = told.rows
+        goals = self.centre.decide(t, agent.lifecycle.phase, agent.lifecycle.start_at)
+        rows = goals.rows
         if not len(rows):
             return
         self._seq[rows] += 1
-        self._goal[rows], self._extra[rows, 0], self._extra[rows, 1] = told.goal, told.yaw, told.pose_stamp
-        start, yaw = float(agent.lifecycle.start_at.min()), self._extra[:, 0]
-        self._goals.send(t, rows, self._seq, self._goal, self._still, yaw=yaw, start=start, extra=self._extra)
-        now, still = np.full(len(rows), t), np.zeros((len(rows), 0))
-        sent = PoseTable(rows, self._seq[rows], now, now, told.goal, still, told.yaw, extra=told.pose_stamp[:, None])
-        self._sent.append(sent)
+        now, start = np.full(len(rows), t), float(agent.lifecycle.start_at.min())
+        sent = PoseTable(
+            rows, self._seq[rows], now, now, goals.goal, np.zeros((len(rows), 3)), goals.yaw,
+            extra=goals.pose_stamp[:, None],
+        )  # fmt: skip
+        self._goals.send(t, sent, start)
+        self._sent.append(replace(sent, velocity=np.zeros((len(rows), 0))))
 
     def logged(self, begin: float) -> CentreLog:
         """The log, with times since the common start at `begin` [s]."""
@@ -233,38 +206,35 @@ class VirtualNetwork:
         """
         agent, centre, instant = self._agent, self._centre, self._channel.instant
         self._deliver(t)
-        said = agent.transmit(t, state)
-        if len(said.rows):
-            self._transmit(t, said, state.yaw)
+        transmission = agent.transmit(t, state)
+        if len(transmission.rows):
+            self._transmit(t, transmission, state.yaw)
             if instant:
                 self._deliver(t)
         if centre is not None and agent.decision_due:
             centre.decide(t, agent)
             if instant:
                 centre.deliver(t, agent)
-        return said
+        return transmission
 
-    def _transmit(self, t: float, said: Transmission, yaw: Array) -> None:
+    def _transmit(self, t: float, transmission: Transmission, yaw: Array) -> None:
         """Transmits poses. Before the common start nothing is lost."""
-        speak, start = said.rows, float(self._agent.lifecycle.start_at.min())
-        self._seq[speak] += 1
-        now = np.full(len(speak), t)
-        if self._lean:
-            self._sent.append(_bare(speak, self._seq[speak], now, now))
-        else:
-            told = (said.position[speak], said.velocity[speak], yaw[speak])
-            self._sent.append(PoseTable(speak, self._seq[speak], now, now, *told))
-        self._channel.send(t, speak, self._seq, said.position, said.velocity, yaw=yaw, start=start)
+        rows, start = transmission.rows, float(self._agent.lifecycle.start_at.min())
+        self._seq[rows] += 1
+        now = np.full(len(rows), t)
+        position, velocity = transmission.position[rows], transmission.velocity[rows]
+        poses = PoseTable(rows, self._seq[rows], now, now, position, velocity, yaw[rows])
+        self._sent.append(_bare(rows, poses.seq, now, now) if self._lean else poses)
+        self._channel.send(t, poses, start)
         if self._centre is not None:
-            self._centre.transmit(t, speak, self._seq, said.position, said.velocity, yaw, start=start)
+            self._centre.transmit(t, poses, start)
 
     def _deliver(self, t: float) -> None:
         """Delivers poses and goals that have arrived."""
-        heard = self._channel.due(t)
-        if heard is not None:
-            self._agent.neighbours.receive(heard.link, heard.position, heard.velocity, heard.stamp, heard.arrival)
+        if (received := self._channel.due(t)) is not None:
+            self._agent.neighbours.receive(received)
             if not self._lean:
-                self._received.append(heard)
+                self._received.append(replace(received, yaw=None, bytes=None))
         if self._centre is not None:
             self._centre.deliver(t, self._agent)
 

@@ -10,12 +10,13 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from agents.agent import Actions, Agent, links_by_sender
+from agents.agent import Actions, Agent
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
+from tests.agents.things import poses
 from twins.body import TwinBody
 
 LEAD_S = 0.5
@@ -30,7 +31,7 @@ class Group:
         self.agent = Agent(self.assignment)
         self.body = TwinBody(bodies.body_request(experiment, self.names, [experiment.seed]))
         self.agent.neighbours.mark_alive(np.arange(len(self.assignment.links)))
-        self.by_speaker = links_by_sender(self.assignment.links, self.assignment.robots)
+        self.by_speaker = self.assignment.links.by_sender(self.assignment.robots)
         self.state: BodyState
         self.actions: Actions
 
@@ -39,10 +40,10 @@ class Group:
         links = self.by_speaker.get(speaker)
         if links is not None:
             many = (len(links), 1)
+            stamps, arrivals = np.full(len(links), stamp), np.full(len(links), arrived)
             self.agent.neighbours.receive(
-                links, np.tile(position, many), np.tile(velocity, many), np.full(len(links), stamp),
-                np.full(len(links), arrived),
-            )  # fmt: skip
+                poses(links, np.tile(position, many), np.tile(velocity, many), stamps, arrivals)
+            )
 
     def step(self, t: float) -> None:
         """One tick of the process."""

@@ -11,6 +11,7 @@ from experiments.definition.experiment import Formation, Leg, Robot, Start
 from experiments.definition.plan import Plan
 from tests.agents.few import pair, triangle
 from tests.agents.swarm import Swarm
+from tests.agents.things import poses
 
 # ---------------------------------------------------------------- what was heard
 
@@ -25,7 +26,7 @@ def bare(**parts):
 
 def say(agent, position, stamp, at=0):
     agent.neighbours.receive(
-        np.array([at]), np.array([position]), np.zeros((1, 3)), np.array([stamp]), np.array([stamp + 0.01])
+        poses(np.array([at]), np.array([position]), np.zeros((1, 3)), np.array([stamp]), np.array([stamp + 0.01]))
     )
 
 
@@ -44,7 +45,7 @@ def test_older_samples_than_known_are_left_out():
 def test_of_samples_that_arrive_together_the_newest_stays(order):
     stamps, places = np.array([1.0, 2.0, 3.0])[order], np.array([[1.0, 0, 0], [2.0, 0, 0], [3.0, 0, 0]])[order]
     together, one_by_one = bare(), bare()
-    together.neighbours.receive(np.zeros(3, dtype=np.intp), places, np.zeros((3, 3)), stamps, np.full(3, 4.0))
+    together.neighbours.receive(poses(np.zeros(3, dtype=np.intp), places, np.zeros((3, 3)), stamps, np.full(3, 4.0)))
     for place, stamp in zip(places.tolist(), stamps.tolist(), strict=True):
         say(one_by_one, place, stamp)
     for agent in (together, one_by_one):

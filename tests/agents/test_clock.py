@@ -13,6 +13,7 @@ from agents.decision.neighbours import NeighbourStates
 from agents.formation.graph import links
 from agents.plugins.predictors import HOLD, ConstantVelocity, Predictor
 from experiments.real_time.hosts.launcher import Launcher
+from tests.agents.things import poses
 
 AHEAD_S = 0.2
 SPEED = 0.3  # [m/s] of a neighbour along x
@@ -30,7 +31,7 @@ def believed(stamp: float, predictor: Predictor) -> float:
     hearing = NeighbourStates(links([(0, 1)], [0.5], [1.0]), None, 1.0)
     where = np.array([[SPEED * T, 0.0, 0.0]])
     at = np.array([0])
-    hearing.receive(at, where, np.array([[SPEED, 0.0, 0.0]]), np.array([stamp]), np.array([T]))
+    hearing.receive(poses(at, where, np.array([[SPEED, 0.0, 0.0]]), np.array([stamp]), np.array([T])))
     return float(hearing.poses.extrapolate_position(predictor, T + LATER, at)[0, 0])
 
 

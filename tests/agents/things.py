@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from agents.arrays import PoseTable
 from agents.body.kinds import KHEPERA4
 from agents.plugins.avoidance import Nearby, OwnState
 
@@ -46,3 +47,8 @@ def near(row, position, *, velocity=0.0, radius=0.0, heard=False, lag=0.0):
 
 
 NOTHING = near([], np.zeros((0, 2)))
+
+
+def poses(link, position, velocity, stamp, arrival, *, yaw=None):
+    """Poses received on links (H,)."""
+    return PoseTable(link, np.zeros(len(link), dtype=np.intp), stamp, arrival, position, velocity, yaw)

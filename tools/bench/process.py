@@ -15,7 +15,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from agents.agent import links_by_sender
 from agents.network import messages
 from agents.network.endpoints import free_endpoint
 from experiments.definition.plan import Plan
@@ -89,7 +88,7 @@ def process() -> Iterator[Figure]:
             start_router(launcher, endpoints)
             for robot in experiment.robots:
                 mine = plan.assignment([robot])
-                senders = links_by_sender(mine.links, mine.robots)
+                senders = mine.links.by_sender(mine.robots)
                 rate = f"{experiment.rates.pose_hz:g}"
                 started = launcher.start(
                     f"bare-{robot}", "tools.bench.bare_process", robot, rate, *senders, "--connect", endpoints[0]

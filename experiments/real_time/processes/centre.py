@@ -13,19 +13,19 @@ import os
 import threading
 import time
 from collections.abc import Sequence
-from math import floor, isfinite, nan
+from math import floor, isfinite
 from typing import Final
 
 import numpy as np
 import zenoh
+from msgspec.structs import replace
 
-from agents.arrays import Index, PoseTable
+from agents.arrays import Index
 from agents.clock import Clock
 from agents.decision.centralised import Centre, CentreGoals
 from agents.decision.lifecycle import IDLE, Phase
 from agents.network import messages, pubsub
 from agents.network import session as network
-from agents.network.channel_model import Channel
 from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken
@@ -33,7 +33,7 @@ from agents.network.shutdown import end
 from agents.network.validation import reach_of
 from agents.plugins import registry
 from agents.runtime import command_line
-from agents.runtime.pose_inbox import NeighbourSubscription, ReceivedPose, TokenChange
+from agents.runtime.pose_inbox import ModelledInbox
 from agents.runtime.telemetry import resident_mb
 from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
@@ -64,13 +64,13 @@ class CentreProcess:
         # poses that are sent on the tick of a decision arrive within half a tick, and still count
         self._patience = 0.5 / assignment.body_hz
         names, rows = self._names, centre.needed.tolist()
-        reach, rate = reach_of(assignment.limits.low, assignment.limits.high), experiment.rates.pose_hz
-        self._speakers = [
-            NeighbourSubscription(session, keys, names[row], np.array([link]), reach=reach, rate=rate, depth=DEPTH)
-            for link, row in enumerate(rows)
-        ]
-        self._heard: Index = np.zeros(len(rows), dtype=np.intp)
-        self._channel = Channel(link_conditions.conditions_to_centre(experiment, centre.needed))
+        self._poses = ModelledInbox(
+            session, keys, {names[row]: np.array([row]) for row in rows},
+            link_conditions.conditions_to_centre(experiment, np.arange(len(names))), centre,
+            reach=reach_of(assignment.limits.low, assignment.limits.high), rate=experiment.rates.pose_hz, depth=DEPTH,
+            counted=self._within_run,
+        )  # fmt: skip
+        self._received: Index = np.zeros(len(names), dtype=np.intp)
         self._guided = [row for row in rows if centre.guided[row]]
         self._statuses = {
             row: pubsub.Inbox(pubsub.pose_subscriber(session, keys.status(names[row])), messages.Status, keys=keys)
@@ -101,76 +101,34 @@ class CentreProcess:
             t = self._next + behind * self._period
             self._late_s = max(self._late_s, now - self._next)
             self._next = t + self._period
-            self._listen(t)
-            self._tell(self.centre.decide(t, self._phase, self._start), t)
+            self._receive(t)
+            self._send(self.centre.decide(t, self._phase, self._start), t)
             if t - self._reported >= REPORT_S - 1e-6:
                 self._report(t)
         self._report(self._next)
         token.undeclare()  # type: ignore[no-untyped-call]
 
-    def _listen(self, t: float) -> None:
+    def _receive(self, t: float) -> None:
         """Receives all since the last decision."""
         self._router.silent_since(t)
         for row, inbox in self._statuses.items():
             for status in inbox.read(_check_status):
                 self._update_status(row, status)
-        for speaker in self._speakers:
-            rows = self.centre.needed[speaker.links]
-            for coming in speaker.comings():
-                if coming is TokenChange.APPEARED:
-                    self.centre.mark_alive(rows)
-                elif coming is TokenChange.NEW_SESSION:
-                    self._begin(speaker)
-                else:
-                    self._channel.forget(speaker.links)
-                    self.centre.mark_lost(rows, t)
-            for said in speaker.news(self._utc + t):
-                if said.anew:
-                    self._begin(speaker)
-                self._send(speaker, said, t)
-        if (got := self._channel.due(t)) is not None:
-            self._believe(got)
         begun = float(self._start[self._guided].min())
-        if begun != self._begun and isfinite(begun):  # decisions fall on the same instants as those of the robots
+        if begun != self._begun:
             self._begun = begun
-            self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
+            if isfinite(begun):  # decisions fall on the same instants as those of the robots
+                self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
+        received = self._poses.receive(t, self._utc, np.full(len(self._names), begun))
+        if received is not None:
+            assert received.extra is not None
+            self.centre.receive(replace(received, stamp=received.extra[:, 0]))
+            for row, stamp in zip(received.link.tolist(), received.stamp.tolist(), strict=True):
+                self._received[row] += self._within_run(stamp)
 
-    def _begin(self, speaker: NeighbourSubscription) -> None:
-        """Forgets a robot that has a new session."""
-        self._channel.forget(speaker.links)
-        self.centre.discard_poses(self.centre.needed[speaker.links])
-
-    def _send(self, speaker: NeighbourSubscription, said: ReceivedPose, t: float) -> None:
-        """Puts a pose into the modelled channel."""
-        pose = said.pose
-        start = float(self._start[self._guided].min())
-        if self._within(pose.stamp - self._utc, start):
-            speaker.lost += said.missed
-        self._channel.send(
-            speaker.links,
-            np.array([pose.seq]),
-            np.array([pose.stamp - self._utc]),
-            np.array([pose.position]),
-            np.array([pose.velocity or messages.STILL]),
-            start=np.array([start]),
-            size=np.array([said.size]),
-            now=t,
-            extra=np.array([[nan if pose.yaw is None else pose.yaw, said.measured - self._utc]]),
-        )
-
-    def _believe(self, got: PoseTable) -> None:
-        """Passes poses that got through to the controller."""
-        assert got.extra is not None  # yaw and time of measurement
-        rows = self.centre.needed[got.link]
-        yaw, measured = got.extra.T
-        self.centre.receive(rows, got.position, got.velocity, yaw, measured, got.arrival)
-        start = float(self._start[self._guided].min())
-        for link, stamp in zip(got.link.tolist(), got.stamp.tolist(), strict=True):
-            self._heard[link] += self._within(stamp, start)
-
-    def _within(self, taken: float, start: float) -> bool:
-        """Whether a pose was measured in the run that began at `start` [s]."""
-        return 0.0 <= taken - start + ROUNDING_S < self.centre.assignment.duration
+    def _within_run(self, stamp: float) -> bool:
+        """Whether a pose was measured in the run that began last."""
+        return 0.0 <= stamp - self._begun + ROUNDING_S < self.centre.assignment.duration
 
     def _update_status(self, row: int, status: messages.Status) -> None:
         self._phase[row] = PHASES[status.phase]
@@ -178,26 +136,26 @@ class CentreProcess:
             self.centre.begin_plan(row, status.origin)
         self._start[row] = status.started - self._utc if status.started > 0.0 else np.inf
 
-    def _tell(self, told: CentreGoals, t: float) -> None:
+    def _send(self, goals: CentreGoals, t: float) -> None:
         """Sends goals, rounded as poses are."""
         self._seq += 1
-        for k, row in enumerate(told.rows.tolist()):
-            x, y, z = told.goal[k].tolist()
-            yaw = float(told.yaw[k])
+        for k, row in enumerate(goals.rows.tolist()):
+            x, y, z = goals.goal[k].tolist()
+            yaw = float(goals.yaw[k])
             goal = messages.Goal(
                 self._names[row],
                 self._seq,
                 round(self._utc + t, 6),
                 (round(x, 6), round(y, 6), round(z, 6)),
                 round(yaw, 6) if isfinite(yaw) else None,
-                round(self._utc + float(told.pose_stamp[k]), 6),
+                round(self._utc + float(goals.pose_stamp[k]), 6),
             )
             self._goals[row].put(messages.encode(goal, self._encoding))
-        self._sent += len(told.rows)
+        self._sent += len(goals.rows)
 
     def _report(self, t: float) -> None:
         cpu_s = time.process_time()
-        listened = [speaker.name for speaker in self._speakers]
+        senders = {int(sender.links[0]): sender for sender in self._poses.senders}  # by row
         report = messages.CentreState(
             stamp=self._utc + t,
             robots=[self._names[row] for row in self._guided],
@@ -207,11 +165,10 @@ class CentreProcess:
             decisions=self.centre.decisions,
             missed=self._missed,
             goals=self._sent,
-            heard=dict(zip(listened, self._heard.tolist(), strict=True)),
-            lost={speaker.name: speaker.lost for speaker in self._speakers},
-            dropped=dict(zip(listened, self._channel.dropped.tolist(), strict=True)),
-            malformed=sum(inbox.malformed for inbox in self._statuses.values())
-            + sum(speaker.malformed for speaker in self._speakers),
+            heard={sender.name: int(self._received[row]) for row, sender in senders.items()},
+            lost={sender.name: sender.lost for sender in senders.values()},
+            dropped={sender.name: int(self._poses.dropped[row]) for row, sender in senders.items()},
+            malformed=sum(inbox.malformed for inbox in self._statuses.values()) + self._poses.malformed,
             pid=os.getpid(),
             cpu_s=cpu_s,
             rss_mb=resident_mb(),

@@ -11,6 +11,7 @@ from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, RUNNING
 from experiments.definition.experiment import Hybrid
 from experiments.definition.plan import Plan
 from experiments.file import document
+from tests.agents.things import poses
 
 NAN = np.nan
 
@@ -40,7 +41,9 @@ class Desk:
         rows = np.array(rows, dtype=np.intp)
         place = self.position[rows] if position is None else np.array(position, dtype=float)
         stamps = np.full(len(rows), t) if stamp is None else np.array(stamp, dtype=float)
-        self.centre.receive(rows, place, np.zeros((len(rows), 3)), np.zeros(len(rows)), stamps, np.full(len(rows), t))
+        self.centre.receive(
+            poses(rows, place, np.zeros((len(rows), 3)), stamps, np.full(len(rows), t), yaw=np.zeros(len(rows)))
+        )
 
     def decide(self, t):
         return self.centre.decide(t, self.phase, self.start)
@@ -63,8 +66,8 @@ def test_it_decides_what_the_robots_would_to_the_last_bit(park, update):
         t = 0.01 * tick
         if tick % 10 == 0:
             place[:, :2] += rng.normal(0.0, 0.02, (7, 2))
-            agent.neighbours.receive(np.arange(len(links)), place[links.sender], still[links.sender],
-                       np.full(len(links), t), np.full(len(links), t))  # fmt: skip
+            agent.neighbours.receive(poses(np.arange(len(links)), place[links.sender], still[links.sender],
+                       np.full(len(links), t), np.full(len(links), t)))  # fmt: skip
             desk.hear(range(7), t, place)
             told = desk.decide(t)
             sent += len(told.rows)

@@ -55,7 +55,7 @@ class Bench:
     def told(self, rows, goal, *, stamp=None, toward=NAN):
         count = len(rows)
         stamps = np.full(count, self.t if stamp is None else stamp)
-        return self.agent.receive_goal(np.array(rows), np.array(goal, dtype=float), np.full(count, toward), stamps)
+        return self.agent.guidance.receive(np.array(rows), np.array(goal, dtype=float), np.full(count, toward), stamps)
 
     def running(self):
         rows = range(len(self.position))
@@ -212,11 +212,7 @@ def test_in_a_hybrid_only_the_others_have_a_law_of_their_own():
     assert told.guided.tolist() == [False, True]
     assert told.links.receiver.tolist() == [0]
     assert told.links.sender.tolist() == [1]
-    assert (
-        not Agent(Plan(hybrid).assignment(["A"]))
-        .receive_goal(np.array([0]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
-        .any()
-    )  # who decides for himself takes no goals
+    assert Agent(Plan(hybrid).assignment(["A"])).guidance is None  # whoever decides for himself takes no goals
 
 
 def test_rows_are_guided_each_for_itself():

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.arrays import no_poses
+from agents.arrays import PoseTable, no_poses
 from agents.network.channel_model import LOSS, USES, Channel, Conditions, Outage, key, uniform
 
 MANY = 40_000
@@ -25,10 +25,9 @@ def say(channel, link, seq, stamp, *, start=0.0, size=100, now=-np.inf):
     """One sample on each of some links."""
     link = np.atleast_1d(link)
     blank = np.zeros((len(link), 3))
-    channel.send(
-        link, np.full(len(link), seq), np.full(len(link), stamp), blank, blank,
-        start=start, size=np.full(len(link), size), now=now,
-    )  # fmt: skip
+    stamps = np.full(len(link), stamp)
+    poses = PoseTable(link, np.full(len(link), seq), stamps, stamps, blank, blank, bytes=np.full(len(link), size))
+    channel.send(poses, start=start, now=now)
 
 
 def heard(channel, t=np.inf):
@@ -238,7 +237,7 @@ def test_every_link_has_a_queue_of_its_own():
 def test_a_narrow_link_wants_to_know_sizes():
     channel, blank = Channel(conditions(bandwidth=1e4)), np.zeros((1, 3))
     with pytest.raises(ValueError, match="sizes"):
-        channel.send(np.array([0]), np.array([1]), np.array([0.0]), blank, blank)
+        channel.send(PoseTable(np.array([0]), np.array([1]), np.zeros(1), np.zeros(1), blank, blank))
 
 
 # ---------------------------------------------------------------------- outages, the start and the end

@@ -17,7 +17,7 @@ from agents.plugins.registry import AVOIDANCES, PluginError, build
 from agents.safety.setpoint_filter import SetpointFilter
 from experiments.definition.experiment import Experiment, Robot
 from experiments.definition.plan import Plan
-from tests.agents.things import NOTHING, near, own
+from tests.agents.things import NOTHING, near, own, poses
 
 LIMITS = Limits(np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5]), speed=0.5)
 
@@ -192,7 +192,7 @@ def running_pair(avoidance, gap=1.0, **parts):
         told = place[links.sender]
         agent.neighbours.mark_alive(np.arange(len(links)))
         agent.neighbours.receive(
-            np.arange(len(links)), told, still[: len(told)], np.zeros(len(told)), np.zeros(len(told))
+            poses(np.arange(len(links)), told, still[: len(told)], np.zeros(len(told)), np.zeros(len(told)))
         )
     return agent, state
 

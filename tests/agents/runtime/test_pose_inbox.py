@@ -44,7 +44,7 @@ class Robot:
     def __init__(self, net: Net, conditions: Conditions | None = None) -> None:
         self.net, self.agent = net, Agent(Plan(pair()).assignment(("A",)))
         self.neighbours = PoseInbox(net.session, KEYS, self.agent, reach=(5.0, 5.0, 5.0), conditions=conditions)
-        (self.sender,) = self.neighbours.speakers
+        (self.sender,) = self.neighbours.senders
         self.t = 0.0
 
     def tell(self, key: str, **what: object) -> None:
@@ -63,7 +63,7 @@ class Robot:
         self.tell(KEYS.alive("B"), gone=gone)
 
     def after(self, seconds: float = 0.02) -> None:
-        self.neighbours.listen(self.t, UTC)
+        self.neighbours.deliver(self.t, UTC)
         self.agent.goal_computer.update_links(self.t)
         self.t += seconds
 

@@ -20,6 +20,7 @@ from experiments.definition.experiment import Formation, Leg, Robot
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.agents.runtime.test_shutdown import Airborne
+from tests.agents.things import poses
 from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
 
@@ -47,7 +48,7 @@ class Life:
         self.t, self.place = 0.0, np.array([[*place, 0.0]])
         if len(links):
             self.agent.neighbours.receive(
-                links, np.array([[0.6, 0.6, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1)
+                poses(links, np.array([[0.6, 0.6, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
             )
         self.step(READY)
         assert self.order(messages.Order("takeoff")) == ""

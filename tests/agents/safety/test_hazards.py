@@ -15,6 +15,7 @@ from agents.safety.landing import PATIENCE_S
 from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import drone, pair, triangle
 from tests.agents.swarm import Swarm
+from tests.agents.things import poses
 
 LIMITS = Limits(np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5]))
 DT = 0.01
@@ -274,7 +275,7 @@ def test_two_that_come_too_near_hold_and_go_on_when_one_is_taken_away():
     agent = swarm.agent("A")
     for k in range(80):  # B is somewhere else now
         agent.neighbours.receive(
-            np.array([0]), np.array([[1.5, 0.0, 0.0]]), np.zeros((1, 3)), *np.full((2, 1), 99.0 + k)
+            poses(np.array([0]), np.array([[1.5, 0.0, 0.0]]), np.zeros((1, 3)), *np.full((2, 1), 99.0 + k))
         )
         swarm.groups[0].by_speaker.clear()
         swarm.step()
@@ -285,7 +286,9 @@ def test_two_that_nearly_touch_land():
     experiment = pair(safety=Safety(separation=0.3))
     swarm = Swarm(experiment, [["A"], ["B"]]).running().run(0.5)
     here = swarm.row("A", "position") + np.array([0.14, 0.0, 0.0])
-    swarm.agent("A").neighbours.receive(np.array([0]), here[None], np.zeros((1, 3)), np.array([99.0]), np.array([99.0]))
+    swarm.agent("A").neighbours.receive(
+        poses(np.array([0]), here[None], np.zeros((1, 3)), np.array([99.0]), np.array([99.0]))
+    )
     swarm.step()
     swarm.step()
     assert swarm.phase("A") >= LANDING

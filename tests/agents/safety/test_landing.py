@@ -14,6 +14,7 @@ from agents.safety.setpoint_filter import SetpointFilter
 from experiments.definition.experiment import Arena, Experiment, Formation, Robot
 from experiments.definition.plan import Plan
 from tests.agents.swarm import Swarm
+from tests.agents.things import poses
 
 DT = 0.01
 SINKS = 0.4  # [m/s]
@@ -60,7 +61,9 @@ class Bench:
         links = self.assignment.links
         speaker = links.sender
         stamps = np.full(len(links), self.t)
-        self.hearing.receive(np.arange(len(links)), self.position[speaker], self.velocity[speaker], stamps, stamps)
+        self.hearing.receive(
+            poses(np.arange(len(links)), self.position[speaker], self.velocity[speaker], stamps, stamps)
+        )
         state = BodyState(
             np.full(len(every), self.t - self.lag), self.position.copy(), self.velocity.copy(), np.zeros(len(every)),
             self.position, np.zeros(len(every)), np.ones(len(every)), self.flies & (self.phase != DONE),
@@ -187,7 +190,7 @@ def test_who_is_gone_may_have_come_down_wherever_it_hung():
     bench = Bench(("crazyflie", "crazyflie"), [[0.0, 0.0, 1.5], [0.05, 0.0, 0.8]])
     bench.phase[0] = DONE
     bench.asked[0] = False
-    bench.hearing.receive(np.arange(2), bench.position[[0, 1]], np.zeros((2, 3)), np.zeros(2), np.zeros(2))
+    bench.hearing.receive(poses(np.arange(2), bench.position[[0, 1]], np.zeros((2, 3)), np.zeros(2), np.zeros(2)))
     bench.t = 1.0
     bench.hearing.mark_lost(np.arange(2), 0.5)
     bench.hearing.receive = lambda *_: None

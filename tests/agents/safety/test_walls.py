@@ -37,7 +37,7 @@ def farthest(kind: str, axis: int, side: float, latency_s: float = 0.0) -> float
     for tick in range(round(9.0 / dt)):
         t = tick * dt
         if tick % 10 == 0:
-            agent.receive_goal(np.array([0]), goal, np.array([np.nan]), np.array([t]))
+            agent.guidance.receive(np.array([0]), goal, np.array([np.nan]), np.array([t]))
         group.step(t)
         agent.lifecycle.takeoff(0)
         if not np.isfinite(agent.lifecycle.start_at[0]):

@@ -28,6 +28,7 @@ from experiments.definition.experiment import (
 from experiments.definition.plan import Plan
 from experiments.file import consistency, document
 from experiments.real_time.conductor.replacement import Refused, Spares
+from tests.agents.things import poses
 
 BOT = Robot(kind="khepera4", start=[0.0, 0.0])
 FLY = Robot(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
@@ -104,7 +105,7 @@ def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     link = np.array([told.robots[j] for j in told.links.sender]) == "B"
     at = np.flatnonzero(link)
     agent.neighbours.mark_alive(at)
-    agent.neighbours.receive(at, np.array([[0.5, 0.0, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+    agent.neighbours.receive(poses(at, np.array([[0.5, 0.0, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1)))
     state = BodyState(
         time=np.zeros(1), position=np.zeros((1, 3)), yaw=np.zeros(1), velocity=np.zeros((1, 3)),
         flying=np.zeros(1, dtype=bool), battery=np.ones(1), true_position=np.zeros((1, 3)), true_yaw=np.zeros(1),

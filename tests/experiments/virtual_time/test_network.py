@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from agents.arrays import PoseTable
 from agents.formation.graph import links
@@ -22,6 +23,12 @@ NET = links([(0, 1), (1, 0), (2, 0), (2, 1)], [1.0] * 4, [1.0] * 4)
 def crowd(parameters, names="ABC", **parts):
     robots = {name: Robot(kind="khepera4", start=[0.0, 0.0]) for name in names}
     return Experiment(title="A crowd", duration_s=1e4, robots=robots, channel=parameters, **parts)
+
+
+def sent(rows, seq, t, position):
+    """Poses of rows that transmit."""
+    now = np.full(len(rows), t)
+    return PoseTable(rows, seq, now, now, position, -position, np.zeros(len(rows)))
 
 
 class Talk:
@@ -43,7 +50,7 @@ class Talk:
         if len(speak):
             self.seq[speak] += 1
             position = np.stack([np.arange(self.rows), np.full(self.rows, t), self.seq], axis=1).astype(float)
-            self.channel.send(t, speak, self.seq, position, -position, yaw=np.zeros(self.rows), start=self.start)
+            self.channel.send(t, sent(speak, self.seq[speak], t, position[speak]), self.start)
         self.tick += 1
 
     def run(self, ticks, speak):
@@ -207,12 +214,10 @@ def test_the_default_is_what_it_was():
 
 def test_what_goes_along_arrives_with_its_pose():
     channel = VirtualChannel(crowd(Parameters(delay_s=0.01, loss=0.4)), NET, [1], stream="goals")
-    still, yaw = np.zeros((3, 3)), np.zeros(3)
     for k in range(100):
-        place = np.full((3, 3), float(k))
-        channel.send(
-            0.02 * k, np.array([0, 1]), np.full(3, k), place, still, yaw=yaw, start=0.0, extra=place[:, :2] + 0.5
-        )
+        place = np.full((2, 3), float(k))
+        poses = sent(np.array([0, 1]), np.full(2, k), 0.02 * k, place)
+        channel.send(0.02 * k, replace(poses, extra=place[:, :2] + 0.5), 0.0)
     got = channel.due(10.0)
     assert len(got.link) == 400 - channel.lost.sum() < 300
     np.testing.assert_array_equal(got.extra, got.position[:, :2] + 0.5)
