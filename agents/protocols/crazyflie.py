@@ -11,6 +11,7 @@ from msgspec import Meta
 
 from agents.body.device_locks import numeric
 from agents.body.interface import BodyError, settings
+from agents.protocols.crazyradio import software
 
 Positive = Annotated[float, Meta(gt=0)]
 Rate = Annotated[float, Meta(ge=1, le=100)]
@@ -70,6 +71,7 @@ class Settings(Part, frozen=True):
     parameters: dict[str, float] = {}  # firmware parameters to set on connecting
     arm: bool = True  # arm it before taking off, where the platform asks for that
     platform: Literal["crazyflie", "brushless"] = "crazyflie"  # for the twin only: a `brushless` one must be armed
+    link: Literal["udp", "radio"] = "udp"  # for the twin only: `radio` puts a software Crazyradio between
     connect_s: Wait = 15.0  # [s] limit for connecting
     converge_s: Wait = 10.0  # [s] limit for the position estimate to settle
 
@@ -98,11 +100,18 @@ def device_of(address: str) -> str:
     scheme, _, rest = address.partition("?")[0].partition("://")
     if scheme == "radio":
         _, channel, rate, *own = rest.split("/")
-        return f"radio channel {channel}, {rate}, address {(own[0] if own else DEFAULT_ADDRESS).upper():0>10}"
+        simulated = software(address)
+        air = "" if simulated is None else f"simulated at {simulated.host}:{simulated.port}, "
+        return f"{air}radio channel {channel}, {rate}, address {(own[0] if own else DEFAULT_ADDRESS).upper():0>10}"
     if scheme == "udp":
         host, _, port = rest.partition(":")
         return f"udp://{numeric(host)}:{int(port)}"
     return f"{scheme}://{int(rest)}"
+
+
+def dongle_of(address: str) -> str:
+    """Number or serial of the radio of an address; empty if there is none."""
+    return address.split("/")[2] if address.startswith("radio://") else ""
 
 
 def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> Settings:
@@ -121,11 +130,11 @@ def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> Settings:
 
 def radio_loads(addresses: Sequence[str], each: Sequence[Settings]) -> list[float | None]:
     """Packets per second of all robots on the radio of each address; None without a radio."""
-    radios = [address.split("/")[2] if address.startswith("radio://") else None for address in addresses]
-    load: dict[str | None, float] = {}
+    radios = [dongle_of(address) for address in addresses]
+    load: dict[str, float] = {}
     for radio, settings_ in zip(radios, each, strict=True):
         load[radio] = load.get(radio, 0.0) + settings_.packets_hz
-    return [None if radio is None else load[radio] for radio in radios]
+    return [load[radio] if radio else None for radio in radios]
 
 
 def crowded(addresses: Sequence[str], each: Sequence[Settings]) -> dict[str, str]:

@@ -38,7 +38,7 @@ class CrazyflieBody:
         for name, kind in zip(request.names, request.kinds, strict=True):
             if kind.name != "crazyflie":
                 raise BodyError(f"{name} is a {kind.name}: this body flies Crazyflies")
-        addresses = [address(*pair) for pair in zip(request.names, request.addresses, strict=True)]
+        self._addresses = addresses = [address(*pair) for pair in zip(request.names, request.addresses, strict=True)]
         devices = [device_of(each) for each in addresses]
         shared = {each for each, device in zip(addresses, devices, strict=True) if devices.count(device) > 1}
         if shared:
@@ -74,7 +74,7 @@ class CrazyflieBody:
         Raises:
             BodyError: If no drone is reachable, or another process uses one.
         """
-        prepare()
+        prepare(self._addresses)
         self._claims.take()
         for pilot in self._pilots:
             pilot.start()

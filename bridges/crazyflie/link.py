@@ -10,13 +10,16 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 from agents.body.interface import BodyError
 from agents.protocols import crtp
+from agents.protocols.crazyflie import dongle_of
+from agents.protocols.crazyradio import software
 from agents.protocols.crtp import Port
+from bridges.crazyflie.dongle import plug_in
 
 FIRST_S: Final = 0.6  # to the first packet; cflib never repeats its first two requests
 SILENCE_S: Final = 1.0  # between two packets while the connection is set up
@@ -41,11 +44,11 @@ class SilentError(LinkError):
     """No answer from the drone."""
 
 
-def prepare() -> None:
-    """Load cflib and its drivers, once per process.
+def prepare(addresses: Sequence[str]) -> None:
+    """Load cflib and its drivers, once per process, and plug in the software radios that the addresses name.
 
     Raises:
-        BodyError: If cflib is not installed.
+        BodyError: If cflib is not installed, or one radio is to be in several simulated airs.
     """
     try:
         import cflib.crtp  # noqa: PLC0415 - an optional extra, under another licence
@@ -53,6 +56,13 @@ def prepare() -> None:
         raise BodyError("Crazyflies need cflib (GPL-3.0), which is an extra: pip install -e '.[crazyflie]'") from None
     if not cflib.crtp.CLASSES:  # a second call would register every driver twice
         cflib.crtp.init_drivers()
+    airs = {(dongle_of(address), air) for address in addresses if (air := software(address)) is not None}
+    if len(dict(airs)) < len(airs):
+        raise BodyError(
+            "one radio cannot reach drones of several twins: give each twin's robots a process of their own"
+        )
+    if airs:
+        plug_in({int(number): air for number, air in airs})
     logging.getLogger("cflib").setLevel(logging.CRITICAL)  # cflib logs tracebacks of errors that are reported here
 
 

@@ -1,4 +1,4 @@
-"""The device: sockets of the Crazyflies of one process, injected losses and delays, and the common clock."""
+"""The device: links of the Crazyflies of one process over UDP or a software radio, and the common clock."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import numpy as np
 from agents.arrays import Array
 from agents.body.interface import BodyError
 from agents.body.kinds import CRAZYFLIE
-from agents.protocols.crtp import SCAN, Port, header
+from agents.protocols.crtp import SCAN, Log, Port, header
 from twins.devices.crazyflie.drone import Drone
 from twins.devices.crazyflie.flock import Flock
+from twins.devices.crazyflie.radio import HOST, Air, RadioLink
 from twins.devices.device import DeviceRequest
 
-HOST: Final = "127.0.0.1"
 LARGEST: Final = 64  # [bytes]
 AT_ONCE: Final = 64  # packets read from one socket before the others are served
 RECEIVE_BYTES: Final = 1 << 20
@@ -85,7 +85,7 @@ class LossyLink:
 
 
 class CrazyflieTwin:
-    """Crazyflies with CRTP over UDP; implements `twins.devices.device.Device`."""
+    """Crazyflies with CRTP over UDP or over a software radio; implements `twins.devices.device.Device`."""
 
     def __init__(self, request: DeviceRequest) -> None:
         body = request.body
@@ -93,19 +93,34 @@ class CrazyflieTwin:
         if strange:
             raise BodyError(f"the Crazyflie twin is no twin of a {', '.join(strange)}; name another body")
         self.flock = Flock(body, request.faults)
-        self.lines = [LossyLink(np.random.default_rng([seed, row]), request) for row, seed in enumerate(body.seeds)]
+        self._air: Air | None = None
+        self._row: dict[socket.socket, int] = {}
+        self.lines = self._open_links(request)
         self.drones = [Drone(self.flock, row, line.send) for row, line in enumerate(self.lines)]
         self.addresses = tuple(line.address for line in self.lines)
-        self._row = {line.socket: row for row, line in enumerate(self.lines)}
+
+    def _open_links(self, request: DeviceRequest) -> Sequence[LossyLink | RadioLink]:
+        random = [np.random.default_rng([seed, row]) for row, seed in enumerate(request.body.seeds)]
+        if any(each.get("link") == "radio" for each in request.body.device):
+            radios = [RadioLink(own, request.faults, row) for row, own in enumerate(random)]
+            self._air = Air(radios, request.faults.exchanges_hz)
+            return radios
+        wires = [LossyLink(own, request) for own in random]
+        self._row = {wire.socket: row for row, wire in enumerate(wires)}
+        return wires
 
     def sockets(self) -> Sequence[socket.socket]:
         """See `Device.sockets`."""
-        return list(self._row)
+        return list(self._row) if self._air is None else [self._air.socket]
 
     def serve(self, ready: socket.socket, t: float) -> None:
         """See `Device.serve`."""
+        if self._air is not None:
+            self._air.serve(t, self._deliver)
+            return
         row = self._row[ready]
-        line, drone = self.lines[row], self.drones[row]
+        line = self.lines[row]
+        assert isinstance(line, LossyLink)
         line.t = t
         for _ in range(AT_ONCE):
             packet = line.receive()
@@ -114,10 +129,13 @@ class CrazyflieTwin:
             if packet[0] == SCAN:
                 line.send(Port.LINK, 3, b"")
                 continue
-            try:
-                drone.receive(packet[0] >> 4, packet[0] & 3, packet[1:])
-            except (struct.error, IndexError, ValueError, UnicodeDecodeError):
-                continue  # not a packet of this protocol
+            self._deliver(row, packet)
+
+    def _deliver(self, row: int, packet: bytes) -> None:
+        try:
+            self.drones[row].receive(packet[0] >> 4, packet[0] & 3, packet[1:])
+        except (struct.error, IndexError, ValueError, UnicodeDecodeError):
+            return  # not a packet of this protocol
 
     def advance(self, t: float) -> None:
         """See `Device.advance`."""
@@ -126,6 +144,8 @@ class CrazyflieTwin:
             line.t = t
             if locked[drone.row]:
                 drone.console("SUP: Locked, reboot required\n")
+            if isinstance(line, RadioLink) and not line.connected:
+                drone.logs.execute(Log.RESET, 0, b"", t)
             drone.send_logs(t)
             line.send_due()
 
@@ -135,8 +155,8 @@ class CrazyflieTwin:
 
     def close(self) -> None:
         """See `Device.close`."""
-        for line in self.lines:
-            line.socket.close()
+        for used in self.sockets():
+            used.close()
 
 
 def open_device(request: DeviceRequest) -> CrazyflieTwin:
