@@ -6,7 +6,6 @@ its liveliness token does.
 
 from __future__ import annotations
 
-import argparse
 import re
 import sys
 import threading
@@ -14,9 +13,11 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from math import atan2, cos, isfinite, sin
-from typing import Final, get_args
+from typing import Annotated, Final
 
+import msgspec
 import zenoh
+from msgspec import Meta
 
 from agents.body.interface import BodyError
 from agents.network import messages, pubsub, validation
@@ -26,7 +27,8 @@ from agents.network.keys import Keys
 from agents.protocols import ros2
 from agents.protocols.ros2 import Distro, Message, Types
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
-from agents.runtime.command_line import add_network, on_termination, reached
+from agents.runtime import command_line
+from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
 
 NODE: Final = "zenpark"
@@ -208,74 +210,48 @@ def diagnostic(types: Types, robot: str, level: int, text: str, values: dict[str
     )
 
 
-def serve(
-    endpoints: Sequence[str],
-    *,
-    ros_endpoints: Sequence[str] = (),
-    realm: str = "park",
-    domain: int = 0,
-    distro: Distro = "jazzy",
-    stop: threading.Event,
-    identity: str = "ros2",
-) -> None:
-    """Run the bridge until `stop` is set; prints a line when ready and whenever a robot comes or goes.
+class Ros2Launch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
+    """The robots as ROS 2 topics."""
 
-    Args:
-        endpoints: Routers of the robots.
-        ros_endpoints: Routers of ROS 2 (rmw_zenohd), if different.
-        realm: Of the robots.
-        domain: ROS_DOMAIN_ID.
-        distro: ROS 2 distribution, for type hashes.
-        stop: Ends the bridge.
-        identity: Name on the certificate, in a lab.
+    ros: Annotated[list[str], Meta(title="ENDPOINT", description="router of ROS 2 (rmw_zenohd), if another")] = (
+        msgspec.field(default_factory=list)
+    )
+    domain: Annotated[int, Meta(ge=0, le=ros2.MAX_DOMAIN, description="ROS_DOMAIN_ID")] = 0
+    distro: Annotated[Distro, Meta(description="ROS 2 distribution, for type hashes")] = "jazzy"
+
+
+def serve(launch: Ros2Launch) -> int:
+    """Run the bridge until a signal or the loss of its lifeline; prints when ready and whenever a robot comes or goes.
 
     Raises:
         BodyError: If the extra `ros` is not installed.
         EndpointError, Unreachable: If a router is not reachable.
     """
-    types = ros2.types(distro)
-    with ExitStack() as stack:
+    stop = threading.Event()
+    if launch.lifeline:
+        Lifeline(stop).start()
+    types = ros2.types(launch.distro)
+    with on_termination(stop.set), ExitStack() as stack:
         session = outside = stack.enter_context(
-            network.open_session(endpoints, name="ros2", stop=stop, identity=identity)
+            network.open_session(launch.endpoints(), name="ros2", stop=stop, identity=launch.identity or "ros2")
         )
-        if ros_endpoints:
-            outside = stack.enter_context(network.open_session(ros_endpoints, name="ros2", stop=stop))
-        graph = Graph(session, Participant(outside, types, style="rmw", domain=domain), Keys(realm))
-        print(f"ros2 ready: node /{NODE}, domain {domain}, {distro}", flush=True)
+        if launch.ros:
+            outside = stack.enter_context(network.open_session(launch.ros, name="ros2", stop=stop))
+        graph = Graph(session, Participant(outside, types, style="rmw", domain=launch.domain), Keys(launch.realm))
+        print(f"ros2 ready: node /{NODE}, domain {launch.domain}, {launch.distro}", flush=True)
         known: tuple[str, ...] = ()
         while not stop.wait(POLL_S):
             graph.poll()
             if graph.robots != known:
                 known = graph.robots
                 print(f"ros2: robots {' '.join(known) or 'none'}", flush=True)
+    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    parser = argparse.ArgumentParser(prog="zenpark bridge ros2", description="The robots as ROS 2 topics.")
-    add_network(parser, "ros2")
-    parser.add_argument("--ros", action="append", default=[], metavar="ENDPOINT", help="router of ROS 2, if another")
-    parser.add_argument("--domain", type=int, default=0, choices=range(ros2.MAX_DOMAIN + 1), metavar="0..232")
-    parser.add_argument("--distro", default="jazzy", choices=get_args(Distro))
-    chosen = parser.parse_args(arguments)
-    stop = threading.Event()
-    if chosen.lifeline:
-        Lifeline(stop).start()
-    try:
-        with on_termination(stop.set):
-            serve(
-                reached(chosen),
-                ros_endpoints=chosen.ros,
-                realm=chosen.realm,
-                domain=chosen.domain,
-                distro=chosen.distro,
-                stop=stop,
-                identity=chosen.identity,
-            )
-    except (BodyError, EndpointError, network.Unreachable) as error:
-        print(f"zenpark: {error}", file=sys.stderr)
-        return 2
-    return 0
+    explained = (BodyError, EndpointError, network.Unreachable)
+    return command_line.run("zenpark bridge ros2", Ros2Launch, serve, explained, arguments)
 
 
 if __name__ == "__main__":

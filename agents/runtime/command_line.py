@@ -13,11 +13,11 @@ from types import FrameType
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import msgspec
+from msgspec import Meta
 
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
 from agents.network.keys import Keys
 from agents.network.lab import LabError, secured
-from agents.runtime.lifeline import SILENCE_S
 
 
 @contextmanager
@@ -35,26 +35,6 @@ def on_termination(end: Callable[[], object]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def add_network(parser: argparse.ArgumentParser, identity: str) -> None:
-    """Adds `--connect`, `--lab`, `--as` (by itself `identity`), `--realm` and `--lifeline`; `reached` reads them."""
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
-    parser.add_argument("--lab", metavar="FOLDER", help="certificates of a lab (`zenpark keys init`)")
-    parser.add_argument("--as", dest="identity", default=identity, metavar="NAME", help="whose certificate, in a lab")
-    parser.add_argument("--realm", default=Keys().realm, help="first chunk of the robots' keys")
-    parser.add_argument(
-        "--lifeline", action="store_true", help=f"end when standard input ends or is silent for {SILENCE_S:g} s"
-    )
-
-
-def reached(chosen: argparse.Namespace) -> list[str]:
-    """The endpoints that were chosen by `--connect` and `--lab`.
-
-    Raises:
-        EndpointError: As `secured_endpoints`.
-    """
-    return secured_endpoints(chosen.connect or [], chosen.lab)
-
-
 def secured_endpoints(connect: Sequence[str], folder: str | None) -> list[str]:
     """Endpoints, the usual one if there are none, each with its lab if there is one.
 
@@ -65,6 +45,22 @@ def secured_endpoints(connect: Sequence[str], folder: str | None) -> list[str]:
         return secured(connect, folder) or [DEFAULT_ENDPOINT]
     except LabError as error:
         raise EndpointError(str(error)) from None
+
+
+class NetworkLaunch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
+    """Options of a process that joins a network without an experiment."""
+
+    connect: Annotated[list[str], Meta(title="ENDPOINT", description=f"default: {DEFAULT_ENDPOINT}")] = []
+    lab: Annotated[str | None, Meta(title="FOLDER", description="certificates of a lab (`zenpark keys init`)")] = None
+    identity: Annotated[str, Meta(title="NAME", description="whose certificate, in a lab")] = msgspec.field(
+        default="", name="as"
+    )
+    realm: Annotated[str, Meta(description="first chunk of the robots' keys")] = Keys().realm
+    lifeline: Annotated[bool, Meta(description="end when standard input ends or is silent")] = False
+
+    def endpoints(self) -> list[str]:
+        """See `secured_endpoints`."""
+        return secured_endpoints(self.connect, self.lab)
 
 
 L = TypeVar("L", bound=msgspec.Struct)
@@ -95,7 +91,7 @@ def parse(prog: str, kind: type[L], arguments: Sequence[str] | None = None) -> L
     parser = argparse.ArgumentParser(prog=prog, description=(kind.__doc__ or "").partition("\n")[0])
     for field in msgspec.structs.fields(kind):
         annotated = get_origin(field.type) is Annotated
-        plain, meta = get_args(field.type)[:2] if annotated else (field.type, msgspec.Meta())
+        plain, meta = get_args(field.type)[:2] if annotated else (field.type, Meta())
         options: dict[str, Any] = {"help": meta.description}
         if plain is bool:
             options["action"] = "store_true"

@@ -5,16 +5,16 @@ Light to start, since every run on one machine starts one.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 import zenoh
+from msgspec import Meta
 
 from agents.network import lab
 from agents.network.access_control import Rights
@@ -22,6 +22,7 @@ from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
 from agents.network.session import deserted, prompt_threads
 from agents.network.shutdown import end, held
 from agents.network.zenoh_config import config, reason, settings
+from agents.runtime import command_line
 from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import Lifeline
 
@@ -165,22 +166,26 @@ def _stamp(file: Path | None) -> int:
         return 0
 
 
+class RouterLaunch(msgspec.Struct, frozen=True, kw_only=True):
+    """A Zenoh router on this machine."""
+
+    listen: Annotated[list[str], Meta(title="ENDPOINT", description=f"default: {DEFAULT_ENDPOINT}")] = []
+    connect: Annotated[list[str], Meta(title="ENDPOINT", description="another router")] = []
+    lifeline: Annotated[bool, Meta(description="end when standard input ends or is silent")] = False
+    linger: Annotated[float, Meta(title="SECONDS", description="and then stay for so long")] = 0.0
+    rights: Annotated[str | None, Meta(title="FILE", description="who may do what, in a lab")] = None
+
+
+def _launched(launch: RouterLaunch) -> int:
+    rights = None if launch.rights is None else msgspec.json.decode(Path(launch.rights).read_bytes(), type=Rights)
+    listen = launch.listen or [DEFAULT_ENDPOINT]
+    return serve(listen, link=launch.connect, lifeline=launch.lifeline, linger_s=launch.linger, rights=rights)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the router process."""
-    parser = argparse.ArgumentParser(prog="zenpark router", description="A Zenoh router on this machine.")
-    parser.add_argument("--listen", action="append", metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", default=[], help="another router")
-    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends or is silent for 3 s")
-    parser.add_argument("--linger", type=float, default=0.0, metavar="SECONDS", help="and then stay for so long")
-    parser.add_argument("--rights", type=Path, metavar="FILE", help="who may do what, in a lab")
-    chosen = parser.parse_args(arguments)
-    try:
-        rights = None if chosen.rights is None else msgspec.json.decode(chosen.rights.read_bytes(), type=Rights)
-        listen = chosen.listen or [DEFAULT_ENDPOINT]
-        return serve(listen, link=chosen.connect, lifeline=chosen.lifeline, linger_s=chosen.linger, rights=rights)
-    except (EndpointError, OSError, msgspec.MsgspecError) as error:
-        print(f"zenpark: {error}", file=sys.stderr)
-        return 2
+    explained = (EndpointError, OSError, msgspec.MsgspecError)
+    return command_line.run("zenpark router", RouterLaunch, _launched, explained, arguments)
 
 
 if __name__ == "__main__":

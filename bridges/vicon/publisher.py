@@ -5,16 +5,17 @@ Occluded and implausible poses are not published: a robot notices silence, but w
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from typing import Annotated, Final
 
+import msgspec
 import numpy as np
 import zenoh
+from msgspec import Meta
 
 from agents.body.external_pose import External
 from agents.clock import Clock
@@ -24,7 +25,8 @@ from agents.network.keys import Keys
 from agents.network.shutdown import Farewell
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Malformed, Segment
-from agents.runtime.command_line import add_network, on_termination, reached
+from agents.runtime import command_line
+from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
 from bridges.vicon.client import Frame, Reader
 
@@ -183,42 +185,39 @@ def describe_error(error: OSError | Malformed) -> str:
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
-def run_bridge(
-    server: str,
-    subjects: Mapping[str, str],
-    endpoints: Sequence[str],
-    *,
-    realm: str = "park",
-    lifeline: bool = False,
-    identity: str = "positioning",
-) -> int:
-    """Run the bridge until SIGINT, SIGTERM or the loss of its lifeline (and of the robots); returns the exit code.
+class ViconLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
+    """Positions from a Vicon for robots."""
 
-    Args:
-        server: "HOST" or "HOST:PORT" of the DataStream server.
-        subjects: Subject name by robot.
-        endpoints: Routers.
-        realm: First chunk of the keys.
-        lifeline: Whether standard input is a lifeline.
-        identity: Name on the certificate, in a lab.
+    server: Annotated[
+        str, Meta(title="HOST[:PORT]", description=f"where Tracker or Nexus runs; port {vicon_datastream.PORT}")
+    ]
+    map: Annotated[
+        list[str], Meta(title="ROBOT[=SUBJECT]", description="a robot, and its subject in the Vicon; may be repeated")
+    ] = msgspec.field(default_factory=list)
+
+
+def serve(launch: ViconLaunch) -> int:
+    """Run the bridge until SIGINT, SIGTERM or the loss of its lifeline (and of the robots); returns the exit code.
 
     Raises:
         network.Unreachable: If no router answers.
-        EndpointError: If an endpoint is malformed.
+        ValueError: If an endpoint, the server or a robot's subject is malformed.
     """
-    host, port = parse_server(server)
+    host, port = parse_server(launch.server)
+    subjects = parse_maps(launch.map)
     stop, lost = threading.Event(), threading.Event()
 
     def print_line(line: str) -> None:
         print(f"vicon: {line}", file=sys.stderr, flush=True)
 
-    if lifeline:
+    if launch.lifeline:
         Lifeline(lost).start()
+    identity = launch.identity or "positioning"
     with (
         on_termination(stop.set),
-        network.open_session(endpoints, name="vicon", stop=stop, identity=identity) as session,
+        network.open_session(launch.endpoints(), name="vicon", stop=stop, identity=identity) as session,
     ):
-        keys, robots = Keys(realm), list(subjects)
+        keys, robots = Keys(launch.realm), list(subjects)
         farewell = Farewell(session, keys, robots, lost)
         made = Bridge(host, port, PoseFilter(subjects, print_line), Positions(session, keys, robots), print_line)
         if made.run(lambda: stop.is_set() or farewell.over()):
@@ -246,8 +245,10 @@ def parse_maps(maps: Sequence[str]) -> dict[str, str]:
     """Subject by robot, from texts "ROBOT=SUBJECT" or "ROBOT" (subject of the same name).
 
     Raises:
-        ValueError: If a text has neither form, or a robot or subject occurs twice.
+        ValueError: If there is none, a text has neither form, or a robot or subject occurs twice.
     """
+    if not maps:
+        raise ValueError("name the robots with --map ROBOT or --map ROBOT=SUBJECT")
     found: dict[str, str] = {}
     for each in maps:
         robot, equals, subject = each.partition("=")
@@ -262,27 +263,7 @@ def parse_maps(maps: Sequence[str]) -> dict[str, str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    parser = argparse.ArgumentParser(prog="zenpark bridge vicon", description="Positions from a Vicon for robots.")
-    parser.add_argument(
-        "server", metavar="HOST[:PORT]", help=f"where Tracker or Nexus runs; port {vicon_datastream.PORT}"
-    )
-    parser.add_argument(
-        "--map", action="append", required=True, metavar="ROBOT[=SUBJECT]", help="a robot, and its subject in the Vicon"
-    )
-    add_network(parser, "positioning")
-    chosen = parser.parse_args(arguments)
-    try:
-        return run_bridge(
-            chosen.server,
-            parse_maps(chosen.map),
-            reached(chosen),
-            realm=chosen.realm,
-            lifeline=chosen.lifeline,
-            identity=chosen.identity,
-        )
-    except (ValueError, network.Unreachable) as error:
-        print(f"zenpark: {error}", file=sys.stderr)
-        return 2
+    return command_line.run("zenpark bridge vicon", ViconLaunch, serve, (ValueError, network.Unreachable), arguments)
 
 
 if __name__ == "__main__":

@@ -212,6 +212,7 @@ def bridge(
     if what in ("-h", "--help"):
         typer.echo(context.get_help())
         raise typer.Exit
-    if what not in ("vicon", "ros2"):
+    modules = {"vicon": "bridges.vicon.publisher", "ros2": "bridges.ros2"}
+    if what not in modules:
         raise typer.BadParameter(f"'{what}' is neither vicon nor ros2")
-    return int(import_module(f"bridges.{what}").main(context.args))
+    return int(import_module(modules[what]).main(context.args))

@@ -1,11 +1,10 @@
 """Protocol twin of a Vicon: a DataStream server with the true poses of the other twins.
 
-`python -m twins.devices.vicon --robots CF01 KH01` receives the true poses on Zenoh; the class takes them directly.
+`python -m twins.devices.vicon CF01 KH01` receives the true poses on Zenoh; the class takes them directly.
 """
 
 from __future__ import annotations
 
-import argparse
 import select
 import socket
 import sys
@@ -15,22 +14,23 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 import numpy as np
 import zenoh
+from msgspec import Meta
 
 from agents.arrays import Array
 from agents.clock import Clock
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
-from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment
-from agents.runtime.command_line import add_network, on_termination, reached
+from agents.runtime import command_line
+from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
 from twins.devices.device import Faults
 
@@ -253,67 +253,64 @@ def serve(vicon: ViconTwin, truth: TruthSubscription, rate_hz: float, over: Call
         vicon.advance(t)
 
 
-def _address(text: str) -> tuple[str, int]:
-    host, _, port = text.rpartition(":")
+class TwinLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
+    """A simulated Vicon that sees simulated robots."""
+
+    robots: Annotated[list[str], Meta(title="ROBOT", description="their names are the subjects'")]
+    listen: Annotated[str, Meta(title="HOST:PORT")] = "127.0.0.1:0"
+    rate: Annotated[float, Meta(ge=1, le=1000, title="HZ", description="frames per second")] = 100.0
+    sigma: Annotated[float, Meta(ge=0, lt=1, title="METRES", description="noise of the positions")] = 0.0003
+    seed: Annotated[int, Meta(ge=0, description="of the noise")] = 0
+    faults: Annotated[str, Meta(title="JSON", description="such as '{\"occluded_from_s\": 5}'")] = "{}"
+
+
+def run(launch: TwinLaunch) -> int:
+    """Runs the twin until a signal, or until its lifeline is lost and the robots are gone; returns the exit code.
+
+    Raises:
+        ValueError: If its address or its faults are malformed.
+        Unreachable: If no router answers.
+    """
+    host, _, port = launch.listen.rpartition(":")
     if not (host and port.isascii() and port.isdigit() and int(port) < 65536):
-        raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT, such as 127.0.0.1:801")
-    return host, int(port)
-
-
-def _faults(text: str) -> Faults:
-    try:
-        return msgspec.json.decode(text, type=Faults)
-    except (msgspec.MsgspecError, RecursionError) as error:
-        raise argparse.ArgumentTypeError(f"{error}; write it like '{{\"occluded_from_s\": 5}}'") from None
+        raise ValueError(f"'{launch.listen}' is not HOST:PORT, such as 127.0.0.1:801")
+    faults = msgspec.json.decode(launch.faults, type=Faults)
+    stop, lost = threading.Event(), threading.Event()
+    if launch.lifeline:
+        Lifeline(lost).start()
+    identity = launch.identity or "twin"
+    with (
+        on_termination(stop.set),
+        network.open_session(launch.endpoints(), name="vicon-twin", stop=stop, identity=identity) as session,
+    ):
+        rng = np.random.default_rng(launch.seed)
+        try:
+            vicon = ViconTwin(
+                launch.robots,
+                rate_hz=launch.rate,
+                sigma=launch.sigma,
+                rng=rng,
+                faults=faults,
+                host=host,
+                port=int(port),
+            )
+        except OSError as error:
+            raise ValueError(f"cannot listen on {launch.listen}: {error.strerror}; choose another port") from None
+        print(f"vicon ready on {vicon.address}", flush=True)
+        try:
+            keys = Keys(launch.realm)
+            farewell = Farewell(session, keys, launch.robots, lost)
+            truth = TruthSubscription(session, keys, launch.robots)
+            serve(vicon, truth, launch.rate, lambda: stop.is_set() or farewell.over())
+        finally:
+            vicon.close()
+    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    parser = argparse.ArgumentParser(prog="vicon twin", description="A simulated Vicon that sees simulated robots.")
-    parser.add_argument("--robots", nargs="+", required=True, metavar="ROBOT", help="their names are the subjects'")
-    parser.add_argument("--listen", type=_address, default=("127.0.0.1", 0), metavar="HOST:PORT")
-    add_network(parser, "twin")
-    parser.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="frames per second")
-    parser.add_argument("--sigma", type=float, default=0.0003, metavar="METRES", help="noise of the positions")
-    parser.add_argument("--seed", type=int, default=0, help="of the noise")
-    parser.add_argument("--faults", type=_faults, default=Faults(), metavar="JSON", help="injected faults")
-    chosen = parser.parse_args(arguments)
-    if not (1.0 <= chosen.rate <= 1000.0 and 0.0 <= chosen.sigma < 1.0 and chosen.seed >= 0):
-        parser.error("--rate is 1 to 1000 Hz, --sigma 0 to 1 m, --seed not negative")
-    stop, lost = threading.Event(), threading.Event()
-
-    if chosen.lifeline:
-        Lifeline(lost).start()
-    host, port = chosen.listen
-    try:
-        with (
-            on_termination(stop.set),
-            network.open_session(reached(chosen), name="vicon-twin", stop=stop, identity=chosen.identity) as session,
-        ):
-            vicon = ViconTwin(
-                chosen.robots,
-                rate_hz=chosen.rate,
-                sigma=chosen.sigma,
-                rng=np.random.default_rng(chosen.seed),
-                faults=chosen.faults,
-                host=host,
-                port=port,
-            )
-            print(f"vicon ready on {vicon.address}", flush=True)
-            try:
-                keys = Keys(chosen.realm)
-                farewell = Farewell(session, keys, chosen.robots, lost)
-                truth = TruthSubscription(session, keys, chosen.robots)
-                serve(vicon, truth, chosen.rate, lambda: stop.is_set() or farewell.over())
-            finally:
-                vicon.close()
-    except (network.Unreachable, EndpointError) as error:
-        print(f"vicon twin: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"vicon twin: cannot listen on {host}:{port}: {error.strerror}; choose another port", file=sys.stderr)
-        return 2
-    return 0
+    explained = (ValueError, network.Unreachable, RecursionError)
+    return command_line.run("vicon twin", TwinLaunch, run, explained, arguments)
 
 
 if __name__ == "__main__":

@@ -38,11 +38,6 @@ class CaseContext:
         """The file of the recorder."""
         return self.folder / f"{self.case}.mcap"
 
-    @property
-    def connect(self) -> list[str]:
-        """Arguments with which processes of this machine reach the routers."""
-        return [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
-
     def ended(self) -> bool:
         """Whether the user or an emergency stop ends the run."""
         return bool(self.emergency) or self.interrupted()
@@ -52,5 +47,6 @@ class CaseContext:
         return f"{self.case}-{role}"
 
     def start(self, role: str, module: str, *arguments: str) -> Process:
-        """Start a process of this case on this machine."""
-        return self.launcher.start(self.process(role), module, *arguments)
+        """Start a process of this case on this machine, with a lifeline and the routers."""
+        connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
+        return self.launcher.start(self.process(role), module, *arguments, *connect, "--lifeline")

@@ -68,17 +68,9 @@ class CaseProcesses:
             StandInError: If a protocol twin or a positioning system does not start in time.
         """
         context = self._context
-        context.start(
-            "recorder",
-            "experiments.real_time.processes.recorder",
-            str(context.file),
-            str(context.recording),
-            "--case",
-            context.case,
-            "--source",
-            str(context.source),
-            *context.connect,
-        )
+        files = str(context.file), str(context.recording)
+        recorder = "experiments.real_time.processes.recorder"
+        context.start("recorder", recorder, *files, "--name", context.case, "--source", str(context.source))
         self._start_standins()
         self._centre = self._servants.start_centre()
 
@@ -125,8 +117,7 @@ class CaseProcesses:
             told_case = document.case_document(told)
             self._abroad[f"{station.name}/{group}"] = station.start(process, names, told_case, self._launcher)
         else:
-            arguments = [str(file), *names, *self._context.connect, "--lifeline"]
-            self._launcher.start(process, "experiments.real_time.processes.robot", *arguments)
+            self._context.start(group, "experiments.real_time.processes.robot", str(file), *names)
 
     def robot(self, name: str) -> Robot:
         """A robot as it is now: another one may have its name, and its body an address that the file does not know."""

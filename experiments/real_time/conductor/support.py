@@ -52,17 +52,8 @@ def start(context: CaseContext) -> StandIns:
     for name, robot in experiment.robots.items():
         if robot.body in words:
             groups.setdefault(robot.body, []).append(name)
-    processes = {
-        word: context.start(
-            word,
-            "experiments.real_time.processes.protocol_twins",
-            str(context.file),
-            *names,
-            *context.connect,
-            "--lifeline",
-        )
-        for word, names in groups.items()
-    }
+    module = "experiments.real_time.processes.protocol_twins"
+    processes = {word: context.start(word, module, str(context.file), *names) for word, names in groups.items()}
     addresses: dict[str, str] = {}
     for word, names in groups.items():
         addresses |= _announced(processes[word], r"^address (\w+) (\S+)$", len(names), context.ended)
@@ -83,9 +74,7 @@ def start_world(context: CaseContext) -> Process | None:
     """Start the world of an experiment, for the first time or again; None if no robot asks for one."""
     if not any(bodies.WORLD in (robot.body, robot.ranges) for robot in context.experiment.robots.values()):
         return None
-    return context.start(
-        "world", "experiments.real_time.processes.world", str(context.file), *context.connect, "--lifeline"
-    )
+    return context.start("world", "experiments.real_time.processes.world", str(context.file))
 
 
 def _start_positioning(
@@ -96,17 +85,17 @@ def _start_positioning(
     if experiment.positioning is None or not measured:
         return [], None
     started = []
-    network = [*context.connect, "--realm", experiment.network.realm, "--lifeline"]
+    realm = ["--realm", experiment.network.realm]
     host = experiment.positioning.removeprefix(VICON)
     if experiment.positioning == bodies.VICON_TWIN:
         sigma = max(bodies.disturbance(experiment, name).position_sigma or 0.0 for name in measured)
         noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
-        arguments = ["--listen", "127.0.0.1:0", "--robots", *measured, *noise, *network]
+        arguments = ["--listen", "127.0.0.1:0", *measured, *noise, *realm]
         twin = context.start(bodies.VICON_TWIN, "twins.devices.vicon", *arguments)
         started.append(twin.name)
         host = _announced(twin, r"^vicon (ready on) (\S+)$", 1, context.ended)["ready on"]
     maps = [part for name in measured for part in ("--map", f"{name}={name}")]
-    bridge = partial(context.start, "vicon", "bridges.vicon.publisher", host, *maps, *network)
+    bridge = partial(context.start, "vicon", "bridges.vicon.publisher", host, *maps, *realm)
     name = bridge().name
     return [*started, name], (name, bridge)
 
@@ -157,14 +146,7 @@ class Servants:
         if Plan(context.experiment).guided:
             self._centre = (context.process("centre"),)
             self._known[self._centre[0]] = _Servant(
-                partial(
-                    context.start,
-                    "centre",
-                    "experiments.real_time.processes.centre",
-                    str(context.file),
-                    *context.connect,
-                    "--lifeline",
-                ),
+                partial(context.start, "centre", "experiments.real_time.processes.centre", str(context.file)),
                 given_up=": the robots that it guides hold, and land at the end",
             )
 

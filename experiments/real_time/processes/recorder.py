@@ -24,9 +24,8 @@ from agents.network.keys import Keys
 from agents.network.messages import M
 from agents.network.shutdown import AFTER_S, end
 from agents.runtime import command_line
-from experiments.file import document
 from experiments.file.problems import DocumentError
-from experiments.real_time.processes.joining import joined
+from experiments.real_time.processes.joining import Launch, joined
 from experiments.recording.reader import RecordingError
 from experiments.recording.topics import DEPTH, TOPICS, Message, Topic
 from experiments.recording.writer import Recording
@@ -164,14 +163,12 @@ def with_truth(state: messages.State, truths: Sequence[messages.Position]) -> me
     return msgspec.structs.replace(state, true_position=(x, y, z), true_yaw=yaw)
 
 
-class RecorderLaunch(msgspec.Struct, frozen=True, kw_only=True):
-    """Records one case of an experiment."""
+class RecorderLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
+    """Records one case of an experiment, from its file as `zenpark run` resolved it."""
 
-    file: Annotated[str, msgspec.Meta(description="the resolved case")]
     target: Annotated[str, msgspec.Meta(description="the recording")]
-    case: Annotated[str, msgspec.Meta(description="its name")] = ""
+    name: Annotated[str, msgspec.Meta(description="of the case, for the recording")] = ""
     source: Annotated[str, msgspec.Meta(title="FILE", description="the experiment file to attach")] = ""
-    connect: Annotated[list[str], msgspec.Meta(title="ENDPOINT", description="router")] = []
 
 
 def record(launch: RecorderLaunch) -> int:
@@ -180,17 +177,17 @@ def record(launch: RecorderLaunch) -> int:
     Raises:
         RecordingError: If the recording cannot be written.
     """
-    experiment = document.read(launch.file).experiment
+    experiment, endpoints = launch.read()
     text = Path(launch.source).read_text("utf-8")
     lost, asked = threading.Event(), threading.Event()
     target, seed = Path(launch.target), experiment.seed
     with (
-        joined(experiment, launch.connect, name="recorder", stop=asked, on_signal=asked.set, lost=lost) as joint,
-        Recording(target, experiment, text, case=launch.case, seed=seed, clock="real") as recording,
+        joined(experiment, endpoints, name="recorder", stop=asked, on_signal=asked.set, lost=lost) as joint,
+        Recording(target, experiment, text, case=launch.name, seed=seed, clock="real") as recording,
     ):
         recorder = Recorder(joint.session, joint.keys, recording)
         joint.declared.append(recorder)
-        router = network.RouterWatch(joint.session, joint.keys.recorder, launch.connect)
+        router = network.RouterWatch(joint.session, joint.keys.recorder, endpoints)
         flush_at = time.monotonic() + FLUSH_S
         last = float("inf")
         while not asked.wait(POLL_S):

@@ -1,13 +1,12 @@
 """Signals are heeded inside and only there; the arguments of the network are the same for every process."""
 
-import argparse
 import os
 import signal
 
 import pytest
 
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
-from agents.runtime.command_line import add_network, on_termination, reached
+from agents.runtime.command_line import NetworkLaunch, on_termination, parse
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -29,18 +28,16 @@ def test_what_was_before_comes_back_after_an_error():
 
 
 def test_the_arguments_of_the_network():
-    parser = argparse.ArgumentParser()
-    add_network(parser, "twin")
-    plain = {"connect": None, "lab": None, "identity": "twin", "realm": "park", "lifeline": False}
-    assert vars(parser.parse_args([])) == plain
-    given = parser.parse_args(["--connect", "tcp/a:1", "--connect", "tcp/b:2", "--realm", "hall", "--lifeline"])
-    assert vars(given) == {**plain, "connect": ["tcp/a:1", "tcp/b:2"], "realm": "hall", "lifeline": True}
-    assert reached(given) == ["tcp/a:1", "tcp/b:2"]
-    assert reached(parser.parse_args([])) == [DEFAULT_ENDPOINT]
+    assert parse("twin", NetworkLaunch, []) == NetworkLaunch()
+    words = ["--connect", "tcp/a:1", "--connect", "tcp/b:2", "--realm", "hall", "--lifeline"]
+    given = parse("twin", NetworkLaunch, words)
+    assert given == NetworkLaunch(connect=["tcp/a:1", "tcp/b:2"], realm="hall", lifeline=True)
+    assert given.endpoints() == ["tcp/a:1", "tcp/b:2"]
+    assert NetworkLaunch().endpoints() == [DEFAULT_ENDPOINT]
 
 
 def test_a_lab_wants_endpoints_that_ask_for_certificates(tmp_path):
-    parser = argparse.ArgumentParser()
-    add_network(parser, "twin")
+    given = parse("twin", NetworkLaunch, ["--connect", "tcp/a:1", "--lab", str(tmp_path), "--as", "CF01"])
+    assert given.identity == "CF01"
     with pytest.raises(EndpointError, match="asks for no certificate"):
-        reached(parser.parse_args(["--connect", "tcp/a:1", "--lab", str(tmp_path), "--as", "CF01"]))
+        given.endpoints()

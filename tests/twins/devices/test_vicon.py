@@ -286,7 +286,7 @@ def test_noise_has_the_size_that_was_asked_for() -> None:
 
 @pytest.fixture
 def process(router: RouterProcess) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "twins.devices.vicon", "--robots", "CF01", "KH01", "--connect", router.endpoint]
+    command = [sys.executable, "-m", "twins.devices.vicon", "CF01", "KH01", "--connect", router.endpoint]
     made = subprocess.Popen(
         [*command, "--sigma", "0", "--rate", "200", "--lifeline"],
         cwd=ROOT,
@@ -362,9 +362,9 @@ def test_what_a_user_can_mend_is_said_without_a_traceback() -> None:
     for arguments, words in (
         (["--listen", "801"], "is not HOST:PORT"),
         (["--faults", '{"occluded": 1}'], "occluded"),
-        (["--rate", "0"], "--rate is 1 to 1000 Hz"),
+        (["--rate", "0"], ">= 1"),
     ):
-        command = [sys.executable, "-m", "twins.devices.vicon", "--robots", "CF01", "--connect", endpoint, *arguments]
+        command = [sys.executable, "-m", "twins.devices.vicon", "CF01", "--connect", endpoint, *arguments]
         ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20, check=False)
         assert ended.returncode == 2
         assert words in ended.stderr
