@@ -33,12 +33,14 @@ experiments.definition experiments.catalogue
 experiments.file
 experiments.recording
 experiments.metrics
+experiments.scene
 experiments.virtual_time
 experiments.check
 experiments.authoring experiments.real_time.hosts experiments.real_time.processes
 experiments.report experiments.real_time.conductor
 experiments.run
-experiments.sweep
+experiments.sweep experiments.view
+tools.progress
 tools.commands
 tools.reliability tools.bench
 tools.main

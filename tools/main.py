@@ -8,7 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from tools.bench import bench
-from tools.commands import check, estop, hosts, lab, network, orders, processes, run, sweep
+from tools.commands import check, estop, hosts, lab, network, orders, processes, run, sweep, view
 from tools.reliability import chaos, soak
 
 
@@ -26,7 +26,7 @@ app: Final = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _module in (run, sweep, check, soak, chaos, bench, processes, network, orders, estop):
+for _module in (run, view, sweep, check, soak, chaos, bench, processes, network, orders, estop):
     app.add_typer(_module.app)
 app.add_typer(hosts.app, name="hosts")
 app.add_typer(lab.app, name="keys")
@@ -51,6 +51,7 @@ EXPLAINED: Final = (
     ("experiments.real_time.conductor.support", "StandInError"),
     ("tools.commands.orders", "WorldOrderError"),
     ("tools.commands.network", "KeyExpressionError"),
+    ("tools.commands.view", "ViewError"),
 )
 
 

@@ -13,7 +13,7 @@ def bootstrap(tmp_path, monkeypatch):
     loader = SourceFileLoader("bootstrap", str(ROOT / "zenpark"))
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader("bootstrap", loader))
     loader.exec_module(module)
-    for name in ("pyproject.toml", "requirements.lock", "requirements-hardware.lock", "requirements-dev.lock"):
+    for name in ("pyproject.toml", *(path.name for path in module.LOCKS.values())):
         (tmp_path / name).write_bytes((ROOT / name).read_bytes())
     (tmp_path / ".venv" / "bin").mkdir(parents=True)
     (tmp_path / ".venv" / "bin" / "python").touch()

@@ -9,17 +9,20 @@ from tests.system import zenohd
 ROOT = Path(__file__).resolve().parents[2]
 
 
+LOCKS = ("requirements.lock", "requirements-view.lock", "requirements-hardware.lock", "requirements-dev.lock")
+
+
 def locked(name):
     return dict(re.findall(r"^([a-z0-9.-]+)==(\S+)", (ROOT / name).read_text(), re.MULTILINE))
 
 
 def test_locks_name_no_address():
-    for name in ("requirements.lock", "requirements-hardware.lock", "requirements-dev.lock"):
+    for name in LOCKS:
         assert not re.search(r"https?:|--index|--extra-index|--find-links", (ROOT / name).read_text())
 
 
 def test_every_locked_package_has_hashes():
-    for name in ("requirements.lock", "requirements-hardware.lock", "requirements-dev.lock"):
+    for name in LOCKS:
         text = re.sub(r"\\\n", "", (ROOT / name).read_text())
         assert all("--hash=sha256:" in line for line in text.splitlines() if not line.startswith("#"))
 
@@ -43,9 +46,7 @@ def test_ready_only_for_what_was_installed(bootstrap):
     assert bootstrap.ready("dev")
 
 
-@pytest.mark.parametrize(
-    "changed", ["pyproject.toml", "requirements.lock", "requirements-hardware.lock", "requirements-dev.lock"]
-)
+@pytest.mark.parametrize("changed", ["pyproject.toml", *LOCKS])
 def test_a_changed_file_makes_it_stale(bootstrap, changed):
     bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} dev\n")
     with (bootstrap.ROOT / changed).open("a") as file:

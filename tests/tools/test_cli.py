@@ -46,6 +46,7 @@ def test_commands():
                 "soak",
                 "chaos",
                 "import",
+                "view",
                 "keys",
                 "echo",
                 "hz",

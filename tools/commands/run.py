@@ -82,7 +82,7 @@ def run(
 def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int) -> list[Run]:
     """Run in virtual time, one run for each seed from the file's on."""
     from experiments.run import simulate_seeds
-    from tools.commands.progress import Bar
+    from tools.progress import Bar
 
     first = read.experiment.seed
     with Bar(passing=True) as bar:
@@ -105,7 +105,7 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
     from experiments.real_time.conductor.conduct import conduct
     from experiments.real_time.conductor.run_view import Emergency
     from experiments.run import read_back
-    from tools.commands.progress import shown
+    from tools.progress import shown
 
     emergency = Emergency()
     with Interrupts() as interrupted:

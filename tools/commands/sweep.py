@@ -108,7 +108,7 @@ def _sweep(request: _Request) -> int:
 
     from experiments.sweep import table as sweep_table
     from experiments.sweep.sweep import sweep
-    from tools.commands.progress import Bar
+    from tools.progress import Bar
 
     with Bar() as bar:
         found = sweep(
@@ -143,7 +143,7 @@ def _optimise(request: _Request, wished: str) -> int:
 
     from experiments.sweep import table as sweep_table
     from experiments.sweep.optimise import tune
-    from tools.commands.progress import Bar
+    from tools.progress import Bar
 
     try:
         with Bar() as bar:

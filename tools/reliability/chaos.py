@@ -148,7 +148,7 @@ def _kinds(given: Sequence[str]) -> list[str]:
 
 
 def _print(result: ChaosResult) -> None:
-    from tools.commands.progress import print_findings
+    from tools.progress import print_findings
     from tools.reliability import chaos_report
 
     made = chaos_report.table(result)

@@ -112,7 +112,7 @@ def soak(
     from agents.runtime.command_line import Interrupts
     from experiments.file.document import chosen, load, loads
     from experiments.recording.run_folder import SOURCE, new_folder
-    from tools.commands.progress import print_findings
+    from tools.progress import print_findings
     from tools.reliability import soak_verdict
     from tools.reliability.run_process import Request
     from tools.reliability.soak_sampler import sample

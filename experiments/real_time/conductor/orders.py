@@ -1,18 +1,29 @@
-"""Orders to robots, to the world and to the conductor of a run, from outside of them."""
+"""Orders to robots, to the world and to the conductor of a run, from outside of them; the emergency stop of a run."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Sequence
-from typing import Final, TypeVar
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import zenoh
 
-from agents.network import messages
+from agents.network import endpoints as topology
+from agents.network import messages, pubsub
+from agents.network import session as network
 from agents.network.keys import Keys
+from agents.network.shutdown import held
+
+if TYPE_CHECKING:
+    from agents.runtime.run_registry import Run
 
 REPLY_S: Final = 1.0
 LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then,
 LEAD_EACH_S: Final = 0.01  # with so much more for each robot
+STOP_ANSWER_S: Final = 2.0
+STOP_AGAIN_S: Final = 0.05
+STOPPED: Final = "done"
 CHANGE_S: Final = 90.0  # a robot lands, its process ends, another starts, is ready, and climbs
 
 R = TypeVar("R", messages.Reply, messages.WorldReply, messages.RunReply)
@@ -75,3 +86,77 @@ def _read(asked: Iterable[zenoh.Reply], kind: type[R]) -> tuple[R | None, str]:
         elif reply.err is not None:
             why = reply.err.payload.to_bytes().decode(errors="replace")
     return None, why
+
+
+@dataclass
+class EmergencyStop:
+    """An emergency stop at the routers of one run."""
+
+    endpoints: Sequence[str]
+    realm: str
+    identity: str  # whose certificate is shown, in a lab
+    run: Run | None = None  # None: only the routers are known
+    seen: set[str] = field(default_factory=set)  # robots that were alive
+    moving: set[str] = field(default_factory=set)  # those of them without a report of their stop
+    failure: Exception | None = None  # why the routers cannot be reached
+
+    @property
+    def where(self) -> str:
+        return f"at {', '.join(topology.bare(self.endpoints))}" if self.run is None else self.run.words
+
+    @property
+    def expected(self) -> bool:
+        """Whether robots must be alive: the process of a run on this machine is."""
+        return self.run is not None and self.run.what == "run" and self.run.alive
+
+    def send(self, reason: str) -> None:
+        """Send the stop until every robot that is alive reports that it has stopped."""
+        try:
+            self._send(reason)
+        except Exception as error:  # noqa: BLE001 - the others are stopped whatever happens to this one
+            self.failure = error
+
+    def _send(self, reason: str) -> None:
+        keys = Keys(self.realm)
+        # a robot that does not answer must not delay the others' stop
+        opened = network.open_session(self.endpoints, name="estop", wait_s=2.0, identity=self.identity, gather_s=0.0)
+        with held(opened) as (session, declared):
+            stop = messages.encode(messages.Stop(self.identity, reason))
+            urgent = session.declare_publisher(
+                keys.estop,
+                encoding=messages.JSON,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.REAL_TIME,
+                express=True,
+            )
+            urgent.put(stop)
+            begun = time.monotonic()
+            statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
+            declared += [urgent, statuses]
+            self.seen = {
+                keys.robot(str(reply.ok.key_expr))
+                for reply in session.liveliness().get(keys.alive("*"), timeout=STOP_ANSWER_S)
+                if reply.ok is not None
+            }
+            self.moving = set(self.seen)
+            watch = pubsub.AliveWatch(session, keys.alive("*"))
+            while (self.moving or self._awaited(session, begun)) and time.monotonic() < begun + STOP_ANSWER_S:
+                urgent.put(stop)
+                time.sleep(STOP_AGAIN_S)
+                for token in network.received(watch.handler):
+                    robot = keys.whose(str(token.key_expr))
+                    if robot is not None and token.kind == zenoh.SampleKind.PUT and robot not in self.seen:
+                        self.seen.add(robot)
+                        self.moving.add(robot)
+                for sample in network.received(statuses.handler):
+                    try:
+                        status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
+                    except messages.Malformed:
+                        continue
+                    if status.phase == STOPPED and keys.robot(str(sample.key_expr)) == status.robot:
+                        self.moving.discard(status.robot)
+
+    def _awaited(self, session: zenoh.Session, begun: float) -> bool:
+        """Whether more members of a mesh may still be linked."""
+        late = time.monotonic() > begun + network.GATHER_S
+        return topology.is_mesh(self.endpoints) and not late and network.count_links(session) < len(self.endpoints)

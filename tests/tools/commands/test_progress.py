@@ -7,7 +7,7 @@ import time
 import pytest
 
 from experiments.real_time.conductor.run_view import Progress, RobotView
-from tools.commands.progress import Lines, Table
+from tools.progress import Lines, Table
 
 
 @pytest.mark.parametrize("kind", [Lines, Table])

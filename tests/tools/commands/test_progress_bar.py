@@ -4,8 +4,8 @@ import io
 
 import pytest
 
-from tools.commands import progress as module
-from tools.commands.progress import Bar
+from tools import progress as module
+from tools.progress import Bar
 
 
 class Terminal(io.StringIO):

@@ -1,0 +1,317 @@
+"""Drawing of a scene with viser: a thin layer over `stage` and `models`. Robots of a kind are one batched mesh.
+
+Nothing is sent that has not changed; callers wrap a round of `draw` in `server.atomic()`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask
+from agents.network.messages import Ranges
+from experiments.scene import models
+from experiments.scene import stage as appearance
+from experiments.scene.stage import NOWHERE, Colour, Colours, Moment, Stage, chassis
+
+if TYPE_CHECKING:
+    import viser
+
+LABELS: Final = 24  # names of more robots are shown only where something is wrong, and of leaders
+LABEL_ROUNDS: Final = 3  # of more robots than that, labels move at every third round
+SHADOWS: Final = 24  # shadows of more robots cost a browser without a graphics card too much
+TALL: Final = 1.2  # [m] walls and obstacles are drawn no higher
+
+
+@dataclass(frozen=True)
+class Look:
+    """Colours of what is no robot."""
+
+    background: Colour
+    grid: Colour
+    section: Colour
+    edge: Colour
+    obstacle: Colour
+
+
+LIGHT: Final = Look((255, 255, 255), (226, 228, 232), (190, 193, 200), (90, 94, 102), (168, 172, 180))
+DARK: Final = Look((27, 28, 31), (52, 54, 60), (78, 82, 90), (150, 155, 165), (105, 110, 120))
+
+
+@dataclass
+class Shown:
+    """Parts that are drawn on demand."""
+
+    names: bool = True
+    trails: bool = True
+    goals: bool = True
+    links: bool = True
+    ranges: bool = False
+    margins: bool = False
+
+
+@dataclass
+class _Kind:
+    """Robots of one kind: their rows and their meshes."""
+
+    rows: Index
+    parts: list[Any]  # body, accent
+    ghosts: Any
+    shadows: Any | None
+    shadow_rows: Index
+
+
+class SceneDrawing:
+    """One case in a scene."""
+
+    def __init__(self, server: viser.ViserServer, stage: Stage, look: Look, root: str = "/case") -> None:
+        """Draws what does not move.
+
+        Args:
+            server: Of the page.
+            stage: Of the case.
+            look: Colours.
+            root: Name of the node that carries everything; `offset` moves it.
+        """
+        self._scene, self.stage, self._look, self._root = server.scene, stage, look, root
+        self.shown = Shown()
+        self._round = 0
+        self._offset = (0.0, 0.0, 0.0)
+        self._frame = self._scene.add_frame(root, show_axes=False)
+        self._few = len(stage.names) <= LABELS
+        self._add_arena()
+        self._obstacles = [self._add_obstacle(number) for number in range(len(stage.scene.names))]
+        self._kinds = [self._add_kind(name) for name in dict.fromkeys(kind.name for kind in stage.kinds)]
+        rows, net = len(stage.names), len(stage.links)
+        hidden = np.tile(np.array(NOWHERE), (max(net, 1), 2, 1))
+        self._links = self._lines("links", hidden, thickness=2.0)
+        self._lit = self._lines("lit", hidden, thickness=5.0)
+        self._broken = self._lines("broken", hidden[:1], thickness=2.0)
+        self._drops = self._lines("drops", np.tile(np.array(NOWHERE), (rows, 2, 1)), look.section, thickness=1.0)
+        self._trails = self._ranges = self._margins = None
+        ring = models.annulus(1.55, 1.95)
+        self._rings = self._batch("rings", ring, rows, scales=stage.radius, cast=False)
+        self._labels: dict[int, Any] = {}
+        self._texts: dict[int, str] = {}
+
+    @property
+    def offset(self) -> tuple[float, float, float]:
+        """Place of the arena's middle in the scene [m]."""
+        return self._offset
+
+    @offset.setter
+    def offset(self, place: tuple[float, float, float]) -> None:
+        self._offset = place
+        self._frame.position = place
+
+    def remove(self) -> None:
+        """Removes everything."""
+        self._frame.remove()
+
+    # ------------------------------------------------------------------ what does not move
+
+    def _add_arena(self) -> None:
+        stage, look = self.stage, self._look
+        x, y, _ = (stage.scene.high - stage.scene.low).tolist()
+        step = 0.25 if max(x, y) <= 6.0 else 1.0
+        self._scene.add_grid(
+            f"{self._root}/floor", width=x, height=y, cell_size=step, section_size=4.0 * step, cell_color=look.grid,
+            section_color=look.section, shadow_opacity=0.25 if self._few else 0.0, fade_distance=60.0,
+        )  # fmt: skip
+        corner = 0.5 * np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
+        if stage.scene.walled:
+            height = min(0.12, 0.05 * max(x, y))
+            panels = [models.panel(a, b, 0.0, height) for a, b in zip(corner, np.roll(corner, -1, 0), strict=True)]
+            self._mesh("border", models.joined(*panels), look.edge, opacity=0.35)
+        else:
+            ring = np.stack([corner, np.roll(corner, -1, 0)], axis=1)
+            self._lines("border", np.concatenate([ring, np.zeros((4, 2, 1))], axis=2), look.edge, thickness=2.0)
+        experiment = stage.experiment
+        for name, start in ({} if experiment is None else experiment.arena.starts).items():
+            half = 0.5 * np.array(start.size)
+            ring = np.array(start.at) + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+            ends = np.stack([ring, np.roll(ring, -1, 0)], axis=1)
+            self._lines(f"starts/{name}", np.concatenate([ends, np.full((4, 2, 1), 0.002)], axis=2), look.section)
+
+    def _add_obstacle(self, number: int) -> Any:  # noqa: ANN401 - handles of viser
+        stage, scene = self.stage, self.stage.scene
+        low = float(scene.bottom[number])
+        if scene.top[number] > low + TALL:  # up to the ceiling: would hide what stands behind it
+            scene = replace(scene, top=np.where(np.arange(len(scene.top)) == number, low + TALL, scene.top))
+        opacity = 0.55 if np.isfinite(scene.mass[number]) else 0.85
+        return self._mesh(
+            f"obstacles/{stage.scene.names[number]}", models.obstacle(scene, number), self._look.obstacle, opacity
+        )
+
+    def _add_kind(self, name: str) -> _Kind:
+        stage = self.stage
+        rows = np.array([row for row, kind in enumerate(stage.kinds) if kind.name == name], dtype=np.intp)
+        model = models.MODELS[name]
+        colours, place = stage.colours[rows], chassis(stage)[rows]
+        parts = [
+            self._batch(f"robots/{name}/body", model.body, len(rows), place),
+            self._batch(f"robots/{name}/accent", model.accent, len(rows), colours),
+        ]
+        ghosts = self._batch(f"goals/{name}", model.whole, len(rows), colours, opacity=0.22, cast=False)
+        beside = np.flatnonzero(stage.shadowed[rows])
+        shadows = None
+        if len(beside):
+            shadows = self._batch(f"shadows/{name}", model.whole, len(beside), colours[beside], opacity=0.5, cast=False)
+        return _Kind(rows, parts, ghosts, shadows, rows[beside])
+
+    def _batch(
+        self, name: str, mesh: models.Mesh, count: int, colours: Colours | None = None, *,
+        opacity: float | None = None, scales: Array | None = None, cast: bool = True,
+    ) -> Any:  # fmt: skip # noqa: ANN401
+        """`count` copies of a mesh, out of sight."""
+        return self._scene.add_batched_meshes_simple(
+            f"{self._root}/{name}", mesh.vertices.astype(np.float32), mesh.faces,
+            np.tile(np.array([1.0, 0.0, 0.0, 0.0]), (count, 1)), np.tile(np.array(NOWHERE), (count, 1)),
+            batched_scales=scales, batched_colors=np.full((count, 3), 128, np.uint8) if colours is None else colours,
+            opacity=opacity, lod="off", flat_shading=True, cast_shadow=cast and len(self.stage.names) <= SHADOWS,
+            receive_shadow=False,
+        )  # fmt: skip
+
+    def _mesh(self, name: str, mesh: models.Mesh, colour: Colour, opacity: float | None = None) -> Any:  # noqa: ANN401
+        return self._scene.add_mesh_simple(
+            f"{self._root}/{name}", mesh.vertices.astype(np.float32), mesh.faces, color=colour, opacity=opacity,
+            flat_shading=True, side="double", cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+
+    def _lines(self, name: str, ends: Array, colours: Any = (140, 140, 140), thickness: float = 1.5) -> Any:  # noqa: ANN401
+        return self._scene.add_line_segments(
+            f"{self._root}/{name}", ends.astype(np.float32), colours, thickness=thickness, thickness_units="screen"
+        )
+
+    # ------------------------------------------------------------------ what moves
+
+    def draw(self, moment: Moment, *, trails: bool = True, scans: Mapping[str, Ranges] | None = None) -> None:
+        """Draws a moment; `trails`: they have changed since the last one. `scans`: last range readings by robot."""
+        self._round += 1
+        self._draw_robots(moment)
+        self._draw_links(moment)
+        for handle, pose in zip(self._obstacles, moment.obstacles, strict=True):
+            if not _same(handle, pose):
+                handle.position, handle.wxyz = (pose[0], pose[1], 0.0), appearance.quaternions(pose[2])
+        if trails:
+            self._draw_trails(moment)
+        self._draw_margins(moment)
+        self._draw_ranges(moment, scans or {})
+        if self._few or self._round % LABEL_ROUNDS == 1:
+            self._draw_labels(moment)
+
+    def _draw_robots(self, moment: Moment) -> None:
+        place, turned = appearance.shown(moment.position), appearance.orientation(moment)
+        goals = appearance.shown(moment.goal) if self.shown.goals else np.broadcast_to(np.array(NOWHERE), place.shape)
+        accents = appearance.accents(self.stage, moment)
+        for kind in self._kinds:
+            rows = kind.rows
+            for part in kind.parts:
+                part.batched_positions, part.batched_wxyzs = place[rows], turned[rows]
+            _update(kind.parts[1], "batched_colors", accents[rows])
+            _update(kind.ghosts, "batched_positions", goals[rows])
+            if self.shown.goals:
+                kind.ghosts.batched_wxyzs = turned[rows]
+            if kind.shadows is not None and moment.shadow is not None:
+                kind.shadows.batched_positions = appearance.shown(moment.shadow[kind.shadow_rows])
+                if moment.shadow_yaw is not None:
+                    kind.shadows.batched_wxyzs = appearance.quaternions(moment.shadow_yaw[kind.shadow_rows])
+        rings, colours = appearance.rings(moment)
+        _update(self._rings, "batched_positions", rings)
+        _update(self._rings, "batched_colors", colours)
+        below = moment.position.copy()
+        below[:, 2] = 0.0
+        high = self.stage.flies & (moment.position[:, 2] > 0.05)
+        _update(self._drops, "points", appearance.visible(np.stack([moment.position, below], axis=1), high))
+
+    def _draw_links(self, moment: Moment) -> None:
+        if not len(self.stage.links):
+            return
+        ends = appearance.segments(self.stage, moment)
+        colours = appearance.link_colours(moment.error)
+        both = np.repeat(colours[:, None], 2, axis=1)
+        there = np.isfinite(moment.error) & self.shown.links
+        whole = there & ~moment.broken
+        _update(self._links, "points", appearance.visible(ends, whole))
+        _update(self._links, "colors", both)
+        _update(self._lit, "points", appearance.visible(ends, whole & appearance.lit(self.stage, moment)))
+        _update(self._lit, "colors", both)
+        gaps = self.shown.links & moment.broken
+        dashes = appearance.dashes(np.where(gaps[:, None, None], ends, np.nan))
+        _update(self._broken, "points", dashes if len(dashes) else np.array([[NOWHERE, NOWHERE]]))
+
+    def _draw_trails(self, moment: Moment) -> None:
+        count = moment.trail.shape[1]
+        if count < 2:
+            return
+        ends = appearance.trail_segments(moment.trail)
+        if not self.shown.trails:
+            ends = np.broadcast_to(np.array(NOWHERE), ends.shape)
+        if self._trails is None or self._trails.points.shape != ends.shape:
+            colours = appearance.trail_colours(self.stage, count, self._look.background)
+            self._trails = self._lines("trails", ends, colours, thickness=2.5)
+        _update(self._trails, "points", ends)
+
+    def _draw_margins(self, moment: Moment) -> None:
+        if self.shown.margins and self._margins is None:
+            outer = self.stage.radius + max(self.stage.margin, 0.0)
+            self._margins = self._batch(
+                "margins", models.annulus(0.92, 1.0), len(outer), self.stage.colours, scales=outer, cast=False
+            )
+        if self._margins is not None:
+            hidden = np.full_like(moment.position, np.nan)
+            _update(
+                self._margins, "batched_positions", appearance.shown(moment.position if self.shown.margins else hidden)
+            )
+
+    def _draw_ranges(self, moment: Moment, scans: Mapping[str, Ranges]) -> None:
+        if not self.shown.ranges and self._ranges is None:
+            return
+        ends = appearance.rays(self.stage, moment, scans if self.shown.ranges else {})
+        if self._ranges is None:
+            self._ranges = self._lines("ranges", ends, (230, 80, 80), thickness=1.0)
+        _update(self._ranges, "points", ends)
+
+    def _draw_labels(self, moment: Moment) -> None:
+        wanted: Mask = np.isfinite(moment.position).all(axis=1) & np.asarray(self.shown.names)
+        if not self._few:
+            notable = np.isin(moment.condition, appearance.RINGED) | self._leading()
+            wanted &= notable & (np.cumsum(wanted & notable) <= LABELS)
+        for row in [row for row in self._labels if not wanted[row]]:
+            self._labels.pop(row).remove()
+        for row in np.flatnonzero(wanted).tolist():
+            text = appearance.label(self.stage, row, int(moment.condition[row]))
+            at = moment.position[row] + np.array([0.0, 0.0, self.stage.kinds[row].height + 0.05])
+            handle = self._labels.get(row)
+            if handle is None or self._texts[row] != text:
+                if handle is not None:
+                    handle.remove()
+                self._texts[row] = text
+                self._labels[row] = self._scene.add_label(
+                    f"{self._root}/names/{row}", text, position=at, anchor="bottom-center", font_screen_scale=0.75
+                )
+            elif np.abs(handle.position - at).max() > 1e-4:
+                handle.position = at
+
+    def _leading(self) -> Mask:
+        return np.isin(np.array(self.stage.names), self.stage.leaders)
+
+
+def _same(handle: Any, pose: Array) -> bool:  # noqa: ANN401
+    """Whether an obstacle is drawn at this pose already."""
+    place = np.array([pose[0], pose[1], 0.0])
+    return bool(
+        np.abs(handle.position - place).max() < 1e-5
+        and np.abs(handle.wxyz - appearance.quaternions(pose[2])).max() < 1e-5
+    )
+
+
+def _update(handle: Any, name: str, value: Array | Colours) -> None:  # noqa: ANN401
+    """Sends an array if it differs from what was sent last."""
+    last = getattr(handle, name)
+    value = value.astype(last.dtype)
+    if last.shape != value.shape or not np.array_equal(last, value):
+        setattr(handle, name, value)

@@ -1,0 +1,394 @@
+"""Scene model: what a case looks like at one moment, from poses, statuses, links and obstacles. Pure; needs no browser.
+
+`Stage` is what stays for a whole case, `Moment` what changes; functions turn both into positions and colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import cached_property
+from math import inf
+from typing import Final, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.arrays import Array, Index, Mask, norm
+from agents.body.kinds import KHEPERA4, Kind
+from agents.decision.lifecycle import Phase
+from agents.formation.changes import Reshaping
+from agents.formation.graph import Links, links
+from agents.network.messages import EMERGENCY, Ranges, Status
+from agents.plugins import registry
+from experiments.definition import bodies
+from experiments.definition.bodies import WORLD
+from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
+from twins.scene import Scene
+
+Colours = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+GOOD_M: Final = 0.025  # error of a link that counts as kept
+FAIR_M: Final = 0.05
+SILENT_S: Final = 3.0  # without a status for so long a robot counts as silent
+FLASH_S: Final = 0.12  # a link is lit for so long after its sender transmits
+TRAIL: Final = 60  # points of a trail
+TRAIL_S: Final = 0.2  # between two of them
+DASH_M: Final = 0.04
+NOWHERE: Final = (0.0, 0.0, -1000.0)  # where hidden parts are put: far below the floor
+
+# Okabe and Ito's colours, which the colour-blind tell apart, and two more
+ROBOTS: Final[tuple[Colour, ...]] = (
+    (0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0), (120, 94, 240),
+    (153, 153, 51),
+)  # fmt: skip
+GOOD, FAIR, BAD, UNKNOWN = (0, 158, 115), (230, 159, 0), (213, 50, 30), (140, 140, 140)
+
+
+class Place(IntEnum):
+    """Where the body of a robot is."""
+
+    TWIN = 0  # simulated in the robot's own process
+    WORLD = 1  # simulated in a world
+    REAL = 2  # hardware, or a simulator of another program
+
+
+PLACES: Final = {Place.TWIN: "own twin", Place.WORLD: "in the world", Place.REAL: "real"}
+CHASSIS: Final[dict[Place, Colour]] = {
+    Place.TWIN: (236, 236, 232), Place.WORLD: (128, 132, 140), Place.REAL: (38, 40, 44),
+}  # fmt: skip
+
+
+class Condition(IntEnum):
+    """Condition of a robot, as it is shown; the numbers grow with what needs attention."""
+
+    ACTIVE = 0
+    WAITING = 1  # not airborne yet
+    DONE = 2
+    LANDING = 3
+    HELD = 4
+    SILENT = 5  # its last status is old
+    STOPPED = 6  # by an emergency stop
+    DEAD = 7  # its liveliness token is gone
+
+
+CONDITIONS: Final[dict[Condition, tuple[str, Colour]]] = {
+    Condition.ACTIVE: ("", (0, 158, 115)),
+    Condition.WAITING: ("waits", (150, 150, 150)),
+    Condition.DONE: ("done", (120, 140, 170)),
+    Condition.LANDING: ("landing", (86, 180, 233)),
+    Condition.HELD: ("held", (230, 159, 0)),
+    Condition.SILENT: ("silent", (160, 110, 200)),
+    Condition.STOPPED: ("stopped", (213, 50, 30)),
+    Condition.DEAD: ("dead", (213, 50, 30)),
+}
+RINGED: Final = (Condition.LANDING, Condition.HELD, Condition.SILENT, Condition.STOPPED, Condition.DEAD)
+PALED: Final = (Condition.SILENT, Condition.STOPPED, Condition.DEAD)
+
+
+def condition(status: Status | None, *, alive: bool, age_s: float) -> Condition:
+    """Condition of a robot.
+
+    Args:
+        status: Its last one; None if it never sent any.
+        alive: Whether its liveliness token stands.
+        age_s: Time since that status [s].
+    """
+    if status is None:
+        return Condition.WAITING if alive else Condition.DEAD
+    phase = status.phase
+    for case, applies in (
+        (Condition.STOPPED, status.reason.startswith(EMERGENCY)),
+        (Condition.DONE, phase == Phase.DONE.word),
+        (Condition.DEAD, not alive),
+        (Condition.SILENT, age_s > SILENT_S),
+        (Condition.LANDING, phase == Phase.LANDING.word),
+        (Condition.WAITING, phase in (Phase.IDLE.word, Phase.READY.word)),
+        (Condition.HELD, status.hazard.startswith("hold")),
+    ):
+        if applies:
+            return case
+    return Condition.ACTIVE
+
+
+def place_of(body: str) -> Place:
+    """Where the body with this address is."""
+    if body == WORLD:
+        return Place.WORLD
+    name = registry.body_name(body)
+    return Place.TWIN if name == "twin" or name in registry.names(registry.DEVICES) else Place.REAL
+
+
+T = TypeVar("T")
+
+
+def _there(plug_in: Callable[[], T]) -> T | None:
+    """A plug-in of an experiment; None where it is not installed."""
+    try:
+        return plug_in()
+    except (registry.PluginError, msgspec.ValidationError):
+        return None
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What stays for a whole case: N robots, E links, M obstacles."""
+
+    title: str
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+    places: tuple[Place, ...]
+    shadowed: Mask  # (N,) with a twin beside the robot
+    scene: Scene
+    links: Links
+    leaders: tuple[str, ...]
+    margin: float  # [m] between surfaces, kept by avoidance; 0 without any
+    experiment: Experiment | None = None  # None: only the robots are known
+    plan: Plan | None = field(default=None, repr=False)
+
+    @classmethod
+    def of_experiment(cls, experiment: Experiment) -> Stage:
+        """The stage of one case."""
+        plan = Plan(experiment)
+        avoidance = _there(lambda: plan.avoidance)
+        formation = _there(lambda: plan.formation)
+        margin = getattr(avoidance, "margin", getattr(avoidance, "clearance", 0.0)) or 0.0
+        return cls(
+            title=experiment.title,
+            names=plan.names,
+            kinds=plan.kinds,
+            places=tuple(place_of(robot.body) for robot in experiment.robots.values()),
+            shadowed=np.array([robot.shadow is not None for robot in experiment.robots.values()], dtype=bool),
+            scene=bodies.scene(experiment),
+            links=links([]) if formation is None else formation.links,
+            leaders=() if formation is None else plan.leaders,
+            margin=float(margin),
+            experiment=experiment,
+            plan=plan,
+        )
+
+    @classmethod
+    def of_robots(cls, names: tuple[str, ...]) -> Stage:
+        """Robots of which nothing but their names is known."""
+        everywhere = Scene.furnished((4.0, 4.0, 2.5), {}, {}, walled=False)
+        return cls(
+            "", names, (KHEPERA4,) * len(names), (Place.TWIN,) * len(names), np.zeros(len(names), dtype=bool),
+            everywhere, links([]), (), 0.0,
+        )  # fmt: skip
+
+    @cached_property
+    def colours(self) -> Colours:
+        """Colour of each robot (N, 3)."""
+        return np.array([ROBOTS[row % len(ROBOTS)] for row in range(len(self.names))], dtype=np.uint8).reshape(-1, 3)
+
+    @cached_property
+    def radius(self) -> Array:
+        """Horizontal half-size of each robot (N,) [m]."""
+        return np.array([kind.radius for kind in self.kinds])
+
+    @cached_property
+    def flies(self) -> Mask:
+        """Robots that fly (N,)."""
+        return np.array([kind.flies for kind in self.kinds], dtype=bool)
+
+
+@dataclass
+class Moment:
+    """State of a case at one moment; unknown numbers are NaN."""
+
+    position: Array  # (N, 3) [m] true if known, else measured
+    yaw: Array  # (N,) [rad]
+    goal: Array  # (N, 3) [m]
+    condition: Index  # (N,) of `Condition`
+    silent_for: Array  # (N,) [s] since the last transmission of each robot
+    error: Array  # (E,) [m] of each link; NaN: unknown, or the link is not there
+    broken: Mask  # (E,) links whose receiver does not get poses of its sender
+    obstacles: Array  # (M, 3) x, y [m], yaw [rad]
+    trail: Array  # (N, K, 3) [m] former positions, the newest first
+    attitude: Array | None = None  # (N, 4) quaternions w, x, y, z; NaN: only yaw is known
+    shadow: Array | None = None  # (N, 3) [m] of the twins beside the robots
+    shadow_yaw: Array | None = None  # (N,) [rad]
+    time: float | None = None  # [s] since the common start; None before it
+
+    @classmethod
+    def unknown(cls, stage: Stage) -> Moment:
+        """Nothing is known yet."""
+        rows, net = len(stage.names), len(stage.links)
+        blank = np.full((rows, 3), np.nan)
+        return cls(
+            blank, np.full(rows, np.nan), blank.copy(), np.full(rows, int(Condition.WAITING)), np.full(rows, inf),
+            np.full(net, np.nan), np.zeros(net, dtype=bool), stage.scene.pose.copy(), np.zeros((rows, 0, 3)),
+        )  # fmt: skip
+
+
+class LinkTracker:
+    """Errors of the links as the law measures them, along a motion."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        plan = stage.plan
+        self._law = None if plan is None else _there(lambda: plan.law)
+        formation = None if plan is None or self._law is None else plan.formation
+        self._reshaping = None
+        if formation is not None and (formation.changes or formation.presence is not None):
+            self._reshaping = Reshaping(formation.links, formation.changes, formation.presence)
+
+    def errors(self, time: float | None, position: Array) -> Array:
+        """Error of each link (E,) [m], NaN for those that are not there, at a time since the common start [s]."""
+        net = self._stage.links
+        if self._law is None or not len(net):
+            return np.full(len(net), np.nan)
+        present = None
+        if self._reshaping is not None:
+            since = np.full(len(position), 0.0 if time is None else time)
+            self._reshaping.advance(since, position, position[net.sender])
+            net, present = self._reshaping.links, self._reshaping.present
+        error = self._law.error(position, position[net.sender], net)
+        return error if present is None else np.where(present, error, np.nan)
+
+    def of_robots(self, error: Array) -> Array:
+        """Sum of the errors of the links on which each robot receives (N,) [m], or sends if it receives on none."""
+        net, rows = self._stage.links, len(self._stage.names)
+        known = np.nan_to_num(error)
+        received = np.bincount(net.receiver, known, minlength=rows)
+        sent = np.bincount(net.sender, known, minlength=rows)
+        receives = np.bincount(net.receiver, minlength=rows) > 0
+        return np.asarray(np.where(receives, received, sent))
+
+
+class Trail:
+    """Former positions of N robots, the newest first."""
+
+    def __init__(self, rows: int) -> None:
+        self.points = np.full((rows, TRAIL, 3), np.nan)  # [m]
+        self._last = -inf
+
+    def add(self, t: float, position: Array) -> bool:
+        """Positions (N, 3) [m] at `t` [s], which go on; returns whether they are kept as new points."""
+        if 0.0 <= t - self._last < TRAIL_S - 1e-6:
+            return False
+        self._last = t
+        self.points = np.concatenate([position[:, None], self.points[:, :-1]], axis=1)
+        return True
+
+
+# ---------------------------------------------------------------------- appearance
+
+
+def quaternions(yaw: Array) -> Array:
+    """Quaternions w, x, y, z (..., 4) of rotations about z by `yaw` (...) [rad]; of unknown ones, none."""
+    half = 0.5 * np.nan_to_num(yaw)
+    zero = np.zeros_like(half)
+    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+
+
+def orientation(moment: Moment) -> Array:
+    """Quaternion w, x, y, z of each robot (N, 4)."""
+    turned = quaternions(moment.yaw)
+    if moment.attitude is None:
+        return turned
+    known = np.isfinite(moment.attitude).all(axis=1, keepdims=True)
+    return np.where(known, moment.attitude, turned)
+
+
+def shown(position: Array) -> Array:
+    """Positions (..., 3) [m] with unknown ones hidden below the floor."""
+    return np.where(np.isfinite(position).all(axis=-1, keepdims=True), position, NOWHERE)
+
+
+def link_colours(error: Array) -> Colours:
+    """Colours (E, 3) of links by their errors (E,) [m]."""
+    level = np.where(np.isnan(error), 3, (error > GOOD_M).astype(int) + (error > FAIR_M))
+    return np.array([GOOD, FAIR, BAD, UNKNOWN], dtype=np.uint8)[level]
+
+
+def segments(stage: Stage, moment: Moment) -> Array:
+    """Both ends (E, 2, 3) of each link, NaN where one is unknown [m]: the middles of the bodies."""
+    middle = moment.position + 0.5 * np.array([[0.0, 0.0, kind.height] for kind in stage.kinds]).reshape(-1, 3)
+    return np.stack([middle[stage.links.sender], middle[stage.links.receiver]], axis=1)
+
+
+def visible(ends: Array, which: Mask) -> Array:
+    """Segments (E, 2, 3) with those hidden that are not chosen, or not known."""
+    there = which & np.isfinite(ends).all(axis=(1, 2))
+    return np.where(there[:, None, None], ends, NOWHERE)
+
+
+def dashes(ends: Array) -> Array:
+    """Dashes (K, 2, 3) along segments (E, 2, 3), those that are unknown left out."""
+    known = ends[np.isfinite(ends).all(axis=(1, 2))]
+    made = []
+    for a, b in known:
+        length = float(norm(b - a))
+        count = max(1, round(length / (2.0 * DASH_M)))
+        begin = np.arange(count) / count
+        share = np.stack([begin, begin + 0.5 / count], axis=1)[..., None]
+        made.append(a + share * (b - a))
+    return np.concatenate(made) if made else np.zeros((0, 2, 3))
+
+
+def lit(stage: Stage, moment: Moment) -> Mask:
+    """Links (E,) whose sender has just transmitted."""
+    return np.asarray(moment.silent_for[stage.links.sender] <= FLASH_S)
+
+
+def accents(stage: Stage, moment: Moment) -> Colours:
+    """Colours (N, 3) of the coloured parts of the robots: grey for those that are silent, stopped or dead."""
+    pale = np.isin(moment.condition, PALED)
+    return np.where(pale[:, None], np.array([105, 105, 105], dtype=np.uint8), stage.colours)
+
+
+def chassis(stage: Stage) -> Colours:
+    """Colours (N, 3) of the other parts, by the place of the body."""
+    return np.array([CHASSIS[place] for place in stage.places], dtype=np.uint8).reshape(-1, 3)
+
+
+def rings(moment: Moment) -> tuple[Array, Colours]:
+    """Places (N, 3) [m] and colours (N, 3) of the rings around robots that need attention; others are hidden."""
+    wanted = np.isin(moment.condition, RINGED)[:, None]
+    colours = np.array([CONDITIONS[Condition(int(each))][1] for each in moment.condition], dtype=np.uint8)
+    return shown(np.where(wanted, moment.position, np.nan)), colours.reshape(-1, 3)
+
+
+def label(stage: Stage, row: int, condition: int) -> str:
+    """Text beside a robot: its name, the place of its body unless it is an own twin, and its condition."""
+    words = [stage.names[row]]
+    if stage.places[row] != Place.TWIN:
+        words.append(PLACES[stage.places[row]])
+    if condition in RINGED:
+        words.append(CONDITIONS[Condition(condition)][0].upper())
+    return " · ".join(words)
+
+
+def rays(stage: Stage, moment: Moment, scans: Mapping[str, Ranges]) -> Array:
+    """Range readings (K, 2, 3) [m] as lines from the robots to what they see; one hidden line if there are none."""
+    made = []
+    for row, name in enumerate(stage.names):
+        scan = scans.get(name)
+        if scan is None or not np.isfinite(moment.position[row]).all():
+            continue
+        reach = np.array([np.nan if each is None else each for each in scan.distance])
+        there = np.isfinite(reach)
+        bearing = np.array(scan.bearing)[there] + np.nan_to_num(moment.yaw[row])
+        up, reach = np.array(scan.elevation)[there], reach[there]
+        way = np.stack([np.cos(up) * np.cos(bearing), np.cos(up) * np.sin(bearing), np.sin(up)], axis=1)
+        begin = moment.position[row] + np.array([0.0, 0.0, 0.8 * stage.kinds[row].height])
+        made.append(np.stack([np.broadcast_to(begin, way.shape), begin + reach[:, None] * way], axis=1))
+    return np.concatenate(made) if made else np.array([[NOWHERE, NOWHERE]])
+
+
+def trail_segments(trail: Array) -> Array:
+    """Segments (N·(K−1), 2, 3) of trails (N, K, 3) [m]; hidden where a point is unknown."""
+    pairs = np.stack([trail[:, :-1], trail[:, 1:]], axis=2).reshape(-1, 2, 3)
+    return visible(pairs, np.ones(len(pairs), dtype=bool))
+
+
+def trail_colours(stage: Stage, points: int, background: Colour) -> Colours:
+    """Colours (N·(K−1), 2, 3) of such segments: from the robot's colour to the background."""
+    share = np.linspace(0.15, 1.0, points)[None, :, None]
+    faded = (1.0 - share) * stage.colours[:, None, :] + share * np.array(background)
+    return np.stack([faded[:, :-1], faded[:, 1:]], axis=2).reshape(-1, 2, 3).astype(np.uint8)

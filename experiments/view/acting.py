@@ -1,0 +1,194 @@
+"""Orders of the page: emergency stop, land, hold, resume, a leader's target, parameters; each is an event."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+import numpy as np
+import zenoh
+
+from agents.clock import Clock
+from agents.network import endpoints as topology
+from agents.network import lab, messages, pubsub
+from agents.network.keys import Keys
+from experiments.real_time.conductor import orders
+from experiments.scene.stage import Moment, Stage
+
+if TYPE_CHECKING:
+    import viser
+
+    from agents.runtime.run_registry import Run
+
+REASON: Final = "button of zenpark view"
+SETTLED_S: Final = 0.4  # after the last move of a slider or target its value is sent
+SLIDERS: Final = 6
+NOTE_S: Final = 8.0
+LAST: Final = "Repeat it with `zenpark estop`, or cut the power."
+
+
+@dataclass(frozen=True)
+class Watched:
+    """The run that is watched."""
+
+    endpoints: Sequence[str]
+    realm: str
+    identity: str  # whose certificate is shown, in a lab
+    run: Run | None = None  # of this machine, if it is registered
+
+    @property
+    def words(self) -> str:
+        """Run and routers, for people."""
+        return f"at {', '.join(topology.bare(self.endpoints))}" if self.run is None else self.run.words
+
+
+def may_act(watched: Watched) -> bool:
+    """Whether the page may give orders: on loopback without a lab, and in a lab with an operator's certificate."""
+    folder = lab.lab_of(watched.endpoints)
+    if folder is None:
+        return True
+    try:
+        known = lab.register(folder).identities.get(watched.identity)
+    except lab.LabError:  # where only the own certificate is: that of an observer
+        return False
+    return known is not None and known.role == "operator"
+
+
+class Acting:
+    """Buttons of an operator's page, and the orders that they give."""
+
+    def __init__(self, session: zenoh.Session, watched: Watched, clock: Clock | None = None) -> None:
+        self._session, self._watched, self._clock = session, watched, clock or Clock()
+        self._keys = keys = Keys(watched.realm)
+        self._events = pubsub.pose_publisher(session, keys.event, messages.JSON, pubsub.EVENTS)
+        self._urgent = session.declare_publisher(
+            keys.estop, encoding=messages.JSON, congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.REAL_TIME, express=True,
+        )  # fmt: skip
+        self._alive: Sequence[str] = ()
+        self._stage = Stage.of_robots(())
+        self._parts: list[Any] = []  # of the present stage
+        self._target: Any = None
+        self._due: dict[str, tuple[float, Callable[[], object]]] = {}  # orders that wait until a control is at rest
+        self._lock = threading.Lock()
+
+    def build(self, server: viser.ViserServer) -> None:
+        """Adds the buttons."""
+        import viser  # noqa: PLC0415 - an extra
+
+        self._server, gui = server, server.gui
+        stop = gui.add_button(
+            "EMERGENCY STOP (Shift+S)", color="red", icon=viser.Icon.HAND_STOP, order=0.0,
+            hint=f"Cuts the motors of all robots: {self._watched.words}",
+        )  # fmt: skip
+        stop.on_click(lambda _: self.emergency_stop())
+        key = gui.add_command("Emergency stop", hotkey="S", modifier="shift", icon=viser.Icon.HAND_STOP)
+        key.on_trigger(lambda _: self.emergency_stop())
+        self._folder = gui.add_folder("Orders", order=15.0)
+        with self._folder:
+            for text, what, icon in (
+                ("Hold all", "hold", viser.Icon.PLAYER_PAUSE), ("Resume all", "resume", viser.Icon.PLAYER_PLAY),
+                ("Land all", "land", viser.Icon.PLANE_ARRIVAL),
+            ):  # fmt: skip
+                button = gui.add_button(text, icon=icon)
+                button.on_click(partial(self._give, messages.Order(what)))  # type: ignore[arg-type]
+
+    def set_stage(self, stage: Stage) -> None:
+        """Another case: its parameters."""
+        self._stage = stage
+        for part in self._parts:
+            part.remove()
+        self._parts = []
+        if stage.plan is None:
+            return
+        with self._folder:
+            for name, value in parameters(stage)[:SLIDERS]:
+                slider = self._server.gui.add_slider(name, 0.0, 4.0 * value, value / 50.0, value)
+                slider.on_update(partial(self._slide, name))
+                self._parts.append(slider)
+
+    def follow(self, moment: Moment, alive: Sequence[str]) -> None:
+        """Takes in the present state, and gives orders that waited for a control to rest."""
+        self._alive = alive
+        now = time.monotonic()
+        with self._lock:
+            due = [name for name, (at, _) in self._due.items() if now >= at]
+            ready = [self._due.pop(name)[1] for name in due]
+        for order in ready:
+            threading.Thread(target=order, daemon=True).start()
+
+    # ------------------------------------------------------------------ orders
+
+    def emergency_stop(self) -> None:
+        """Cuts the motors of all robots of the run, and says which run it was and what answered."""
+        stop = messages.encode(messages.Stop(self._watched.identity, REASON))
+        self._urgent.put(stop)
+        sent = orders.EmergencyStop(self._watched.endpoints, self._watched.realm, self._watched.identity)
+        sent.run = self._watched.run
+        sent.send(REASON)
+        if sent.failure is not None:
+            said, bad = f"NOT known to have stopped: {sent.failure}. {LAST}", True
+        elif sent.moving:
+            said, bad = f"NOT known to have stopped: {', '.join(sorted(sent.moving))}. {LAST}", True
+        elif sent.seen:
+            said, bad = f"stopped: {', '.join(sorted(sent.seen))}", False
+        else:
+            said, bad = f"no robot is seen. {LAST}", True
+        self._record("emergency stop", said)
+        self._note("Emergency stop", f"{sent.where}: {said}", bad=bad, stays=True)
+
+    def _give(self, order: messages.Order, _: object = None) -> None:
+        """Gives an order to all robots that are there, and says what they answered."""
+        robots = sorted(self._alive)
+        self._report(order.order, orders.send_order(self._session, self._keys, robots, order))
+
+    def _slide(self, name: str, event: viser.GuiEvent[Any]) -> None:
+        value = float(event.target.value)
+        order = messages.Order("set", name=name, value=value)
+        self._later(name, lambda: self._set(order))
+
+    def _set(self, order: messages.Order) -> None:
+        robots = sorted(self._alive)
+        self._report(f"{order.name} = {order.value:g}", orders.send_order(self._session, self._keys, robots, order))
+
+    def _later(self, name: str, order: Callable[[], object]) -> None:
+        with self._lock:
+            self._due[name] = (time.monotonic() + SETTLED_S, order)
+
+    def _report(self, what: str, replies: dict[str, messages.Reply]) -> None:
+        refused = {name: reply.reason for name, reply in replies.items() if not reply.ok}
+        done = [name for name in replies if name not in refused]
+        said = f"{len(done)} of {len(replies)} robots"
+        if refused:
+            said += "; " + "; ".join(f"{name}: {reason}" for name, reason in list(refused.items())[:5])
+        self._record(what, said)
+        self._note(what, said, bad=bool(refused) or not replies)
+
+    def _record(self, what: str, said: str) -> None:
+        event = messages.Event(self._clock.utc(), "order", self._watched.identity, f"{what}: {said}")
+        self._events.put(messages.encode(event))
+
+    def _note(self, title: str, text: str, *, bad: bool, stays: bool = False) -> None:
+        for client in self._server.get_clients().values():
+            client.add_notification(
+                title, text, color="red" if bad else "green", auto_close_seconds=None if stays else NOTE_S
+            )
+
+
+def parameters(stage: Stage) -> list[tuple[str, float]]:
+    """Parameters that robots change in flight, by the name of the order, with their values."""
+    assert stage.plan is not None
+    assert stage.experiment is not None
+    trigger: Any = stage.plan.trigger
+    numbers = [(f"trigger.{name}", value) for name, value in msgspec.structs.asdict(trigger).items()]
+    formation = stage.experiment.formation
+    numbers += [("clamp", formation.clamp), ("tracking_gain", formation.tracking_gain)]
+    return [
+        (name, float(value)) for name, value in numbers
+        if isinstance(value, int | float) and not isinstance(value, bool) and 0.0 < value < np.inf
+    ]  # fmt: skip

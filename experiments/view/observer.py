@@ -1,0 +1,257 @@
+"""What an observer learns of a run from the network alone: the experiment, poses, statuses, transmissions, events."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from math import inf, nan
+from typing import Final
+
+import numpy as np
+import zenoh
+
+from agents.arrays import Array
+from agents.clock import Clock
+from agents.network import messages, pubsub
+from agents.network.keys import Keys
+from agents.network.session import received
+from experiments.file import document
+from experiments.file.problems import DocumentError
+from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail, condition
+
+UNKNOWN_S: Final = 2.0  # without an experiment for so long, robots are drawn of which only the names are known
+RATE_S: Final = 1.0
+DEPTH: Final = 8192  # samples between two rounds
+EVENTS: Final = 200  # kept
+
+
+@dataclass
+class RobotReport:
+    """What is known of one robot."""
+
+    state: messages.State | None = None
+    status: messages.Status | None = None
+    heard_at: float = -inf  # [s, monotonic] arrival of that status
+    alive: bool = False
+    known: bool = False  # it was alive, or reported, at some time
+    sent_at: float = -inf  # [s, monotonic] arrival of its last transmitted pose
+    sent: int = 0  # poses since the rate was computed
+    rate: float = 0.0  # [1/s] of transmitted poses, over the last second
+    delay: dict[str, float] = field(default_factory=dict)  # [s] of the last pose, by sender
+    last_incident: int = 0
+    pid: int = 0
+
+
+class Observer:
+    """A realm as it is seen from outside; polled. Needs no experiment file."""
+
+    stage: Stage
+    robots: dict[str, RobotReport]  # by name, in the order of the stage
+    events: deque[messages.Event]  # of the run, incidents of robots included, oldest first
+    world: messages.WorldState | None
+    scans: dict[str, messages.Ranges]  # last range readings, while they are asked for
+
+    def __init__(self, session: zenoh.Session, keys: Keys, clock: Clock | None = None) -> None:
+        self._session, self._keys, self._clock = session, keys, clock or Clock()
+        self._experiments = pubsub.pose_subscriber(session, keys.experiment, 4)
+        self._states = pubsub.subscriber(session, keys.state("*"), DEPTH)
+        self._poses = pubsub.subscriber(session, keys.pose("*"), DEPTH)
+        self._statuses = pubsub.Inbox(
+            pubsub.pose_subscriber(session, keys.status("*"), 1024), messages.Status, keys=keys
+        )
+        self._told = pubsub.Inbox(pubsub.pose_subscriber(session, keys.event, 256, pubsub.EVENTS), messages.Event)
+        self._worlds = pubsub.Inbox(pubsub.subscriber(session, keys.world, 8), messages.WorldState)
+        self._watch = pubsub.AliveWatch(session, keys.alive("*"))
+        self._conductor = pubsub.AliveWatch(session, keys.conductor)
+        self._ranges: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
+        self._opened = self._rated = time.monotonic()
+        self.stage = Stage.of_robots(())
+        self.robots, self.scans = {}, {}
+        self.events = deque(maxlen=EVENTS)
+        self.world, self.conducted = None, False
+        self._begin(self.stage)
+
+    # ------------------------------------------------------------------ reception
+
+    def update(self) -> bool:
+        """Takes in what has arrived; returns whether another case has begun, with another stage."""
+        now = time.monotonic()
+        changed = self._read_experiment()
+        for token in received(self._watch.handler):
+            name = self._keys.whose(str(token.key_expr))
+            if name is not None:
+                report = self._report(name)
+                report.alive = token.kind == zenoh.SampleKind.PUT
+                report.known |= report.alive
+        for _, there in self._conductor.changes():
+            self.conducted = there
+        for status in self._statuses.read():
+            self._receive_status(status, now)
+        self._read_states()
+        for sample in received(self._poses.handler):
+            name = self._keys.whose(str(sample.key_expr))
+            if name is not None:
+                report = self._report(name)
+                report.sent_at, report.sent = now, report.sent + 1
+        for event in self._told.read():
+            self.events.append(event)
+        for world in self._worlds.read():
+            self.world = world
+        self._read_ranges()
+        if now - self._rated >= RATE_S:
+            for report in self.robots.values():
+                report.rate, report.sent = report.sent / (now - self._rated), 0
+            self._rated = now
+        if not changed and self.stage.experiment is None and now - self._opened > UNKNOWN_S:
+            names = tuple(sorted(name for name, report in self.robots.items() if report.known))
+            if names != self.stage.names:
+                self._begin(Stage.of_robots(names))
+                changed = True
+        return changed
+
+    def _read_experiment(self) -> bool:
+        changed = False
+        for sample in received(self._experiments.handler):
+            try:
+                read = document.received(sample.payload.to_bytes().decode(), str(sample.key_expr))
+            except (DocumentError, UnicodeDecodeError):
+                continue  # of another version: robots are drawn without it
+            if read.experiment != self.stage.experiment:
+                self._begin(Stage.of_experiment(read.experiment))
+                self.events.clear()
+                changed = True
+        return changed
+
+    def _begin(self, stage: Stage) -> None:
+        """Another case."""
+        self.stage = stage
+        before, self.robots = self.robots, {}
+        for name in stage.names:
+            self.robots[name] = before.get(name, RobotReport())
+        for name, report in before.items():
+            self.robots.setdefault(name, report)
+        self._tracker, self._trail = LinkTracker(stage), Trail(len(stage.names))
+        self._starts = np.full(len(stage.names), nan)
+
+    def _report(self, name: str) -> RobotReport:
+        found = self.robots.get(name)
+        if found is None:
+            found = self.robots[name] = RobotReport()
+        return found
+
+    def _receive_status(self, status: messages.Status, now: float) -> None:
+        report = self._report(status.robot)
+        if status.pid != report.pid:
+            report.pid, report.last_incident = status.pid, 0
+        for incident in status.incidents:
+            if incident.seq > report.last_incident:
+                report.last_incident = incident.seq
+                if not self.conducted:  # else it says so
+                    self.events.append(messages.Event(incident.stamp, "hazard", status.robot, incident.text))
+        report.status, report.heard_at, report.known = status, now, True
+
+    def _read_states(self) -> None:
+        """The newest state of each robot; those before it are not decoded."""
+        newest = {str(sample.key_expr): sample for sample in received(self._states.handler)}
+        for key, sample in newest.items():
+            try:
+                state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
+            except messages.Malformed:
+                continue
+            if self._keys.whose(key) == state.robot:
+                report = self._report(state.robot)
+                report.state, report.known = state, True
+                for each in state.heard:
+                    report.delay[each.speaker] = each.arrived - each.stamp
+
+    def watch_ranges(self, *, wanted: bool) -> None:
+        """Receives range readings, or receives them no more."""
+        if wanted and self._ranges is None:
+            self._ranges = pubsub.subscriber(self._session, self._keys.ranges("*"), DEPTH)
+        elif not wanted and self._ranges is not None:
+            self._ranges.undeclare()  # type: ignore[no-untyped-call]
+            self._ranges = None
+            self.scans.clear()
+
+    def _read_ranges(self) -> None:
+        if self._ranges is None:
+            return
+        for key, sample in {str(sample.key_expr): sample for sample in received(self._ranges.handler)}.items():
+            try:
+                scan = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Ranges)
+            except messages.Malformed:
+                continue
+            if self._keys.whose(key) == scan.robot:
+                self.scans[scan.robot] = scan
+
+    # ------------------------------------------------------------------ what is drawn
+
+    @property
+    def elapsed(self) -> float | None:
+        """Time since the common start [s]; None before it is known."""
+        starts = [r.status.started for r in self.robots.values() if r.status is not None and r.status.started > 0.0]
+        return self._clock.utc() - min(starts) if starts else None
+
+    def moment(self) -> Moment:
+        """The case as it is now."""
+        now, stage = time.monotonic(), self.stage
+        reports = [self.robots[name] for name in stage.names]
+        states = [report.state for report in reports]
+        position = _vectors([None if s is None else s.true_position or s.position for s in states])
+        elapsed = self.elapsed
+        error = self._tracker.errors(elapsed, position)
+        self._trail.add(now, position)
+        conditions = [condition(r.status, alive=r.alive, age_s=now - r.heard_at) for r in reports]
+        under_way = [None if s is None or c in (Condition.WAITING, Condition.DONE) else s.goal
+                     for s, c in zip(states, conditions, strict=True)]  # fmt: skip
+        return Moment(
+            position=position,
+            yaw=np.array([_number(None if s is None else s.yaw if s.true_yaw is None else s.true_yaw) for s in states]),
+            goal=_vectors(under_way),
+            condition=np.array(conditions, dtype=np.intp),
+            silent_for=np.array([now - report.sent_at for report in reports]),
+            error=error,
+            broken=self._broken(reports, np.array(conditions)),
+            obstacles=self._obstacles(elapsed),
+            trail=self._trail.points,
+            attitude=_rows([None if s is None else s.attitude for s in states], 4),
+            shadow=_rows([None if s is None else s.shadow_position for s in states], 3),
+            shadow_yaw=np.array([_number(None if s is None else s.shadow_yaw) for s in states]),
+            time=elapsed,
+        )
+
+    def _broken(self, reports: list[RobotReport], conditions: Array) -> np.ndarray:
+        """Links (E,) whose sender is gone, or misses in the last status of the receiver."""
+        net, names = self.stage.links, self.stage.names
+        missing = {
+            (row, name) for row, report in enumerate(reports) if report.status is not None
+            for name in report.status.missing
+        }  # fmt: skip
+        gone = np.isin(conditions, (Condition.SILENT, Condition.STOPPED, Condition.DEAD))
+        named = [(i, names[j]) in missing for i, j in zip(net.receiver.tolist(), net.sender.tolist(), strict=True)]
+        return np.asarray(gone[net.sender] | gone[net.receiver] | np.array(named, dtype=bool))
+
+    def _obstacles(self, elapsed: float | None) -> Array:
+        """As the world says; without one, where their plans put them."""
+        scene = self.stage.scene
+        pose = scene.at(elapsed or 0.0)
+        for each in [] if self.world is None else self.world.obstacles:
+            if each.name in scene.names and (scene.plans[k := scene.names.index(each.name)] is None):
+                pose[k] = each.pose
+        return pose
+
+
+def _number(value: float | None) -> float:
+    return nan if value is None else value
+
+
+def _vectors(values: list[messages.Vector | None]) -> Array:
+    return np.array([(nan, nan, nan) if each is None else each for each in values], dtype=float).reshape(-1, 3)
+
+
+def _rows(values: list[tuple[float, ...] | None], width: int) -> Array | None:
+    """Optional vectors as rows (N, width); None if there is none."""
+    if not any(values):
+        return None
+    return np.array([(nan,) * width if each is None else each for each in values], dtype=float)

@@ -1,0 +1,237 @@
+"""Side panel of the view: phase and clock, a table of the robots, moving plots, events. Shows, and decides nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from agents.arrays import Array
+from agents.network.messages import Event
+from experiments.scene.stage import (
+    BAD,
+    CHASSIS,
+    CONDITIONS,
+    FAIR,
+    FAIR_M,
+    GOOD,
+    GOOD_M,
+    PLACES,
+    UNKNOWN,
+    Colour,
+    Condition,
+    Stage,
+)
+
+if TYPE_CHECKING:
+    import viser
+
+HISTORY_S: Final = 30.0
+PLOT_S: Final = 0.25
+CURVES: Final = 12  # of more robots, the largest, the median and the smallest value are plotted
+TABLE: Final = 20  # rows; of more robots, those that need attention first, then the worst
+EVENTS: Final = 12
+QUIET: Final = ("says",)  # kinds of events that are not shown
+
+
+@dataclass(frozen=True)
+class Row:
+    """One robot in the table; None where nothing is known."""
+
+    name: str
+    condition: Condition
+    error: float | None = None  # [m]
+    rate: float | None = None  # [1/s]
+    battery: float | None = None  # 0 to 1
+    missed: int | None = None  # ticks
+    delay: float | None = None  # [s] largest of its links
+    note: str = ""
+
+
+class History:
+    """Errors and rates of N robots over the last 30 s."""
+
+    def __init__(self, rows: int) -> None:
+        self._rows = rows
+        self.time: list[float] = []  # [s]
+        self.error: list[Array] = []  # (N,) [m] each
+        self.rate: list[Array] = []  # (N,) [1/s] each
+
+    def add(self, t: float, error: Array, rate: Array) -> None:
+        """Values (N,) at `t` [s], which goes on."""
+        self.time.append(t)
+        self.error.append(np.nan_to_num(error))
+        self.rate.append(np.nan_to_num(rate))
+        while self.time and self.time[0] < t - HISTORY_S:
+            for column in (self.time, self.error, self.rate):
+                column.pop(0)
+
+    def curves(self, values: Sequence[Array]) -> tuple[Array, ...]:
+        """Time before now [s], then one curve a robot; of many, the largest, the median and the smallest."""
+        time = np.array(self.time) - (self.time[-1] if self.time else 0.0)
+        table = np.array(values).reshape(len(time), self._rows)
+        if self._rows > CURVES:
+            return time, table.max(axis=1), np.median(table, axis=1), table.min(axis=1)
+        return (time, *table.T)
+
+
+class Panel:
+    """The panel of one page."""
+
+    def __init__(self, server: viser.ViserServer, *, plots: bool = True) -> None:
+        self._gui, self._plots = server.gui, plots
+        self._head = self._gui.add_html("", order=1.0)
+        self._bar: Any = self._gui.add_progress_bar(0.0, color=(90, 130, 180), order=2.0)
+        with self._gui.add_folder("Robots", order=10.0):
+            self._table = self._gui.add_html("")
+        self._plot_folder = self._gui.add_folder("Last 30 s", order=20.0, visible=plots)
+        self._error: Any = None
+        self._rate: Any = None
+        with self._gui.add_folder("Events", order=30.0):
+            self._list = self._gui.add_html("")
+        with self._gui.add_folder("Legend", order=60.0, expand_by_default=False):
+            self._gui.add_html(legend())
+        self.stage = Stage.of_robots(())
+        self.history = History(0)
+
+    def set_stage(self, stage: Stage) -> None:
+        """Another case: its robots, and empty plots."""
+        self.stage, self.history = stage, History(len(stage.names))
+        for plot in (self._error, self._rate):
+            if plot is not None:
+                plot.remove()
+        self._error = self._rate = None
+        if not self._plots or not stage.names:
+            return
+        many = len(stage.names) > CURVES
+        names = ("largest", "median", "smallest") if many else stage.names
+        colours = [(213, 94, 0), (0, 114, 178), (0, 158, 115)] if many else stage.colours.tolist()
+        lines: Any = [{"label": name, "stroke": css(c), "width": 1.5} for name, c in zip(names, colours, strict=True)]
+        series: Any = ({"label": "s"}, *lines)
+        empty = (np.zeros(1), *(np.zeros(1) for _ in lines))
+        with self._plot_folder:
+            self._error = self._plot("error [m]", empty, series)
+            self._rate = self._plot("transmissions [1/s]", empty, series)
+
+    def _plot(self, title: str, data: Any, series: Any) -> Any:  # noqa: ANN401 - viser's own types
+        return self._gui.add_uplot(
+            data, series, title=title, height=140, legend={"show": False},
+            scales={"x": {"time": False, "range": (-HISTORY_S, 0.0)}},
+        )  # fmt: skip
+
+    def show_head(self, phase: str, elapsed: float | None, duration: float, where: str) -> None:
+        """Title, phase, clock [s], and which run it is."""
+        clock = "" if elapsed is None else f"{elapsed:.1f} s of {duration:g} s" if duration else f"{elapsed:.1f} s"
+        text = (
+            f'<div style="padding:0 1em;font-size:0.85em"><b>{escape(self.stage.title or "robots")}</b><br>'
+            f"<span>{escape(phase)}</span> <span style='float:right'>{clock}</span>"
+            f"<div style='opacity:0.6;overflow-wrap:anywhere'>{escape(where)}</div></div>"
+        )
+        _set(self._head, text)
+        share = 0.0 if elapsed is None or not duration else min(100.0, max(0.0, 100.0 * elapsed / duration))
+        if abs(self._bar.value - share) >= 0.5:
+            self._bar.value = share
+
+    def show_robots(self, rows: Sequence[Row]) -> None:
+        """The table of the robots."""
+        _set(self._table, table(rows, self.stage))
+
+    def show_plots(self) -> None:
+        """The curves as they are now."""
+        if self._error is None or len(self.history.time) < 2:
+            return
+        self._error.data = self.history.curves(self.history.error)
+        self._rate.data = self.history.curves(self.history.rate)
+
+    def show_events(self, events: Sequence[Event], start: float | None) -> None:
+        """The last events; times since the common start [s, UTC] if that is known."""
+        _set(self._list, event_list(events, start))
+
+
+def _set(handle: Any, text: str) -> None:  # noqa: ANN401
+    if handle.content != text:
+        handle.content = text
+
+
+def css(colour: Sequence[int]) -> str:
+    """Colour for a page."""
+    red, green, blue = colour
+    return f"rgb({red},{green},{blue})"
+
+
+def table(rows: Sequence[Row], stage: Stage) -> str:
+    """Table of robots as HTML: of many, those that need attention first, then by error."""
+    colours: Mapping[str, Sequence[int]] = dict(zip(stage.names, stage.colours.tolist(), strict=True))
+    shown = list(rows)
+    left = ""
+    if len(shown) > TABLE:
+        shown.sort(key=lambda row: (-row.condition, -(row.error or 0.0)))
+        left = f"<div style='opacity:0.6'>and {len(rows) - TABLE} more; the worst are shown</div>"
+        shown = shown[:TABLE]
+    heads = "".join(f"<th style='text-align:right;font-weight:500;opacity:0.6'>{each}</th>"
+                    for each in ("error", "tx/s", "battery", "missed", "delay"))  # fmt: skip
+    lines = []
+    for row in shown:
+        word, colour = CONDITIONS[row.condition]
+        dot = f"<span style='color:{css(colours.get(row.name, UNKNOWN))}'>&#9679;</span>"
+        badge = f" <span style='color:{css(colour)};font-weight:600'>{word}</span>" if word else ""
+        cells = (
+            ""
+            if row.error is None
+            else f"<span style='color:{css(_graded(row.error))}'>{100 * row.error:.1f} cm</span>",
+            "" if row.rate is None else f"{row.rate:.1f}",
+            "" if row.battery is None else f"{100 * row.battery:.0f} %",
+            "" if row.missed is None else f"{row.missed}",
+            "" if row.delay is None else f"{1e3 * row.delay:.1f} ms",
+        )
+        note = ""
+        if row.note:
+            note = f"<tr><td colspan='6' style='color:{css(colour)};padding-left:1.2em'>{escape(row.note)}</td></tr>"
+        lines.append(
+            f"<tr><td style='white-space:nowrap'>{dot} {escape(row.name)}{badge}</td>"
+            + "".join(f"<td style='text-align:right;white-space:nowrap'>{cell}</td>" for cell in cells)
+            + f"</tr>{note}"
+        )
+    return (
+        "<div style='padding:0 0.75em;font-size:0.75em;font-variant-numeric:tabular-nums'>"
+        "<table style='width:100%;border-spacing:0.35em 0.1em'>"
+        f"<tr><th></th>{heads}</tr>{''.join(lines)}</table>{left}</div>"
+    )
+
+
+def _graded(error: float) -> Colour:
+    return GOOD if error <= GOOD_M else FAIR if error <= FAIR_M else BAD
+
+
+def event_list(events: Sequence[Event], start: float | None) -> str:
+    """The last events as HTML, the newest first."""
+    lines = []
+    for event in [event for event in events if event.kind not in QUIET][: -EVENTS - 1 : -1]:
+        at = "" if start is None else f"{event.stamp - start:.1f} s"
+        grave = event.kind in ("hazard", "lost", "stop", "failed", "killed")
+        colour = f"color:{css(BAD)};" if grave else ""
+        lines.append(
+            f"<div style='{colour}overflow-wrap:anywhere'><span style='opacity:0.6'>{at}</span> "
+            f"<b>{escape(event.source)}</b> {escape(event.kind)}: {escape(event.text)}</div>"
+        )
+    return f"<div style='padding:0 1em;font-size:0.75em'>{''.join(lines) or 'none yet'}</div>"
+
+
+def legend() -> str:
+    """Meaning of the colours, as HTML."""
+    links = ((GOOD, f"within {100 * GOOD_M:g} cm"), (FAIR, f"within {100 * FAIR_M:g} cm"), (BAD, "beyond"))
+    said = [f"<span style='color:{css(colour)}'>&#9473; {text}</span>" for colour, text in links]
+    bodies = [f"<span style='background:{css(CHASSIS[place])};border:1px solid #888'>&nbsp;&nbsp;&nbsp;</span> {text}"
+              for place, text in PLACES.items()]  # fmt: skip
+    states = [
+        f"<span style='color:{css(colour)}'>&#9711; {word}</span>" for word, colour in CONDITIONS.values() if word
+    ]
+    return (
+        "<div style='padding:0 1em;font-size:0.75em'>"
+        f"<div>links by error: {', '.join(said)}; wide when the sender transmits; dashed when broken</div>"
+        f"<div>bodies: {', '.join(bodies)}; translucent: goals and shadow twins</div>"
+        f"<div>rings: {', '.join(states)}</div></div>"
+    )

@@ -1,0 +1,189 @@
+"""The scene of a case at one moment: what is drawn where, in which colour and condition. No browser."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.body.kinds import KINDS
+from agents.network import messages
+from experiments.file.document import load, loads
+from experiments.scene import models, stage
+from experiments.scene.stage import BAD, FAIR, GOOD, UNKNOWN, Condition, LinkTracker, Moment, Place, Stage, Trail
+
+ALIVE = {"alive": True, "age_s": 0.1}
+
+
+def status(phase: str = "running", **fields: object) -> messages.Status:
+    zero = dict.fromkeys(
+        ("sent", "heard", "malformed", "refused", "ticks", "missed", "decisions", "interventions", "avoided", "pid"), 0
+    )
+    return messages.Status(
+        **{"robot": "CF01", "stamp": 0.0, "phase": phase, "reason": "", "body": "", "battery": None, "lost": {},
+           "dropped": {}, "late_s": 0.0, "started": 0.0, "missing": [], "cpu_s": 0.0, "rss_mb": 0.0, **zero, **fields}
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def park() -> Stage:
+    return Stage.of_experiment(load("robotic-park").cases()["event"])
+
+
+def at_start(park: Stage) -> Moment:
+    moment = Moment.unknown(park)
+    assert park.experiment is not None
+    for row, robot in enumerate(park.experiment.robots.values()):
+        moment.position[row] = (*robot.start[:2], robot.hover or 0.0)
+    return moment
+
+
+@pytest.mark.parametrize(
+    ("said", "seen", "is_"),
+    [
+        (status(), ALIVE, Condition.ACTIVE),
+        (status(), {"alive": False, "age_s": 0.1}, Condition.DEAD),
+        (status(), {"alive": True, "age_s": 4.0}, Condition.SILENT),
+        (status("landing"), ALIVE, Condition.LANDING),
+        (status("done"), {"alive": False, "age_s": 9.0}, Condition.DONE),
+        (status("done", reason="emergency stop by operator"), ALIVE, Condition.STOPPED),
+        (status(hazard="hold: minimum separation: 0.18 m from CF03"), ALIVE, Condition.HELD),
+        (status("ready"), ALIVE, Condition.WAITING),
+        (None, ALIVE, Condition.WAITING),
+        (None, {"alive": False, "age_s": 9.0}, Condition.DEAD),
+    ],
+)
+def test_condition_of_a_robot(said, seen, is_):
+    assert stage.condition(said, **seen) == is_
+
+
+def test_bodies_are_told_apart():
+    assert [stage.place_of(body) for body in ("twin", "crazyflie-twin", "world", "radio://0/80/2M/E7E7E7E701")] == [
+        Place.TWIN, Place.TWIN, Place.WORLD, Place.REAL,
+    ]  # fmt: skip
+    assert len({tuple(colour) for colour in stage.CHASSIS.values()}) == len(Place)
+
+
+def test_links_change_colour_with_their_error():
+    colours = stage.link_colours(np.array([0.0, 0.024, 0.026, 0.049, 0.051, np.nan]))
+    assert [tuple(each) for each in colours.tolist()] == [GOOD, GOOD, FAIR, FAIR, BAD, UNKNOWN]
+
+
+def test_errors_are_those_of_the_law(park):
+    moment = at_start(park)
+    error = LinkTracker(park).errors(None, moment.position)
+    net = park.links
+    apart = np.linalg.norm(moment.position[net.receiver] - moment.position[net.sender], axis=1)
+    assert error == pytest.approx(np.abs(apart - net.distance))
+    leader = park.names.index("TB01")  # receives on no link: those count on which it sends
+    assert LinkTracker(park).of_robots(error)[leader] == pytest.approx(error[net.sender == leader].sum())
+
+
+def test_links_that_are_not_there_have_no_error():
+    text = """
+        title = "two"
+        duration_s = 9.0
+        robots.A = { kind = "khepera4", start = [0.0, 0.0] }
+        robots.B = { kind = "khepera4", start = [0.5, 0.0] }
+        formation.links."A > B" = { distance = 0.5, from_s = 3.0 }
+    """
+    pair = Stage.of_experiment(loads(text).cases()["default"])
+    tracker, place = LinkTracker(pair), np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]])
+    assert np.isnan(tracker.errors(1.0, place)).all()
+    assert tracker.errors(4.0, place) == pytest.approx([0.1])
+
+
+def test_a_link_is_lit_while_its_sender_has_just_transmitted(park):
+    moment = at_start(park)
+    moment.silent_for[park.names.index("TB01")] = 0.05
+    senders = {park.names[row] for row in park.links.sender[stage.lit(park, moment)]}
+    assert senders == {"TB01"}
+
+
+def test_unknown_robots_are_out_of_sight(park):
+    moment = Moment.unknown(park)
+    assert (stage.shown(moment.position)[:, 2] < -100.0).all()
+    ends = stage.segments(park, moment)
+    assert (stage.visible(ends, np.ones(len(ends), dtype=bool))[..., 2] < -100.0).all()
+    assert len(stage.dashes(ends)) == 0
+
+
+def test_dashes_lie_on_the_link_and_leave_half_of_it_free():
+    made = stage.dashes(np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]))
+    assert np.linalg.norm(made[:, 1] - made[:, 0], axis=1).sum() == pytest.approx(0.5)
+    assert made[..., 0].min() >= 0.0
+    assert made[..., 0].max() <= 1.0
+
+
+def test_robots_that_need_attention_have_a_ring_and_a_word(park):
+    moment = at_start(park)
+    row = park.names.index("CF02")
+    moment.condition[:] = Condition.ACTIVE
+    moment.condition[row] = Condition.DEAD
+    places, _ = stage.rings(moment)
+    assert np.flatnonzero(places[:, 2] > -100.0).tolist() == [row]
+    assert stage.label(park, row, Condition.DEAD) == "CF02 · DEAD"
+    assert stage.label(park, row, Condition.ACTIVE) == "CF02"
+    assert (stage.accents(park, moment)[row] != park.colours[row]).any()
+
+
+def test_a_trail_has_a_point_each_fifth_of_a_second_and_fades(park):
+    trail = Trail(2)
+    kept = [trail.add(0.1 * k, np.full((2, 3), 0.1 * k)) for k in range(9)]
+    assert kept == [True, False, True, False, True, False, True, False, True]
+    assert trail.points[0, :5, 0] == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0])
+    ends = stage.trail_segments(trail.points)
+    assert (ends[:, 0, 2] > -100.0).sum() == 2 * 4
+    colours = stage.trail_colours(park, 60, (255, 255, 255))
+    assert colours[58, 1].tolist() == [255, 255, 255]
+
+
+def test_ranges_reach_from_the_robot_to_what_it_sees(park):
+    moment = at_start(park)
+    moment.yaw[:] = np.pi / 2
+    scan = messages.Ranges("KH01", 0.0, [0.0, 1.0], [0.0, 0.0], [0.5, None])
+    (line,) = stage.rays(park, moment, {"KH01": scan})
+    assert line[1] - line[0] == pytest.approx([0.0, 0.5, 0.0])
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
+def test_every_kind_has_a_model_of_its_size(kind):
+    model = models.MODELS[kind.name].whole
+    assert len(model.faces) < 500
+    low, high = model.vertices.min(axis=0), model.vertices.max(axis=0)
+    assert low[2] == pytest.approx(0.0, abs=1e-9)
+    assert high[2] == pytest.approx(kind.height)
+    assert np.hypot(*model.vertices[:, :2].T).max() == pytest.approx(kind.radius, rel=0.35)
+
+
+@pytest.mark.parametrize(
+    "mesh", [models.box(1.0, 2.0, 0.0, 0.5), models.cylinder(0.3, 0.1, 0.4), models.MODELS["khepera4"].whole]
+)
+def test_faces_look_outward(mesh):
+    a, b, c = (mesh.vertices[mesh.faces[:, k].astype(int)] for k in range(3))
+    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0 > 0.0  # the volume, positive
+
+
+def test_obstacles_stand_where_the_file_says():
+    course = Stage.of_experiment(next(iter(load("obstacle-course").cases().values())))
+    scene = course.scene
+    for k in range(len(scene.names)):
+        mesh = models.obstacle(scene, k)
+        assert mesh.vertices[:, 2].min() == pytest.approx(scene.bottom[k])
+        assert mesh.vertices[:, 2].max() == pytest.approx(scene.top[k])
+    assert Moment.unknown(course).obstacles == pytest.approx(scene.pose)
+
+
+def test_a_case_with_a_plug_in_that_is_not_here_is_drawn_without_errors(park):
+    assert park.experiment is not None
+    formation = msgspec.structs.replace(park.experiment.formation, law="not-here")
+    other = Stage.of_experiment(msgspec.structs.replace(park.experiment, formation=formation, avoidance="not-here"))
+    assert np.isnan(LinkTracker(other).errors(0.0, at_start(park).position)).all()
+
+
+def test_robots_without_an_experiment_are_drawn_too():
+    found = Stage.of_robots(("A", "B"))
+    assert LinkTracker(found).errors(None, np.zeros((2, 3))).shape == (0,)
+    assert replace(Moment.unknown(found)).position.shape == (2, 3)
