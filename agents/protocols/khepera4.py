@@ -1,14 +1,15 @@
 """Khepera IV: the two protocols in use, their words and units, and where its range sensors look.
 
-*Park* is the server of Robotic Park on the robot: TCP 50000, ASCII without delimiters, one read of the server is one
-command, centimetres. *K-Team* is the maker's `kh4server`: lines over a serial port or TCP, motor units and encoder
-pulses. Figures: Khepera IV User Manual, rev. 1.1.
+*Park* are the servers of Robotic Park on the robot: TCP 50000, ASCII without delimiters, one read of the server is one
+command, centimetres; `PARK` has each that was published. *K-Team* is the maker's `kh4server`: lines over a serial port
+or TCP, motor units and encoder pulses. Figures: Khepera IV User Manual, rev. 1.1.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import msgspec
@@ -34,20 +35,47 @@ LIGHT_TOUCHING: Final = 1000
 LIGHT_SCALE: Final = 0.0925  # [m] so that LIGHT_NOTHING falls at 0.2 m; not calibrated, surfaces differ
 
 
+Server = Literal["2023-01-07", "2023-01-15", "2023-04-10", "2025-05", "fork", "kteam"]
+
+
+@dataclass(frozen=True)
+class ParkServer:
+    """Behaviour of one published server of Robotic Park (`server.c`, `prog-template.c` of its ROS package).
+
+    All read one command per `read()`, without a time limit for the last one: none stops a robot whose link is gone.
+    """
+
+    answer: Literal["increments", "heading", "pose"]  # of `p`: d,dθ or d,θ or x,y,θ
+    decimals: int  # of the numbers in that answer
+    drives: bool  # whether `d` moves the robot; else only `g` does
+    per_turn: bool  # d of `p` is the way in one turn of the server's loop, so each other command swallows a part
+    clients: int | None  # connections that it accepts in its life; None: any number, one after the other
+    base: float = 0.105  # [m] distance of the wheels by which it computes angles
+
+    @property
+    def posed(self) -> bool:
+        """Whether `i` sets the heading, too: where `p` answers with a pose."""
+        return self.answer == "pose"
+
+
+PARK: Final[dict[str, ParkServer]] = {
+    "2023-01-07": ParkServer("increments", 4, drives=True, per_turn=False, clients=1),
+    "2023-01-15": ParkServer("heading", 4, drives=False, per_turn=True, clients=1),
+    "2023-04-10": ParkServer("pose", 4, drives=False, per_turn=False, clients=1),
+    "2025-05": ParkServer("pose", 2, drives=True, per_turn=False, clients=None, base=BASE),
+    "fork": ParkServer("heading", 4, drives=True, per_turn=True, clients=None),
+}
+NEWEST: Final = "2025-05"
+
+
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """The `device` table of a Khepera IV."""
 
-    protocol: Literal["park", "kteam"] = "park"  # which of the two its protocol twin speaks; hardware: by the address
-    odometry: Literal["pose", "increments", "heading"] = "pose"  # park: what `p` answers: x,y,th or d,dth or d,th
+    server: Server | None = None  # what runs on the robot; None: found out where `p` tells, else refused
     poll_hz: float = 25.0  # [1/s] drive command and odometry
-    ranges: bool = True  # read its range sensors, five times a second
-    silence_s: float = 0.5  # [s] without an answer after which the link is made anew
+    ranges: bool | None = None  # read its range sensors, five times a second; None: with K-Team's protocol only
+    silence_s: float = 0.5  # [s] without an answer after which the robot is stopped
     low_battery: float = 0.05  # below this charge it stops (K-Team's protocol only; park has no battery)
-
-    @property
-    def stops_alone(self) -> bool:
-        """Whether the server stops the wheels without a client: only the newest park server does (x,y,θ)."""
-        return self.protocol == "park" and self.odometry == "pose"
 
     def __post_init__(self) -> None:
         if not 2.0 <= self.poll_hz <= 30.0:
@@ -56,11 +84,65 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             raise ValueError("silence_s must be 0.1 to 10 s")
         if not 0.0 <= self.low_battery < 1.0:
             raise ValueError("low_battery is a share: 0 <= low_battery < 1")
+        if self.ranges and self.server not in {None, "kteam", "2023-01-07"}:
+            raise ValueError(
+                f"ranges: the server of {self.server} has no range poll that is safe (it takes get_data for a goal, or "
+                "does not know it); leave ranges out"
+            )
+        if self.server in PARK and PARK[self.server].per_turn and self.poll_hz < 22.0:
+            raise ValueError(f"poll_hz must be 22 to 30 with server = '{self.server}': it forgets way after 50 ms")
+
+
+def fitting(answer: str) -> list[str]:
+    """The park servers whose `p` may be answered like that."""
+    words = answer.split(",")
+    if not all(re.fullmatch(r"[-+]?\d+\.\d+", word) for word in words):
+        return []
+    decimals = {len(word.partition(".")[2]) for word in words}
+    return [
+        name
+        for name, server in PARK.items()
+        if len(words) == (3 if server.answer == "pose" else 2) and decimals == {server.decimals}
+    ]
 
 
 def park_drive(v: float, turn: float) -> bytes:
     """Command of park's server for `v` [m/s] and `turn` [rad/s]."""
     return f"d {v / CENTIMETRE:.3f} {turn:.4f}".encode()
+
+
+def park_goal(x: float, y: float) -> bytes:
+    """Command of park's server for a goal [m] in its own frame."""
+    return f"g {x:.5f} {y:.5f}".encode()
+
+
+def park_goal_2023_04(v: float, turn: float) -> tuple[float, float]:
+    """Goal (x, y) [m] at which the controller of 2023-04-10 drives `v` [m/s] and `turn` [rad/s] from (0, 0, π/2).
+
+    Its law, from the bearing error e of the goal: ω = 1.5 sin e, and v = (|Δx| + 100 Δy²) (3.14 − ⌊|e|⌋)/3.14 in cm/s,
+    10 at most and never negative; it stands when |Δx| + 100 Δy² is at most 0.01. Along y such a goal is near: 10 cm/s
+    need 0.32 m, so a robot that is told nothing more stops there. The least goal that turns on the spot lies 1 cm away.
+    """
+    if not v and not turn:
+        return 0.0, 0.0
+    error = math.asin(max(-1.0, min(1.0, turn / 1.5)))
+    share = (3.14 - int(abs(error))) / 3.14
+    way = max(0.011, min(max(v, 0.0) / CENTIMETRE / share, 20.0))
+    sin, cos = abs(math.sin(error)), math.cos(error)
+    distance = 2.0 * way / (sin + math.sqrt(sin * sin + 400.0 * cos * cos * way))
+    return -distance * math.sin(error), distance * cos
+
+
+def park_goal_2023_01(v: float, turn: float, theta: float) -> tuple[float, float]:
+    """Goal (x, y) [m] at which the controller of 2023-01-15 drives `v` [m/s] and `turn` [rad/s] from (0, 0, `theta`).
+
+    Its law, from the bearing error e and the distance r of the goal: v = 10 r cos e in cm/s, 0 below 0.02, and
+    ω = sin e. A goal 1 mm ahead stops it; one at its own place makes it turn.
+    """
+    error = math.asin(max(-0.95, min(0.95, turn)))
+    distance = max(abs(v) / (10.0 * CENTIMETRE) / math.cos(error), 0.001)
+    error = math.pi - error if v < 0.0 else error
+    return distance * math.cos(theta + error), distance * math.sin(theta + error)
 
 
 def units(v: float, turn: float) -> tuple[int, int]:

@@ -14,6 +14,7 @@ from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState, RangeScan, Rays, settings
 from agents.protocols import khepera4 as protocol
+from bridges.khepera4.drivers import awake
 from bridges.khepera4.link import Address, Link
 
 OPEN_S: Final = 3.0  # deadline of the first odometry
@@ -31,6 +32,7 @@ class KheperaBody:
         self._external_rows = np.flatnonzero(request.external)
         self._external = External(len(self._names))
         self._links: list[Link] = []
+        self._read_at = -math.inf  # [s, `awake`] the state on which the next command is decided
 
     def open(self) -> None:
         """See `Body.open`. Robots without answer are retried while the others drive."""
@@ -41,7 +43,9 @@ class KheperaBody:
             self._links.append(Link(name, address, device, (x, y, yaw)))
             self._links[-1].start()
         deadline, pause = time.monotonic() + OPEN_S, threading.Event()
-        while time.monotonic() < deadline and any(link.odometry.stamp == -math.inf for link in self._links):
+        while time.monotonic() < deadline and any(
+            link.odometry.stamp == -math.inf and not link.refused for link in self._links
+        ):
             pause.wait(0.01)
         if all(link.odometry.stamp == -math.inf for link in self._links):
             reasons = [f"{name}: {link.trouble}" for name, link in zip(self._names, self._links, strict=True)]
@@ -50,7 +54,7 @@ class KheperaBody:
 
     def read(self, t: float) -> BodyState:
         """See `Body.read`."""
-        now = time.monotonic()
+        now, self._read_at = time.monotonic(), awake()
         odometry = [link.odometry for link in self._links]
         rows = len(odometry)
         # unknown before the first odometry: the pose is counted by the robot, not read from the file
@@ -79,10 +83,9 @@ class KheperaBody:
 
     def command(self, setpoint: Array) -> None:
         """See `Body.command`."""
-        now = time.monotonic()
         for link, (v, turn, _, _) in zip(self._links, setpoint.tolist(), strict=True):
             if math.isfinite(v + turn):
-                link.drive(v, turn, now)
+                link.drive(v, turn, self._read_at)
 
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Body.takeoff`: no effect on a ground robot."""

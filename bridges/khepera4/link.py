@@ -5,22 +5,20 @@ from __future__ import annotations
 import fcntl
 import math
 import os
-import select
 import socket
+import sys
 import termios
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Protocol
-from urllib.parse import urlsplit
-
-import numpy as np
+from typing import Final
+from urllib.parse import parse_qsl, urlsplit
 
 from agents.arrays import Array
 from agents.body.device_locks import numeric
 from agents.body.interface import FRESH_S, TROUBLE, BodyError
 from agents.protocols import khepera4 as protocol
+from bridges.khepera4.drivers import Driver, KTeam, Wire, WrongServer, awake, identify
 from bridges.khepera4.odometry import Odometer
 
 CONNECT_S: Final = 1.5
@@ -31,53 +29,23 @@ BATTERY_S: Final = 5.0
 STOP_TRIES_S: Final = 3.0  # time for attempts to stop a robot whose connection broke while it moved
 STOP_RETRY_S: Final = 0.1  # between two such attempts
 STANDING: Final = 0.02  # [m/s] slower robots stand
+AGAIN_S: Final = 0.2  # a silent robot is told to stop so often, so that it stops as soon as it hears again
+KEEP_S: Final = 20.0  # a silent robot is stopped over the same connection for so long: most servers accept no other
+TCP_THIN_LINEAR_TIMEOUTS: Final = 16  # of Linux: the first repetitions of lost bytes do not wait longer and longer
 ANSWER_S: Final = 2.5  # the note reports a robot that is not known to stand so long after a halt
-
-
-class UnknownAnswer(OSError):
-    """The answer does not belong to this protocol."""
-
-
-class Wire:
-    """Byte stream to and from a robot: a TCP connection or a serial line."""
-
-    def __init__(self, descriptor: int, close: Callable[[], None]) -> None:
-        self._descriptor, self.close = descriptor, close
-        self._poll = select.poll()
-        self._poll.register(descriptor, select.POLLIN)
-
-    def send(self, data: bytes) -> None:
-        """Discard earlier input, which cannot be the answer, then write at once."""
-        while self._poll.poll(0):
-            self._read()
-        os.write(self._descriptor, data)
-
-    def receive(self, until: float) -> bytes:
-        """Next bytes received.
-
-        Raises:
-            TimeoutError: If nothing comes before `until` [s, monotonic].
-            ConnectionError: If the other end has closed.
-        """
-        if not self._poll.poll(max(0.0, 1e3 * (until - time.monotonic()))):
-            raise TimeoutError
-        return self._read()
-
-    def _read(self) -> bytes:
-        data = os.read(self._descriptor, 1024)
-        if not data:
-            raise ConnectionResetError("the robot closed the connection")
-        return data
 
 
 @dataclass(frozen=True)
 class Address:
-    """Address and protocol of a robot: `khepera4://HOST[:PORT]`, `kteam://HOST:PORT` or `kteam:///dev/ttyS0`."""
+    """Address and protocol of a robot: `khepera4://HOST[:PORT][?server=2023-01-07]`, `kteam://HOST:PORT` or
+    `kteam:///dev/ttyS0`.
+    """
 
     kteam: bool
     host: str
     port: int
     serial: str
+    server: str | None  # of Robotic Park's; None: not named
 
     @classmethod
     def parse(cls, robot: str, address: str) -> Address:
@@ -93,13 +61,33 @@ class Address:
             raise BodyError(f"{robot}: {address}: {error}") from error
         kteam = parts.scheme == "kteam"
         if kteam and not host and parts.path:
-            return cls(kteam, "", 0, parts.path)
+            return cls(kteam, "", 0, parts.path, None)
         if parts.scheme not in ("khepera4", "kteam") or not host or (kteam and not port):
             raise BodyError(
                 f"{robot}: {address}: write khepera4://HOST for Robotic Park's server, kteam://HOST:PORT or "
                 "kteam:///dev/ttyS0 for K-Team's kh4server"
             )
-        return cls(kteam, host, port or protocol.PARK_PORT, "")
+        asked = dict(parse_qsl(parts.query, keep_blank_values=True))
+        server = asked.pop("server", None)
+        if asked or (server is not None and (kteam or server not in protocol.PARK)):
+            raise BodyError(
+                f"{robot}: {address}: after '?' comes server=, for Robotic Park's: {', '.join(protocol.PARK)}"
+            )
+        return cls(kteam, host, port or protocol.PARK_PORT, "", server)
+
+    def server_of(self, robot: str, chosen: protocol.Settings) -> str | None:
+        """The server on the robot by its address and its `device` table; None if neither names one.
+
+        Raises:
+            BodyError: If they contradict one another.
+        """
+        named = chosen.server or self.server
+        if named is not None and ((named == "kteam") != self.kteam or (self.server or named) != named):
+            raise BodyError(
+                f"{robot}: {self}: device.server is '{chosen.server}', but its address is that of "
+                f"{self.server or ('K-Team' if self.kteam else 'Robotic Park')}'s server"
+            )
+        return named
 
     def __str__(self) -> str:
         return self.serial or f"{self.host}:{self.port}"
@@ -118,6 +106,8 @@ class Address:
         if not self.serial:
             wire = socket.create_connection((self.host, self.port), CONNECT_S)
             wire.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if sys.platform == "linux":
+                wire.setsockopt(socket.IPPROTO_TCP, TCP_THIN_LINEAR_TIMEOUTS, 1)
             return Wire(wire.fileno(), wire.close)
         line = os.open(self.serial, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
@@ -134,138 +124,6 @@ class Address:
             os.close(line)
             raise OSError(*error.args) from error
         return Wire(line, lambda: os.close(line))
-
-
-class Driver(Protocol):
-    """One protocol. Every method raises OSError if the robot does not answer, or not in this protocol."""
-
-    def begin(self) -> None:
-        """Initialise a new connection."""
-        ...
-
-    def drive(self, v: float, turn: float) -> None:
-        """Drive at v [m/s] and ω [rad/s]; zeros stop the robot."""
-        ...
-
-    def move(self, odometer: Odometer) -> None:
-        """Request odometry and update `odometer`."""
-        ...
-
-    def ranges(self) -> tuple[Array, Array]:
-        """Bearings [rad] and distances from the robot's centre [m]."""
-        ...
-
-    def battery(self) -> float:
-        """Charge, 0 to 1; NaN if the protocol has no such value."""
-        ...
-
-
-class Park:
-    """The server of Robotic Park."""
-
-    def __init__(self, wire: Wire, chosen: protocol.Settings) -> None:
-        self._wire, self._settings = wire, chosen
-        self._free = 0.0
-
-    def begin(self) -> None:
-        """See `Driver`."""
-
-    def drive(self, v: float, turn: float) -> None:
-        """See `Driver`."""
-        self._send_command(protocol.park_drive(v, turn) if v or turn else b"stop")
-
-    def move(self, odometer: Odometer) -> None:
-        """See `Driver`."""
-        kind = self._settings.odometry
-        values = self._request(b"p", 3 if kind == "pose" else 2, 'does device = { odometry = "..." } fit its server?')
-        stamp = time.monotonic()
-        if kind == "pose":
-            x, y, theta = values
-            odometer.pose(x, y, theta, stamp)
-            return
-        way, angle = values
-        if kind == "increments":
-            odometer.steps(way, angle, stamp)
-        else:
-            odometer.heading(way, angle, stamp)
-
-    def ranges(self) -> tuple[Array, Array]:
-        """See `Driver`."""
-        count = len(protocol.SOUND_BEARING)
-        sound = self._request(b"get_data", count, "if its server does not know get_data: device = { ranges = false }")
-        return protocol.SOUND_BEARING, protocol.sound_distance(np.array(sound))
-
-    def battery(self) -> float:
-        """See `Driver`."""
-        return math.nan
-
-    def _send_command(self, command: bytes) -> None:
-        time.sleep(max(0.0, self._free - time.monotonic()))  # the server reads two commands in one segment as one
-        self._wire.send(command)
-        self._free = time.monotonic() + protocol.GAP_S
-
-    def _request(self, command: bytes, count: int, remedy: str) -> list[float]:
-        self._send_command(command)
-        try:
-            answer = self._wire.receive(time.monotonic() + self._settings.silence_s).decode("ascii", "replace")
-        except TimeoutError as error:
-            raise TimeoutError(f"no answer to {command.decode()}; {remedy}") from error
-        values = protocol.numbers(answer.strip("\0\r\n "))
-        if len(values) != count:
-            raise UnknownAnswer(f"answers {command.decode()} with {answer[:40]!r}, not with {count} numbers; {remedy}")
-        return values
-
-
-class KTeam:
-    """K-Team's `kh4server`."""
-
-    def __init__(self, wire: Wire, chosen: protocol.Settings) -> None:
-        self._wire, self._settings = wire, chosen
-
-    def begin(self) -> None:
-        """See `Driver`."""
-        self._request("B")
-        if self._settings.ranges:
-            self._request("U,31")
-
-    def drive(self, v: float, turn: float) -> None:
-        """See `Driver`."""
-        left, right = protocol.units(v, turn)
-        self._request(f"D,{left},{right}")
-
-    def move(self, odometer: Odometer) -> None:
-        """See `Driver`."""
-        left, right = self._request("R", 2)[:2]
-        odometer.wheels(left, right, time.monotonic())
-
-    def ranges(self) -> tuple[Array, Array]:
-        """See `Driver`."""
-        sound, light = len(protocol.SOUND_BEARING), len(protocol.LIGHT_BEARING)
-        distances = (
-            protocol.sound_distance(np.array(self._request("G", sound)[:sound])),
-            protocol.light_distance(np.array(self._request("N", light)[:light])),
-        )
-        return np.concatenate([protocol.SOUND_BEARING, protocol.LIGHT_BEARING]), np.concatenate(distances)
-
-    def battery(self) -> float:
-        """See `Driver`."""
-        return 0.01 * self._request("V,5", 1)[0]
-
-    def _request(self, request: str, count: int = 0) -> list[float]:
-        """Send a request; returns the numbers of the answer, at least `count`."""
-        self._wire.send(f"{request}\r".encode())
-        until = time.monotonic() + self._settings.silence_s
-        answer = b""
-        while not answer.endswith(b"\n"):
-            try:
-                answer += self._wire.receive(until)
-            except TimeoutError as error:
-                raise TimeoutError(f"no answer to {request}") from error
-        letter, _, rest = answer.decode("ascii", "replace").strip().rpartition("\n")[2].partition(",")
-        values = protocol.numbers(rest)
-        if letter != request[0].lower() or len(values) < count:
-            raise UnknownAnswer(f"answers {request} with {answer[:40]!r}; is it K-Team's kh4server?")
-        return values
 
 
 @dataclass(frozen=True)
@@ -288,10 +146,11 @@ class Link:
         self.odometry = Odometry()
         self.scan: tuple[float, Array, Array] | None = None  # monotonic time [s], bearings [rad], distances [m]
         self.battery = math.nan  # charge, 0 to 1
-        self.setpoint = (0.0, 0.0, -math.inf)  # v [m/s], ω [rad/s], monotonic time of the command [s]
+        self.setpoint = (0.0, 0.0, -math.inf)  # v [m/s], ω [rad/s], time [s, `awake`] of what it was decided on
         self.halted_since = math.inf  # monotonic [s]; infinity while the robot may move
+        self.refused = False  # the server must not be driven; it is not tried again
         self.trouble = f"{address}: not connected yet"  # for users; empty while connected
-        self._address, self._settings = address, chosen
+        self._address, self._settings, self._server = address, chosen, address.server_of(name, chosen)
         self._odometer = Odometer(*start)
         self._stands = True  # by the last command that was answered
         self._stop_deadline = math.inf
@@ -302,16 +161,16 @@ class Link:
         """Start the thread, which connects and reconnects until `end`."""
         self._thread.start()
 
-    def drive(self, v: float, turn: float, now: float) -> None:
-        """Drive at v [m/s], ω [rad/s] until the next command, for `FRESH_S` at most."""
+    def drive(self, v: float, turn: float, decided: float) -> None:
+        """Drive at v [m/s], ω [rad/s], `decided` on the state of that time [s, `awake`], for `FRESH_S` from then."""
         if v or turn:
             self.halted_since = math.inf
-        self.setpoint = (v, turn, now)
+        self.setpoint = (v, turn, decided)
 
     def halt(self, now: float) -> None:
         """Stop the robot."""
         self.halted_since = min(self.halted_since, now)
-        self.setpoint = (0.0, 0.0, now)
+        self.setpoint = (0.0, 0.0, -math.inf)
 
     def unanswered(self, now: float) -> bool:
         """Whether a halt is not confirmed by odometry in time."""
@@ -343,13 +202,18 @@ class Link:
             else:
                 try:
                     self._run_connection(
-                        KTeam(wire, self._settings) if self._address.kteam else Park(wire, self._settings)
+                        KTeam(wire, self._settings)
+                        if self._address.kteam
+                        else identify(wire, self._settings, self._server)
                     )
                 except TROUBLE as error:  # of any kind: the wheels must stop
                     why = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
                     self.trouble = f"{self._address}: {why or error}"
                     if isinstance(error, TimeoutError):
                         self.trouble += "; another program may hold it, or the robot uses the other protocol"
+                    if isinstance(error, WrongServer):
+                        self.refused = True
+                        return
                 finally:
                     wire.close()
                 self._odometer.reconnected()
@@ -375,34 +239,61 @@ class Link:
     def _run_connection(self, driver: Driver) -> None:
         """Loop of one connection, until it breaks or the link ends."""
         driver.begin()
-        driver.drive(0.0, 0.0)
         driver.move(self._odometer)  # before any motion: counters at zero show that the robot was switched on anew
         self._stands = True
         period = 1.0 / self._settings.poll_hz
-        ranges_due = battery_due = due = time.monotonic()
+        ranges_due = battery_due = due = answered = time.monotonic()
+        silent = False
         while not self._ending.wait(max(0.0, due - time.monotonic())):
             due = max(due + period, time.monotonic())
-            twist = self._current_twist()
-            self._stands = self._stands and not any(twist)
-            driver.drive(*twist)
-            driver.move(self._odometer)
-            self._stands = not any(twist)
+            v, turn, until = (0.0, 0.0, math.inf) if silent else self._current_twist()
+            moves = v != 0.0 or turn != 0.0
+            self._stands = self._stands and not moves
+            try:
+                driver.drive(v, turn, until)
+                driver.move(self._odometer)
+            except TimeoutError as error:
+                # stops wait in the connection until the robot hears again; the next exchange after that stops it
+                self.trouble = f"{self._address}: {error}; it is told to stop until it answers"
+                silent, driver.patience_s = True, AGAIN_S
+                if time.monotonic() - answered > KEEP_S:
+                    raise
+                continue
+            silent, driver.patience_s = False, self._settings.silence_s
+            self._stands = not moves
             now, at = time.monotonic(), self._odometer
+            answered = now
             self.odometry = Odometry(now, at.x, at.y, at.yaw, at.velocity)
             self.trouble = ""
-            if self._settings.ranges and now >= ranges_due:
-                ranges_due = now + RANGES_S
-                bearing, distance = driver.ranges()
-                self.scan = (now, bearing, distance)
-            if now >= battery_due:
-                battery_due = now + BATTERY_S
-                self.battery = driver.battery()
-        for _ in range(STOPS):
-            driver.drive(0.0, 0.0)
-        self._stands = True
+            try:
+                if driver.ranged and now >= ranges_due:
+                    ranges_due = now + RANGES_S
+                    bearing, distance = driver.ranges()
+                    self.scan = (now, bearing, distance)
+                if now >= battery_due:
+                    battery_due = now + BATTERY_S
+                    self.battery = driver.battery()
+            except TimeoutError:
+                silent = True
+        self._stop_and_confirm(driver)
 
-    def _current_twist(self) -> tuple[float, float]:
-        v, turn, since = self.setpoint
-        if self.battery_empty or time.monotonic() - since > FRESH_S:
-            return 0.0, 0.0
-        return v, turn
+    def _stop_and_confirm(self, driver: Driver) -> None:
+        """Stop the robot at the end of the link, until an answer shows that it has read that."""
+        while True:
+            try:
+                for _ in range(STOPS):
+                    driver.drive(0.0, 0.0)
+                driver.move(self._odometer)
+            except TimeoutError:
+                if time.monotonic() > self._stop_deadline:
+                    raise
+                continue
+            self._stands = True
+            return
+
+    def _current_twist(self) -> tuple[float, float, float]:
+        """v [m/s], ω [rad/s], and until when they may be sent [s, `awake`]."""
+        v, turn, decided = self.setpoint
+        if self.battery_empty or awake() > decided + FRESH_S:
+            return 0.0, 0.0, math.inf
+        return v, turn, decided + FRESH_S

@@ -19,29 +19,32 @@ from twins.devices.device import Device, DeviceRequest, Faults
 
 
 def khepera_twin() -> Iterator[Target]:
-    """Both protocols: the first byte says which."""
+    """Every server: the first byte says which."""
+    from agents.protocols.khepera4 import PARK  # noqa: PLC0415
     from twins.devices import khepera4  # noqa: PLC0415
 
     park = ["d 10.0 0.5", "stop", "p", "t", "get_data", "g 1.0 0.5", "i 0.1 0.2 0.3", "d -81.0 -7"]
     kteam = ["B", "D,100,-100", "R", "G", "N", "O", "V,5", "U,31", "I", "E", "S", "T", "M,1,2", "K", "H", "J"]
-    examples = [b"p" + word.encode() for word in park] + [b"k" + "\r".join([word, "R", ""]).encode() for word in kteam]
+    letters = dict(zip("pqrstk", (*PARK, "kteam"), strict=True))
+    examples = [letter.encode() + word.encode() for word in park for letter in "pqrst"]
+    examples += [b"k" + "\r".join([word, "R", ""]).encode() for word in kteam]
 
     def make():
         nonlocal devices
         for device in devices.values():
             device.close()
         devices = {}
-        for protocol in ("park", "kteam"):
-            made = twin_request("khepera4", ["khepera4-twin"], device={"protocol": protocol})
-            devices[protocol[0]] = khepera4.open_device(DeviceRequest(made, Faults()))
+        for letter, server in letters.items():
+            made = twin_request("khepera4", ["khepera4-twin"], device={"server": server})
+            devices[letter] = khepera4.open_device(DeviceRequest(made, Faults()))
         t = 0.0
 
         def take(data: bytes) -> None:
             nonlocal t
-            device: Any = devices["k" if data[:1] == b"k" else "p"]
+            device: Any = devices.get(data[:1].decode("ascii", "replace"), devices["p"])
             wire = Wire()
             server = device._servers[0]
-            server._client = wire
+            server._client, server._left = wire, False
             wire.waiting += [data[1:256], data[256:512]] if len(data) > 256 else [data[1:]]
             while wire.waiting:
                 device.serve(wire, t)
@@ -59,9 +62,9 @@ def khepera_twin() -> Iterator[Target]:
 
 
 def khepera_bridge() -> Iterator[Target]:
-    """Answers of both servers to everything that the link asks, apart by zero bytes."""
-    from agents.protocols.khepera4 import Settings  # noqa: PLC0415
-    from bridges.khepera4.link import KTeam, Park  # noqa: PLC0415
+    """Answers of all servers to everything that the link asks, apart by zero bytes."""
+    from agents.protocols import khepera4  # noqa: PLC0415
+    from bridges.khepera4.drivers import KTeam, Park, identify  # noqa: PLC0415
     from bridges.khepera4.odometry import Odometer  # noqa: PLC0415
 
     class Line:
@@ -71,15 +74,22 @@ def khepera_bridge() -> Iterator[Target]:
         def send(self, data: bytes) -> None:
             assert data
 
+        def pending(self) -> bytes:
+            return b""
+
         def receive(self, _until: float) -> bytes:
             if not self.parts:
                 raise TimeoutError
             return self.parts.popleft()[:1024]
 
-    park = [b"0.1,0.2,0.3", b"1000,1000,50,1000,1000"]
+    whole = [b"0.10,0.20,0.30"] * 3 + [b"1000,1000,50,1000,1000"]
+    posed, pairs = [b"0.1000,0.2000,0.3000"] * 3, [b"0.1000,0.2000"] * 3
     kteam = [b"b,C,4\r\n", b"u\r\n", b"d\r\n", b"r,100,-100\r\n", b"g,1000,1000,50,1000,2000\r\n",
         b"n,40,40,40,40,40,40,40,900,1,1,1,1\r\n", b"v,80\r\n"]  # fmt: skip
-    examples = [b"p\0" + b"\0".join(park), b"s\0" + park[0][:7], b"k\0" + b"\0".join(kteam)]
+    examples = [letter + b"\0".join([b"", *parts]) for letter, parts in (
+        (b"n", whole), (b"n", posed), (b"p", pairs), (b"q", pairs), (b"t", pairs), (b"n", [whole[0][:7]]), (b"k", kteam)
+    )]  # fmt: skip
+    named = {b"p": "2023-01-07", b"q": "2023-01-15", b"t": "fork"}
 
     def take(data: bytes) -> None:
         which, *parts = data.split(b"\0")
@@ -87,13 +97,19 @@ def khepera_bridge() -> Iterator[Target]:
         odometer = Odometer(0.0, 0.0, 0.0)
         driver: Park | KTeam
         if which[:1] == b"k":
-            driver = KTeam(line, Settings())
+            driver = KTeam(line, khepera4.Settings())
         else:
-            driver = Park(line, Settings(odometry="pose" if which[:1] == b"p" else "increments"))
-            driver._free = -np.inf
-            driver._send_command = line.send  # type: ignore[method-assign]  # without the pause
-        driver.begin()
+            gap, khepera4.GAP_S = khepera4.GAP_S, 0.0  # type: ignore[misc]  # without the pauses
+            try:
+                driver = identify(line, khepera4.Settings(), named.get(which[:1]))
+                driver.begin()
+                driver.drive(0.1, 0.2)
+                driver.move(odometer)
+                driver.drive(-0.1, 0.2)
+            finally:
+                khepera4.GAP_S = gap  # type: ignore[misc]
         if isinstance(driver, KTeam):
+            driver.begin()
             driver.drive(0.1, 0.2)
         driver.move(odometer)
         assert np.isfinite((odometer.x, odometer.y, odometer.yaw)).all()

@@ -1,4 +1,8 @@
-"""Protocol twin of Khepera IV robots: Robotic Park's server or K-Team's, over TCP; each robot has its own port."""
+"""Protocol twin of Khepera IV robots, over TCP; each robot has its own port.
+
+A robot runs one of the servers that Robotic Park has published, each with what it really does (which commands move the
+robot, what `p` answers, whether it serves a second client), or K-Team's. None has a time limit for commands.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,6 @@ import numpy as np
 from agents.arrays import Array
 from agents.body.interface import BodyError, settings
 from agents.body.kinds import KHEPERA4
-from agents.decision.position_control import drive
 from agents.protocols import khepera4 as protocol
 from twins.body import CATCH_UP_S
 from twins.devices.device import DeviceRequest, Faults
@@ -21,88 +24,160 @@ from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Latency
 from twins.models.noise import Noise
 
-SCHEMES: Final = {"park": "khepera4", "kteam": "kteam"}
-BOARD_GOAL: Final = {  # Robotic Park's controller on board, for `g`
-    "response": np.array([KHEPERA4.response]),
-    "turn_response": np.array([KHEPERA4.turn_response]),
-    "speed": np.array([KHEPERA4.speed]),
-    "turn_rate": np.array([KHEPERA4.turn_rate]),
-}
+GARBAGE: Final = (3.0, -2.0)  # [m] goal of servers whose goal was never set; theirs is what the memory holds
+RECEIVE_S: Final = 0.05  # [s] after which the fork's loop turns without a command,
+SELECT_S: Final = 1.0  # [s] that of 2023-04-10, and
+MAIN_S: Final = 0.02  # [s] that of 2025-05, whether or not there are commands
 
 
 class _Robot:
-    """State of a robot's server: odometry since power-on, and commands of the wheels."""
+    """The robot below its server: wheels, encoders and battery."""
 
-    def __init__(self, chosen: protocol.Settings, faults: Faults) -> None:
-        self.odometry = chosen.odometry
+    def __init__(self, faults: Faults) -> None:
         self.charge = faults.battery
-        self.pose = np.zeros(3)  # x, y [m], theta [rad]
-        self.pulses = [0.0, 0.0]
+        self.pulses = np.zeros(2)  # of the left and the right encoder, since power-on
         self.speed = (0.0, 0.0)  # units
-        self.twist = (0.0, 0.0)  # v [m/s], ω [rad/s]
-        self.goal: tuple[float, float] | None = None
-        self.last_answer = (0.0, 0.0, 0.0)  # way [m] and turn [rad] since power-on, at the last `p`
-        self.way = self.turn = 0.0
+        self.twist = (0.0, 0.0)  # commanded v [m/s], ω [rad/s]
         self.sounding = 31  # mask of the ultrasonic sensors
 
     def drive(self, left: int, right: int) -> None:
         """Set the wheel speeds in units, within the motors' limits."""
         limit = protocol.FASTEST
-        self.goal = None
         self.twist = protocol.twist(max(-limit, min(limit, left)), max(-limit, min(limit, right)))
 
     def halt(self) -> None:
         """Stop both wheels."""
-        self.goal, self.twist = None, (0.0, 0.0)
+        self.twist = (0.0, 0.0)
 
-    def run_goal_controller(self) -> None:
-        """Run the controller on board, if there is a goal."""
-        if self.goal is not None:
-            way = np.array([[self.goal[0] - self.pose[0], self.goal[1] - self.pose[1]]])
-            v, turn = drive(way, self.pose[2:], np.array([np.nan]), **BOARD_GOAL)[0].tolist()
-            self.twist = protocol.twist(*protocol.units(v, turn))
-
-    def add_motion(self, ahead: float, moved: Array, turn: float, dt: float) -> None:
-        """Add one step: way along the nose [m], motion (2,) [m] in the frame of odometry, turn [rad]."""
-        self.pose[:2] += moved
-        self.pose[2] = math.remainder(self.pose[2] + turn, 2.0 * math.pi)
-        self.way, self.turn = self.way + ahead, self.turn + turn
+    def add_motion(self, ahead: float, turn: float, dt: float) -> None:
+        """Add one step of the wheels: way along the nose [m] and turn [rad]."""
         half = 0.5 * protocol.BASE * turn
-        for wheel, way in enumerate((ahead - half, ahead + half)):
-            self.pulses[wheel] += way / protocol.PULSE
+        self.pulses += np.array([ahead - half, ahead + half]) / protocol.PULSE
         self.speed = (ahead - half) / dt / protocol.UNIT, (ahead + half) / dt / protocol.UNIT
 
 
-def answer_park(robot: _Robot, received: bytes) -> bytes:
-    """Answer of Robotic Park's server, which reads one command per read; most commands have no answer."""
-    text = received.decode("ascii", "replace").strip("\0\r\n ")
-    if text == "stop":
-        robot.halt()
-    elif text == "get_data":
-        return b",".join([str(protocol.SOUND_NOTHING).encode()] * len(protocol.SOUND_BEARING))
-    elif text[:1] in ("p", "t"):
-        return _answer_pose(robot, text[0])
-    else:
-        values = protocol.scanned(text[1:])
-        if text[:1] == "d" and len(values) >= 2:
-            robot.drive(*protocol.units(values[0] * protocol.CENTIMETRE, values[1]))
-        elif text[:1] == "g" and len(values) >= 2:
-            robot.goal = (values[0], values[1])
-        elif text[:1] == "i" and len(values) >= 2:
-            robot.pose[: len(values)] = values
-    return b""
+class ParkProgram:
+    """The program of one published park server: its loop, its controller on board, and its answers.
 
+    The loop reads the encoders, lets the controller drive if a goal was set, and waits for one command.
+    """
 
-def _answer_pose(robot: _Robot, letter: str) -> bytes:
-    """Answer to `p`, of which three variants exist, and to `t`."""
-    x, y, theta = robot.pose.tolist()
-    way, turn = robot.way - robot.last_answer[0], robot.turn - robot.last_answer[1]
-    if letter == "t":
-        return f"{way:.4f},{theta:.4f}".encode()
-    if robot.odometry == "pose":
-        return f"{x:.4f},{y:.4f},{theta:.4f}".encode()
-    robot.last_answer = (robot.way, robot.turn, 0.0)
-    return f"{way:.6f},{turn if robot.odometry == 'increments' else theta:.6f}".encode()
+    def __init__(self, robot: _Robot, name: str) -> None:
+        self.robot, self.name, self.kind = robot, name, protocol.PARK[name]
+        self._last = robot.pulses.copy()
+        self._place = [0.0, 0.0]  # [m]
+        self._theta = self._way = self._sum = 0.0  # [rad]; [m] in the last turn; sum of the bearing errors [rad]
+        self._goal, self._active = GARBAGE, False
+        self._due = 0.0  # [s] of the next turn without a command
+
+    def begin_session(self) -> None:
+        """A client was accepted."""
+        if self.name == "fork":
+            self._active = False
+        self._last = self.robot.pulses.copy()
+
+    def end_session(self) -> None:
+        """The client has gone."""
+        if self.kind.clients is None:
+            self.robot.halt()
+
+    def advance(self, t: float, *, connected: bool, left: bool) -> None:
+        """Let the loop turn until `t` [s] without a command; one whose client has `left` no longer waits for any."""
+        period = {"2023-04-10": SELECT_S, "fork": RECEIVE_S, "2025-05": MAIN_S}.get(self.name, math.inf)
+        if left and self.kind.clients is not None:
+            self._turn()
+        elif (connected or self.name == "2025-05") and t >= self._due:
+            self._turn()
+            self._due = t + period
+
+    def answer(self, received: bytes, t: float) -> bytes:
+        """The answer to what one `read()` brought, if it has one."""
+        text = received.rstrip(b"\0").decode("ascii", "replace")
+        answer = self._obey(text, text[:1], protocol.scanned(text[1:]))
+        if self.name != "2025-05":  # its loop is a thread of its own
+            self._turn()
+            self._due = t + (SELECT_S if self.name == "2023-04-10" else RECEIVE_S)
+        return answer.encode()
+
+    def _obey(self, text: str, letter: str, values: list[float]) -> str:
+        newest = self.name == "2025-05"  # the only one that compares whole words
+        if letter == "d" and len(values) >= 2:
+            if self.kind.drives and not (self.name == "fork" and self._active):
+                self._drive(values[0], values[1])
+            self._active = self._active and not newest
+        elif letter == "g" and self.name != "2023-01-07":
+            if len(values) >= 2:
+                self._goal = (values[0], values[1])
+            self._active = self._active or len(values) >= 2 or not newest
+            return self._sounds() if text == "get_data" and self.kind.per_turn else ""
+        elif letter == "i" and len(values) >= 2 and self.name != "2023-01-07":
+            self._place = values[:2]
+            if self.name == "2023-04-10" and len(values) >= 3:
+                self._theta = values[2]
+            self._active = self._active and not newest
+        elif text == "stop":
+            self.robot.halt()
+        elif text == "get_data":
+            return self._sounds() if self.name == "2023-01-07" else ""
+        elif text == "p" or (letter == "p" and not newest):
+            return self._odometry()
+        elif letter == "t" and self.name == "2023-04-10":
+            return f"{self._way:.4f},{self._theta:.4f}"
+        return ""
+
+    def _sounds(self) -> str:
+        return ",".join([str(protocol.SOUND_NOTHING)] * len(protocol.SOUND_BEARING))
+
+    def _odometry(self) -> str:
+        if self.kind.answer == "increments":
+            way, turn = self._encoders()
+            return f"{way:.4f},{turn:.4f}"
+        if self.kind.answer == "heading":
+            return f"{self._way:.4f},{self._theta:.4f}"
+        decimals = self.kind.decimals
+        return ",".join(f"{value:.{decimals}f}" for value in (*self._place, self._theta))
+
+    def _encoders(self) -> tuple[float, float]:
+        """Way [m] and turn [rad] since the encoders were read last; whole pulses."""
+        left, right = np.trunc(self.robot.pulses - self._last)
+        self._last = self.robot.pulses.copy()
+        return 0.5 * protocol.PULSE * (left + right), protocol.PULSE * (right - left) / self.kind.base
+
+    def _turn(self) -> None:
+        """One turn of the loop."""
+        if self.kind.answer == "increments":  # it has no controller, and reads the encoders for `p` alone
+            return
+        self._way, turn = self._encoders()
+        self._place = [
+            self._place[0] + self._way * math.cos(self._theta),
+            self._place[1] + self._way * math.sin(self._theta),
+        ]
+        self._theta += turn
+        if self._active:
+            self._drive(*self._controller())
+
+    def _controller(self) -> tuple[float, float]:
+        """v [cm/s] and ω [rad/s] toward the goal, by the law of this program."""
+        dx, dy = self._goal[0] - self._place[0], self._goal[1] - self._place[1]
+        error = math.atan2(dy, dx) - self._theta
+        if self.name == "2023-04-10":
+            off = abs(dx) + 100.0 * dy * dy
+            if off <= 0.01:
+                return 0.0, 0.0
+            error = math.remainder(error, 2.0 * math.pi)
+            v = min(off * (3.14 - int(abs(error))) / 3.14, 10.0)
+            self._sum += error
+            return v, 1.5 * math.sin(error) + 0.008 * self._sum * 0.003
+        ahead = dx * math.cos(self._theta) + dy * math.sin(self._theta)
+        if self.name == "2025-05" and abs(ahead) <= 0.01:
+            return 0.0, 0.0
+        v = 10.0 * ahead
+        return (0.0 if abs(v) < 0.02 and self.name != "2025-05" else v), math.sin(error)
+
+    def _drive(self, v: float, turn: float) -> None:
+        """Drive at v [cm/s] and ω [rad/s], cut to whole units."""
+        half, unit = 0.5 * 100.0 * protocol.BASE * turn, 100.0 * protocol.UNIT
+        self.robot.drive(int((v - half) / unit), int((v + half) / unit))
 
 
 def answer_kteam(robot: _Robot, line: str) -> str:
@@ -137,7 +212,7 @@ def answer_kteam(robot: _Robot, line: str) -> str:
     elif letter == "U" and len(values) == 1:
         robot.sounding = values[0]
     elif letter == "I":
-        robot.pulses = [0.0, 0.0]
+        robot.pulses[:] = 0.0
     elif letter == "V" and values and values[0] in measured:
         return f"v,{round(measured[values[0]])}"
     elif letter in answers:
@@ -148,28 +223,32 @@ def answer_kteam(robot: _Robot, line: str) -> str:
 
 
 class _Server:
-    """Port of one robot: serves one client; others wait until that client has left."""
+    """Port of one robot: serves one client; others wait until that client has left, or for ever."""
 
-    def __init__(self, robot: _Robot, chosen: protocol.Settings, faults: Faults, listener: socket.socket) -> None:
+    def __init__(self, robot: _Robot, name: str, faults: Faults, listener: socket.socket) -> None:
         self.robot, self.listener = robot, listener
-        self._protocol, self._stops_alone, self._faults = chosen.protocol, chosen.stops_alone, faults
+        self._program = ParkProgram(robot, name) if name in protocol.PARK else None
+        self._faults = faults
         self._client: socket.socket | None = None
+        self._left = False  # whether a client has left
         self._partial = b""
         self._outbox: deque[tuple[float, bytes]] = deque()
 
     def sockets(self, *, silent: bool) -> list[socket.socket]:
-        """Sockets to wait on."""
-        if self._client is not None:
-            return [self._client]
-        return [] if silent else [self.listener]
+        """Sockets to wait on; what is sent to a silent robot waits in its connection, as in a gap of the radio."""
+        if silent or (self._left and self._program is not None and self._program.kind.clients == 1):
+            return []
+        return [self.listener if self._client is None else self._client]
 
-    def serve(self, ready: socket.socket, t: float, *, silent: bool) -> None:
+    def serve(self, ready: socket.socket, t: float) -> None:
         """Accept a client, answer a command, or close the connection."""
         try:
             if ready is self.listener:
                 self._client, _ = self.listener.accept()
                 self._client.setblocking(False)
                 self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                if self._program is not None:
+                    self._program.begin_session()
                 return
             received = ready.recv(255)
         except BlockingIOError:
@@ -178,9 +257,14 @@ class _Server:
             received = b""
         if not received:
             self.hang_up()
-        elif not silent:
-            self._outbox.append((t + self._faults.delay_s, self._answer(received)))
+        else:
+            self._outbox.append((t + self._faults.delay_s, self._answer(received, t)))
             self.flush(t)
+
+    def advance(self, t: float) -> None:
+        """Let the program on the robot go on until `t` [s]."""
+        if self._program is not None:
+            self._program.advance(t, connected=self._client is not None, left=self._left)
 
     def flush(self, t: float) -> None:
         """Send due answers."""
@@ -196,14 +280,15 @@ class _Server:
         """Close the client's connection: the robot stops if its server does that, else it drives on."""
         if self._client is not None:
             self._client.close()
+            self._left = True
+            if self._program is not None:
+                self._program.end_session()
         self._client, self._partial = None, b""
         self._outbox.clear()
-        if self._stops_alone:
-            self.robot.halt()
 
-    def _answer(self, received: bytes) -> bytes:
-        if self._protocol == "park":
-            return answer_park(self.robot, received)
+    def _answer(self, received: bytes, t: float) -> bytes:
+        if self._program is not None:
+            return self._program.answer(received, t)
         *lines, self._partial = (self._partial + received).replace(b"\n", b"\r").split(b"\r")
         answers = [answer_kteam(self.robot, line.decode("ascii", "replace")) for line in lines if line]
         return "".join(f"{answer}\r\n" for answer in answers).encode()
@@ -225,10 +310,10 @@ class KheperaDevice:
         try:
             for name, address, choice in zip(body.names, body.addresses, chosen, strict=True):
                 listener = _listen(name, address)
-                robot = _Robot(choice, request.faults)
-                self._servers.append(_Server(robot, choice, request.faults, listener))
+                server = choice.server or protocol.NEWEST
+                self._servers.append(_Server(_Robot(request.faults), server, request.faults, listener))
                 host, port = listener.getsockname()
-                addresses.append(f"{SCHEMES[choice.protocol]}://{host}:{port}")
+                addresses.append(f"{'kteam' if server == 'kteam' else 'khepera4'}://{host}:{port}")
         except BodyError:
             self.close()
             raise
@@ -242,15 +327,17 @@ class KheperaDevice:
         """See `Device.serve`."""
         for server in self._servers:
             if ready in server.sockets(silent=False):
-                server.serve(ready, t, silent=self._silent(server, t))
+                server.serve(ready, t)
 
     def advance(self, t: float) -> None:
         """See `Device.advance`."""
         steps = round((t - self._t) / self._dt)
         if steps * self._dt > CATCH_UP_S:
             steps = 1
-        for _ in range(steps):
+        for step in range(steps):
             self._step()
+            for server in self._servers:
+                server.advance(t - (steps - 1 - step) * self._dt)
         self._t = t
         for server in self._servers:
             if not self._faults.silent(t):
@@ -276,7 +363,6 @@ class KheperaDevice:
             robot.charge = max(0.0, robot.charge - self._faults.drain * self._dt / KHEPERA4.endurance_s)
             if robot.charge <= 0.0:
                 robot.halt()
-            robot.run_goal_controller()
             wanted[row, :2] = robot.twist
         if self._latency.present:
             wanted = self._latency.delay(wanted)
@@ -286,16 +372,13 @@ class KheperaDevice:
         moved, turn = (self._model.position - place)[:, :2], self._model.yaw - yaw
         middle = yaw + 0.5 * turn
         ahead = np.cos(middle) * moved[:, 0] + np.sin(middle) * moved[:, 1]
-        if self._drift.present:
+        if self._drift.present:  # of the encoders: wheels that slip
             error = self._drift.error.copy()
             self._drift.advance(moved)
-            moved = moved + self._drift.error - error
+            slip = self._drift.error - error
+            ahead = ahead + np.cos(middle) * slip[:, 0] + np.sin(middle) * slip[:, 1]
         for row, server in enumerate(self._servers):
-            frame = float(server.robot.pose[2] - yaw[row])  # between its odometry and the world
-            cos, sin = math.cos(frame), math.sin(frame)
-            x, y = moved[row].tolist()
-            own = np.array([cos * x - sin * y, sin * x + cos * y])
-            server.robot.add_motion(float(ahead[row]), own, float(turn[row]), self._dt)
+            server.robot.add_motion(float(ahead[row]), float(turn[row]), self._dt)
 
 
 def _listen(name: str, address: str) -> socket.socket:

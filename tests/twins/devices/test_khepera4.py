@@ -20,8 +20,8 @@ DT = 0.01
 class Conversation:
     """A client of one robot that lets its time pass tick by tick."""
 
-    def __init__(self, speaks, *, faults=None, **parts):
-        rows = request("khepera4", ["khepera4-twin"], device={"protocol": speaks, **parts.pop("device", {})}, **parts)
+    def __init__(self, server, *, faults=None, **parts):
+        rows = request("khepera4", ["khepera4-twin"], device={"server": server}, **parts)
         self.device = khepera4.open_device(DeviceRequest(rows, Faults(**(faults or {}))))
         host, port = self.device.addresses[0].partition("://")[2].split(":")
         self.place = (host, int(port))
@@ -73,8 +73,8 @@ class Conversation:
 def talk():
     made = []
 
-    def begin(speaks, **parts):
-        made.append(Conversation(speaks, **parts))
+    def begin(server, **parts):
+        made.append(Conversation(server, **parts))
         return made[-1]
 
     yield begin
@@ -86,86 +86,142 @@ def values(answer):
     return [float(word) for word in answer.split(",")]
 
 
-def test_park_drives_in_centimetres_and_counts_its_own_pose(talk):
-    robot = talk("park", start=[[0.5, -0.2, 0.0]], yaw=np.pi / 2)
-    assert robot.ask(b"p") == "0.0000,0.0000,0.0000"
+def speed(robot):
+    """Speed over the floor [m/s], from now on."""
+    before = robot.truth()
+    robot.wait(0.5)
+    after = robot.truth()
+    return np.hypot(after[0] - before[0], after[1] - before[1]) / 0.5
+
+
+def test_the_server_of_2025_drives_in_centimetres_and_tells_its_pose_in_centimetres(talk):
+    robot = talk("2025-05", start=[[0.5, -0.2, 0.0]], yaw=np.pi / 2)
+    assert robot.ask(b"p") == "0.00,0.00,0.00"
     robot.say(b"d 10.0 0.0")
     robot.wait(2.0)
     assert robot.truth() == pytest.approx([0.5, 0.0, np.pi / 2], abs=0.004)
-    assert values(robot.ask(b"p")) == pytest.approx([0.2, 0.0, 0.0], abs=0.004)
+    assert values(robot.ask(b"p")) == pytest.approx([0.2, 0.0, 0.0], abs=0.006)
     robot.say(b"d 0.0 0.5")
     robot.wait(1.0)
-    assert values(robot.ask(b"p"))[2] == pytest.approx(0.5, abs=0.02)
+    assert values(robot.ask(b"p"))[2] == pytest.approx(0.5, abs=0.04)  # wheels turn in whole units
     robot.say(b"stop")
     robot.wait(0.2)
-    before = robot.truth()
-    robot.wait(1.0)
-    assert robot.truth() == before
-    assert robot.ask(b"get_data") == "1000,1000,1000,1000,1000"
-
-
-def test_park_has_no_watchdog_but_stops_when_its_client_goes(talk):
-    robot = talk("park")
-    robot.say(b"d 5 0")
-    robot.wait(5.0)
-    assert robot.truth()[0] == pytest.approx(0.25, abs=0.01)
-    robot.client.close()
-    robot.serve()
-    robot.wait(0.2)
-    before = robot.truth()
-    robot.wait(1.0)
-    assert robot.truth() == before
+    assert speed(robot) == 0.0
+    assert robot.ask(b"get_data") is None
+    assert speed(robot) == 0.0
 
 
 @pytest.mark.parametrize(
-    ("speaks", "odometry", "words"),
-    [("park", "increments", b"d 5 0"), ("park", "heading", b"d 5 0"), ("kteam", "pose", b"D,74,74\r")],
+    ("server", "moves"),
+    [("2023-01-07", True), ("2023-01-15", False), ("2023-04-10", False), ("2025-05", True), ("fork", True)],
 )
-def test_older_servers_drive_on_when_the_client_has_gone(talk, speaks, odometry, words):
-    robot = talk(speaks, device={"odometry": odometry})
+def test_only_some_servers_obey_a_speed(talk, server, moves):
+    robot = talk(server)
+    robot.say(b"d 5 0")
+    robot.wait(0.5)
+    assert (speed(robot) > 0.04) == moves
+
+
+@pytest.mark.parametrize(
+    ("server", "words"),
+    [("2023-01-07", b"d 5 0"), ("2023-01-15", b"g 5 0"), ("2023-04-10", b"g 0 5"), ("2025-05", b"d 5 0"),
+     ("fork", b"d 5 0"), ("kteam", b"D,74,74\r")],
+)  # fmt: skip
+def test_no_server_has_a_watchdog_and_some_drive_on_without_a_client(talk, server, words):
+    robot = talk(server)
     robot.say(words)
-    robot.wait(1.0)
+    robot.wait(4.0)
+    assert speed(robot) > 0.03
     robot.client.close()
     robot.serve()
-    robot.wait(9.0)
-    assert robot.truth()[0] == pytest.approx(0.5, abs=0.01)
+    robot.wait(0.2)
+    assert (speed(robot) > 0.03) == (server not in {"2025-05", "fork"})
+
+
+@pytest.mark.parametrize("server", ["2023-01-07", "2023-01-15", "2023-04-10", "2025-05", "fork", "kteam"])
+def test_the_servers_of_2023_accept_one_client_in_their_life(talk, server):
+    robot = talk(server)
+    question = b"R\r" if server == "kteam" else b"p"
+    second = robot.connect()
+    robot.say(question, second)
+    assert robot.heard(second) is None
+    assert robot.ask(question) is not None
+    robot.client.close()
+    for _ in range(3):  # the first goes, the second is let in, and heard
+        robot.serve()
+    assert (robot.heard(second) is None) == server.startswith("2023")
 
 
 def test_park_loses_what_is_glued_to_a_command(talk):
-    robot = talk("park")
+    robot = talk("2023-01-07")
     robot.say(b"d 10.0 0.0stop")
     robot.wait(1.0)
     assert robot.truth()[0] > 0.08
 
 
-def test_park_sets_its_pose_and_goes_to_a_goal_by_itself(talk):
-    robot = talk("park", start=[[0.3, 0.0, 0.0]])
+def test_the_range_poll_is_a_goal_to_the_servers_since_2023_01_15(talk):
+    for server, drives, answers in (
+        ("2023-01-07", False, True),
+        ("2023-01-15", True, True),
+        ("2023-04-10", True, False),
+        ("2025-05", False, False),
+        ("fork", True, True),
+    ):
+        robot = talk(server)
+        assert (robot.ask(b"get_data") == "1000,1000,1000,1000,1000") == answers
+        robot.wait(1.5)
+        assert (speed(robot) > 0.0) == drives, server
+        robot.say(b"stop")
+        robot.wait(2.0)
+        assert (speed(robot) > 0.0) == drives, server  # the next turn of its loop drives again
+
+
+def test_a_goal_is_reached_by_the_controller_of_2023_04_10(talk):
+    robot = talk("2023-04-10", start=[[0.3, 0.0, 0.0]])
     robot.say(b"i 1.0 0.5 1.0")
     assert robot.ask(b"p") == "1.0000,0.5000,1.0000"
     assert robot.ask(b"t") == "0.0000,1.0000"
-    robot.say(b"g 1.2 0.6")
-    robot.wait(8.0)
-    assert values(robot.ask(b"p"))[:2] == pytest.approx([1.2, 0.6], abs=0.006)
+    robot.say(b"g 1.0 0.9")
+    for _ in range(400):  # slower and slower: v falls with the square of Δy
+        robot.ask(b"p")
+        robot.wait(0.05)
+    assert values(robot.ask(b"p"))[:2] == pytest.approx([1.0, 0.9], abs=0.06)
     x, y, _ = robot.truth()  # its frame is turned by 1 rad against the world
     cos, sin = np.cos(-1.0), np.sin(-1.0)
-    assert [x - 0.3, y] == pytest.approx([cos * 0.2 - sin * 0.1, sin * 0.2 + cos * 0.1], abs=0.01)
+    assert [x - 0.3, y] == pytest.approx([-sin * 0.4, cos * 0.4], abs=0.06)
 
 
-@pytest.mark.parametrize(("odometry", "expected"), [("increments", [0.05, 0.1]), ("heading", [0.05, 0.2])])
-def test_park_of_other_years_counts_from_the_last_question(talk, odometry, expected):
-    robot = talk("park", device={"odometry": odometry})
+def test_increments_count_from_the_last_question(talk):
+    robot = talk("2023-01-07")
     robot.say(b"d 5.0 0.1")
     robot.wait(1.0)
     robot.ask(b"p")
     robot.wait(1.0)
-    assert values(robot.ask(b"p")) == pytest.approx(expected, abs=0.006)
+    assert values(robot.ask(b"p")) == pytest.approx([0.05, 0.1], abs=0.006)
 
 
-@pytest.mark.parametrize("nonsense", [b"d", b"d fast", b"g 1", b"i", b"x", b"\xff\x00", b"d nan nan", b"d 1e999 0"])
+@pytest.mark.parametrize("server", ["2023-01-15", "fork"])
+def test_way_counts_from_the_last_command(talk, server):
+    """Of 40 ms at 0.1 m/s 30 are reported: those before the speed command, not the 10 behind it."""
+    robot = talk(server)
+    drive = b"d 10 0" if server == "fork" else b"g 1000 0"
+    if server == "2023-01-15":
+        robot.say(b"i 999 0")  # one metre before its goal: 10 cm/s
+    told = []
+    for _ in range(25):
+        robot.say(drive)
+        robot.wait(0.01)
+        told.append(values(robot.ask(b"p"))[0])
+        robot.wait(0.03)
+    assert told[5:] == pytest.approx([0.003] * 20, abs=0.0005)
+    assert robot.truth()[0] == pytest.approx(0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("nonsense", [b"d", b"d fast", b"i", b"x", b"\xff\x00", b"d nan nan", b"d 1e999 0"])
 def test_park_ignores_what_it_does_not_understand(talk, nonsense):
-    robot = talk("park")
+    robot = talk("2025-05")
     assert robot.ask(nonsense) is None
-    assert robot.ask(b"p") == "0.0000,0.0000,0.0000"
+    assert robot.ask(b"p") == "0.00,0.00,0.00"
 
 
 def test_kteam_speaks_in_lines_units_and_pulses(talk):
@@ -209,22 +265,8 @@ def test_the_motors_have_a_limit(talk):
     assert robot.ask(b"E\r") == "e,1200,1200\r\n"
 
 
-@pytest.mark.parametrize("speaks", ["park", "kteam"])
-def test_a_second_client_waits_until_the_first_has_gone(talk, speaks):
-    robot = talk(speaks)
-    question = {"park": b"p", "kteam": b"R\r"}[speaks]
-    second = robot.connect()
-    robot.say(question, second)
-    assert robot.heard(second) is None
-    assert robot.ask(question) is not None
-    robot.client.close()
-    for _ in range(3):  # the first goes, the second is let in, and heard
-        robot.serve()
-    assert robot.heard(second) is not None
-
-
 def test_silence_and_delay(talk):
-    robot = talk("park", faults={"silent_from_s": 1.0, "silent_for_s": 1.0, "delay_s": 0.05})
+    robot = talk("2023-01-07", faults={"silent_from_s": 1.0, "silent_for_s": 1.0, "delay_s": 0.05})
     assert robot.ask(b"p") is None
     robot.wait(0.05)
     assert robot.heard() is not None
@@ -236,9 +278,13 @@ def test_silence_and_delay(talk):
     assert robot.heard() is None
     assert robot.truth()[0] > 0.12  # it drives on, for it heard nothing
     robot.wait(0.6)
-    robot.say(b"p")
+    robot.serve()  # both come at once, and it reads the first
     robot.wait(0.06)
     assert robot.heard() is not None
+    assert speed(robot) > 0.09
+    robot.say(b"stop")
+    robot.wait(0.2)
+    assert speed(robot) == 0.0
 
 
 def test_a_battery_that_ends_stops_and_silences_it(talk):
@@ -254,17 +300,17 @@ def test_a_battery_that_ends_stops_and_silences_it(talk):
 
 
 def test_odometry_drifts_and_commands_are_late_as_the_experiment_says(talk):
-    robot = talk("park", disturbance=Disturbance(odometry_drift=0.02, latency_s=0.2))
+    robot = talk("2025-05", disturbance=Disturbance(odometry_drift=0.02, latency_s=0.2))
     robot.say(b"d 20 0")
     robot.wait(0.2)
     assert robot.truth()[0] == 0.0
     robot.wait(5.0)
     error = np.array(values(robot.ask(b"p"))[:2]) - robot.truth()[:2]
-    assert 0.001 < np.abs(error).max() < 0.1  # 0.02 m per root metre, on one metre
+    assert 0.001 < np.abs(error).max() < 0.1  # 0.02 m per root metre along its nose, on one metre
 
 
 def test_addresses_that_cannot_be_had(talk):
-    held = talk("park").device.addresses[0].removeprefix("khepera4://")
+    held = talk("2023-01-07").device.addresses[0].removeprefix("khepera4://")
     for address, why in [
         (f"khepera4-twin://{held}", "name another address"),
         ("khepera4-twin://192.168.0.21", "loopback"),
@@ -273,8 +319,8 @@ def test_addresses_that_cannot_be_had(talk):
     ]:
         with pytest.raises(BodyError, match=why):
             khepera4.open_device(DeviceRequest(request("khepera4", [address]), Faults()))
-    with pytest.raises(BodyError, match=r"R0: device: .*protocol"):
-        khepera4.open_device(DeviceRequest(request("khepera4", ["k"], device={"protocol": "morse"}), Faults()))
+    with pytest.raises(BodyError, match=r"R0: device: .*server"):
+        khepera4.open_device(DeviceRequest(request("khepera4", ["k"], device={"server": "morse"}), Faults()))
 
 
 @given(st.floats(-0.27, 0.27), st.floats(-2.0, 2.0))

@@ -1,0 +1,379 @@
+"""Drivers of a Khepera IV on one connection: K-Team's protocol, and the park servers, by what each of them obeys."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import select
+import time
+from collections.abc import Callable
+from typing import Final, Protocol
+
+import numpy as np
+
+from agents.arrays import Array
+from agents.protocols import khepera4 as protocol
+from bridges.khepera4.odometry import Odometer
+
+BOOT_CLOCK: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # goes on while the machine sleeps
+NEVER: Final = math.inf
+REPORTED_S: Final = (0.004, 0.045)  # a report of way that covers less or more is not used to complete another
+GAP_S: Final = 0.3  # [s] commands further apart were parted by a gap of the link
+PLACED_S: Final = 1.0  # [s] between two positions that are given to a server which does not tell its own
+
+
+def awake() -> float:
+    """Time [s] on a clock that counts suspensions of the machine."""
+    return time.clock_gettime(BOOT_CLOCK)
+
+
+class UnknownAnswer(OSError):
+    """The answer does not belong to this protocol, or to the server that was named."""
+
+
+class WrongServer(UnknownAnswer):
+    """The server is none that is known, not known which, or not the one that was named: it must not be driven."""
+
+
+class Wire:
+    """Byte stream to and from a robot: a TCP connection or a serial line."""
+
+    def __init__(self, descriptor: int, close: Callable[[], None]) -> None:
+        self._descriptor, self._close = descriptor, close
+        self._poll = select.poll()
+        self._poll.register(descriptor, select.POLLIN)
+
+    def send(self, data: bytes) -> None:
+        """Write at once."""
+        os.write(self._descriptor, data)
+
+    def pending(self) -> bytes:
+        """Input that has come so far.
+
+        Raises:
+            ConnectionError: If the other end has closed.
+        """
+        data = b""
+        while self._poll.poll(0):
+            data += self._read()
+        return data
+
+    def receive(self, until: float) -> bytes:
+        """Next bytes received.
+
+        Raises:
+            TimeoutError: If nothing comes before `until` [s, monotonic].
+            ConnectionError: If the other end has closed.
+        """
+        if not self._poll.poll(max(0.0, 1e3 * (until - time.monotonic()))):
+            raise TimeoutError
+        return self._read()
+
+    def close(self) -> None:
+        """Close it; what was written is still delivered, which TCP does only if all input was read before."""
+        try:
+            self.pending()
+        except OSError:
+            pass
+        finally:
+            self._close()
+
+    def _read(self) -> bytes:
+        data = os.read(self._descriptor, 1024)
+        if not data:
+            raise ConnectionResetError("the robot closed the connection")
+        return data
+
+
+class Driver(Protocol):
+    """One protocol. Every method raises OSError if the robot does not answer, or not in this protocol."""
+
+    ranged: bool  # whether it reads ranges
+    patience_s: float  # [s] without an answer after which a request fails
+
+    def begin(self) -> None:
+        """Stop the robot of a new connection, then make sure which server runs on it."""
+        ...
+
+    def drive(self, v: float, turn: float, until: float = NEVER) -> None:
+        """Drive at v [m/s] and ω [rad/s]; zeros stop the robot, as does whatever is sent after `until` [s, `awake`]."""
+        ...
+
+    def move(self, odometer: Odometer) -> None:
+        """Request odometry and update `odometer`; the answer shows that the last command was read."""
+        ...
+
+    def ranges(self) -> tuple[Array, Array]:
+        """Bearings [rad] and distances from the robot's centre [m]."""
+        ...
+
+    def battery(self) -> float:
+        """Charge, 0 to 1; NaN if the protocol has no such value."""
+        ...
+
+
+class Park:
+    """A server of Robotic Park that obeys `d`; what else it does is in `protocol.PARK`."""
+
+    def __init__(self, wire: Wire, chosen: protocol.Settings, server: protocol.ParkServer) -> None:
+        self._wire, self.server = wire, server
+        self.ranged, self.patience_s = bool(chosen.ranges), chosen.silence_s
+        self._number = re.compile(rf"[-+]?\d+\.\d{{{server.decimals}}}")
+        self._count = 3 if server.answer == "pose" else 2
+        self._angle = server.base / protocol.BASE  # of a true angle, per angle that the server counts
+        self._free = -math.inf  # [s] earliest time of the next command
+        self._sent = (math.nan, math.nan)  # [s] of the last two commands, the later one last
+        self._asked = self._counted = math.nan  # [s] of the last p; end of the way that is counted
+        self._speed = (0.0, 0.0)  # [m/s, rad/s] by the last good report
+
+    def begin(self) -> None:
+        """See `Driver`. `identify` has made sure of the server."""
+        self.drive(0.0, 0.0)
+
+    def drive(self, v: float, turn: float, until: float = NEVER) -> None:
+        """See `Driver`."""
+        self._send(protocol.park_drive(v, turn) if v or turn else b"stop", b"stop", until)
+
+    def move(self, odometer: Odometer) -> None:
+        """See `Driver`."""
+        self._add(self._reports(self._wire.pending()), odometer)  # late answers, after a gap
+        before, asked = self._sent, self._asked
+        self._asked = self._send(b"p")
+        answer = self._receive("p")
+        reports = self._reports(answer)
+        if not reports:
+            raise UnknownAnswer(f"answers p with {_shown(answer)}, not with {self._count} numbers as before")
+        if self.server.answer == "increments":
+            self._add(reports, odometer)
+        else:
+            self._add_last(reports[-1], odometer, before, asked)
+
+    def ranges(self) -> tuple[Array, Array]:
+        """See `Driver`."""
+        self._send(b"get_data")
+        try:
+            answer = self._receive("get_data")
+        except TimeoutError:
+            self.ranged = False  # one that comes late would be read as odometry
+            raise
+        sound = protocol.numbers(answer.decode("ascii", "replace").strip("\0\r\n "))
+        if len(sound) != len(protocol.SOUND_BEARING):
+            raise UnknownAnswer(f"answers get_data with {_shown(answer)}; leave ranges out of its device table")
+        return protocol.SOUND_BEARING, protocol.sound_distance(np.array(sound))
+
+    def battery(self) -> float:
+        """See `Driver`."""
+        return math.nan
+
+    def _send(self, command: bytes, instead: bytes = b"", until: float = NEVER) -> float:
+        """Send a command in a segment of its own, or `instead` if it is past `until`; returns when [s]."""
+        time.sleep(max(0.0, self._free - time.monotonic()))  # of two commands in one segment the second is lost
+        self._wire.send(command if awake() <= until else instead)
+        now = time.monotonic()
+        self._free = now + protocol.GAP_S
+        self._sent = self._sent[1], now
+        return now
+
+    def _receive(self, asked: str) -> bytes:
+        try:
+            return self._wire.receive(time.monotonic() + self.patience_s)
+        except TimeoutError as error:
+            raise TimeoutError(f"no answer to {asked}") from error
+
+    def _reports(self, received: bytes) -> list[list[float]]:
+        """Answers to `p`, which come without a mark between them."""
+        numbers = [float(word) for word in self._number.findall(received.decode("ascii", "replace"))]
+        whole = len(numbers) - len(numbers) % self._count
+        return [numbers[at : at + self._count] for at in range(0, whole, self._count)]
+
+    def _add(self, reports: list[list[float]], odometer: Odometer) -> None:
+        """Add increments, each of which is reported once."""
+        for way, turn in reports if self.server.answer == "increments" else ():
+            odometer.steps(way, self._angle * turn, time.monotonic())
+
+    def _add_last(self, report: list[float], odometer: Odometer, sent: tuple[float, float], _asked: float) -> None:
+        """Add the newest report of any other kind; two commands were `sent` before its request [s]."""
+        if self.server.answer == "pose":
+            x, y, theta = report
+            odometer.pose(x, y, self._angle * theta, time.monotonic())
+        else:
+            self._add_turn(report, odometer, sent)
+
+    def _add_turn(self, report: list[float], odometer: Odometer, sent: tuple[float, float]) -> float:
+        """Add the way of one turn of the server's loop [m], and its heading [rad]; returns the way with what lacks.
+
+        The turn lasts from one command to the next, and only `p` reports it: the way between the last two commands of a
+        period is lost. All is counted at the speed of this report, or across a gap at that of the last.
+        """
+        way, theta = report
+        begin, end = sent
+        since = end - self._counted
+        if since <= GAP_S and REPORTED_S[0] <= end - begin <= REPORTED_S[1]:
+            self._speed = way / (end - begin), 0.0
+        way = self._speed[0] * since if since > 0.0 else 0.0
+        self._counted = end
+        odometer.heading(way, self._angle * theta, time.monotonic())
+        return way
+
+
+class GoalPark(Park):
+    """A server of Robotic Park that obeys only goals: its own controller is led by a goal just ahead of the robot.
+
+    The server is told that the robot stands at the origin, and the goal is laid where the law of the server gives the
+    wanted speeds (`protocol.park_goal_2023_04`, `protocol.park_goal_2023_01`). `stop` does not help: the next turn of
+    its loop drives again.
+    """
+
+    def __init__(self, wire: Wire, chosen: protocol.Settings, server: protocol.ParkServer) -> None:
+        super().__init__(wire, chosen, server)
+        self._theta = 0.0  # [rad] heading by the server's count
+        self._placed = -math.inf  # [s] when the server was told its position
+        self._way = np.zeros(2)  # [m] since then, in its frame
+        self._about = 0.0  # [rad/s] of a turn toward a goal behind
+
+    def begin(self) -> None:
+        """See `Driver`. The heading must be known before a goal is sent."""
+        if not self.server.posed:
+            self._send(b"p")
+            reports = self._reports(self._receive("p"))
+            if not reports:
+                raise UnknownAnswer("answers p differently from one time to the next")
+            self._theta = reports[-1][1]
+        self.drive(0.0, 0.0)
+
+    def drive(self, v: float, turn: float, until: float = NEVER) -> None:
+        """See `Driver`."""
+        if self.server.posed:
+            if v < 0.0:  # it drives ahead only: it turns about until the goal is before it
+                self._about = self._about or -math.copysign(1.0, turn)
+                v, turn = 0.0, self._about
+            else:
+                self._about = 0.0
+            self._send(b"i 0.0 0.0 1.570796")
+            goal, stay = protocol.park_goal_2023_04(v, turn), (0.0, 0.0)
+        else:
+            now = time.monotonic()
+            if not (v or turn) or now - self._placed > PLACED_S:
+                self._send(b"i 0.0 0.0")
+                self._way, self._placed = np.zeros(2), now
+            here = self._way.tolist()
+            goal, stay = (
+                (here[0] + x, here[1] + y)
+                for x, y in (
+                    protocol.park_goal_2023_01(v, turn, self._theta),
+                    protocol.park_goal_2023_01(0.0, 0.0, self._theta),
+                )
+            )
+        self._send(protocol.park_goal(*goal), protocol.park_goal(*stay), until)
+
+    def _add_last(self, report: list[float], odometer: Odometer, sent: tuple[float, float], asked: float) -> None:
+        if not self.server.posed:
+            way = self._add_turn(report, odometer, sent)
+            self._theta = report[1]
+            self._way = self._way + way * np.array([math.cos(self._theta), math.sin(self._theta)])
+            return
+        # the pose counts from the p before the last `i`, since a turn of the loop ends behind each command
+        _, way, theta = report
+        end = sent[1]
+        since, reported = end - self._counted, end - asked
+        turn = self._angle * math.remainder(theta - 0.5 * math.pi, 2.0 * math.pi)
+        if since <= GAP_S and reported >= REPORTED_S[0]:
+            self._speed = way / reported, turn / reported
+        self._counted = end
+        if since > 0.0:
+            odometer.steps(self._speed[0] * since, self._speed[1] * since, time.monotonic())
+
+
+def identify(wire: Wire, chosen: protocol.Settings, server: str | None) -> Park:
+    """Stop a park robot, and find out or make sure by the answer to `p` which `server` runs on it.
+
+    Raises:
+        WrongServer: If the answer is that of no server, of several, or not that of `server`.
+        TimeoutError: If none comes.
+        OSError: If the connection is lost.
+    """
+    wire.send(b"stop")
+    time.sleep(protocol.GAP_S)
+    wire.send(b"p")
+    try:
+        answer = wire.receive(time.monotonic() + chosen.silence_s)
+    except TimeoutError as error:
+        raise TimeoutError(
+            "no answer to p; a server of 2023 serves one client in its life: start it anew on the robot, for each case"
+        ) from error
+    time.sleep(protocol.GAP_S)
+    fitting = protocol.fitting(answer.decode("ascii", "replace").strip("\0\r\n "))
+    if not fitting:
+        raise WrongServer(f"answers p with {_shown(answer)}, as no known server does")
+    if server is not None and server not in fitting:
+        raise WrongServer(
+            f"answers p with {_shown(answer)}, as the server of {' or '.join(fitting)} does, not that of {server}: "
+            'set device = { server = "..." }'
+        )
+    if server is None and len(fitting) > 1:
+        raise WrongServer(
+            f"answers p with {_shown(answer)}, as the servers {', '.join(fitting)} do: write which of them runs there, "
+            f'such as device = {{ server = "{fitting[0]}" }}, and start it anew, for it may serve one client only'
+        )
+    kind = protocol.PARK[server or fitting[0]]
+    return (Park if kind.drives else GoalPark)(wire, chosen, kind)
+
+
+def _shown(answer: bytes) -> str:
+    return repr(answer[:40].decode("ascii", "replace"))
+
+
+class KTeam:
+    """K-Team's `kh4server`."""
+
+    def __init__(self, wire: Wire, chosen: protocol.Settings) -> None:
+        self._wire = wire
+        self.ranged, self.patience_s = chosen.ranges is not False, chosen.silence_s
+
+    def begin(self) -> None:
+        """See `Driver`."""
+        self.drive(0.0, 0.0)
+        self._request("B")
+        if self.ranged:
+            self._request("U,31")
+
+    def drive(self, v: float, turn: float, until: float = NEVER) -> None:
+        """See `Driver`."""
+        left, right = protocol.units(v, turn) if awake() <= until else (0, 0)
+        self._request(f"D,{left},{right}")
+
+    def move(self, odometer: Odometer) -> None:
+        """See `Driver`."""
+        left, right = self._request("R", 2)[:2]
+        odometer.wheels(left, right, time.monotonic())
+
+    def ranges(self) -> tuple[Array, Array]:
+        """See `Driver`."""
+        sound, light = len(protocol.SOUND_BEARING), len(protocol.LIGHT_BEARING)
+        distances = (
+            protocol.sound_distance(np.array(self._request("G", sound)[:sound])),
+            protocol.light_distance(np.array(self._request("N", light)[:light])),
+        )
+        return np.concatenate([protocol.SOUND_BEARING, protocol.LIGHT_BEARING]), np.concatenate(distances)
+
+    def battery(self) -> float:
+        """See `Driver`."""
+        return 0.01 * self._request("V,5", 1)[0]
+
+    def _request(self, request: str, count: int = 0) -> list[float]:
+        """Send a request; returns the numbers of the answer, at least `count`."""
+        self._wire.pending()  # cannot be the answer
+        self._wire.send(f"{request}\r".encode())
+        until = time.monotonic() + self.patience_s
+        answer = b""
+        while not answer.endswith(b"\n"):
+            try:
+                answer += self._wire.receive(until)
+            except TimeoutError as error:
+                raise TimeoutError(f"no answer to {request}") from error
+        letter, _, rest = answer.decode("ascii", "replace").strip().rpartition("\n")[2].partition(",")
+        values = protocol.numbers(rest)
+        if letter != request[0].lower() or len(values) < count:
+            raise WrongServer(f"answers {request} with {answer[:40]!r}; is it K-Team's kh4server?")
+        return values

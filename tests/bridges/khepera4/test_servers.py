@@ -1,0 +1,179 @@
+"""The Khepera bridge with each published server of Robotic Park, on a simulated clock: motion, gaps, refusals."""
+
+import math
+
+import pytest
+
+from agents.body.interface import FRESH_S, BodyError
+from agents.protocols import khepera4 as protocol
+from bridges.khepera4 import drivers
+from bridges.khepera4.drivers import WrongServer
+from bridges.khepera4.link import Address, Link
+from tests.bridges.khepera4.lab import Lab
+
+SERVERS = list(protocol.PARK)
+
+
+@pytest.fixture
+def lab(monkeypatch):
+    made = []
+
+    def begin(server, **parts):
+        made.append(Lab(server, monkeypatch, **parts))
+        return made[-1]
+
+    yield begin
+    for each in made:
+        each.close()
+
+
+def stands(robot):
+    before = robot.truth()
+    for _ in range(25):
+        robot.exchange(0.0, 0.0)
+    return robot.truth() == before
+
+
+@pytest.mark.parametrize(("goal", "seconds"), [((0.6, 0.0), 15.0), ((0.3, 0.3), 12.0)])
+@pytest.mark.parametrize("server", SERVERS)
+def test_motion_within_5_percent_of_what_was_asked(lab, server, goal, seconds):
+    robot = lab(server)
+    robot.go_to(goal, seconds)
+    x, y, _ = robot.truth()
+    assert math.hypot(x - goal[0], y - goal[1]) < 0.05 * math.hypot(*goal)
+    assert (robot.odometer.x, robot.odometer.y) == pytest.approx((x, y), abs=0.006)
+    assert stands(robot)
+
+
+@pytest.mark.parametrize("server", SERVERS)
+def test_a_goal_behind_is_reached(lab, server):
+    robot = lab(server)
+    robot.go_to((-0.3, 0.05), 18.0)
+    assert robot.truth()[:2] == pytest.approx((-0.3, 0.05), abs=0.015)
+
+
+@pytest.mark.parametrize("server", SERVERS)
+def test_speeds_are_those_that_were_asked_for(lab, server):
+    robot = lab(server)
+    for _ in range(10):
+        robot.exchange(0.08, 0.3)
+    x, y, yaw = robot.truth()
+    for _ in range(50):
+        robot.exchange(0.08, 0.3)
+    now = robot.truth()
+    assert now[2] - yaw == pytest.approx(0.6, rel=0.05)
+    chord = 0.08 / 0.3 * 2.0 * math.sin(0.3)
+    assert math.hypot(now[0] - x, now[1] - y) == pytest.approx(chord, rel=0.05)
+    assert robot.odometer.yaw == pytest.approx(now[2], abs=0.02)
+
+
+@pytest.mark.parametrize("server", SERVERS)
+def test_a_gap_of_the_link_ends_in_a_stop_over_the_same_connection(lab, server):
+    robot = lab(server)
+    for _ in range(25):
+        robot.exchange(0.1, 0.0)
+    begin, x = robot.now, robot.truth()[0]
+    robot.gap_until = begin + 0.7
+    with pytest.raises(TimeoutError):
+        robot.exchange(0.1, 0.0)
+    robot.driver.patience_s = 0.2  # as `Link` does
+    while True:
+        try:
+            robot.exchange(0.0, 0.0)
+            break
+        except TimeoutError:
+            assert robot.now < begin + 1.5
+    robot.sleep(0.1)
+    assert stands(robot)
+    assert robot.truth()[0] - x < 0.1  # all that it drove since the gap began
+    assert robot.odometer.x == pytest.approx(robot.truth()[0], abs=0.02)  # what it drove unheard is estimated
+
+
+@pytest.mark.parametrize("server", SERVERS)
+def test_a_command_that_has_waited_too_long_is_sent_as_a_stop(lab, server):
+    robot = lab(server)
+    for _ in range(25):
+        robot.exchange(0.1, 0.0)
+    robot.driver.drive(0.1, 0.0, robot.now - 0.1)  # the process was suspended between decision and sending
+    robot.driver.move(robot.odometer)
+    robot.sleep(0.2)
+    assert stands(robot)
+
+
+def test_a_command_is_as_old_as_the_state_on_which_it_was_decided(monkeypatch):
+    link = Link("KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Settings(), (0.0, 0.0, 0.0))
+    link.drive(0.1, 0.2, drivers.awake())
+    assert link._current_twist()[:2] == (0.1, 0.2)
+    assert link._current_twist()[2] == pytest.approx(drivers.awake() + FRESH_S, abs=0.4)
+    link.drive(0.1, 0.2, drivers.awake() - FRESH_S - 3.0)  # read before a suspension, commanded after it
+    assert link._current_twist()[:2] == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("server", SERVERS)
+def test_nothing_is_sent_that_the_server_takes_for_a_goal(lab, server):
+    robot = lab(server)
+    for _ in range(5):
+        robot.exchange(0.1, 0.0)
+    goals = [read for read in robot.heard if read[:1] == b"g"]
+    assert not robot.driver.ranged
+    assert bool(goals) == (not protocol.PARK[server].drives)
+    assert b"get_data" not in goals
+
+
+@pytest.mark.parametrize("server", ["2023-04-10", "2025-05"])
+def test_a_server_that_tells_its_year_is_found_out(lab, server):
+    assert lab(server, named=False).driver.server == protocol.PARK[server]
+
+
+@pytest.mark.parametrize("server", ["2023-01-07", "2023-01-15", "fork"])
+def test_a_server_that_several_may_be_is_asked_for_and_not_driven(lab, server):
+    with pytest.raises(WrongServer, match=r'2023-01-07, 2023-01-15, fork do: .* device = { server = "2023-01-07" }'):
+        lab(server, named=False)
+
+
+def test_a_server_that_is_not_the_named_one_is_refused(lab, monkeypatch):
+    robot = lab("2025-05")
+    with pytest.raises(WrongServer, match="as the server of 2025-05 does, not that of 2023-01-07"):
+        drivers.identify(robot, protocol.Settings(server="2023-01-07"), "2023-01-07")
+    robot.program.kind = protocol.ParkServer("pose", 3, drives=True, per_turn=False, clients=1)
+    with pytest.raises(WrongServer, match="as no known server does"):
+        drivers.identify(robot, protocol.Settings(), None)
+    assert set(robot.heard) == {b"stop", b"p"}
+
+
+def test_way_that_is_reported_late_is_counted_once(lab):
+    robot = lab("2023-01-07")
+    robot.driver.patience_s = 0.2
+    robot.exchange(0.2, 0.0)
+    robot.gap_until = robot.now + 0.5
+    for _ in range(2):
+        with pytest.raises(TimeoutError):
+            robot.exchange(0.0, 0.0)
+    robot.sleep(0.3)
+    for _ in range(20):
+        robot.exchange(0.0, 0.0)
+    assert robot.odometer.x == pytest.approx(robot.truth()[0], abs=0.001)
+
+
+@pytest.mark.parametrize(
+    ("address", "device", "server"),
+    [
+        ("khepera4://h", {}, None),
+        ("khepera4://h?server=fork", {}, "fork"),
+        ("khepera4://h", {"server": "2023-01-07"}, "2023-01-07"),
+        ("khepera4://h?server=fork", {"server": "fork"}, "fork"),
+        ("kteam://h:1", {"server": "kteam"}, "kteam"),
+    ],
+)
+def test_the_server_is_named_in_the_address_or_in_the_table(address, device, server):
+    assert Address.parse("R0", address).server_of("R0", protocol.Settings(**device)) == server
+
+
+@pytest.mark.parametrize(
+    ("address", "device"),
+    [("khepera4://h?server=fork", {"server": "2025-05"}), ("kteam://h:1", {"server": "fork"}),
+     ("khepera4://h", {"server": "kteam"})],
+)  # fmt: skip
+def test_address_and_table_must_not_contradict_one_another(address, device):
+    with pytest.raises(BodyError, match=r"R0: h:.*: device\.server is "):
+        Address.parse("R0", address).server_of("R0", protocol.Settings(**device))
