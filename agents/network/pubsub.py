@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from typing import Final, Generic, Protocol, Self, TypeVar
 
 import zenoh
@@ -119,6 +119,7 @@ class Inbox(Generic[M]):
         kind: type[M],
         *,
         keys: Keys | None = None,
+        robots: Container[str] | None = None,
         on_refusal: Callable[[str, str], object] | None = None,
     ) -> None:
         """Reads `kind` from a subscription.
@@ -127,9 +128,11 @@ class Inbox(Generic[M]):
             subscription: Its queue is emptied by `read`.
             kind: Of the messages.
             keys: If given, a message must carry the name of the robot of its key.
+            robots: Messages of others are left out; None: of all.
             on_refusal: Called with key and reason of each refusal.
         """
         self._subscription, self._kind, self._keys, self._on_refusal = subscription, kind, keys, on_refusal
+        self._robots = robots
         self.malformed, self.trouble = 0, ""
 
     def read(self, check: Callable[[M], object] | None = None) -> Iterator[M]:
@@ -158,7 +161,8 @@ class Inbox(Generic[M]):
                 if self._on_refusal is not None:
                     self._on_refusal(key, self.trouble)
             else:
-                yield message, sample
+                if self._robots is None or getattr(message, "robot", "") in self._robots:
+                    yield message, sample
 
     def close(self) -> None:
         """Ends the subscription."""

@@ -103,7 +103,7 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
     """
     from agents.runtime.command_line import Interrupts
     from experiments.real_time.conductor.conduct import conduct
-    from experiments.real_time.conductor.run_view import Emergency
+    from experiments.real_time.conductor.emergency import Emergency
     from experiments.run import read_back
     from tools.progress import shown
 

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection
-from contextlib import suppress
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import zenoh
@@ -25,7 +24,6 @@ from agents.network.keys import Keys
 from agents.network.messages import Command
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
-from experiments.real_time.conductor.run_view import by_robots
 
 TOUCH_M: Final = 1e-3  # [m] less overlap than this is rounding and the age of what was heard
 OUT_M: Final = 0.01  # [m] so far outside a place is outside
@@ -150,11 +148,13 @@ class Observer:
         self.session = session
         keys = self.keys = Keys(experiment.network.realm)
         self.invariants = Invariants(experiment)
-        self._statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
-        self._states = pubsub.subscriber(session, keys.state("*"), 8192)
-        self._truths = pubsub.subscriber(session, keys.truth("*"), 8192)
-        self._commands = pubsub.subscriber(session, keys.setpoint("*"), 8192)
-        self._contacts = pubsub.subscriber(session, keys.contact, 1024)
+        typed: Any = {"keys": keys, "robots": self.invariants.names}
+        statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
+        self._statuses = pubsub.Inbox(statuses, messages.Status, **typed)
+        self._states = pubsub.Inbox(pubsub.subscriber(session, keys.state("*"), 8192), messages.State, **typed)
+        self._truths = pubsub.Inbox(pubsub.subscriber(session, keys.truth("*"), 8192), messages.Position, **typed)
+        self._commands = pubsub.Inbox(pubsub.subscriber(session, keys.setpoint("*"), 8192), messages.Command, **typed)
+        self._contacts = pubsub.Inbox(pubsub.subscriber(session, keys.contact, 1024), messages.Contact)
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         # the last of each robot, and when it came; all times are monotonic [s]
         self.status: dict[str, messages.Status] = {}
@@ -168,31 +168,27 @@ class Observer:
 
     def update(self) -> None:
         """Take in what was received since the last update."""
-        now, names = time.monotonic(), self.invariants.names
+        now = time.monotonic()
         self.connected = network.connected(self.session)
-        for status in by_robots(self._statuses.handler, messages.Status, keys=self.keys, robots=names):
+        for status in self._statuses.read():
             self.status[status.robot], self.status_at[status.robot] = status, now
-        for truth in by_robots(self._truths.handler, messages.Position, keys=self.keys, robots=names):
+        for truth in self._truths.read():
             self.invariants.place(truth.robot, truth.position)
-        for state in by_robots(self._states.handler, messages.State, keys=self.keys, robots=names):
+        for state in self._states.read():
             self.received_at |= {(state.robot, heard.speaker): now for heard in state.heard}
             if state.true_position is not None:
                 self.invariants.place(state.robot, state.true_position)
-        for command in by_robots(self._commands.handler, messages.Command, keys=self.keys, robots=names):
+        for command in self._commands.read():
             self.command[command.robot] = command, now
             if command.action != "drive":
                 self.orders.append(command)
             if invalid := self.invariants.invalid_command(command):
                 self.wrong.append(invalid)
-        for sample in network.received(self._contacts.handler):
-            with suppress(messages.Malformed):  # of our own making, as often as not
-                contact = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Contact)
-                if sample.kind == zenoh.SampleKind.PUT:
-                    self.wrong.append(f"{contact.first} and {contact.second} touched")
-        for sample in network.received(self._watch.handler):
-            name = self.keys.whose(str(sample.key_expr))
-            if name is not None:
-                (self.alive.discard if sample.kind == zenoh.SampleKind.DELETE else self.alive.add)(name)
+        for contact in self._contacts.read():
+            self.wrong.append(f"{contact.first} and {contact.second} touched")
+        for token, there in self._watch.changes():
+            if (name := self.keys.whose(token)) is not None:
+                (self.alive.add if there else self.alive.discard)(name)
         self.wrong += self.invariants.violations()
 
     def violations(self) -> list[str]:

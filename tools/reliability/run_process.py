@@ -29,7 +29,8 @@ from experiments.file.document import load
 from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.conduct import RunOptions, conduct
 from experiments.real_time.conductor.conductor import RunFailed
-from experiments.real_time.conductor.run_view import Emergency, News, Progress
+from experiments.real_time.conductor.emergency import Emergency
+from experiments.real_time.conductor.run_view import News, Progress
 from experiments.real_time.conductor.support import StandInError
 from experiments.real_time.hosts.hosts import HostError
 from experiments.real_time.hosts.launcher import RUN, Launcher, Process

@@ -19,7 +19,6 @@ from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from experiments.definition.experiment import Experiment
 from experiments.real_time.conductor.conductor import RunFailed
-from experiments.real_time.conductor.run_view import by_robots
 from experiments.real_time.hosts.launcher import Launcher
 from tools.reliability.run_process import Request, WatchedRun, usage_of
 from tools.reliability.soak_verdict import COLUMNS, Row, Soaked
@@ -39,17 +38,17 @@ class Listener:
     """The last status of each robot, and the delays [s] of the poses that it received since the last sample."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str]) -> None:
-        self._keys = keys
         self.status: dict[str, messages.Status] = {}
         self.delays: dict[str, list[float]] = {name: [] for name in robots}
-        self._statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
-        self._states = pubsub.subscriber(session, keys.state("*"), 16384)
+        statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
+        self._statuses = pubsub.Inbox(statuses, messages.Status, keys=keys, robots=self.delays)
+        states = pubsub.subscriber(session, keys.state("*"), 16384)
+        self._states = pubsub.Inbox(states, messages.State, keys=keys, robots=self.delays)
 
     def read(self) -> None:
         """Take in what has been received since the last call."""
-        for status in by_robots(self._statuses.handler, messages.Status, keys=self._keys, robots=self.delays):
-            self.status[status.robot] = status
-        for state in by_robots(self._states.handler, messages.State, keys=self._keys, robots=self.delays):
+        self.status |= {status.robot: status for status in self._statuses.read()}
+        for state in self._states.read():
             if state.phase == "running":
                 self.delays[state.robot] += [heard.arrived - heard.stamp for heard in state.heard]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from experiments.definition.experiment import Experiment
-from experiments.real_time.conductor.run_view import Emergency
+from experiments.real_time.conductor.emergency import Emergency
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher, Process
 

@@ -29,7 +29,8 @@ from experiments.file.document import Document, chosen
 from experiments.file.problems import DocumentError, Problem
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import CaseResult, Conductor
-from experiments.real_time.conductor.run_view import Emergency, Shown
+from experiments.real_time.conductor.emergency import Emergency
+from experiments.real_time.conductor.run_view import Shown
 from experiments.real_time.conductor.support import divided
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher

@@ -286,15 +286,7 @@ class Conductor:
     # ------------------------------------------------------------------ what happens meanwhile
 
     def _join(self, stack: ExitStack) -> None:
-        self._view = NetworkView(
-            stack,
-            self._experiment,
-            self._context.endpoints,
-            self._progress,
-            self._context.folder,
-            identity=self._context.identity,
-            clock=self._clock,
-        )
+        self._view = NetworkView(stack, self._context, self._progress)
         stack.callback(self._context.emergency.listen(self._view.session, self._keys).close)
         self._changes = HotChanges(self._experiment, self._processes, self._view, self._keys)
 

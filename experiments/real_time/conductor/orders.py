@@ -132,6 +132,7 @@ class EmergencyStop:
             urgent.put(stop)
             begun = time.monotonic()
             statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
+            inbox = pubsub.Inbox(statuses, messages.Status, keys=keys)
             declared += [urgent, statuses]
             self.seen = {
                 keys.robot(str(reply.ok.key_expr))
@@ -143,17 +144,13 @@ class EmergencyStop:
             while (self.moving or self._awaited(session, begun)) and time.monotonic() < begun + STOP_ANSWER_S:
                 urgent.put(stop)
                 time.sleep(STOP_AGAIN_S)
-                for token in network.received(watch.handler):
-                    robot = keys.whose(str(token.key_expr))
-                    if robot is not None and token.kind == zenoh.SampleKind.PUT and robot not in self.seen:
+                for token, there in watch.changes():
+                    robot = keys.whose(token)
+                    if robot is not None and there and robot not in self.seen:
                         self.seen.add(robot)
                         self.moving.add(robot)
-                for sample in network.received(statuses.handler):
-                    try:
-                        status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
-                    except messages.Malformed:
-                        continue
-                    if status.phase == STOPPED and keys.robot(str(sample.key_expr)) == status.robot:
+                for status in inbox.read():
+                    if status.phase == STOPPED:
                         self.moving.discard(status.robot)
 
     def _awaited(self, session: zenoh.Session, begun: float) -> bool:

@@ -1,16 +1,13 @@
-"""What the conductor hears of a run, and what it says: its session, and what becomes of each robot by what arrives."""
+"""The run as its conductor sees it: session, events to all others, and the state of each robot by its messages."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from math import inf
-from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, Protocol, Self, TypeVar
-
-import zenoh
+from typing import Final, Literal, Protocol, Self
 
 from agents.clock import Clock
 from agents.decision.lifecycle import Phase
@@ -20,67 +17,36 @@ from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
 from agents.network.shutdown import held
-from agents.network.zenoh_config import ASK_S
 from experiments.definition import mesh
-from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.real_time.conductor import orders
-
-M = TypeVar("M", messages.Status, messages.State, messages.Position, messages.Command)
-
-
-def by_robots(
-    handler: network.Polled[zenoh.Sample], kind: type[M], *, keys: Keys, robots: Container[str]
-) -> Iterator[M]:
-    """What has come on the keys of some robots; what is malformed, or says another name than its key, is left out."""
-    for sample in network.received(handler):
-        try:
-            message = messages.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
-        except messages.Malformed:
-            continue
-        if message.robot in robots and keys.whose(str(sample.key_expr)) == message.robot:
-            yield message
-
+from experiments.real_time.conductor.case_context import CaseContext
 
 ORDER: Final = tuple(phase.word for phase in Phase)
 FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
-
-Out = Literal["", "lost", "removed", "standby"]
+ROUTER_S: Final = 10.0  # limit for a router that was just started to answer
+MISSED_S: Final = 1.0  # a robot that changes from one router to another is back sooner
+OUTPUT: Final = "says"  # kind of the events that are a line of a process's output
 
 
 @dataclass
 class RobotView:
-    """What the conductor knows of a robot.
+    """State of a robot as the conductor knows it."""
 
-    Attributes:
-        status: Its last status.
-        error: Formation error as the robot itself sees it [m]; None of one that is guided, and sees none.
-        sent: Poses that it sent, and `rate` of them over the last second [1/s].
-        alive: Whether its liveliness token stands.
-        left_because: Why the run goes on without the robot: process ended or token vanished ("lost"), it was
-            taken out ("removed"), or nobody asked for it yet ("standby").
-        vanished: Since when its token is missing [s, monotonic]; infinity while it is not, and when that was told.
-        behind: The least time from a stamp of it to its arrival [s]: small, if its clock is right.
-        last_incident: Number of the last incident that was said.
-        place: Where it last said that it was [m].
-        origin: Where it, or its plan, began, as its last process said: x, y, z [m] and yaw [rad].
-        former: The process whose statuses are of the past: the robot has a new one, or will have.
-        began: Stamp of its first tick in the experiment, UTC [s].
-    """
-
-    status: messages.Status | None = None
-    error: float | None = 0.0
-    rate: float = 0.0
-    alive: bool = False
-    left_because: Out = ""
-    counted: tuple[float, int] = (0.0, 0)
-    vanished: float = inf
-    behind: float = inf
-    last_incident: int = 0
-    place: messages.Vector | None = None
-    origin: messages.Setpoint | None = None
-    former: int | None = None
-    began: float | None = None
+    status: messages.Status | None = None  # last received
+    error: float | None = 0.0  # [m] formation error by its own knowledge; None of a guided robot, which has none
+    rate: float = 0.0  # [1/s] transmitted poses over the last second
+    alive: bool = False  # its liveliness token stands
+    # why the run goes on without it: process ended or token vanished, taken out, or not asked for yet
+    left_because: Literal["", "lost", "removed", "standby"] = ""
+    counted: tuple[float, int] = (0.0, 0)  # stamp and number of transmitted poses at the last `rate`
+    vanished: float = inf  # [s, monotonic] loss of its token; infinity while it stands, and once that was reported
+    behind: float = inf  # [s] least time from a stamp to its arrival: small, if its clock is right
+    last_incident: int = 0  # number of the last reported incident
+    place: messages.Vector | None = None  # [m] last known
+    origin: messages.Setpoint | None = None  # start of the robot, or of its plan: x, y, z [m], yaw [rad]
+    former: int | None = None  # process whose statuses are outdated: the robot has a new one, or will have
+    began: float | None = None  # [s, UTC] stamp of its first tick in the experiment
 
     @property
     def gone(self) -> bool:
@@ -96,7 +62,7 @@ class RobotView:
         return self.status is not None and ORDER.index(self.status.phase) >= ORDER.index(phase)
 
     def forget_process(self) -> None:
-        """The process that it had is over: what it said last holds no more, but for where it was and began."""
+        """Forget the process that has ended, but for its last place and its origin."""
         self.former = self.status.pid if self.status is not None else self.former
         self.status, self.alive, self.vanished = None, False, inf
         self.rate, self.counted, self.behind, self.last_incident = 0.0, (0.0, 0), inf, 0
@@ -105,7 +71,7 @@ class RobotView:
 
 @dataclass
 class Progress:
-    """What there is to show of a run; `silent_since` says when the routers fell silent [s, monotonic], if they have."""
+    """State of a run, to be shown."""
 
     case: str
     phase: str
@@ -113,129 +79,109 @@ class Progress:
     duration: float
     robots: dict[str, RobotView]
     events: list[messages.Event] = field(default_factory=list)
-    silent_since: float = inf
+    silent_since: float = inf  # [s, monotonic] begin of the silence of the routers
     clock: Clock = field(default_factory=Clock)
 
 
 class News:
-    """Tells each event of a run once, whatever its case."""
+    """Each event of a run once, whatever its case."""
 
     def __init__(self) -> None:
-        self._told, self._case = 0, ""
+        self._shown, self._case = 0, ""
 
     def new_events(self, progress: Progress) -> list[messages.Event]:
-        """What has happened since it was asked last."""
+        """Events since the last call."""
         if progress.case != self._case:
-            self._case, self._told = progress.case, 0
-        events = progress.events[self._told :]
-        self._told = len(progress.events)
+            self._case, self._shown = progress.case, 0
+        events = progress.events[self._shown :]
+        self._shown = len(progress.events)
         return events
 
 
 Show = Callable[[Progress], None]
 
 
-ROUTER_S: Final = 10.0
-MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
-
-
 class NetworkView:
     """The network as the conductor of a case sees it."""
 
-    def __init__(
-        self,
-        stack: ExitStack,
-        experiment: Experiment,
-        endpoints: Sequence[str],
-        progress: Progress,
-        folder: Path,
-        *,
-        identity: str,
-        clock: Clock,
-    ) -> None:
-        """Join the network.
+    def __init__(self, stack: ExitStack, context: CaseContext, progress: Progress) -> None:
+        """Join the network; `stack` leaves it.
 
         Raises:
             Unreachable: If no router answers.
         """
-        self.clock = clock
-        self.robots, self._progress = progress.robots, progress
+        self.clock, self.robots, self._progress = progress.clock, progress.robots, progress
+        experiment, endpoints = context.experiment, context.endpoints
         self._keys = keys = Keys(experiment.network.realm)
         opened = network.open_session(
             endpoints,
             name="conductor",
             wait_s=ROUTER_S,
-            identity=identity,
+            identity=context.identity,
             rights=mesh.member_rights(experiment, endpoints),
         )
-        self._session, declared = stack.enter_context(held(opened))
+        self.session, declared = stack.enter_context(held(opened))
         declared.append(self)
-        self._events = pubsub.pose_publisher(self._session, keys.event, messages.JSON, pubsub.EVENTS)
+        session = self.session
+        self._events = pubsub.pose_publisher(session, keys.event, messages.JSON, pubsub.EVENTS)
         if list(endpoints) != [DEFAULT_ENDPOINT]:
-            options = lab.options(endpoints[0]) if len(endpoints) == 1 else f"--connect @{folder / mesh.ENDPOINTS}"
+            network_file = f"--connect @{context.folder / mesh.ENDPOINTS}"
+            options = lab.options(endpoints[0]) if len(endpoints) == 1 else network_file
             where = "a mesh" if topology.is_mesh(endpoints) else ", ".join(lab.bare(endpoints))
             self.report("router", "conductor", f"{where}: look with `zenpark keys {options}`")
-        self._clock = pubsub.publisher(self._session, keys.clock, messages.JSON)
-        self._told = pubsub.pose_publisher(self._session, keys.experiment, messages.JSON)
-        self._told.put(document.case_document(experiment))
-        self.orders = pubsub.Orders(self._session, keys.run_order, messages.RunOrder)  # to the conductor
-        self._token = pubsub.alive_token(self._session, keys.conductor)
-        self._statuses = pubsub.pose_subscriber(self._session, keys.status("*"), 4096)
-        self._states = pubsub.subscriber(self._session, keys.state("*"), 4096)
-        self._watch = pubsub.AliveWatch(self._session, keys.alive("*"))
-        self._recorder_watch = pubsub.AliveWatch(self._session, keys.recorder)
+        self._clock = pubsub.publisher(session, keys.clock, messages.JSON)
+        self._experiment = pubsub.pose_publisher(session, keys.experiment, messages.JSON)
+        self._experiment.put(document.case_document(experiment))
+        self.orders = pubsub.Orders(session, keys.run_order, messages.RunOrder)  # to the conductor
+        self._token = pubsub.alive_token(session, keys.conductor)
+        statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
+        self._statuses = pubsub.Inbox(statuses, messages.Status, keys=keys, robots=self.robots)
+        states = pubsub.subscriber(session, keys.state("*"), 4096)
+        self._states = pubsub.Inbox(states, messages.State, keys=keys, robots=self.robots)
+        self._watch = pubsub.AliveWatch(session, keys.alive("*"))
+        self._recorder_watch = pubsub.AliveWatch(session, keys.recorder)
         self.recording_begun = False  # the recorder is there
         self._cut_off = -inf
-        self._router = network.RouterWatch(self._session, keys.conductor, endpoints)
+        self._router = network.RouterWatch(session, keys.conductor, endpoints)
         self._safety, self._mesh = experiment.safety, topology.is_mesh(endpoints)
 
-    @property
-    def session(self) -> zenoh.Session:
-        """Its session, for whoever hears more by it."""
-        return self._session
-
     def refuse_joining(self) -> None:
-        """Who joins from now on waits for the next run."""
-        self._told.undeclare()  # type: ignore[no-untyped-call]
+        """Robots that join from now on wait for the next run."""
+        self._experiment.undeclare()  # type: ignore[no-untyped-call]
 
     def update(self) -> list[str]:
-        """Take in what has arrived since the last update; return the robots whose token has vanished for good."""
-        for sample in network.received(self._recorder_watch.handler):
-            self.recording_begun |= sample.kind == zenoh.SampleKind.PUT
-        for status in by_robots(self._statuses.handler, messages.Status, keys=self._keys, robots=self.robots):
+        """Receive all since the last update; return the robots whose token has vanished for good."""
+        self.recording_begun |= any(there for _, there in self._recorder_watch.changes())
+        for status in self._statuses.read():
             self._receive_status(status)
-        for state in by_robots(self._states.handler, messages.State, keys=self._keys, robots=self.robots):
-            seen = self.robots[state.robot]
-            if seen.error is not None:
-                seen.error = state.error
-            seen.place = state.true_position or state.position or seen.place
-        for sample in network.received(self._watch.handler):
-            name = self._keys.whose(str(sample.key_expr))
-            if name is not None and (known := self.robots.get(name)) is not None:
-                known.alive = sample.kind == zenoh.SampleKind.PUT
-                known.vanished = inf if known.alive else time.monotonic()
+        for state in self._states.read():
+            view = self.robots[state.robot]
+            view.error = state.error if view.error is not None else None
+            view.place = state.true_position or state.position or view.place
+        for token, there in self._watch.changes():
+            if (known := self.robots.get(self._keys.whose(token) or "")) is not None:
+                known.alive, known.vanished = there, inf if there else time.monotonic()
         return self._missed()
 
     def order(self, names: Sequence[str], order: messages.Order) -> dict[str, messages.Reply]:
         """Give an order to robots, see `orders.send_order`."""
-        return orders.send_order(self._session, self._keys, names, order)
+        return orders.send_order(self.session, self._keys, names, order)
 
     def report(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
-        """An event of the run, now or at `stamp` [s, UTC]."""
+        """Report an event of the run, now or at `stamp` [s, UTC]."""
         event = messages.Event(self.clock.utc() if stamp is None else stamp, kind, source, text)
         self._progress.events.append(event)
         self._events.put(messages.encode(event))
 
-    def report_clocks(self, clocks: Sequence[messages.HostClock]) -> None:
+    def report_clocks(self, clocks: Iterable[messages.HostClock]) -> None:
         """Report the offsets of the hosts' clocks, for the recording."""
         for each in clocks:
             self._clock.put(messages.encode(each))
-            self.report(
-                "clock", each.host, f"{each.offset * 1e3:+.2f} ms ± {each.uncertainty * 1e3:.2f} ms against ours"
-            )
+            offset_ms, uncertainty_ms = each.offset * 1e3, each.uncertainty * 1e3
+            self.report("clock", each.host, f"{offset_ms:+.2f} ms ± {uncertainty_ms:.2f} ms against ours")
 
     def report_drift(self, measured: Iterable[messages.HostClock], trouble: Iterable[str]) -> None:
-        """Report, for the recording, how the hosts' clocks have drifted and what their robots do about it."""
+        """Report, for the recording, the drift of the hosts' clocks and how their robots follow it."""
         for each in measured:
             self._clock.put(messages.encode(each))
         for text in trouble:
@@ -245,7 +191,7 @@ class NetworkView:
         """Robots whose token has been missing for long: where there is another router, it comes back at once."""
         now = time.monotonic()
         self._watch_router(now)
-        missed = [name for name, seen in self.robots.items() if now - max(seen.vanished, self._cut_off) > MISSED_S]
+        missed = [name for name, view in self.robots.items() if now - max(view.vanished, self._cut_off) > MISSED_S]
         for name in missed:
             self.robots[name].vanished = inf
         return missed
@@ -265,75 +211,26 @@ class NetworkView:
             self.report("router", "conductor", f"a router answers again, after {away_s:.1f} s")
 
     def _receive_status(self, status: messages.Status) -> None:
-        seen = self.robots[status.robot]
-        if status.phase not in ORDER or status.pid == seen.former:
+        view = self.robots[status.robot]
+        if status.phase not in ORDER or status.pid == view.former:
             return
-        if seen.status is not None and (seen.status.phase, seen.status.reason) != (status.phase, status.reason):
+        if view.status is not None and (view.status.phase, view.status.reason) != (status.phase, status.reason):
             self.report("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
-        if seen.status is not None and seen.status.pid != status.pid:
-            seen.last_incident = 0
+        if view.status is not None and view.status.pid != status.pid:
+            view.last_incident = 0
         for incident in status.incidents:
-            if incident.seq > seen.last_incident:
-                seen.last_incident = incident.seq
+            if incident.seq > view.last_incident:
+                view.last_incident = incident.seq
                 self.report("hazard", status.robot, incident.text)
-        since, sent = seen.counted
+        since, sent = view.counted
         if status.stamp - since >= 0.9:
-            seen.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0
-            seen.counted = (status.stamp, status.sent)
-        if status.phase == Phase.RUNNING.word and seen.phase != status.phase:
-            seen.began = status.stamp
-        seen.status = status
-        seen.origin = status.origin or seen.origin
-        seen.behind = min(seen.behind, self.clock.utc() - status.stamp)
-
-
-class Emergency:
-    """Listens for emergency stops as long as a run goes on, between its cases too."""
-
-    def __init__(self) -> None:
-        self.stop: messages.Stop | None = None  # the first one received
-
-    def __bool__(self) -> bool:
-        return self.stop is not None
-
-    @property
-    def words(self) -> str:
-        """Who stopped the run, and why; empty if nobody has."""
-        return "" if self.stop is None else self.stop.words
-
-    def listen(self, session: zenoh.Session, keys: Keys) -> pubsub.ImmediateSubscriber:
-        """Receive stops in a realm, for as long as what is returned is kept."""
-        return pubsub.ImmediateSubscriber(session, keys.estop, self._receive_stop)
-
-    @contextmanager
-    def throughout(
-        self, endpoints: Sequence[str], keys: Keys, identity: str, *, starting: bool = False
-    ) -> Iterator[None]:
-        """Receive stops by a session of its own: those of the cases are closed between them.
-
-        Args:
-            endpoints: Routers.
-            keys: Of the realm.
-            identity: Whose certificate is shown, in a lab.
-            starting: The routers were started just now, which takes seconds on a busy machine.
-
-        Raises:
-            Unreachable: If no router answers.
-        """
-        wait_s = ROUTER_S if starting else ASK_S
-        opened = network.open_session(endpoints, name="emergency stops", identity=identity, wait_s=wait_s)
-        with held(opened) as (session, declared):
-            declared.append(self.listen(session, keys))
-            yield
-
-    def _receive_stop(self, stop: messages.Stop) -> None:
-        self.stop = self.stop or stop
-
-
-OUTPUT: Final = "says"  # kind of the events that are a line of a process's output
-
-if TYPE_CHECKING:
-    pass
+            view.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0
+            view.counted = (status.stamp, status.sent)
+        if status.phase == Phase.RUNNING.word and view.phase != status.phase:
+            view.began = status.stamp
+        view.status = status
+        view.origin = status.origin or view.origin
+        view.behind = min(view.behind, self.clock.utc() - status.stamp)
 
 
 class Shown(Protocol):

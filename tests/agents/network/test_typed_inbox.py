@@ -49,6 +49,15 @@ def test_an_inbox_passes_on_valid_messages_and_counts_the_others() -> None:
     assert list(inbox.read()) == []
 
 
+def test_messages_of_other_robots_are_left_out_and_not_refused() -> None:
+    channel = Channel(KEYS.setpoint("*"))
+    inbox = pubsub.Inbox(channel, messages.Command, keys=KEYS, robots={"A"})
+    for robot in "BA":
+        channel.add(Sample(KEYS.setpoint(robot), messages.JSON, stop(robot)))
+    assert [command.robot for command in inbox.read()] == ["A"]
+    assert inbox.malformed == 0
+
+
 @pytest.mark.parametrize("payload", [b"{}", b"nonsense", b'{"order": "fly"}'])
 def test_a_malformed_order_is_answered_and_counted(payload: bytes) -> None:
     channel = Channel(KEYS.order("A"), asked=True)

@@ -8,15 +8,15 @@ from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.network.session import Unreachable
 from agents.runtime.router import serve_router
-from experiments.real_time.conductor import run_view
-from experiments.real_time.conductor.run_view import Emergency
+from experiments.real_time.conductor import emergency
+from experiments.real_time.conductor.emergency import Emergency
 
 KEYS = Keys("park")
 
 
 @pytest.fixture
 def endpoint(monkeypatch):
-    monkeypatch.setattr(run_view, "ASK_S", 0.2)
+    monkeypatch.setattr(emergency, "ASK_S", 0.2)
     return free_endpoint(preferred_port=0)
 
 
