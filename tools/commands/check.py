@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -125,6 +126,36 @@ def _worded(of: Figures) -> dict[str, str]:
 
 def _spared(spare: int | None, vital: int) -> str:
     return "-" if spare is None else f"{spare} of {spare + vital}"
+
+
+@app.command()
+def explain(
+    key: Annotated[str, typer.Argument(help="such as disturbance.hover_jitter, trigger.threshold, safety")],
+) -> int:
+    """Explain a key of the experiment file: its text, unit, default, limits and an example."""
+    from agents.plugins.registry import did_you_mean
+    from experiments.file import reference
+
+    found = reference.matching(key)
+    if not found:
+        known = {".".join(entry.words): None for entry in reference.entries()}
+        hint = did_you_mean(key, known) or "`zenpark explain safety` shows the keys of a table"
+        print(f"zenpark: no key of the experiment file is named {key!r}; {hint}", file=sys.stderr)
+        return 2
+    first = found[0].text
+    alike = [entry for entry in found if entry.text == first and not entry.key.startswith(f"{found[0].key}.")]
+    print("\n".join(entry.key for entry in alike), "\n")
+    for paragraph in first.split("\n\n"):
+        print(textwrap.fill(paragraph, WIDEST, initial_indent="  ", subsequent_indent="  "))
+    rows = {"type": found[0].type, "limits": found[0].limits, "default": found[0].default}
+    print(*(f"  {name:8} {text}" for name, text in rows.items() if text), sep="\n")
+    print(textwrap.indent(f"\n{found[0].example}", "    "))
+    rest = [entry for entry in found if entry not in alike]
+    if rest:
+        print()
+    for entry in rest:
+        print(textwrap.shorten(f"{entry.key}  {entry.text}", WIDEST, placeholder=" ..."))
+    return 0
 
 
 @app.command()

@@ -1,0 +1,217 @@
+"""Pages of the documentation site that are generated: the reference, from the code's own texts.
+
+A hook of mkdocs (`mkdocs.yml`): the pages exist only in the site.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from collections.abc import Callable, Iterator, Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    import click
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+
+NOTEBOOKS: Final = ("experiments.run",)
+PLUGINS: Final = (
+    "agents.arrays",
+    "agents.plugins.laws",
+    "agents.plugins.triggers",
+    "agents.plugins.predictors",
+    "agents.plugins.planners",
+    "agents.plugins.avoidance",
+    "agents.body.interface",
+    "twins.engines.engine",
+)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Adds the generated pages."""
+    from mkdocs.structure.files import File  # noqa: PLC0415
+
+    for name, make in PAGES.items():
+        files.append(File.generated(config, f"reference/{name}.md", content="\n".join(make())))
+    return files
+
+
+def experiment_file() -> Iterator[str]:
+    """Every key of the experiment file."""
+    from experiments.file import reference  # noqa: PLC0415
+
+    yield "# The experiment file\n"
+    yield (
+        "Every table and key, with the plug-ins that come along. `./zenpark explain KEY` prints the same. Names in"
+        " capitals stand for names of your own; a plug-in stands in parentheses. `[cases.NAME]` may override any key.\n"
+    )
+    entries = reference.entries()
+    tops = list(dict.fromkeys(re.split(r"[.(]", entry.key)[0] for entry in entries))
+    simple = [top for top in tops if not any(entry.key.startswith((f"{top}.", f"{top}(")) for entry in entries)]
+    yield "## Top of the file\n"
+    yield from _keys([entry for entry in entries if entry.key in simple], "")
+    for top in tops:
+        if top in simple:
+            continue
+        yield f"\n## `[{top}]`\n"
+        whole, *below = (entry for entry in entries if re.split(r"[.(]", entry.key)[0] == top)
+        yield f"{whole.text}\n"
+        plain = [entry for entry in below if "(" not in entry.key]
+        if plain:
+            yield from _keys(plain, top)
+        for number, entry in enumerate(below):
+            if not entry.key.endswith(")"):
+                continue
+            yield f"\n### `{entry.key}`\n"
+            yield f"{entry.text}\n"
+            own = [each for each in below[number:] if each.key.startswith(f"{entry.key}.")]
+            if own:
+                yield from _keys(own, entry.key)
+
+
+def _keys(entries: Sequence[Any], owner: str) -> Iterator[str]:
+    yield from ("| key | meaning | value | default | example |", "|---|---|---|---|---|")
+    for entry in entries:
+        value = entry.type + (f", {entry.limits}" if entry.limits else "")
+        default = f"`{_cell(entry.default)}`" if entry.default else ("**required**" if entry.required else "–")
+        example = "<br>".join(f"`{_cell(line)}`" for line in entry.example.splitlines())
+        key = entry.key.removeprefix(owner).lstrip(".")
+        yield f"| `{key}` | {_cell(entry.text)} | {_cell(value)} | {default} | {example} |"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n\n", " ").replace("<", "&lt;").replace("\n", " ")
+
+
+def commands() -> Iterator[str]:
+    """Every command with its options, and the exit codes."""
+    import typer.main  # noqa: PLC0415
+
+    from tools.main import app  # noqa: PLC0415
+
+    yield "# Commands\n"
+    yield "`./zenpark COMMAND --help` prints the same.\n"
+    yield from ("| exit code | meaning |", "|---|---|", "| 0 | done |", "| 1 | it ran, and something failed |")
+    yield "| 2 | wrong input: the message names the place and the remedy |\n| 130 | ended by Ctrl-C |\n"
+    yield from _command(typer.main.get_command(app), "./zenpark", 2)
+
+
+def _command(command: click.Command, name: str, depth: int) -> Iterator[str]:
+    below = getattr(command, "commands", {})
+    if depth > 2:
+        arguments = " ".join(str(part.name).upper() for part in command.params if not _is_option(part))
+        yield f"\n{'#' * min(depth, 4)} {name.removeprefix('./zenpark ')}\n"
+        yield f"    {name} {arguments}\n" if not below else ""
+        yield f"{inspect.cleandoc(command.help or '')}\n"
+        rows = [part for part in command.params if getattr(part, "help", None) and part.name != "help"]
+        if rows:
+            yield from ("| option | meaning | default |", "|---|---|---|")
+            for part in rows:
+                names = ", ".join(f"`{each}`" for each in part.opts) if _is_option(part) else f"`{part.name}`"
+                plain = isinstance(part.default, int | float | str) and part.default is not False
+                yield f"| {names} | {_cell(getattr(part, 'help', ''))} | {part.default if plain else ''} |"
+    for child, each in below.items():
+        if not each.hidden:
+            yield from _command(each, f"{name} {child}", depth + 1)
+
+
+def _is_option(part: click.Parameter) -> bool:
+    return part.param_type_name == "option"
+
+
+def metrics() -> Iterator[str]:
+    """Metrics, which are the columns of metrics.csv and the fields of metrics.json."""
+    from experiments.metrics import results  # noqa: PLC0415
+
+    yield "# Metrics and CSV columns\n"
+    yield (
+        "`metrics.csv` has a row per case and robot and a row `mean` per case (over the robots with `in_mean` 1), with"
+        " the fields of `RobotMetrics` as columns; those of a later phase begin with `phase2_`, of the closest approach"
+        " with `near_` and `near_arena_`, of the shadow twin with `shadow_`. `metrics.json` has everything below.\n"
+    )
+    yield from _structs(results)
+
+
+def recordings() -> Iterator[str]:
+    """Topics and messages of a recording."""
+    from experiments.recording import topics  # noqa: PLC0415
+
+    yield "# Recordings\n"
+    yield (
+        "A recording is an [MCAP](https://mcap.dev) file with ROS 2 messages (CDR), their definitions included. Read"
+        " one with `mcap-ros2-support`, `rosbags`, rerun or Foxglove, or with `experiments.recording.reader`.\n"
+    )
+    yield from ("| topic | type | key on the network |", "|---|---|---|")
+    from agents.network.keys import Keys  # noqa: PLC0415
+
+    for topic in topics.TOPICS:
+        yield f"| `{topic.name}` | `zenpark_msgs/{topic.recorded.__name__}` | `{topic.key(Keys())}` |"
+    yield "\n" + (inspect.getdoc(topics) or "").partition("\n\n")[2] + "\n"
+    yield from _structs(topics)
+
+
+def network() -> Iterator[str]:
+    """Network keys and the messages on them."""
+    from agents.network import keys, messages  # noqa: PLC0415
+
+    yield "# Network keys and messages\n"
+    yield "Payloads are JSON unless their encoding says MessagePack. `park` is the realm (`[network] realm`).\n"
+    yield from ("| key | meaning |", "|---|---|")
+    made = keys.Keys()
+    for name, member in vars(keys.Keys).items():
+        if name.startswith("_") or not (isinstance(member, property) or inspect.isfunction(member)):
+            continue
+        text = _cell((inspect.getdoc(member) or "").partition("\n")[0])
+        if isinstance(member, property):
+            yield f"| `{getattr(made, name)}` | {text} |"
+        elif list(inspect.signature(member).parameters) == ["self", "robot"]:
+            yield f"| `{member(made, 'CF01')}` | {text} |"
+    yield ""
+    yield from _structs(messages)
+
+
+def _structs(module: ModuleType) -> Iterator[str]:
+    """Structs of a module as tables; the text of a field is the comment at the field, or right above it."""
+    source = inspect.getsource(module)
+    lines = source.splitlines()
+    for node in ast.parse(source).body:
+        if not isinstance(node, ast.ClassDef) or node.name.startswith("_"):
+            continue
+        fields = [each for each in node.body if isinstance(each, ast.AnnAssign)]
+        if not fields:
+            continue
+        yield f"\n## {node.name}\n"
+        yield f"{ast.get_docstring(node) or ''}\n"
+        yield from ("| field | type | meaning |", "|---|---|---|")
+        for each in fields:
+            above = []
+            number = each.lineno - 2
+            while lines[number].strip().startswith("#"):
+                above.insert(0, lines[number].strip(" #"))
+                number -= 1
+            beside = lines[(each.end_lineno or each.lineno) - 1][each.end_col_offset or 0 :].partition("#")[2].strip()
+            text = " ".join([*above, beside]).strip()
+            yield f"| `{ast.unparse(each.target)}` | `{_cell(ast.unparse(each.annotation))}` | {_cell(text)} |"
+
+
+def api() -> Iterator[str]:
+    """What notebooks and plug-ins may import."""
+    yield "# Python API\n"
+    yield "## Notebooks\n"
+    yield from (f"::: {module}\n" for module in NOTEBOOKS)
+    yield "## Plug-ins\n"
+    yield "How to write one: [Plug-ins](../plugins.md).\n"
+    yield from (f"::: {module}\n" for module in PLUGINS)
+
+
+PAGES: Final[dict[str, Callable[[], Iterator[str]]]] = {
+    "experiment-file": experiment_file,
+    "commands": commands,
+    "metrics": metrics,
+    "recordings": recordings,
+    "network": network,
+    "api": api,
+}

@@ -1,0 +1,280 @@
+"""Reference of the experiment file: each key with its text, unit, default, limits and an example.
+
+Read off the JSON schema, that is, off the fields of the structs, plug-ins included. `zenpark explain` and the reference
+pages print the same entries.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from typing import Any, Final
+
+import msgspec
+
+from experiments.catalogue.index import FOLDER
+from experiments.file.json_schema import schema
+
+_NAMES: Final = {  # tables whose keys are names, with the example of such a name
+    "robots": ("ROBOT", "CF01"),
+    "disturbance": ("KIND", "crazyflie"),
+    "hosts": ("HOST", "lab1"),
+    "cases": ("CASE", "event"),
+    "obstacles": ("OBSTACLE", "post"),
+    "starts": ("PLACE", "left"),
+    "links": ("LINK", '"TB01 > KH01"'),
+    "anchors": ("ROBOT", "TB01"),
+}
+_LIMITS: Final = {
+    "minimum": "≥ {}",
+    "exclusiveMinimum": "> {}",
+    "maximum": "≤ {}",
+    "exclusiveMaximum": "< {}",
+    "pattern": "matches `{}`",
+    "minProperties": "at least {} of them",
+}
+_TYPES: Final = {
+    "number": "a number",
+    "integer": "a whole number",
+    "string": "a text",
+    "boolean": "true or false",
+    "object": "a table",
+    "null": "",
+}
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """One key of the experiment file."""
+
+    key: str  # with the names in capitals: robots.ROBOT.start; plug-ins: trigger(send-on-delta).threshold
+    text: str
+    type: str  # in words
+    limits: str  # in words; empty without any
+    default: str  # as it would be written; empty if there is none
+    required: bool
+    example: str  # lines of a file
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Parts of the key that a user types: without names in capitals and without plug-ins."""
+        return tuple(part for part in re.sub(r"\([^)]*\)", "", self.key).split(".") if not part.isupper())
+
+
+@cache
+def entries() -> tuple[Entry, ...]:
+    """Every key, tables before their keys, in the order of the structs."""
+    whole = schema()
+    return tuple(_walk(whole, whole["definitions"], ""))
+
+
+def matching(asked: str) -> list[Entry]:
+    """Entries of a key as a user writes it: names may be real ones, in capitals, or left out; a plug-in in the place
+    of its kind (`trigger.send-on-delta.threshold`) or left out; the end of a key is enough if no key is meant in full.
+
+    A key of a table is followed by the keys of that table.
+    """
+    parts = [part for part in re.split(r"[.()\[\]]+", asked.strip().strip('"')) if part]
+    found = [entry for entry in entries() if _fits(entry, parts)]
+    if not found:
+        found = [entry for entry in entries() if len(parts) <= len(entry.words) and _ends(entry, parts)]
+    below = [each for each in entries() for entry in found if each.key.startswith((f"{entry.key}.", f"{entry.key}("))]
+    return found + [each for each in below if each not in found]
+
+
+def _fits(entry: Entry, parts: Sequence[str]) -> bool:
+    """Whether the parts name the entry: literal words all, names and plug-ins matched or skipped."""
+
+    def match(pattern: Sequence[str], rest: Sequence[str]) -> bool:
+        if not pattern:
+            return not rest
+        first, *later = pattern
+        if first.isupper() or first.startswith("("):
+            right = bool(rest) and (first.isupper() or first.strip("()") == rest[0])
+            return match(later, rest) or (right and match(later, rest[1:]))
+        return bool(rest) and rest[0] == first and match(later, rest[1:])
+
+    return match([part for part in re.split(r"\.|(\([^)]*\))", entry.key) if part], parts)
+
+
+def _ends(entry: Entry, parts: Sequence[str]) -> bool:
+    return entry.words[-len(parts) :] == tuple(parts)
+
+
+def _walk(node: Mapping[str, Any], definitions: Mapping[str, Any], path: str) -> Iterator[Entry]:
+    for name, field in node.get("properties", {}).items():
+        if name == "kind" and "const" in field:
+            continue
+        key = f"{path}.{name}" if path else name
+        yield _entry(key, field, name in node.get("required", []), definitions)
+        if key != "cases":  # a case repeats what stands above
+            yield from _below(key, name, field, definitions)
+
+
+def _below(key: str, name: str, field: Mapping[str, Any], definitions: Mapping[str, Any]) -> Iterator[Entry]:
+    """Keys of the tables that a field can hold."""
+    for option in field.get("anyOf", [field]):
+        inner = _resolved(option, definitions)
+        if isinstance(more := inner.get("additionalProperties"), dict):
+            named = f"{key}.{_NAMES.get(name, ('NAME', ''))[0]}"
+            for each in more.get("anyOf", [more]):
+                yield from _walk(_resolved(each, definitions), definitions, named)
+        elif inner.get("type") == "array" and isinstance(inner.get("items"), dict):
+            yield from _walk(_resolved(inner["items"], definitions), definitions, key)
+        elif "kind" in inner.get("properties", {}) and "const" in inner["properties"]["kind"]:
+            plugin = f"{key}({inner['properties']['kind']['const']})"
+            text = _joined(inner.get("description", ""))
+            yield Entry(plugin, text, "a plug-in", "", "", False, _example(plugin, {}, definitions))
+            yield from _walk(inner, definitions, plugin)
+        else:
+            yield from _walk(inner, definitions, key)
+
+
+def _resolved(node: Mapping[str, Any], definitions: Mapping[str, Any]) -> Mapping[str, Any]:
+    while "$ref" in node:
+        node = definitions[node["$ref"].rpartition("/")[2]]
+    return node
+
+
+def _entry(key: str, field: Mapping[str, Any], required: bool, definitions: Mapping[str, Any]) -> Entry:
+    inner = _resolved(field, definitions)
+    text = _joined(field.get("description") or inner.get("description", ""))
+    default = "" if "default" not in field or field["default"] is None else written(field["default"])
+    return Entry(
+        key, text, _type(field, definitions), _limits(inner), default, required, _example(key, field, definitions)
+    )
+
+
+def _joined(text: str) -> str:
+    """A docstring or description as paragraphs of one line each."""
+    return "\n\n".join(" ".join(part.split()) for part in re.split(r"\n\s*\n", text.strip()))
+
+
+def _type(field: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
+    inner = _resolved(field, definitions)
+    if "enum" in inner:
+        return "one of " + ", ".join(written(each) for each in inner["enum"])
+    if "anyOf" in inner:
+        kinds = dict.fromkeys(_type(each, definitions) for each in inner["anyOf"])
+        return " or ".join(kind for kind in kinds if kind)
+    if inner.get("type") == "array":
+        items = inner.get("items", {})
+        each = _resolved(items[0] if isinstance(items, list) and items else items, definitions)
+        least, most = inner.get("minItems"), inner.get("maxItems")
+        count = f"{least} " if least == most and least else f"{least} to {most} " if most else ""
+        many = {"number": "numbers", "integer": "whole numbers", "string": "texts", "array": "lists"}
+        return f"a list of {count}{many.get(each.get('type', ''), 'tables')}"
+    if isinstance(inner.get("additionalProperties"), dict) and not inner.get("properties"):
+        return "a table of names"
+    return _TYPES.get(str(inner.get("type")), "a value")
+
+
+def _limits(field: Mapping[str, Any]) -> str:
+    options = [field, *field.get("anyOf", [])]
+    found = [text.format(option[name]) for option in options for name, text in _LIMITS.items() if name in option]
+    return ", ".join(dict.fromkeys(found))
+
+
+def written(value: object) -> str:
+    """A value as TOML writes it, on one line."""
+    if isinstance(value, str):
+        return msgspec.json.encode(value).decode()
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {written(each)}" for key, each in value.items()) + " }" if value else "{}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(written(each) for each in value) + "]"
+    return f"{value:g}" if isinstance(value, float) and value != int(value) else str(value)
+
+
+def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
+    """Lines from a ready-made experiment, or else made of the default and the limits."""
+    parts = _parts(key)
+    found = next((lines for document in _documents() for lines in _occurrences(document, parts, ())), None)
+    if found is not None:
+        return found
+    value = field.get("default")
+    made = _made(field, definitions) if value in (None, {}, []) else value
+    names = dict(_NAMES.values())
+    return _lines([(names.get(part, "A"), None) if part.isupper() else (part, None) for part in parts], made)
+
+
+def _parts(key: str) -> list[str]:
+    """Words, names in capitals, and plug-ins in parentheses."""
+    return [part for part in re.split(r"\.|(\([^)]*\))", key) if part]
+
+
+@cache
+def _documents() -> tuple[dict[str, Any], ...]:
+    """The ready-made experiments."""
+    return tuple(tomllib.loads(path.read_text("utf-8")) for path in sorted(FOLDER.glob("*.toml")))
+
+
+Step = tuple[str, bool | None]  # a part of a key, and whether it is one of a list of tables
+
+
+def _occurrences(value: object, parts: Sequence[str], path: tuple[Step, ...]) -> Iterator[str]:
+    """The lines at which a document has a key."""
+    if not parts:
+        if not (isinstance(value, dict | list) and len(written(value)) > 80):
+            yield _lines(path, value)
+        return
+    first, *later = parts
+    if isinstance(value, list):
+        for each in value:
+            yield from _occurrences(each, parts, (*path[:-1], (path[-1][0], True)))
+    elif not isinstance(value, dict):
+        return
+    elif first.startswith("("):
+        if value.get("kind") == first.strip("()"):
+            yield from _occurrences(value, later, (*path, (first, None)))
+    elif first.isupper():
+        for name, each in value.items():
+            yield from _occurrences(each, later, (*path, (_quoted(name), None)))
+    elif first in value:
+        yield from _occurrences(value[first], later, (*path, (first, None)))
+
+
+def _quoted(name: str) -> str:
+    return name if re.fullmatch(r"[\w-]+", name) else written(name)
+
+
+def _lines(path: Sequence[Step], value: object) -> str:
+    """A key and its value below the header of its table; a plug-in as a table in one line."""
+    *tables, (last, _) = path
+    if tables and tables[-1][0].startswith("("):
+        kind = tables.pop()[0].strip("()")
+        *tables, (owner, _) = tables
+        last, value = owner, {"kind": kind, last: value}
+    if last.startswith("("):
+        *tables, (owner, _) = tables
+        last, value = owner, {"kind": last.strip("()")}
+    header = ".".join(name for name, _ in tables)
+    many = bool(tables and tables[-1][1])
+    return (f"[[{header}]]\n" if many else f"[{header}]\n" if header else "") + f"{last} = {written(value)}"
+
+
+def _made(field: Mapping[str, Any], definitions: Mapping[str, Any]) -> object:
+    """A value that the schema permits."""
+    inner = _resolved(field, definitions)
+    value: object = {"boolean": True, "string": "a text"}.get(str(inner.get("type")), 1.0)
+    if "enum" in inner:
+        value = inner["enum"][0]
+    elif "anyOf" in inner:
+        value = _made(next(each for each in inner["anyOf"] if each.get("type") != "null"), definitions)
+    elif inner.get("type") == "array":
+        items = inner.get("items", {"type": "number"})
+        each = items if isinstance(items, list) else [items] * max(1, inner.get("minItems", 1))
+        value = [_made(item, definitions) for item in each]
+    elif inner.get("type") == "object":
+        needed = {name: _made(inner["properties"][name], definitions) for name in inner.get("required", [])}
+        more = inner.get("additionalProperties")
+        value = {"A": _made(more, definitions)} if not needed and isinstance(more, dict) else needed
+    elif inner.get("type") in {"number", "integer"}:
+        least = inner.get("minimum", inner.get("exclusiveMinimum", 0))
+        most = inner.get("maximum", inner.get("exclusiveMaximum", least + 2))
+        number = (least + most) / 2 if most < least + 2 else least + 1
+        value = int(number) if inner["type"] == "integer" else number
+    return value

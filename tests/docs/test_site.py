@@ -1,0 +1,64 @@
+"""The documentation site: builds without a warning, has every page, and its reference has every key."""
+
+import os
+import re
+import subprocess
+import sys
+from html import unescape
+from pathlib import Path
+
+import pytest
+
+from experiments.file import reference
+from experiments.recording.topics import TOPICS
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--site-dir", folder],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert built.returncode == 0, built.stderr
+    return folder
+
+
+def text(page: Path) -> str:
+    return unescape(re.sub(r"<[^>]+>", "", page.read_text("utf-8")))
+
+
+@pytest.mark.slow
+def test_the_site_has_every_page_and_fetches_nothing(site):
+    pages = {page.stem for page in (ROOT / "docs").glob("*.md")}
+    assert pages <= {page.stem for page in site.glob("*.html")}
+    navigation = (site / "index.html").read_text("utf-8")
+    assert not [page for page in pages if f'href="{page}.html"' not in navigation and page != "index"]
+    loaded = {
+        url
+        for page in site.rglob("*.html")
+        for url in re.findall(r"<(?:script|img|link)[^>]* (?:src|href)=\"?(https?://[^\"> ]+)", page.read_text("utf-8"))
+    }
+    assert loaded == set()
+
+
+@pytest.mark.slow
+def test_the_reference_has_every_key_command_topic_and_column(site):
+    from experiments.metrics.results import RobotMetrics
+    from tools.main import app
+
+    file = text(site / "reference" / "experiment-file.html")
+    assert not [entry.key for entry in reference.entries() if entry.text and entry.text.split("\n\n")[0][:40] not in file]
+    commands = text(site / "reference" / "commands.html")
+    assert not [group.name for group in app.registered_groups if group.name and f"./zenpark {group.name}" not in commands]
+    assert all(topic.name in text(site / "reference" / "recordings.html") for topic in TOPICS)
+    assert all(field in text(site / "reference" / "metrics.html") for field in RobotMetrics.__struct_fields__)
+    assert "park/CF01/pose" in text(site / "reference" / "network.html")
+    assert "simulate" in text(site / "reference" / "api.html")
