@@ -161,14 +161,12 @@ def network() -> Iterator[str]:
     yield "Payloads are JSON unless their encoding says MessagePack. `park` is the realm (`[network] realm`).\n"
     yield from ("| key | meaning |", "|---|---|")
     made = keys.Keys()
-    for name, member in vars(keys.Keys).items():
-        if name.startswith("_") or not (isinstance(member, property) or inspect.isfunction(member)):
-            continue
-        text = _cell((inspect.getdoc(member) or "").partition("\n")[0])
-        if isinstance(member, property):
-            yield f"| `{getattr(made, name)}` | {text} |"
-        elif list(inspect.signature(member).parameters) == ["self", "robot"]:
-            yield f"| `{member(made, 'CF01')}` | {text} |"
+    lines = inspect.getsource(keys).splitlines()
+    (table,) = (each for each in ast.parse("\n".join(lines)).body if getattr(each, "name", "") == "Keys")
+    for node in table.body:
+        if isinstance(node, ast.Assign):
+            key = getattr(made, ast.unparse(node.targets[0]))
+            yield f"| `{key if isinstance(key, str) else key('CF01')}` | {_cell(_comment(node, lines))} |"
     yield ""
     yield from _structs(messages)
 
@@ -187,14 +185,19 @@ def _structs(module: ModuleType) -> Iterator[str]:
         yield f"{ast.get_docstring(node) or ''}\n"
         yield from ("| field | type | meaning |", "|---|---|---|")
         for each in fields:
-            above = []
-            number = each.lineno - 2
-            while lines[number].strip().startswith("#"):
-                above.insert(0, lines[number].strip(" #"))
-                number -= 1
-            beside = lines[(each.end_lineno or each.lineno) - 1][each.end_col_offset or 0 :].partition("#")[2].strip()
-            text = " ".join([*above, beside]).strip()
+            text = _comment(each, lines)
             yield f"| `{ast.unparse(each.target)}` | `{_cell(ast.unparse(each.annotation))}` | {_cell(text)} |"
+
+
+def _comment(node: ast.stmt, lines: Sequence[str]) -> str:
+    """The comment beside a statement, or right above it."""
+    above: list[str] = []
+    number = node.lineno - 2
+    while lines[number].strip().startswith("#"):
+        above.insert(0, lines[number].strip(" #"))
+        number -= 1
+    beside = lines[(node.end_lineno or node.lineno) - 1].encode()[node.end_col_offset or 0 :].decode()
+    return " ".join([*above, beside.partition("#")[2].strip()]).strip()
 
 
 def api() -> Iterator[str]:

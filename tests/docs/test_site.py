@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from experiments.file import reference
+from experiments.metrics.results import RobotMetrics
 from experiments.recording.topics import TOPICS
+from tools.main import app
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -51,13 +53,14 @@ def test_the_site_has_every_page_and_fetches_nothing(site):
 
 @pytest.mark.slow
 def test_the_reference_has_every_key_command_topic_and_column(site):
-    from experiments.metrics.results import RobotMetrics
-    from tools.main import app
-
     file = text(site / "reference" / "experiment-file.html")
-    assert not [entry.key for entry in reference.entries() if entry.text and entry.text.split("\n\n")[0][:40] not in file]
+    assert not [
+        entry.key for entry in reference.entries() if entry.text and entry.text.split("\n\n")[0][:40] not in file
+    ]
     commands = text(site / "reference" / "commands.html")
-    assert not [group.name for group in app.registered_groups if group.name and f"./zenpark {group.name}" not in commands]
+    assert not [
+        group.name for group in app.registered_groups if group.name and f"./zenpark {group.name}" not in commands
+    ]
     assert all(topic.name in text(site / "reference" / "recordings.html") for topic in TOPICS)
     assert all(field in text(site / "reference" / "metrics.html") for field in RobotMetrics.__struct_fields__)
     assert "park/CF01/pose" in text(site / "reference" / "network.html")

@@ -1,0 +1,60 @@
+"""Reference of the experiment file: every key has a type and an example that is TOML and holds the key."""
+
+import tomllib
+
+import pytest
+from typer.testing import CliRunner
+
+from experiments.file import reference
+from tools.main import app
+
+
+@pytest.mark.parametrize("entry", reference.entries(), ids=lambda entry: entry.key)
+def test_an_example_is_a_part_of_a_file(entry):
+    value = tomllib.loads(entry.example)
+    for part in entry.words:
+        while part not in value:  # below a name
+            (value,) = value.values()
+        value = value[part]
+        value = value[0] if isinstance(value, list) and value and isinstance(value[0], dict) else value
+    assert entry.type
+
+
+@pytest.mark.parametrize(
+    ("asked", "first"),
+    [
+        ("disturbance.hover_jitter", "disturbance.KIND.hover_jitter"),
+        ("disturbance.crazyflie.hover_jitter", "disturbance.KIND.hover_jitter"),
+        ("robots.CF01.start", "robots.ROBOT.start"),
+        ("trigger.send-on-delta.threshold", "trigger(send-on-delta).threshold"),
+        ("trigger(send-on-delta).threshold", "trigger(send-on-delta).threshold"),
+        ("body_hz", "rates.body_hz"),
+    ],
+)
+def test_a_key_is_found_as_users_write_it(asked, first):
+    assert reference.matching(asked)[0].key == first
+
+
+def test_a_table_is_followed_by_its_keys():
+    keys = [entry.key for entry in reference.matching("safety")]
+    assert keys[0] == "safety"
+    assert {"safety.speed", "safety.separation"} < set(keys)
+
+
+def test_an_entry_says_default_and_limits():
+    (entry,) = reference.matching("rates.body_hz")
+    assert (entry.type, entry.limits, entry.default) == ("a number", "> 0, ≤ 2000", "100.0")
+    assert entry.example.startswith("[rates]\nbody_hz = ")
+
+
+def test_the_command_explains_a_key():
+    said = CliRunner().invoke(app, ["explain", "rates.body_hz"])
+    assert said.exit_code == 0
+    for part in ("rates.body_hz", "position control and body", "> 0, ≤ 2000", "100.0", "[rates]"):
+        assert part in said.output
+
+
+def test_an_unknown_key_is_wrong_input():
+    said = CliRunner().invoke(app, ["explain", "saftey"])
+    assert said.exit_code == 2
+    assert "did you mean 'safety'?" in said.output
