@@ -58,6 +58,7 @@ def test_commands():
                 "bridge",
                 "centre",
                 "world",
+                "explain",
                 "world-order",
                 "hosts",
                 "station",
