@@ -163,8 +163,7 @@ def test_members_of_a_lab_let_nobody_do_what_is_not_his(tmp_path: Path) -> None:
                 for key in ("park/estop", "park/**"):
                     intruder.put(key, stop, encoding=messages.JSON)
                 intruder.put("park/KH01/pose", pose, encoding=messages.JSON)
-                time.sleep(0.01)
-            order = messages.encode(messages.Order("land"))
+            order = messages.encode(messages.Order("land"))  # behind all others on the same way
             assert not [reply for reply in intruder.get("park/CF01/order", payload=order, timeout=0.5) if reply.ok]
     code, _ = flight.finish()
     assert code == 0, flight.logs()

@@ -116,8 +116,7 @@ def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[L
                 intruder.put(keys.pose("KH01"), forged, encoding=messages.JSON)
                 intruder.put(keys.estop, stop, encoding=messages.JSON)
                 intruder.put("park/**", stop, encoding=messages.JSON)
-                time.sleep(0.01)
-            order = messages.encode(messages.Order("land"))
+            order = messages.encode(messages.Order("land"))  # behind all others on the same way
             assert not [reply for reply in intruder.get(keys.order("KH01"), payload=order, timeout=1.0) if reply.ok]
             heard = {str(sample.key_expr) for sample in network.received(states.handler)}
             assert heard <= {"park/**"}, "its own words, and nobody else's"

@@ -11,11 +11,13 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import psutil
 import pytest
 
 from agents.arrays import Index
 from agents.runtime.watchdog import HUNG, Watchdog
 from tests.conftest import ROOT
+from tests.waiting import until
 
 SILENCE_S = 0.1
 
@@ -56,8 +58,8 @@ class Kennel:
         )
 
     def beat_for(self, seconds: float) -> None:
-        until, pause = time.monotonic() + seconds, threading.Event()
-        while time.monotonic() < until:
+        end, pause = time.monotonic() + seconds, threading.Event()
+        while time.monotonic() < end:
             self.dog.beat()
             pause.wait(0.01)
 
@@ -123,7 +125,9 @@ def test_a_process_that_was_frozen_is_not_a_loop_that_hangs():
     assert process.stdout is not None
     assert process.stdout.readline() == "runs\n"
     os.kill(process.pid, signal.SIGSTOP)
-    time.sleep(1.0)
+    until(lambda: psutil.Process(process.pid).status() == psutil.STATUS_STOPPED, "it is frozen")
+    frozen = time.monotonic()
+    until(lambda: time.monotonic() > frozen + 1.0, "it was frozen for twice as long as the watchdog allows")
     os.kill(process.pid, signal.SIGCONT)
     out, _ = process.communicate(timeout=30)
     assert out == "over\n"
