@@ -16,24 +16,20 @@ from experiments.metrics.statistics import by_case
 from experiments.recording.trace import Trace
 from experiments.report import figures, scenery
 from experiments.report import figures as shadow_figures
-from experiments.report.feature_tables import (
-    EXPLAINED,
-    architecture_table,
-    clearance_tables,
-    collision_table,
-    network_tables,
-    shadow_tables,
-)
-from experiments.report.feature_tables import PROSE as MODELLED
 from experiments.report.page import Finding, PageFigure, Section, date_of, numbered, render, seeds_in_words
 from experiments.report.tables import (
     DEFINITIONS,
+    architecture_table,
+    clearance_tables,
     clocks_table,
+    collision_table,
     events_table,
     gaps_table,
     links_table,
+    network_tables,
     proof_tables,
     robot_tables,
+    shadow_tables,
     summary_table,
     whole_table,
 )
@@ -55,6 +51,16 @@ WORKED_OUT: Final = (
 SHADOWS: Final = (
     "Robots and the twins beside them: left from above, twins dashed; right the difference, twin less robot, in the "
     "robot's heading and in height."
+)
+ARCHITECTURE: Final = (
+    "In the centralised architecture one process decides for all robots, from the poses that they send; in a hybrid "
+    "one for some. Messages are poses and goals of the whole network, leaders too; deliveries count each once for "
+    "every receiver. A delay is from the measurement of a robot's pose to its acting on the first goal that "
+    "rests on it: both ways through the network, and the wait for the next decision."
+)
+NETWORK: Final = (
+    "The effects that the file asks of the network, on top of the real network's own: dropped poses did arrive, and "
+    "were discarded. Delays are from the stamp of a pose to its arrival, whatever caused them."
 )
 MOST_LINKS: Final = 60  # longer tables are folded
 ORIGIN: Final = "run.json"  # how and when a run was made, for when its report is made again
@@ -225,7 +231,7 @@ def _modelled(cases: Sequence[CaseMetrics]) -> list[Section]:
     tables = network_tables(cases)
     many = any(len(table.rows) > MOST_LINKS for table in tables)
     title, folded = "What the modelled network did", "Show all links" if many else ""
-    return [Section(title, (MODELLED,), tables, folded=folded)] if tables else []
+    return [Section(title, (NETWORK,), tables, folded=folded)] if tables else []
 
 
 def _origin(folder: Path, now: RunOrigin) -> RunOrigin:
@@ -263,7 +269,7 @@ def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Pa
 def _of_architecture(cases: Sequence[CaseMetrics]) -> list[Section]:
     """Architecture, if not each robot decides for itself."""
     table = architecture_table(cases)
-    return [] if table is None else [Section("Architecture", (EXPLAINED,), (table,))]
+    return [] if table is None else [Section("Architecture", (ARCHITECTURE,), (table,))]
 
 
 def _of_clocks(traces: Sequence[Trace]) -> list[Section]:

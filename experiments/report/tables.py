@@ -1,17 +1,28 @@
-"""The tables of a report, from measured cases; several seeds of a case become means with 95 % intervals."""
+"""Tables of a report, from measured cases; several seeds of a case become means with 95 % intervals.
+
+Two shapes: numbers of a case, with a column for each case (`_across`); and numbers of each robot or link (`_Rows`), in
+a table for each case or with the cases side by side.
+"""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Sequence
-from typing import Final
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any, Final, Generic, TypeVar
 
-from experiments.metrics.results import Approach, CaseMetrics, RobotMetrics
+from experiments.metrics.results import Approach, CaseMetrics, Passage, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import by_case, ratios, spread
 from experiments.recording.trace import Trace
-from experiments.report.page import Cell, Row, Table, interval, number
+from experiments.report.page import NONE, Cell, Row, Table, interval, number
+
+T = TypeVar("T")  # a robot, or a link
+Line = tuple[str, Callable[[CaseMetrics], float | None], float]  # label, value of a run, scale
+Column = tuple[str, Callable[[Sequence[T]], Cell]]  # head, cell of the same robot or link in all seeds
 
 MOST_EVENTS: Final = 200
+MOST_COLLISIONS: Final = 100
 
 SUMMARY: Final = (
     ("f_hz", "Transmissions per second f [Hz]"),
@@ -64,68 +75,180 @@ DEFINITIONS: Final = (
 )  # fmt: skip
 
 
+# ---------------------------------------------------------------------- numbers of a case
+
+
+def _across(head: str, cases: Sequence[CaseMetrics], lines: Iterable[Line]) -> Table:
+    """A row for each number of a case, a column for each case."""
+    grouped = by_case(cases)
+    rows = [
+        Row((label, *(_over_seeds([value(run) for run in runs], scale) for runs in grouped.values())))
+        for label, value, scale in lines
+    ]
+    return Table((head, *grouped), tuple(rows))
+
+
+def _over_seeds(values: Sequence[float | None], scale: float = 1.0) -> str:
+    """Mean and interval over the seeds, and the number of seeds whose value is known."""
+    found = spread(values)
+    return interval(found, scale) + (f" ({found.n} of {len(values)})" if 0 < found.n < len(values) else "")
+
+
 def summary_table(cases: Sequence[CaseMetrics]) -> Table:
     """The indices of each case, averaged over the followers, and their ratios to the first case."""
     grouped = by_case(cases)
     first = next(iter(grouped.values()))
-    rows = []
-    for index, label in SUMMARY:
-        if index == "dropped" and not any(case.modelled for case in cases):
-            continue
-        cells: list[Cell] = [label]
-        for runs in grouped.values():
-            found = spread([run.mean[index] for run in runs])
-            share = spread(ratios(runs, first, index))
-            known = f" ({found.n} of {len(runs)})" if 0 < found.n < len(runs) else ""
-            text = interval(found) + known
-            relative = "" if runs is first or share.mean is None else f"× {share.mean:.3f}"
-            half = "" if not relative or share.ci95 is None else f" ± {share.ci95:.3f}"
-            cells.append((text, relative + half) if relative else text)
-        rows.append(Row(tuple(cells)))
+
+    def cell(runs: Sequence[CaseMetrics], index: str) -> Cell:
+        text, share = _over_seeds([run.mean[index] for run in runs]), spread(ratios(runs, first, index))
+        if runs is first or share.mean is None:
+            return text
+        return text, f"× {share.mean:.3f}" + ("" if share.ci95 is None else f" ± {share.ci95:.3f}")
+
+    modelled = any(case.modelled for case in cases)
+    rows = [
+        Row((label, *(cell(runs, index) for runs in grouped.values())))
+        for index, label in SUMMARY
+        if modelled or index != "dropped"
+    ]
     seeds = max(len(runs) for runs in grouped.values())
-    return Table(
-        ("Mean per robot", *grouped),
-        tuple(rows),
-        note=(f"× is relative to {next(iter(grouped))}." if len(grouped) > 1 else "")
-        + (f" Means over {seeds} seeds with their 95 % confidence intervals." if seeds > 1 else ""),
-    )
+    note = f"× is relative to {next(iter(grouped))}." if len(grouped) > 1 else ""
+    note += f" Means over {seeds} seeds with their 95 % confidence intervals." if seeds > 1 else ""
+    return Table(("Mean per robot", *grouped), tuple(rows), note=note)
 
 
 def whole_table(cases: Sequence[CaseMetrics]) -> Table:
     """Numbers of the formation as a whole."""
-    grouped = by_case(cases)
     phases = max(len(case.starts_s) for case in cases)
-
-    def row(label: str, value: Callable[[CaseMetrics], float | None], scale: float = 1.0) -> Row:
-        cells = []
-        for runs in grouped.values():
-            found = spread([value(run) for run in runs])
-            known = f" ({found.n} of {len(runs)})" if 0 < found.n < len(runs) else ""
-            cells.append(interval(found, scale) + known)
-        return Row((label, *cells))
-
-    rows = []
+    lines: list[Line] = []
     for k in range(phases):
-        rows += [
-            row(f"Acquired by all followers{_phase(cases, k)} [s]", lambda case, k=k: _at(case.acquired_s, k)),  # type: ignore[misc]
-            row(f"Worst link{_phase_end(cases, k, phases)} [cm]", lambda case, k=k: _worst(case, k), 100.0),  # type: ignore[misc]
-            row(f"Net rotation{_phase(cases, k)} [mrad/s]", lambda case, k=k: _at(case.rotation_rad_s, k), 1000.0),  # type: ignore[misc]
+        lines += [
+            (f"Acquired by all followers{_phase(cases, k)} [s]", lambda case, k=k: _at(case.acquired_s, k), 1.0),  # type: ignore[misc]
+            (f"Worst link{_phase_end(cases, k, phases)} [cm]", lambda case, k=k: _worst(case, k), 100.0),  # type: ignore[misc]
+            (f"Net rotation{_phase(cases, k)} [mrad/s]", lambda case, k=k: _at(case.rotation_rad_s, k), 1000.0),  # type: ignore[misc]
         ]
-    rows += [
-        row("Belief error, RMS [mm]", lambda case: case.belief_rms, 1000.0),
-        row("Belief error, largest [mm]", lambda case: case.belief_max, 1000.0),
-        row("Closest approach of two robots [m]", lambda case: case.closest),
-        row("Closest approach of two surfaces [cm]", lambda case: _gap(case.near), 100.0),
-        row("Closest approach to the arena [cm]", lambda case: _gap(case.near_arena), 100.0),
-        row("Collisions", lambda case: float(len(case.collisions))),
-        row("Hardest impulse [mN s]", lambda case: _of(max, (each.impulse for each in case.collisions)), 1000.0),
-        row("Changed by safety [% of ticks]", lambda case: case.intervened_share, 100.0),
-        row("Changed by avoidance [% of ticks]", lambda case: case.avoided_share, 100.0),
-        row("Farthest outside the arena [mm]", lambda case: case.excursion, 1000.0),
-        row("Missed deadlines [% of ticks]", lambda case: case.missed_share, 100.0),
-        row("Cost J2", lambda case: case.j2),
+    lines += [
+        ("Belief error, RMS [mm]", attrgetter("belief_rms"), 1000.0),
+        ("Belief error, largest [mm]", attrgetter("belief_max"), 1000.0),
+        ("Closest approach of two robots [m]", attrgetter("closest"), 1.0),
+        ("Closest approach of two surfaces [cm]", lambda case: None if case.near is None else case.near.gap, 100.0),
+        (
+            "Closest approach to the arena [cm]",
+            lambda case: None if case.near_arena is None else case.near_arena.gap,
+            100.0,
+        ),
+        ("Collisions", lambda case: float(len(case.collisions)), 1.0),
+        ("Hardest impulse [mN s]", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0),
+        ("Changed by safety [% of ticks]", attrgetter("intervened_share"), 100.0),
+        ("Changed by avoidance [% of ticks]", attrgetter("avoided_share"), 100.0),
+        ("Farthest outside the arena [mm]", attrgetter("excursion"), 1000.0),
+        ("Missed deadlines [% of ticks]", attrgetter("missed_share"), 100.0),
+        ("Cost J2", attrgetter("j2"), 1.0),
     ]
-    return Table(("Whole formation", *grouped), tuple(rows))
+    return _across("Whole formation", cases, lines)
+
+
+def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:
+    """A column for each case; None if every robot of every case decides for itself."""
+    if not any(case.guidance for case in cases):
+        return None
+    grouped = by_case(cases)
+    reference, first = next(iter(grouped.items()))
+
+    def centre(name: str) -> Callable[[CaseMetrics], float | None]:
+        return lambda case: getattr(case.guidance, name, None)
+
+    table = _across(
+        "Architecture",
+        cases,
+        [
+            ("Messages of the network", attrgetter("network_messages"), 1.0),
+            ("of them poses of robots", lambda case: sum(robot.messages for robot in case.robots), 1.0),
+            ("of them goals of the centre", centre("goals"), 1.0),
+            ("Deliveries", attrgetter("deliveries"), 1.0),
+            ("Payload [kB]", attrgetter("network_bytes"), 0.001),
+            ("Goals per second", centre("goals_hz"), 1.0),
+            ("Goals that were lost", centre("goals_lost"), 1.0),
+            ("Poses that the centre never got", centre("poses_lost"), 1.0),
+            ("Delay, mean [ms]", centre("delay_mean_s"), 1000.0),
+            ("Delay, 95 % are below [ms]", centre("delay_p95_s"), 1000.0),
+            ("Delay, longest [ms]", centre("delay_max_s"), 1000.0),
+            ("Load of the centre, mean [% of a core]", centre("load"), 100.0),
+            ("Load of the centre, busiest second [% of a core]", centre("load_max"), 100.0),
+            ("Decisions that came too late", centre("missed"), 1.0),
+        ],
+    )
+    rows = [Row(("Decides", *(architecture_of(runs[0]) for runs in grouped.values()))), *table.rows]
+    if len(grouped) > 1:
+        for index in ("iae", "itae", "rmse"):
+            relative = (interval(spread(ratios(runs, first, index))) for runs in grouped.values())
+            rows.append(Row((f"{index.upper()} relative to {reference}", *relative)))
+    return Table(table.head, tuple(row for row in rows if any(cell != NONE for cell in row.cells[1:])))
+
+
+def architecture_of(case: CaseMetrics) -> str:
+    """The architecture, in words."""
+    if case.guidance is None:
+        return "every robot"
+    guided = case.guidance.guided
+    return "the centre" if len(guided) == len(case.robots) else f"the centre for {', '.join(guided)}"
+
+
+# ---------------------------------------------------------------------- numbers of each robot or link
+
+
+@dataclass(frozen=True)
+class _Rows(Generic[T]):
+    """Rows of a table: one for each robot or link, all seeds together."""
+
+    head: str  # of the names
+    items: Callable[[CaseMetrics], Iterable[T]]  # robots or links of a run
+    name: Callable[[T], Cell]  # the same in all seeds
+    columns: Sequence[Column[T]]
+
+    def row(self, name: Cell, items: Sequence[T], *, summed: bool = False) -> Row:
+        return Row((name, *(cell(items) for _, cell in self.columns)), sum=summed)
+
+    def groups(self, runs: Sequence[CaseMetrics]) -> Mapping[Cell, list[T]]:
+        """Robots or links by name."""
+        found: dict[Cell, list[T]] = {}
+        for run in runs:
+            for item in self.items(run):
+                found.setdefault(self.name(item), []).append(item)
+        return found
+
+    def table(self, case: str, runs: Sequence[CaseMetrics], sums: Mapping[Cell, Sequence[T]] | None = None) -> Table:
+        """The table of one case, with further rows of `sums`."""
+        rows = [self.row(name, items) for name, items in self.groups(runs).items()]
+        rows += [self.row(name, items, summed=True) for name, items in (sums or {}).items()]
+        return Table((self.head, *(head for head, _ in self.columns)), tuple(rows), title=case)
+
+    def side_by_side(self, cases: Sequence[CaseMetrics], unit: str) -> Table:
+        """One table of all cases, with their columns side by side."""
+        grouped = {case: self.groups(runs) for case, runs in by_case(cases).items()}
+        names = dict.fromkeys(name for groups in grouped.values() for name in groups)
+        rows = [
+            Row((name, *(cell(groups.get(name, [])) for groups in grouped.values() for _, cell in self.columns)))
+            for name in names
+        ]
+        head = [f"{case}: {what} [{unit}]" for case in grouped for what, _ in self.columns]
+        return Table((self.head, *head), tuple(rows))
+
+
+def _cell(what: Callable[[Iterable[Any]], float], field: str, scale: float = 1.0) -> Callable[[Sequence[Any]], str]:
+    """A statistic of the known values of a field."""
+    value = attrgetter(field)
+    return lambda items: number(_known(what, map(value, items)), scale)
+
+
+def _mean(values: Iterable[float]) -> float:
+    """The mean; a single value as it is, so that a whole number is shown as one."""
+    first, *others = values
+    return statistics.fmean([first, *others]) if others else first
+
+
+def _robots(run: CaseMetrics) -> Sequence[RobotMetrics]:
+    return run.robots
 
 
 def robot_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
@@ -134,98 +257,184 @@ def robot_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
 
 
 def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
-    out = {name for run in runs for name in (*run.leaders, *run.died)}
-    names = [robot.robot for robot in runs[0].robots]
-    kinds = {robot.robot: robot.kind for robot in runs[0].robots}
-    kept = [name for name in names if name not in out]
-    later = range(max(len(run.starts_s) for run in runs) - 1)
-    columns: list[tuple[str, Callable[[RobotMetrics], float | None], float]] = [
-        ("f [Hz]", lambda robot: robot.f_hz, 1.0),
-        ("Sent", lambda robot: robot.messages, 1.0),
-        ("IAE [m s]", lambda robot: robot.iae, 1.0),
-        ("ITAE [m s²]", lambda robot: robot.itae, 1.0),
-        ("RMSE [m]", lambda robot: robot.rmse, 1.0),
-        ("Acquired [s]", lambda robot: robot.acquired_s, 1.0),
-        *((f"{_phase(runs, k + 1).strip()} [s]", lambda robot, k=k: _later(robot, k), 1.0) for k in later),
-        ("Worst link [cm]", lambda robot: robot.by_the_end[0], 100.0),
+    left_out = {name for run in runs for name in (*run.leaders, *run.died)}
+    columns: list[Column[RobotMetrics]] = [
+        ("f [Hz]", _cell(_mean, "f_hz")),
+        ("Sent", _cell(_mean, "messages")),
+        ("IAE [m s]", _cell(_mean, "iae")),
+        ("ITAE [m s²]", _cell(_mean, "itae")),
+        ("RMSE [m]", _cell(_mean, "rmse")),
+        ("Acquired [s]", _cell(_mean, "acquired_s")),
     ]
+    for k in range(1, max(len(run.starts_s) for run in runs)):
+        later = lambda robots, k=k: _known(_mean, (p.acquired_s for r in robots for p in r.phases[k - 1 : k]))  # noqa: E731
+        columns.append((f"{_phase(runs, k).strip()} [s]", lambda robots, later=later: number(later(robots))))  # type: ignore[misc]
+    columns.append(("Worst link [cm]", lambda robots: number(_known(_mean, (r.by_the_end[0] for r in robots)), 100.0)))
     if any(robot.coverage < 1.0 for run in runs for robot in run.robots):
-        columns.append(("Known [%]", lambda robot: robot.coverage, 100.0))
-
-    def cells(group: Sequence[str], value: Callable[[RobotMetrics], float | None], scale: float) -> str:
-        found = [value(robot) for run in runs for robot in run.robots if robot.robot in group]
-        known = [each for each in found if each is not None]
-        return number(known[0] if len(known) == 1 else _of(statistics.fmean, known), scale)
-
-    rows = []
-    for name in names:
-        shown = (f"({name})" if name in out else name, kinds[name])
-        rows.append(Row((shown, *(cells([name], value, scale) for _, value, scale in columns))))
-    groups = {kind: [name for name in kept if kinds[name] == kind] for kind in dict.fromkeys(kinds.values())}
-    groups = {kind: group for kind, group in groups.items() if 1 < len(group) < len(kept)}
-    for kind, group in [*groups.items(), ("", kept)]:
-        averages = (cells(group, value, scale) for _, value, scale in columns)
-        rows.append(Row(((f"mean of {len(group)}", kind), *averages), sum=True))
-    return Table(("Robot", *(label for label, _, _ in columns)), tuple(rows), title=case)
+        columns.append(("Known [%]", _cell(_mean, "coverage", 100.0)))
+    kept = [robot for run in runs for robot in run.robots if robot.robot not in left_out]
+    every = {robot.robot: robot.kind for robot in kept}
+    kinds = {kind: [name for name in every if every[name] == kind] for kind in dict.fromkeys(every.values())}
+    groups = {kind: group for kind, group in kinds.items() if 1 < len(group) < len(every)} | {"": [*every]}
+    sums: dict[Cell, list[RobotMetrics]] = {
+        (f"mean of {len(group)}", kind): [robot for robot in kept if robot.robot in group]
+        for kind, group in groups.items()
+    }
+    rows = _Rows("Robot", _robots, lambda r: (f"({r.robot})" if r.robot in left_out else r.robot, r.kind), columns)
+    return rows.table(case, runs, sums)
 
 
 def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """Per case: poses sent, recorded, received, lost, and dropped by a modelled network; seeds are added up."""
-    tables = []
-    for name, runs in by_case(cases).items():
-        columns = 6 if runs[0].modelled else 5
-        rows, total = [], [0] * columns
-        for k, robot in enumerate(runs[0].robots):
-            same = [run.robots[k] for run in runs]
-            counts = [
-                sum(each.messages for each in same),
-                sum(each.recorded for each in same),
-                sum(each.messages * each.listeners for each in same),
-                sum(each.heard for each in same),
-                sum(each.lost for each in same),
-                sum(each.dropped for each in same),
-            ][:columns]
-            total = [a + b for a, b in zip(total, counts, strict=True)]
-            rows.append(Row((robot.robot, str(robot.listeners), *(number(count) for count in counts))))
-        rows.append(Row(("all", "", *(number(count) for count in total)), sum=True))
-        head = ("Robot", "Listeners", "Sent", "Recorded", "To be heard", "Heard", "Lost", "Dropped")
-        tables.append(Table(head[: 2 + columns], tuple(rows), title=name))
-    return tuple(tables)
+    columns: list[Column[RobotMetrics]] = [
+        ("Listeners", lambda robots: str(robots[0].listeners) if len({r.robot for r in robots}) == 1 else ""),
+        ("Sent", _cell(sum, "messages")),
+        ("Recorded", _cell(sum, "recorded")),
+        ("To be heard", lambda robots: number(sum(robot.messages * robot.listeners for robot in robots))),
+        ("Heard", _cell(sum, "heard")),
+        ("Lost", _cell(sum, "lost")),
+        ("Dropped", _cell(sum, "dropped")),
+    ]
+    return tuple(
+        _Rows("Robot", _robots, attrgetter("robot"), columns if runs[0].modelled else columns[:-1]).table(
+            name, runs, {"all": [robot for run in runs for robot in run.robots]}
+        )
+        for name, runs in by_case(cases).items()
+    )
 
 
 def gaps_table(cases: Sequence[CaseMetrics]) -> Table:
     """Shortest, median and longest time between transmissions, per robot and case."""
-    grouped = by_case(cases)
-    rows = []
-    for robot in dict.fromkeys(robot.robot for case in cases for robot in case.robots):
-        cells: list[str] = [robot]
-        for runs in grouped.values():
-            same = [each for run in runs for each in run.robots if each.robot == robot]
-            cells += [
-                number(_of(min, (each.gap_min_s for each in same))),
-                number(_of(statistics.median, (each.gap_median_s for each in same))),
-                number(_of(max, (each.gap_max_s for each in same))),
-            ]
-        rows.append(Row(tuple(cells)))
-    head = [f"{name}: {what} [s]" for name in grouped for what in ("shortest", "median", "longest")]
-    return Table(("Robot", *head), tuple(rows))
+    columns = [
+        ("shortest", _cell(min, "gap_min_s")),
+        ("median", _cell(statistics.median, "gap_median_s")),
+        ("longest", _cell(max, "gap_max_s")),
+    ]
+    return _Rows("Robot", _robots, attrgetter("robot"), columns).side_by_side(cases, "s")
 
 
 def links_table(cases: Sequence[CaseMetrics]) -> Table:
     """Belief error of each link, per case; the mean and the largest over several seeds."""
-    grouped = by_case(cases)
+    columns = [("RMS", _cell(statistics.fmean, "rms", 1000.0)), ("largest", _cell(max, "max", 1000.0))]
+    name = "{0.listener} of {0.speaker}".format
+    return _Rows("Receiver of sender", attrgetter("belief"), name, columns).side_by_side(cases, "mm")
+
+
+def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
+    """For each case with a modelled network the fate of the poses on each link; several seeds are added up."""
+    columns: list[Column[Passage]] = [
+        ("Heard", _cell(sum, "heard")),
+        ("Dropped", _cell(sum, "dropped")),
+        ("Share [%]", lambda links: number(dropped_share(links))),
+        ("Mean delay [ms]", lambda links: number(mean_delay(links), 1e3)),
+        ("Longest [ms]", _cell(max, "delay_max", 1e3)),
+    ]
+    rows: _Rows[Passage] = _Rows("Link", attrgetter("passages"), "{0.speaker} > {0.listener}".format, columns)
+    return tuple(
+        rows.table(name, runs, {"all": [link for run in runs for link in run.passages]})
+        for name, runs in by_case(cases).items()
+        if runs[0].modelled
+    )
+
+
+def dropped_share(links: Sequence[Passage]) -> float | None:
+    """Share of the poses on some links that the modelled network dropped [%]; None without poses."""
+    dropped = sum(link.dropped for link in links)
+    every = dropped + sum(link.heard for link in links)
+    return 100.0 * dropped / every if every else None
+
+
+def mean_delay(links: Sequence[Passage]) -> float | None:
+    """Mean delay over all poses received on some links [s]; None without poses."""
+    heard = sum(link.heard for link in links)
+    total = sum(link.heard * link.delay_mean for link in links if link.delay_mean is not None)
+    return total / heard if heard else None
+
+
+def clearance_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
+    """Closest approaches of each robot and its changed ticks, per case; over seeds the nearest and the mean."""
+
+    def gap(near: Approach | None) -> Cell:
+        return NONE if near is None else (number(near.gap, 100.0), near.between[1])
+
+    def at(near: Approach | None) -> str:
+        return NONE if near is None else f"{near.at_s:.2f}"
+
+    def nearest(show: Callable[[Approach | None], Cell], field: str) -> Callable[[Sequence[RobotMetrics]], Cell]:
+        def cell(robots: Sequence[RobotMetrics]) -> Cell:
+            known = [near for near in map(attrgetter(field), robots) if near is not None]
+            return show(min(known, key=attrgetter("gap"), default=None))
+
+        return cell
+
+    columns = [
+        ("To a robot [cm]", nearest(gap, "near")),
+        ("t [s]", nearest(at, "near")),
+        ("To the arena [cm]", nearest(gap, "near_arena")),
+        ("t [s]", nearest(at, "near_arena")),
+        ("Collisions", _cell(sum, "collisions")),
+        ("Changed by safety [%]", _cell(statistics.fmean, "intervened_share", 100.0)),
+        ("By avoidance [%]", _cell(statistics.fmean, "avoided_share", 100.0)),
+    ]
+    rows: _Rows[RobotMetrics] = _Rows("Robot", _robots, attrgetter("robot"), columns)
+    return tuple(rows.table(name, runs) for name, runs in by_case(cases).items())
+
+
+def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
+    """Per case the agreement of shadow twins with their robots, of the first seed; nothing where there are none."""
+
+    def signed(*fields: str, scale: float = 1000.0, form: str = ".1f") -> Callable[[Sequence[RobotMetrics]], str]:
+        """Values with a sign, those along axes one by one; 0.0 instead of -0.0."""
+
+        def text(value: float | None) -> str:
+            return NONE if value is None else f"{round(value * scale, int(form[1])) + 0.0:{form}}".replace("-", "−")
+
+        def cell(robots: Sequence[RobotMetrics]) -> str:
+            values = [getattr(robots[0].shadow, field) for field in fields]
+            return ", ".join(text(part) for each in values for part in (each if isinstance(each, tuple) else (each,)))
+
+        return cell
+
+    def ahead(robots: Sequence[RobotMetrics]) -> str:
+        horizon_s = robots[0].shadow and robots[0].shadow.horizon_s
+        return "all of it" if horizon_s is None else f"{horizon_s:g}"
+
+    columns: list[Column[RobotMetrics]] = [
+        ("Ahead [s]", ahead),
+        ("Bias x, y, z [mm]", signed("bias")),
+        ("Along, across [mm]", signed("along", "across")),
+        ("Yaw [mrad]", signed("bias_yaw")),
+        ("RMSE [mm]", _cell(max, "shadow.rmse", 1000.0)),
+        ("RMSE yaw [mrad]", _cell(max, "shadow.rmse_yaw", 1000.0)),
+        ("Largest [mm]", _cell(max, "shadow.largest", 1000.0)),
+        ("Correlation x, y, z", signed("correlation", scale=1.0, form=".4f")),
+        ("of speeds", signed("correlation_speed", scale=1.0, form=".4f")),
+    ]
+    followed = lambda run: [robot for robot in run.robots if robot.shadow is not None]  # noqa: E731
+    rows: _Rows[RobotMetrics] = _Rows("Robot", followed, attrgetter("robot"), columns)
+    tables = (rows.table(name, runs[:1]) for name, runs in by_case(cases).items())
+    return tuple(table for table in tables if table.rows)
+
+
+def shadowed(cases: Sequence[CaseMetrics]) -> list[tuple[CaseMetrics, RobotMetrics, ShadowMetrics]]:
+    """Robots with a shadow twin."""
+    return [(case, robot, robot.shadow) for case in cases for robot in case.robots if robot.shadow is not None]
+
+
+# ---------------------------------------------------------------------- lists of what happened
+
+
+def collision_table(cases: Sequence[CaseMetrics]) -> Table:
+    """Contacts, case by case."""
+    several = len({case.seed for case in cases}) > 1
+    found = [(case, each) for case in cases for each in case.collisions]
     rows = []
-    for k, link in enumerate(cases[0].belief):
-        cells = [f"{link.listener} of {link.speaker}"]
-        for runs in grouped.values():
-            same = [run.belief[k] for run in runs]
-            cells += [
-                number(_of(statistics.fmean, (each.rms for each in same)), 1000.0),
-                number(_of(max, (each.max for each in same)), 1000.0),
-            ]
-        rows.append(Row(tuple(cells)))
-    head = [f"{name}: {what} [mm]" for name in grouped for what in ("RMS", "largest")]
-    return Table(("Who holds of whom", *head), tuple(rows))
+    for case, each in found[:MOST_COLLISIONS]:
+        where = (case.case, f"seed {case.seed}") if several else case.case
+        depth, impulse = number(each.overlap, 1000.0), number(each.impulse, 1000.0)
+        rows.append(Row((where, f"{each.time_s:.2f}", each.first, each.second, impulse, depth)))
+    head = ("Case", "t [s]", "First", "Second", "Impulse [mN s]", "Overlap [mm]")
+    return Table(head, tuple(rows), note=_more(len(found) - MOST_COLLISIONS, "metrics.json"), words=True)
 
 
 def clocks_table(traces: Sequence[Trace]) -> Table:
@@ -258,38 +467,30 @@ def clocks_table(traces: Sequence[Trace]) -> Table:
 
 def events_table(traces: Sequence[Trace]) -> Table:
     """Events of the conductor and the robots, case by case."""
-    said = [(trace.case, event) for trace in traces for event in trace.events]
-    rows = [
-        Row((case, f"{event.stamp:.2f}", event.kind, event.source, event.text)) for case, event in said[:MOST_EVENTS]
-    ]
-    note = f"{len(said) - MOST_EVENTS} more are in the recording." if len(said) > MOST_EVENTS else ""
-    return Table(
-        ("Case", "t [s]", "What", "Who", ""), tuple(rows), note=note or ("" if rows else "Nothing."), words=True
-    )
+    events = [(trace.case, event) for trace in traces for event in trace.events]
+    shown = [(case, f"{event.stamp:.2f}", event.kind, event.source, event.text) for case, event in events[:MOST_EVENTS]]
+    note = _more(len(events) - MOST_EVENTS, "the recording") or ("" if events else "Nothing.")
+    return Table(("Case", "t [s]", "Event", "Source", ""), tuple(map(Row, shown)), note=note, words=True)
 
 
-def _of(what: Callable[[Iterable[float]], float], values: Iterable[float | None]) -> float | None:
+def _more(hidden: int, where: str) -> str:
+    return f"{hidden} more are in {where}." if hidden > 0 else ""
+
+
+def _known(what: Callable[[Iterable[Any]], float], values: Iterable[float | None]) -> float | None:
+    """A statistic of the known values; None without any."""
     known = [value for value in values if value is not None]
     return what(known) if known else None
-
-
-def _gap(near: Approach | None) -> float | None:
-    return None if near is None else near.gap
 
 
 def _at(values: Sequence[float | None], k: int) -> float | None:
     return values[k] if k < len(values) else None
 
 
-def _later(robot: RobotMetrics, k: int) -> float | None:
-    return robot.phases[k].acquired_s if k < len(robot.phases) else None
-
-
 def _worst(case: CaseMetrics, k: int) -> float | None:
-    left = [
-        robot.residual if k == 0 else robot.phases[k - 1].residual for robot in case.robots if k <= len(robot.phases)
-    ]
-    return _of(max, left)
+    """Largest residual of a phase [m]."""
+    residuals = ([robot.residual, *(phase.residual for phase in robot.phases)] for robot in case.robots)
+    return _known(max, (each[k] for each in residuals if k < len(each)))
 
 
 def _phase(cases: Sequence[CaseMetrics], k: int) -> str:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from experiments.metrics.results import CaseMetrics, Collision
 from experiments.metrics.statistics import by_case, ratios, same_length, spread
-from experiments.report.feature_tables import sentences, shadowed
 from experiments.report.page import Finding, Mark, interval, number
+from experiments.report.tables import dropped_share, mean_delay, shadowed
 
 KEPT_UP = 0.99  # a world that is slower than this share of real time falls behind
 UNFINISHED_M = 0.3  # a robot that is nearer to where its plan wants it merely lags
@@ -20,7 +20,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *interruptions(cases),
         *_troubles(cases),
         *_nothing_lost(cases),
-        *(Finding("plain", text) for text in sentences(cases)),
+        *_modelled(cases),
         *_deadlines(cases),
         *_died(cases),
         *_guided(cases),
@@ -91,6 +91,25 @@ def _troubles(cases: Sequence[CaseMetrics]) -> list[Finding]:
         shown = [*case.troubles[:NAMED], *([f"{more} more like this"] if more > 0 else [])]
         if shown:
             found.append(Finding("bad", f"In {case.case}: {'; '.join(shown)}."))
+    return found
+
+
+def _modelled(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Loss and delay of each modelled network."""
+    found, several = [], len(by_case(cases)) > 1
+    for name, runs in by_case(cases).items():
+        if not runs[0].modelled:
+            continue
+        links = [link for run in runs for link in run.passages]
+        dropped = sum(link.dropped for link in links)
+        every = dropped + sum(link.heard for link in links)
+        text = f"The modelled network dropped {number(dropped)} of {number(every)} samples"
+        text += (f" in {name}" if several else "") + (f" ({number(dropped_share(links))} %)" if dropped else "")
+        mean = mean_delay(links)
+        if mean is not None:
+            longest = max(link.delay_max for link in links if link.delay_max is not None)
+            text += f"; those received took {number(mean, 1e3)} ms, at most {number(longest, 1e3)} ms"
+        found.append(Finding("plain", f"{text}."))
     return found
 
 

@@ -15,7 +15,7 @@ from experiments.file.problems import DocumentError
 from experiments.metrics import measure
 from experiments.recording import playback
 from experiments.report import metrics_files, report
-from experiments.report.feature_tables import architecture_table
+from experiments.report.tables import architecture_table
 from experiments.report.verdict import findings
 from experiments.virtual_time import simulation
 from experiments.virtual_time.log import Logbook
