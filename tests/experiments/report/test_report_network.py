@@ -9,8 +9,7 @@ from experiments.file.document import load
 from experiments.metrics.measure import measure
 from experiments.recording import playback
 from experiments.report import report
-from experiments.report.tables import network_tables
-from experiments.report.tables import proof_tables, summary_table
+from experiments.report.tables import network_tables, proof_tables, summary_table
 from experiments.report.verdict import findings
 from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import simulate
