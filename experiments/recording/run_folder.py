@@ -16,8 +16,8 @@ RUNS: Final = Path("runs")
 SOURCE: Final = "experiment.toml"
 
 
-def new_folder(read: Document, out: str | None) -> Path:
-    """Makes the folder of a run: `out`, or one below `runs` with experiment and time in its name.
+def new_folder(read: Document, out: str | None, what: str = "") -> Path:
+    """Makes the folder of a run: `out`, or one below `runs` with experiment and time in its name, and `what`, if given.
 
     Raises:
         DocumentError: If it holds something already, or cannot be made.
@@ -26,7 +26,7 @@ def new_folder(read: Document, out: str | None) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if out is None:
-            return _folder_of_now(folder, read.path.stem)
+            return _folder_of_now(folder, "-".join(part for part in (read.path.stem, what) if part))
         taken = any(folder.iterdir())
     except OSError as error:
         hint = "choose a place that may be written to with --out"

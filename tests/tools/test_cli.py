@@ -35,6 +35,7 @@ def test_commands():
                 "agent",
                 "router",
                 "check",
+                "preflight",
                 "report",
                 "export",
                 "recover",
@@ -137,6 +138,13 @@ def test_bad_flags_end_with_2(arguments):
     said = CliRunner().invoke(app, arguments)
     assert said.exit_code == 2
     assert "Error: " in said.stderr
+
+
+@pytest.mark.parametrize("bridge", ["vicon", "ros2"])
+def test_each_bridge_explains_its_options(bridge):
+    said = CliRunner().invoke(app, ["bridge", bridge, "--help"])
+    assert said.exit_code == 0
+    assert said.stdout.startswith(f"usage: zenpark bridge {bridge} ")
 
 
 @pytest.mark.parametrize("command", [["keys"], ["echo", "park/**"], ["hz", "park/**"]])

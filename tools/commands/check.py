@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, File, Settings
+from tools.commands.options import As, AsJson, Bodies, Cases, File, Here, Lab, Out, Settings, check_bodies
 
 if TYPE_CHECKING:
     from experiments.check.check import Figures, Finding
     from experiments.file.document import Document
+    from experiments.real_time.conductor.preflight_checks import RobotChecks
 
 app: Final = typer.Typer()
 
 WIDEST: Final = 110  # columns of print
+CHECKED: Final = {"ok": "✓", "warn": "!", "bad": "✗", "unknown": "·"}
 
 
 @app.command()
@@ -42,6 +44,93 @@ def check(file: File, settings: Settings = None, as_json: AsJson = False) -> int
     else:
         _print_table(given, found, numbers)
     return 2 if any(each.severity == "error" for each in found) else 0
+
+
+@app.command()
+def preflight(
+    file: File,
+    *,
+    case: Cases = None,
+    settings: Settings = None,
+    bodies: Bodies = None,
+    hop: Annotated[
+        bool, typer.Option("--hop", help="Robot by robot: a drone hops 20 cm, a robot on wheels drives 10 cm.")
+    ] = False,
+    stop: Annotated[
+        bool, typer.Option("--stop", help="Robot by robot: an emergency stop while it begins to climb, or drives.")
+    ] = False,
+    here: Here = False,
+    lab: Lab = None,
+    identity: As = "operator",
+    out: Out = None,
+    as_json: AsJson = False,
+) -> int:
+    """Check the robots of an experiment before the first flight; motors turn with --hop and --stop only."""
+    import sys
+
+    from agents.runtime.command_line import Interrupts
+    from experiments.file.document import chosen, load
+    from experiments.real_time.conductor.conduct import RunOptions
+    from experiments.real_time.conductor.emergency import Emergency
+    from experiments.real_time.conductor.preflight import Trials, check_robots
+    from experiments.recording.run_folder import new_folder, remove_unused
+    from tools.progress import shown
+
+    options = RunOptions(case or [], bodies, here, lab, identity)
+    read = load(file, *(settings or []))
+    check_bodies(bodies)
+    chosen(read, options.cases)
+    folder, emergency = new_folder(read, out, "preflight"), Emergency()
+    try:
+        with Interrupts() as interrupted:
+            found = check_robots(
+                read,
+                folder,
+                options,
+                Trials(hop=hop, stop=stop),
+                show=shown(quiet=as_json),
+                interrupted=interrupted,
+                emergency=emergency,
+                tell=lambda lines: print(*lines, sep="\n", file=sys.stderr) if lines else None,
+            )
+            ended = interrupted()
+    finally:
+        remove_unused(folder)
+    red = [each.robot for each in found if each.red]
+    if as_json:
+        import json
+
+        import msgspec
+
+        said = msgspec.to_builtins(
+            {"file": str(read.path), "ok": not (red or ended or emergency), "robots": found, "folder": str(folder)}
+        )
+        print(json.dumps(said, indent=2))
+    else:
+        _print_checks(found)
+        verdict = f"red: {', '.join(red)}" if red else "interrupted" if ended else "nothing is red"
+        print(f"\n{verdict}; logs: {folder / 'logs'}")
+    if emergency:
+        print(f"zenpark: {emergency.words}", file=sys.stderr)
+    return 130 if ended else int(bool(red or emergency))
+
+
+def _print_checks(found: Sequence[RobotChecks]) -> None:
+    """A table for each robot: a line for each check, and what to do about each that is not green."""
+    import shutil
+    import sys
+
+    width = min(WIDEST, shutil.get_terminal_size((WIDEST, 24)).columns)
+    lines = []
+    for robot in found:
+        lines += ["", f"{robot.robot}  {robot.kind}  {robot.body}"]
+        for check in robot.checks:
+            head = f"  {CHECKED[check.verdict]} {check.check:<16} "
+            lines += textwrap.wrap(check.found, width, initial_indent=head, subsequent_indent=" " * len(head))
+            if check.remedy:
+                lines += textwrap.wrap(check.remedy, width, initial_indent=" " * 21 + "→ ", subsequent_indent=" " * 23)
+    encoding = sys.stdout.encoding or "utf-8"
+    print("\n".join(lines).encode(encoding, "replace").decode(encoding))
 
 
 def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:

@@ -34,6 +34,7 @@ Bodies = Annotated[
         help="Every robot in a twin of its own, in one world, or behind a protocol twin (real time).",
     ),
 ]
+Here = Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")]
 Report = Annotated[bool, typer.Option(help="Writes the report.")]
 Anyway = Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")]
 OpenReport = Annotated[bool, typer.Option("--open", help="Opens it in the browser.")]
@@ -50,3 +51,12 @@ def routers(connect: list[str] | None, lab: str | None) -> list[str]:
     from experiments.definition.endpoints import listed
 
     return secured(listed(connect or []), lab)
+
+
+def check_bodies(bodies: str | None) -> None:
+    """Raises DocumentError for a word behind `--bodies` that there is not."""
+    from experiments.definition.bodies import BODIES
+    from experiments.file.problems import DocumentError, Problem
+
+    if bodies not in (None, *BODIES):
+        raise DocumentError([Problem(f"--bodies {bodies}", 0, 0, "is not known", f"there are: {', '.join(BODIES)}")])

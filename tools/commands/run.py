@@ -9,7 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from tools.commands.options import Anyway, As, AsJson, Bodies, Cases, File, Lab, OpenReport, Out, Report, Settings
+from tools.commands.options import (
+    Anyway,
+    As,
+    AsJson,
+    Bodies,
+    Cases,
+    File,
+    Here,
+    Lab,
+    OpenReport,
+    Out,
+    Report,
+    Settings,
+    check_bodies,
+)
 
 if TYPE_CHECKING:
     from experiments.file.document import Document
@@ -37,7 +51,7 @@ def run(
         int, typer.Option(min=1, max=100_000, help="Runs so many seeds: mean and 95 % interval (virtual only).")
     ] = 1,
     bodies: Bodies = None,
-    here: Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")] = False,
+    here: Here = False,
     anyway: Anyway = False,
     report: Report = True,
     open_report: OpenReport = False,
@@ -153,15 +167,11 @@ def _warn(lines: Sequence[str]) -> None:
 
 def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:
     """Raises DocumentError for options that do not go together."""
-    from experiments.definition.bodies import BODIES
     from experiments.file.problems import DocumentError, Problem
 
     if seeds > 1 and not virtual:
         raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
-    if options.bodies not in (None, *BODIES):
-        raise DocumentError(
-            [Problem(f"--bodies {options.bodies}", 0, 0, "is not known", f"there are: {', '.join(BODIES)}")]
-        )
+    check_bodies(options.bodies)
     for option, given in (("--bodies", options.bodies), ("--lab", options.lab)):
         if given is not None and virtual:
             raise DocumentError([Problem(option, 0, 0, "is for real time", "leave out --virtual")])

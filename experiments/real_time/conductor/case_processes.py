@@ -6,7 +6,7 @@ one of the experiment.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -61,16 +61,17 @@ class CaseProcesses:
         self._joining = context.folder / f"{context.case}-joining.json"
         self._abroad: dict[str, Process] = {}  # by host and group
 
-    def prepare(self) -> None:
-        """Start all but router and robots: the recorder, then what robots need.
+    def prepare(self, *, recorder: bool = True) -> None:
+        """Start all but router and robots: the recorder, if one is wanted, then what robots need.
 
         Raises:
             StandInError: If a protocol twin or a positioning system does not start in time.
         """
         context = self._context
-        files = str(context.file), str(context.recording)
-        recorder = "experiments.real_time.processes.recorder"
-        context.start("recorder", recorder, *files, "--name", context.case, "--source", str(context.source))
+        if recorder:
+            files = str(context.file), str(context.recording)
+            module = "experiments.real_time.processes.recorder"
+            context.start("recorder", module, *files, "--name", context.case, "--source", str(context.source))
         self._start_standins()
         self._centre = self._servants.start_centre()
 
@@ -79,11 +80,12 @@ class CaseProcesses:
         self.adopted = {*there, *self.away}
         return sorted(self.adopted)
 
-    def start(self) -> None:
-        """Start all robots that are neither adopted nor on standby, on their machines."""
+    def start(self, only: Collection[str] | None = None) -> None:
+        """Start all robots that are neither adopted nor on standby, or `only` some of them, on their machines."""
         robots = self._context.experiment.robots
         for names in self._groups.values():
-            if missing := [name for name in names if not (name in self.adopted or robots[name].standby)]:
+            wanted = names if only is None else [name for name in names if name in only]
+            if missing := [name for name in wanted if not (name in self.adopted or robots[name].standby)]:
                 self._start(missing, self._addressed, self._reached)
 
     def start_again(self, names: Sequence[str], bodies: Mapping[str, Robot] | None = None) -> None:
@@ -149,10 +151,14 @@ class CaseProcesses:
 
     def end(self) -> None:
         """End all but the router: robots land first, and the recorder sees it."""
-        self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
+        self.end_robots()
         self._launcher.end(self._centre, grace_s=2.0)  # its last word is recorded
         self._launcher.end([self._context.process("recorder")], grace_s=5.0)
         self._launcher.end(self._standins, grace_s=2.0)
+
+    def end_robots(self) -> None:
+        """End the processes of all robots: these land first."""
+        self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
 
     def deaths(self) -> Iterator[Death]:
         """What has died since the last call; router, world, centre and positioning are started again, a few times."""

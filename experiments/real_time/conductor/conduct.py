@@ -6,9 +6,9 @@ See also `experiments.virtual_time.simulation`.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -85,14 +85,73 @@ def conduct(
         DocumentError: If robots that run on hosts are to be put behind protocol twins, or are hardware that another
             run of this machine has.
     """
+    results: dict[str, CaseResult] = {}
+    embodied = embody(read, staging)
+    with (
+        staged(
+            read,
+            embodied,
+            folder,
+            staging,
+            interrupted=interrupted,
+            emergency=emergency,
+            launching=launching,
+            tell=tell,
+        ) as stage,
+        show,
+    ):
+        for name in embodied:
+            if interrupted() or emergency:
+                break
+            results[name] = Conductor(stage.context(name), show).run()
+    unflown = ", ".join(name for name in embodied if name not in results)
+    stopped = [emergency.words + (f"; not run: {unflown}" if unflown else "")] if emergency else []
+    notes = (
+        stopped + [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost]
+    ) + stage.left
+    return {case: result.recording for case, result in results.items() if result.start is not None}, notes
+
+
+def embody(read: Document, staging: RunOptions) -> dict[str, Experiment]:
+    """The chosen cases of an experiment, with the bodies and on the machines that are asked for.
+
+    Raises:
+        DocumentError: If there is no such case, or robots that run on hosts are to be put behind protocol twins.
+    """
     if staging.bodies == "protocol" and read.experiment.hosts and not staging.here:
         hint = "add --here, which lets all robots run on this machine"
         raise DocumentError([Problem("--bodies protocol", 0, 0, "protocol twins cannot be seen from hosts", hint)])
-    results: dict[str, CaseResult] = {}
-    read.keep(folder / SOURCE)
     embodied = {name: choose_bodies(case, staging.bodies) for name, case in chosen(read, staging.cases).items()}
     if staging.here:
         embodied = {name: msgspec.structs.replace(case, hosts={}) for name, case in embodied.items()}
+    return embodied
+
+
+@dataclass
+class Stage:
+    """Routers and hosts of a run, while it is up."""
+
+    context: Callable[[str], CaseContext]  # of a case, by its name
+    left: list[str] = field(default_factory=list)  # what was left behind on hosts, known at the end
+
+
+@contextmanager
+def staged(
+    read: Document,
+    embodied: Mapping[str, Experiment],
+    folder: Path,
+    staging: RunOptions,
+    *,
+    interrupted: Callable[[], bool],
+    emergency: Emergency,
+    launching: Callable[[Path], Launcher] = Launcher,
+    tell: Callable[[Sequence[str]], None] = lambda _: None,
+) -> Iterator[Stage]:
+    """Put routers and hosts up for some cases, list the run on this machine, and listen for emergency stops.
+
+    Args, Raises: As `conduct`; `embodied` are the cases, see `embody`.
+    """
+    read.keep(folder / SOURCE)
     network = read.experiment.network
     meshed = network.topology == "mesh"
     own_router = network.connect is None and not meshed
@@ -122,31 +181,26 @@ def conduct(
         hears = (
             nullcontext() if meshed else emergency.throughout(endpoints, keys, staging.identity, starting=own_router)
         )
-        with show, hears:
-            for name, experiment in embodied.items():
-                if interrupted() or emergency:
-                    break
-                context = CaseContext(
-                    experiment,
-                    name,
-                    folder,
-                    source=folder / SOURCE,
-                    endpoints=endpoints,
-                    launcher=launcher,
-                    hosts=hosts,
-                    interrupted=interrupted,
-                    rights=rights,
-                    identity=staging.identity,
-                    emergency=emergency,
-                )
-                results[name] = Conductor(context, show).run()
-        left = hosts.sweep()
-    unflown = ", ".join(name for name in embodied if name not in results)
-    stopped = [emergency.words + (f"; not run: {unflown}" if unflown else "")] if emergency else []
-    notes = (
-        stopped + [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost] + left
-    )
-    return {case: result.recording for case, result in results.items() if result.start is not None}, notes
+
+        def context(name: str) -> CaseContext:
+            return CaseContext(
+                embodied[name],
+                name,
+                folder,
+                source=folder / SOURCE,
+                endpoints=endpoints,
+                launcher=launcher,
+                hosts=hosts,
+                interrupted=interrupted,
+                rights=rights,
+                identity=staging.identity,
+                emergency=emergency,
+            )
+
+        stage = Stage(context)
+        with hears:
+            yield stage
+        stage.left += hosts.sweep()
 
 
 def hardware(cases: Iterable[Experiment]) -> dict[str, str]:

@@ -21,7 +21,7 @@ from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.case_processes import CaseProcesses
 from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
 from experiments.real_time.conductor.orders import start_lead_s
-from experiments.real_time.conductor.run_view import OUTPUT, NetworkView, Progress, RobotView, Show
+from experiments.real_time.conductor.run_view import AHEAD_S, BEHIND_S, OUTPUT, NetworkView, Progress, RobotView, Show
 from experiments.real_time.hosts.clock_drift import Drift
 from experiments.real_time.hosts.launcher import LAND_S
 
@@ -31,9 +31,7 @@ GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is l
 
 ADOPT_S: Final = 0.5
 MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
-AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead,
 LATE_S: Final = 1.0  # who says that it waits so long after the common start has not heard of it
-BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behind
 LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
 
 

@@ -23,6 +23,8 @@ from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.case_context import CaseContext
 
 ORDER: Final = tuple(phase.word for phase in Phase)
+AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead [s],
+BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behind
 FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
 ROUTER_S: Final = 10.0  # limit for a router that was just started to answer
 MISSED_S: Final = 1.0  # a robot that changes from one router to another is back sooner

@@ -1,0 +1,388 @@
+"""Checks of the robots of an experiment before the first flight: each alone, by the processes that a run starts.
+
+All stand at first, at the same time, so that radios and networks carry what they carry in a run. Motors are touched in
+the trials only, one robot after the other, under the safety of the robot's own process; an interrupt lands it.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from agents.body.interface import UNANSWERED
+from agents.clock import Clock
+from agents.network import messages, pubsub
+from agents.network.keys import Keys
+from experiments.definition.experiment import Experiment, Formation, Leg, Robot
+from experiments.file.document import Document, write_json
+from experiments.real_time.conductor import preflight_checks as checks
+from experiments.real_time.conductor.case_context import CaseContext
+from experiments.real_time.conductor.case_processes import CaseProcesses
+from experiments.real_time.conductor.conduct import RunOptions, embody, staged
+from experiments.real_time.conductor.emergency import Emergency
+from experiments.real_time.conductor.hot_changes import CLIMB_S
+from experiments.real_time.conductor.orders import start_lead_s
+from experiments.real_time.conductor.preflight_checks import DRIVE_M, HOP_M, Check, Observed, RobotChecks, Tried
+from experiments.real_time.conductor.run_view import OUTPUT, NetworkView, Progress, RobotView, Show, Shown
+from experiments.real_time.hosts.launcher import LAND_S
+
+PREFLIGHT: Final = "preflight"  # name of the case, in files and on the console
+POLL_S: Final = 0.02
+SAMPLE_S: Final = 2.0  # how long robots are observed at rest
+INSPECT_S: Final = 0.2  # from one inspection to the next
+HOLD_S: Final = 2.0  # how long a hopping drone stays at its height
+DRIVE_M_S: Final = 0.05  # speed of the drive
+DRIVE_S: Final = 4.0  # its duration: the way, and time to come to rest
+RADIUS_M: Final = 1.0  # of its arc, which begins along the robot's nose
+RISEN_M: Final = 0.03  # a climbing drone is stopped when it is this high,
+MOVED_M: Final = 0.02  # and a robot on wheels when it has moved so far
+TRY_S: Final = 4.0  # what does not move for so long is stopped nevertheless
+STOP_LIMIT_S: Final = 3.0  # how long a stop is waited for
+STANDS_M_S: Final = 0.02  # slower: a robot on wheels stands
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What is tried beyond observing; both touch the motors."""
+
+    hop: bool = False  # drones hop to `HOP_M`, robots on wheels drive `DRIVE_M`
+    stop: bool = False  # emergency stop of a drone that begins to climb, of a robot on wheels that drives
+
+
+def check_robots(
+    read: Document,
+    folder: Path,
+    options: RunOptions,
+    trials: Trials,
+    *,
+    show: Shown,
+    interrupted: Callable[[], bool],
+    emergency: Emergency,
+    tell: Callable[[Sequence[str]], None] = lambda _: None,
+) -> list[RobotChecks]:
+    """Check the robots of an experiment before the first flight.
+
+    Args:
+        read: The experiment; of several cases, the first of the chosen ones.
+        folder: Where logs go; it exists.
+        options: What the file leaves open.
+        trials: What is tried.
+        show: Shows the progress.
+        interrupted: Asked whether the user wants to end: the robot that moves lands.
+        emergency: Hears emergency stops, which end the checks.
+        tell: Takes what the user should know before it begins.
+
+    Returns:
+        The checks of each robot; none if the user ended them before they began.
+
+    Raises:
+        As `conduct`.
+    """
+    experiment = alone(next(iter(embody(read, options).values())))
+    with (
+        staged(
+            read, {PREFLIGHT: experiment}, folder, options, interrupted=interrupted, emergency=emergency, tell=tell
+        ) as stage,
+        show,
+    ):
+        return Inspector(stage.context(PREFLIGHT), show, trials).run()
+
+
+def alone(experiment: Experiment) -> Experiment:
+    """The robots of a case without formation and plans: drones hop to `HOP_M`, robots on wheels drive `DRIVE_M`."""
+    robots = {
+        name: msgspec.structs.replace(
+            robot, hover=None if robot.hover is None else min(HOP_M, robot.hover), shadow=None, standby=False
+        )
+        for name, robot in experiment.robots.items()
+    }
+    arc = {
+        "kind": "circle",
+        "radius": RADIUS_M,
+        "period_s": math.tau * RADIUS_M / DRIVE_M_S,
+        "turns": DRIVE_M / (math.tau * RADIUS_M),
+    }
+    return msgspec.structs.replace(
+        experiment,
+        robots=robots,
+        duration_s=DRIVE_S,
+        formation=Formation(),
+        timeline=[Leg(at_s=0.0, robot=name, plan=arc) for name, robot in robots.items() if robot.hover is None],
+        architecture="distributed",
+        avoidance=None,
+        channel=type(experiment.channel)(),
+        on_loss="none",
+        cases={},
+    )
+
+
+class Inspector:
+    """Checks the robots of one case, see `check_robots`."""
+
+    def __init__(self, context: CaseContext, show: Show, trials: Trials) -> None:
+        """Write the case as a file for its processes; nothing is started yet."""
+        self._context, self._show, self._trials = context, show, trials
+        self._experiment = experiment = context.experiment
+        context.file.write_bytes(write_json(experiment))
+        self._keys = Keys(experiment.network.realm)
+        self._clock = context.launcher.clock = Clock()
+        self._robots = {name: RobotView() for name in experiment.robots}
+        self._progress = Progress(PREFLIGHT, "starting", None, DRIVE_S, self._robots, clock=self._clock)
+        self._processes = CaseProcesses(context)
+        self._ended: dict[str, str] = {}  # last words of processes that have ended
+        self._states: dict[str, list[messages.State]] = {}  # of the robots that are observed
+
+    def run(self) -> list[RobotChecks]:
+        """Check all robots; those that have moved are down in any case.
+
+        Raises:
+            HostError: If a host cannot be reached.
+            StandInError: If a protocol twin or a positioning system does not start.
+        """
+        self._context.hosts.join(self._experiment)
+        try:
+            self._processes.prepare(recorder=False)
+            with ExitStack() as stack:
+                self._join(stack)
+                self._processes.adopt(())
+                self._phase("waiting until all answer")
+                self._processes.start()
+                self._wait_ready(list(self._robots))
+                if self._context.ended():
+                    return []
+                observed = self._observe()
+                today = datetime.now(UTC).date()
+                found = checks.at_rest(observed, self._experiment.safety, today)
+                for name, each in observed.items():
+                    if each.status is not None:
+                        found[name].append(self._stop_at_rest(name, each))
+                self._processes.end_robots()
+                for name, each in observed.items():
+                    found[name] += self._try(name, each, red=any(check.verdict == "bad" for check in found[name]))
+                self._phase("done")
+        finally:
+            self._processes.end()
+        robots = self._experiment.robots
+        return [RobotChecks(name, robots[name].kind, robots[name].body, each) for name, each in found.items()]
+
+    # ------------------------------------------------------------------ at rest
+
+    def _observe(self) -> dict[str, Observed]:
+        """Observe all robots for `SAMPLE_S`."""
+        self._phase("observing all at rest")
+        observed = {name: Observed(self._experiment.robots[name]) for name in self._robots}
+        self._states = {name: each.states for name, each in observed.items()}
+        deadline = time.monotonic() + SAMPLE_S
+        while time.monotonic() < deadline and not self._context.ended():
+            there = [name for name, seen in self._robots.items() if seen.status is not None and name not in self._ended]
+            for name, inspection in self._inspect(there):
+                observed[name].inspections.append(inspection)
+            self._wait(INSPECT_S, lambda: False)
+        for name, each in observed.items():
+            each.status, each.behind_s = self._robots[name].status, self._robots[name].behind
+            if name in self._ended:
+                each.status, each.ended = None, self._ended[name]
+            elif name in self._processes.adopted:
+                each.ended = "its host has no address: it is started there by hand or at boot; check it there"
+        return observed
+
+    def _stop_at_rest(self, name: str, each: Observed) -> Check:
+        self._phase(f"{name}: stop, motors off")
+        tried = Tried()
+        self._stop(name, tried)
+        return checks.stop_at_rest(each, tried)
+
+    def _stop(self, name: str, tried: Tried) -> None:
+        """Order the motors off, and wait until the robot reports that."""
+        tried.states = self._states[name] = []
+        begun = time.monotonic()
+        reply = self._order(name, messages.Order("stop"))
+        tried.failure = "" if reply.ok else f"refused: {reply.reason}"
+        seen, drone = self._robots[name], self._experiment.robots[name].hover is not None
+
+        def obeyed() -> bool:
+            status = seen.status
+            if status is None or not seen.reached("done") or UNANSWERED in status.body:
+                return False
+            if drone:
+                return not any(inspection.flying for _, inspection in self._inspect([name]))
+            last = tried.states[-1].velocity if tried.states else None
+            return last is not None and math.hypot(*last[:2]) < STANDS_M_S
+
+        if reply.ok and self._wait(STOP_LIMIT_S, obeyed):
+            tried.stopped_s = time.monotonic() - begun
+        tried.note = "" if seen.status is None else seen.status.body
+
+    # ------------------------------------------------------------------ in motion
+
+    def _try(self, name: str, each: Observed, *, red: bool) -> Iterator[Check]:
+        """Hop or drive, then stop in motion, of one robot; what is red is not moved."""
+        what = checks.hop_of(each.robot)
+        wanted = [(what, self._trials.hop), ("stop, motors on", self._trials.stop)]
+        for check, asked in wanted:
+            option = "--stop" if check.startswith("stop") else "--hop"
+            if not asked:
+                yield checks.not_tried(check, f"{option} tries it")
+            elif red or self._context.ended():
+                yield checks.not_tried(
+                    check, "not tried: interrupted" if self._context.ended() else "not tried: mend that first"
+                )
+            else:
+                self._phase(f"{name}: {check}")
+                tried = self._move(name, each.robot, stop=option == "--stop")
+                if self._context.ended():
+                    yield checks.not_tried(check, "interrupted; it is down")
+                    continue
+                made = (
+                    checks.stop_in_motion(each, tried)
+                    if option == "--stop"
+                    else checks.hop(each, tried, self._experiment.safety)
+                )
+                red = made.verdict == "bad"
+                yield made
+
+    def _move(self, name: str, robot: Robot, *, stop: bool) -> Tried:
+        """One robot in a process of its own hops or drives, and lands or is stopped."""
+        tried = Tried()
+        self._robots[name].forget_process()
+        self._processes.start([name])
+        try:
+            self._wait_ready([name])
+            if not self._robots[name].reached("ready"):
+                tried.failure = f"not ready: {self._why(name)}"
+                return tried
+            tried.states = self._states[name] = []
+            tried.failure = self._set_out(name, robot)
+            if not tried.failure:
+                if stop:
+                    self._wait(TRY_S, lambda: _moved(tried.states, robot))
+                    self._stop(name, tried)
+                else:
+                    self._fly(name, robot, tried)
+        finally:
+            self._processes.end_robots()  # lands it, whatever has happened
+        return tried
+
+    def _set_out(self, name: str, robot: Robot) -> str:
+        """Order a robot to move; the reason of a refusal."""
+        reply = self._order(name, messages.Order("takeoff"))
+        if reply.ok and robot.hover is None:
+            self._wait(TRY_S, lambda: self._robots[name].reached("airborne"))
+            reply = self._order(name, messages.Order("start", at=self._clock.utc() + start_lead_s(1)))
+        return "" if reply.ok else f"refused: {reply.reason}"
+
+    def _fly(self, name: str, robot: Robot, tried: Tried) -> None:
+        """Follow a hop or a drive to its end."""
+        seen = self._robots[name]
+        measured = -math.inf
+
+        def measure() -> None:
+            nonlocal measured
+            if time.monotonic() - measured > INSPECT_S:
+                measured = time.monotonic()
+                for _, inspection in self._inspect([name]):
+                    tried.volts = min(tried.volts, math.inf if inspection.volts is None else inspection.volts)
+            charge = None if seen.status is None else seen.status.battery
+            tried.charge = min(tried.charge, math.inf if charge is None else charge)
+
+        def over() -> bool:
+            measure()
+            return seen.reached("landing") or name in self._ended
+
+        if robot.hover is None:
+            self._wait(DRIVE_S + start_lead_s(1) + LAND_S, over)
+        else:
+            self._wait(CLIMB_S, lambda: over() or seen.reached("airborne"))
+            if not seen.reached("airborne"):
+                tried.failure = f"not at {robot.hover:g} m after {CLIMB_S:g} s: {self._why(name)}"
+            elif not self._wait(HOLD_S, over):
+                tried.states = list(tried.states)  # the landing is no part of it
+                self._order(name, messages.Order("land"))
+                if not self._wait(LAND_S, lambda: seen.reached("done") or name in self._ended):
+                    tried.failure = f"not down after {LAND_S:g} s: {self._why(name)}"
+                return
+        status = seen.status
+        if name in self._ended or (status is not None and status.hazard):
+            tried.failure = tried.failure or self._why(name)
+        elif robot.hover is not None and not tried.failure:
+            tried.failure = f"came down by itself: {self._why(name)}"
+
+    # ------------------------------------------------------------------ parts of the above
+
+    def _join(self, stack: ExitStack) -> None:
+        self._view = NetworkView(stack, self._context, self._progress)
+        states = pubsub.subscriber(self._view.session, self._keys.state("*"), 4096)
+        self._telemetry = pubsub.Inbox(states, messages.State, keys=self._keys, robots=self._robots)
+        stack.callback(states.undeclare)
+        stack.callback(self._context.emergency.listen(self._view.session, self._keys).close)
+
+    def _phase(self, text: str) -> None:
+        self._progress.phase = text
+        self._view.report("phase", "conductor", text)
+        self._show(self._progress)
+
+    def _update(self) -> None:
+        """Take in what has happened since the last update."""
+        self._view.update()
+        for state in self._telemetry.read():
+            if state.robot in self._states:
+                self._states[state.robot].append(state)
+        for death in self._processes.deaths():
+            if death.kind == "lost":
+                self._ended[death.source] = (
+                    self._processes.last_line(death.source).removeprefix("zenpark: ") or death.text
+                )
+            else:
+                self._view.report(death.kind, death.source, death.text)
+        now = self._clock.utc()
+        self._progress.events += [messages.Event(now, OUTPUT, place, line) for place, line in self._processes.output()]
+        self._show(self._progress)
+
+    def _wait(self, limit_s: float, true: Callable[[], bool]) -> bool:
+        """Wait until something is true; False at the limit, or if the user or an emergency stop ends the checks."""
+        deadline = time.monotonic() + limit_s
+        while True:
+            self._update()
+            if true():
+                return True
+            if self._context.ended() or time.monotonic() > deadline:
+                return False
+            time.sleep(POLL_S)
+
+    def _wait_ready(self, names: Sequence[str]) -> None:
+        """Wait until robots are ready, or have ended, for as long as the file allows."""
+        self._ended = {name: words for name, words in self._ended.items() if name not in names}
+        limit_s = self._experiment.start.deadline_s
+        awaited = [name for name in names if name not in self._processes.adopted]
+        self._wait(limit_s, lambda: all(self._robots[n].reached("ready") or n in self._ended for n in awaited))
+
+    def _inspect(self, names: Sequence[str]) -> Iterator[tuple[str, messages.Inspection]]:
+        for name, reply in self._view.order(names, messages.Order("inspect")).items():
+            if reply.inspection is not None:
+                yield name, reply.inspection
+
+    def _order(self, name: str, order: messages.Order) -> messages.Reply:
+        return self._view.order([name], order)[name]
+
+    def _why(self, name: str) -> str:
+        status = self._robots[name].status
+        if name in self._ended or status is None:
+            return self._ended.get(name, "its process says nothing")
+        return status.hazard or status.reason or f"it is {status.phase}" + (f"; {status.body}" if status.body else "")
+
+
+def _moved(states: Sequence[messages.State], robot: Robot) -> bool:
+    """Whether a robot has begun to climb or to drive."""
+    known = [state.position for state in states if state.position is not None]
+    if len(known) < 2:
+        return False
+    first, last = known[0], known[-1]
+    return math.dist(first[:2], last[:2]) > MOVED_M if robot.hover is None else last[2] - first[2] > RISEN_M

@@ -1,0 +1,339 @@
+"""Checks of one robot before the first flight, from what it said of itself: pure, with a remedy for each red one."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+
+from agents.arrays import Array
+from agents.body.limits import Safety
+from agents.network import messages
+from agents.safety.detection import clock_off, clock_text
+from experiments.definition.experiment import Robot
+from experiments.real_time.conductor.run_view import AHEAD_S, BEHIND_S
+
+Verdict = Literal["ok", "warn", "bad", "unknown"]
+
+HOP_M: Final = 0.2  # height of the hop
+HOP_OFF_M: Final = 0.08  # farther from this height on average: bad
+HOP_DRIFT_M: Final = 0.2  # a hop that ends farther to the side is bad
+DRIVE_M: Final = 0.1  # way of the drive of a robot on wheels
+DRIVE_OFF_M: Final = 0.03  # farther from this way: bad
+STEADY_M: Final = 0.02  # largest spread of the position of a robot at rest without a warning,
+UNSTEADY_M: Final = 0.05  # and with which it must not fly
+TURNED: Final = math.radians(20.0)  # yaw farther than this from that of `start`: bad
+STALE: Final = 0.5  # share of `own_silence_s`: positions older than this at times are bad
+OLD_MONTHS: Final = 24  # firmware older than this: a warning
+STOP_S: Final = 1.0  # a stop that takes longer is bad
+STOP_WAY_M: Final = 0.05  # a robot on wheels rolls no farther after a stop
+RELEASE: Final = re.compile(r"(20\d\d)\.(\d{1,2})")  # as Bitcraze numbers them
+
+CONNECT: Final[Mapping[str, str]] = {
+    "crazyflie": "switch it on; channel, rate and address as in the Crazyflie client; radio plugged in and permitted "
+    "(docs/crazyflie.md)",
+    "tello": "switch it on; this computer in its Wi-Fi; UDP 8889 and 8890 through the firewall (docs/tello.md)",
+    "khepera4": "switch it on, start its server, ping its address (docs/khepera4.md)",
+    "turtlebot3": "switch it on, start its bringup and the Zenoh bridge, `ROS_DOMAIN_ID` as in the file "
+    "(docs/turtlebot3.md)",
+}
+BATTERY: Final[Mapping[str, str]] = {
+    "crazyflie": "charge it; one that sags under load although it was full is worn: replace it",
+    "tello": "charge it, or put a full one in",
+    "khepera4": "charge it",
+    "turtlebot3": "charge it; below 11 V the board beeps",
+}
+
+
+class Check(msgspec.Struct, frozen=True, kw_only=True):
+    """One check of one robot."""
+
+    check: str
+    verdict: Verdict
+    found: str
+    remedy: str = ""  # of a warning and of a bad one
+
+
+class RobotChecks(msgspec.Struct, frozen=True):
+    """The checks of one robot, in the order in which they are to be mended."""
+
+    robot: str
+    kind: str
+    body: str  # address
+    checks: list[Check]
+
+    @property
+    def red(self) -> bool:
+        """Whether one of them is bad."""
+        return any(check.verdict == "bad" for check in self.checks)
+
+
+@dataclass
+class Observed:
+    """What a robot said of itself while it stood."""
+
+    robot: Robot
+    status: messages.Status | None = None  # the last one
+    ended: str = ""  # last words of its process, if that has ended
+    states: list[messages.State] = field(default_factory=list)
+    inspections: list[messages.Inspection] = field(default_factory=list)
+    behind_s: float = math.inf  # least time from a stamp of it to its arrival
+
+    def positions(self) -> Array:
+        """Measured positions (n, 3) [m]."""
+        return np.array([state.position for state in self.states if state.position is not None]).reshape(-1, 3)
+
+    def yaw(self) -> float | None:
+        """Mean measured yaw [rad]; None if it is not measured."""
+        turned = np.array([state.yaw for state in self.states if state.yaw is not None])
+        return math.atan2(np.sin(turned).sum(), np.cos(turned).sum()) if len(turned) else None
+
+    @property
+    def last(self) -> messages.Inspection:
+        """Last inspection; an empty one if there was none."""
+        return self.inspections[-1] if self.inspections else messages.Inspection()
+
+
+@dataclass
+class Tried:
+    """What came of a hop, a drive or a stop."""
+
+    failure: str = ""  # why it could not be tried, or what went wrong on the way
+    stopped_s: float = math.nan  # from the order to motors off
+    states: list[messages.State] = field(default_factory=list)  # from the order to move on, or from that to stop on
+    volts: float = math.inf  # lowest
+    charge: float = math.inf  # lowest
+    note: str = ""  # of the body, at the end
+
+
+def at_rest(observed: Mapping[str, Observed], safety: Safety, today: date) -> dict[str, list[Check]]:
+    """Checks of robots that stand, by robot; some compare one robot with the others."""
+    made = {name: [_address(each)] for name, each in observed.items()}
+    for name, each in observed.items():
+        if each.status is not None:  # else there is nothing to look at
+            made[name] += [
+                _firmware(name, observed, today),
+                _battery(each, each.status, safety),
+                _position(each, safety),
+                _start(name, observed, safety),
+                _radio(each),
+                _clock(name, each, safety),
+                _ready(each.status),
+            ]
+    return made
+
+
+def _address(each: Observed) -> Check:
+    remedy = CONNECT.get(each.robot.kind, "is it switched on, and its address right?")
+    if each.status is None:
+        return _bad("address", each.ended or "its process says nothing", remedy)
+    silent = not len(each.positions()) and each.status.battery is None and each.last.firmware is None
+    if silent and each.status.body:
+        return _bad("address", each.status.body, remedy)
+    if silent:
+        return Check(check="address", verdict="unknown", found="it does not say whether it answers")
+    return Check(check="address", verdict="ok", found="answers" + (f"; {each.status.body}" if each.status.body else ""))
+
+
+def _firmware(name: str, observed: Mapping[str, Observed], today: date) -> Check:
+    each = observed[name]
+    version = each.last.firmware
+    if version is None:
+        return _not_known("firmware", each)
+    same = [other for other, seen in observed.items() if seen.robot.kind == each.robot.kind]
+    other = next((o for o in same if observed[o].last.firmware not in (None, version)), None)
+    found, remedy = version, ""
+    if (release := RELEASE.match(version)) is not None:
+        months = 12 * (today.year - int(release[1])) + today.month - int(release[2])
+        found += f", {months} months old"
+        if months > OLD_MONTHS:
+            remedy = f"older than {OLD_MONTHS} months: flash the current release"
+    if other is not None and not remedy:
+        remedy = f"{other} has {observed[other].last.firmware}: flash the same to all of a kind"
+    return Check(check="firmware", verdict="warn" if remedy else "ok", found=found, remedy=remedy)
+
+
+def _battery(each: Observed, status: messages.Status, safety: Safety) -> Check:
+    charge, volts = status.battery, each.last.volts
+    if charge is None and volts is None:
+        return _not_known("battery", each)
+    said = _charged(math.inf if charge is None else charge, math.inf if volts is None else volts)
+    if charge is not None and charge < safety.battery_min:
+        return _bad("battery", f"{said}, less than {safety.battery_min:.0%}", BATTERY.get(each.robot.kind, "charge it"))
+    return Check(check="battery", verdict="ok", found=f"{said} at rest")
+
+
+def _charged(charge: float, volts: float) -> str:
+    parts = [f"{charge:.0%}"] if charge < math.inf else []
+    return ", ".join([*parts, *([f"{volts:.2f} V"] if volts < math.inf else [])])
+
+
+def _position(each: Observed, safety: Safety) -> Check:
+    positions = each.positions()
+    source = "motion capture" if each.robot.position == "external" else "its positioning system"
+    if not len(positions):
+        return _bad("position", "none", f"does {source} see it where it stands? `zenpark echo 'park/*/position'`")
+    spread = float(positions.std(axis=0).max())
+    ages = [seen.age_s for seen in each.inspections if seen.age_s is not None]
+    oldest = max(ages, default=0.0)
+    found = f"spread {1e3 * spread:.1f} mm, at most {1e3 * oldest:.0f} ms old"
+    if oldest > STALE * safety.own_silence_s:
+        return _bad("position", found, f"gaps in {source}: markers or stations hidden, network or radio overloaded")
+    if spread > STEADY_M:
+        remedy = f"{source} is unsteady for a robot at rest: calibrate it, remove reflections, look for lost markers"
+        return Check(check="position", verdict="bad" if spread > UNSTEADY_M else "warn", found=found, remedy=remedy)
+    return Check(check="position", verdict="ok", found=found)
+
+
+def _start(name: str, observed: Mapping[str, Observed], safety: Safety) -> Check:
+    each = observed[name]
+    positions = each.positions()
+    if not len(positions):
+        return _not_known("start pose", each)
+    here = np.median(positions[:, :2], axis=0)
+    away = _distance(here, each.robot)
+    yaw, wanted = each.yaw(), each.robot.start[2] if len(each.robot.start) > 2 else None
+    turned = None if yaw is None or wanted is None else math.remainder(yaw - wanted, math.tau)
+    said = f"{away:.2f} m from `start`" + ("" if turned is None else f", turned by {math.degrees(turned):.0f}°")
+    if safety.start_within and away > safety.start_within:
+        nearer = min(observed, key=lambda other: _distance(here, observed[other].robot))
+        swapped = nearer != name and _distance(here, observed[nearer].robot) <= safety.start_within
+        remedy = (
+            f"it stands where {nearer} begins: addresses, markers or robots are swapped"
+            if swapped
+            else f"put it at ({each.robot.start[0]:g}, {each.robot.start[1]:g}) m, or correct `start`; its positioning "
+            "system may have another origin"
+        )
+        return _bad("start pose", said, remedy)
+    if turned is not None and abs(turned) > TURNED:
+        return _bad("start pose", said, f"turn it to {wanted:g} rad, or correct `start`")
+    return Check(check="start pose", verdict="ok", found=said)
+
+
+def _distance(here: Array, robot: Robot) -> float:
+    return math.dist(here.tolist(), robot.start[:2])
+
+
+def _radio(each: Observed) -> Check:
+    asked, carried = each.last.packets_hz, each.last.capacity_hz
+    if asked is None or carried is None:
+        return Check(check="radio", verdict="unknown", found="no shared radio")
+    found = f"{asked:.0f} of {carried:.0f} packets/s"
+    if asked > carried:
+        return _bad("radio", found, "lower log_hz and status_hz, or plug in another radio for some of its robots")
+    return Check(check="radio", verdict="ok", found=found)
+
+
+def _clock(name: str, each: Observed, safety: Safety) -> Check:
+    if each.behind_s == math.inf:
+        return _not_known("clock", each)
+    if not AHEAD_S < each.behind_s < BEHIND_S:
+        return _bad("clock", f"its computer's is {-each.behind_s:+.2f} s off", "set it (chrony or NTP), or use [hosts]")
+    ahead = np.array([math.nan if each.last.ahead_s is None else each.last.ahead_s])
+    if clock_off(ahead, safety.own_silence_s)[0]:
+        return _bad("clock", clock_text([name], ahead, 0), "set the clock of the computer that measures positions")
+    return Check(check="clock", verdict="ok", found=f"{1e3 * each.behind_s:.1f} ms from stamp to arrival")
+
+
+def _ready(status: messages.Status) -> Check:
+    """Conditions of take-off, as the robot's own process checks them in a run (`agents.safety.preflight`)."""
+    if status.phase == "ready":
+        return Check(check="ready", verdict="ok", found="yes")
+    why = status.reason or f"it is {status.phase}"
+    return _bad("ready", why, "docs/safety.md, section `Before take-off`, has every condition")
+
+
+def stop_at_rest(observed: Observed, tried: Tried) -> Check:
+    """Emergency stop of a robot that stands: order accepted, motors off, nothing moved."""
+    return _stop("stop, motors off", observed, tried)
+
+
+def stop_in_motion(observed: Observed, tried: Tried) -> Check:
+    """Emergency stop of a drone that begins to climb, or of a robot that drives."""
+    check = _stop("stop, motors on", observed, tried)
+    way = _way(tried.states)
+    if check.verdict == "ok" and observed.robot.hover is None and way > STOP_WAY_M:
+        return _bad(check.check, f"rolled on for {way:.2f} m", "lower its speed; do its brakes and wheels hold?")
+    if check.verdict == "ok" and observed.robot.kind == "crazyflie":
+        return msgspec.structs.replace(check, found=f"{check.found}; locked until it is switched off and on")
+    return check
+
+
+def _stop(what: str, observed: Observed, tried: Tried) -> Check:
+    remedy = "do not fly it: end its other clients, look at its log, and keep a hand on its switch"
+    if tried.failure:
+        return _bad(what, tried.failure, remedy)
+    if not tried.stopped_s <= STOP_S:
+        took = f"not in {STOP_S:g} s" if math.isnan(tried.stopped_s) else f"after {tried.stopped_s:.2f} s"
+        return _bad(what, f"motors off {took}" + (f": {tried.note}" if tried.note else ""), remedy)
+    return Check(check=what, verdict="ok", found=f"after {tried.stopped_s:.2f} s")
+
+
+def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
+    """Hop of a drone to `HOP_M`, or drive of a robot on wheels by `DRIVE_M`; the battery under load."""
+    what = hop_of(observed.robot)
+    load = _charged(tried.charge, tried.volts)
+    loaded = f"; battery {load} under load" if load else ""
+    positions = np.array([state.position for state in tried.states if state.position is not None]).reshape(-1, 3)
+    if tried.failure:
+        return _bad(what, tried.failure + loaded, "look at its log; do not fly it before the cause is clear")
+    if not len(positions):
+        return _bad(what, "its position was not known", "see the line on its position")
+    side = float(np.hypot(*(positions[:, :2] - positions[0, :2]).T).max())
+    if what == "drive":
+        said, remedy = f"{side:.3f} m of {DRIVE_M:g} m{loaded}", _drive_remedy(side)
+    else:
+        height = float(positions[:, 2].max() - positions[0, 2])
+        said = f"{height:.2f} m of {HOP_M:g} m high, {side:.2f} m to the side{loaded}"
+        remedy = _hop_remedy(height, side)
+    if not remedy and tried.charge < safety.battery_low:
+        remedy = BATTERY.get(observed.robot.kind, "charge it")
+    return Check(check=what, verdict="bad" if remedy else "ok", found=said, remedy=remedy)
+
+
+def hop_of(robot: Robot) -> Literal["hop", "drive"]:
+    """What a robot does where a drone hops."""
+    return "drive" if robot.hover is None else "hop"
+
+
+def _drive_remedy(way: float) -> str:
+    """What to do about a drive of `way` [m]; nothing if that is right."""
+    if way < DRIVE_OFF_M:
+        return "told to drive and does not: motors on, wheels free, server and message type right?"
+    wrong = abs(way - DRIVE_M) > DRIVE_OFF_M
+    return "its speed is not what it is told: units and wheel sizes of its server, slipping wheels" if wrong else ""
+
+
+def _hop_remedy(height: float, side: float) -> str:
+    """What to do about a hop of `height` [m] that went `side` [m] to the side; nothing if that is right."""
+    if abs(height - HOP_M) > HOP_OFF_M:
+        return "does not keep its height: propellers, battery, trim, height of its positioning system"
+    drifts = side > HOP_DRIFT_M
+    return (
+        "drifts: yaw of its positioning system against its nose, propellers, calibration of its IMU" if drifts else ""
+    )
+
+
+def _way(states: Sequence[messages.State]) -> float:
+    """Largest distance from the first known position [m]; 0 if none is known."""
+    positions = np.array([state.position for state in states if state.position is not None]).reshape(-1, 3)
+    return float(np.linalg.norm(positions - positions[0], axis=1).max()) if len(positions) else 0.0
+
+
+def not_tried(what: str, why: str) -> Check:
+    """A check that was not made."""
+    return Check(check=what, verdict="unknown", found=why)
+
+
+def _bad(check: str, found: str, remedy: str) -> Check:
+    return Check(check=check, verdict="bad", found=found, remedy=remedy)
+
+
+def _not_known(check: str, each: Observed) -> Check:
+    return Check(check=check, verdict="unknown", found=f"not known by a {each.robot.kind} at {each.robot.body}")

@@ -1,0 +1,48 @@
+"""Commands and experiment files that stand in README and docs: the command line knows each, the files are valid."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+import pytest
+import typer.main
+
+from experiments.check.check import check
+from experiments.file import document
+from tests.docs.test_references import PAGES, ROOT
+from tools.main import app
+
+COMMAND = re.compile(r"^ {4,}(?:\./)?zenpark (?P<words>[^#\n]*)", re.MULTILINE)
+BLOCK = re.compile(r"^```toml\n(title = .*?)^```", re.MULTILINE | re.DOTALL)
+COMMAND_LINE = typer.main.get_command(app)
+BOOTSTRAP = {"hardware", "install", "test"}  # of the script `zenpark`, before Python's packages are there
+
+
+def commands(page) -> list[str]:
+    """Commands in the blocks of a page, without what a shell does with their input and output."""
+    text = page.read_text("utf-8").replace("\\\n", " ")
+    return [re.split(r" [|>&]", found["words"])[0].strip() for found in COMMAND.finditer(text)]
+
+
+def parse(words: list[str]) -> None:
+    """Raises a usage error if the command line does not know a command or an option."""
+    command, name = COMMAND_LINE, "zenpark"
+    while hasattr(command, "commands") and words and not words[0].startswith("-"):
+        name, *words = words
+        command = command.commands[name]
+    command.make_context(name, words)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_command_line_knows_every_command_of_a_page(page):
+    for text in commands(page):
+        words = shlex.split(text)
+        if words and words[0] not in BOOTSTRAP and "--help" not in words:
+            parse(words)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_experiments_of_a_page_are_sound(page):
+    for text in BLOCK.findall(page.read_text("utf-8")):
+        assert [str(found) for found in check(document.loads(text)) if found.severity == "error"] == []

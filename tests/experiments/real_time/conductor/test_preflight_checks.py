@@ -1,0 +1,187 @@
+"""Checks before the first flight: what each finds, when it is red, and which remedy it names."""
+
+from __future__ import annotations
+
+import math
+from datetime import date
+
+import msgspec
+import pytest
+
+from agents.body.limits import Safety
+from agents.network.messages import Inspection, State, Status
+from experiments.definition.experiment import Robot
+from experiments.definition.plan import Plan
+from experiments.file import document
+from experiments.real_time.conductor import preflight_checks as checks
+from experiments.real_time.conductor.preflight import alone
+from experiments.real_time.conductor.preflight_checks import Observed, Tried
+
+TODAY = date(2026, 3, 1)
+DRONE = Robot(kind="crazyflie", start=[0.0, 0.5, 0.0], hover=0.8, body="radio://0/80/2M/E7E7E7E701")
+OTHER = Robot(kind="crazyflie", start=[0.0, -0.5, 0.0], hover=0.8, body="radio://0/80/2M/E7E7E7E702")
+WHEELS = Robot(kind="khepera4", start=[1.0, 0.0], body="khepera4://192.0.2.1")
+
+
+def status(**values) -> Status:
+    zeros = dict.fromkeys(
+        ("sent", "heard", "malformed", "refused", "ticks", "missed", "decisions", "interventions", "avoided", "pid"), 0
+    )
+    numbers = {"stamp": 0.0, "late_s": 0.0, "started": 0.0, "cpu_s": 0.0, "rss_mb": 0.0}
+    given = {"robot": "CF01", "phase": "ready", "reason": "", "body": "", "battery": 0.9}
+    return Status(**{**zeros, **numbers, **given, "lost": {}, "dropped": {}, "missing": [], **values})
+
+
+def states(*places, yaw: float | None = 0.0) -> list[State]:
+    return [State("CF01", k, 0.02 * k, "idle", place, yaw=yaw) for k, place in enumerate(places)]
+
+
+def standing(robot=DRONE, *, place=(0.0, 0.5, 0.0), yaw: float | None = 0.0, **inspected) -> Observed:
+    known = {"firmware": "2025.02", "volts": 4.1, "age_s": 0.02, **inspected}
+    return Observed(robot, status(), "", states(place, place, yaw=yaw), [Inspection(**known)], 0.001)
+
+
+def found(each: Observed, check: str, **others: Observed):
+    made = checks.at_rest({"CF01": each, **others}, Safety(), TODAY)["CF01"]
+    return next(one for one in made if one.check == check)
+
+
+def test_a_robot_that_is_in_order_is_green():
+    made = checks.at_rest({"CF01": standing(packets_hz=180.0, capacity_hz=250.0)}, Safety(), TODAY)["CF01"]
+    assert {each.check: each.verdict for each in made} == dict.fromkeys(
+        ["address", "firmware", "battery", "position", "start pose", "radio", "clock", "ready"], "ok"
+    )
+    assert not any(each.remedy for each in made)
+
+
+@pytest.mark.parametrize(
+    ("inspected", "check", "verdict", "text"),
+    [
+        ({"firmware": "2023.11"}, "firmware", "warn", "2023.11, 28 months old"),
+        ({"firmware": "twin"}, "firmware", "ok", "twin"),
+        ({"firmware": None}, "firmware", "unknown", "not known by a crazyflie at radio://0/80/2M/E7E7E7E701"),
+        ({"age_s": 0.3}, "position", "bad", "at most 300 ms old"),
+        ({"packets_hz": 480.0, "capacity_hz": 250.0}, "radio", "bad", "480 of 250 packets/s"),
+        ({}, "radio", "unknown", "no shared radio"),
+        ({"ahead_s": 2.3}, "clock", "bad", "positions of CF01 are stamped 2.3 s ahead"),
+        ({"place": (0.5, 0.5, 0.0)}, "start pose", "bad", "0.50 m from `start`"),
+        ({"yaw": 1.0}, "start pose", "bad", "0.00 m from `start`, turned by 57°"),
+        ({"yaw": None}, "start pose", "ok", "0.00 m from `start`"),
+    ],
+)
+def test_what_is_measured_at_rest(inspected, check, verdict, text):
+    made = found(standing(**inspected), check)
+    assert (made.verdict, bool(made.remedy)) == (verdict, verdict in ("warn", "bad"))
+    assert text in made.found
+
+
+def test_swapped_robots_are_named():
+    here, there = standing(place=(0.0, -0.5, 0.0)), standing(OTHER, place=(0.0, 0.5, 0.0))
+    assert found(here, "start pose", CF02=there).remedy == (
+        "it stands where CF02 begins: addresses, markers or robots are swapped"
+    )
+
+
+def test_robots_of_a_kind_have_the_same_firmware():
+    made = found(standing(), "firmware", CF02=standing(OTHER, firmware="2025.09"))
+    assert (made.verdict, made.remedy) == ("warn", "CF02 has 2025.09: flash the same to all of a kind")
+
+
+@pytest.mark.parametrize(("noise", "verdict"), [(0.001, "ok"), (0.03, "warn"), (0.2, "bad")])
+def test_a_position_that_moves_at_rest(noise, verdict):
+    each = standing()
+    each.states = states((-noise, 0.5, 0.0), (noise, 0.5, 0.0))
+    assert found(each, "position").verdict == verdict
+
+
+def test_a_robot_without_a_position_is_not_known_to_be_anywhere():
+    each = standing()
+    each.states = []
+    assert [found(each, check).verdict for check in ("position", "start pose")] == ["bad", "unknown"]
+
+
+def test_a_robot_that_does_not_answer_has_one_red_line_with_a_remedy():
+    silent = Observed(DRONE, ended="no answer at radio://0/80/2M/E7E7E7E701")
+    (made,) = checks.at_rest({"CF01": silent}, Safety(), TODAY)["CF01"]
+    assert (made.check, made.verdict, made.found) == ("address", "bad", silent.ended)
+    assert made.remedy.startswith("switch it on")
+
+
+def test_one_of_several_drones_of_a_process_that_never_answered():
+    said = status(battery=None, phase="idle", reason="no position of its own", body="no answer at radio://0/80/...")
+    each = Observed(DRONE, said, "", states(None), [Inspection()], 0.001)
+    assert found(each, "address").verdict == found(each, "ready").verdict == "bad"
+
+
+@pytest.mark.parametrize(
+    ("said", "check", "text"),
+    [
+        ({"battery": 0.1}, "battery", "10%, 4.10 V, less than 20%"),
+        ({"phase": "idle", "reason": "it is not level: it leans 40°"}, "ready", "it is not level: it leans 40°"),
+    ],
+)
+def test_what_its_own_process_says(said, check, text):
+    each = standing()
+    each.status = msgspec.structs.replace(each.status, **said)
+    made = found(each, check)
+    assert (made.verdict, made.found) == ("bad", text)
+
+
+def test_a_clock_that_is_off():
+    each = standing()
+    each.behind_s = -1.5
+    assert found(each, "clock").found == "its computer's is +1.50 s off"
+
+
+@pytest.mark.parametrize(
+    ("tried", "verdict"),
+    [
+        (Tried(stopped_s=0.1), "ok"),
+        (Tried(stopped_s=1.5), "bad"),
+        (Tried(stopped_s=math.nan, note="the emergency stop is not answered"), "bad"),
+        (Tried(failure="refused: no answer"), "bad"),
+    ],
+)
+def test_stops(tried, verdict):
+    assert checks.stop_at_rest(standing(), tried).verdict == verdict
+    made = checks.stop_in_motion(standing(), tried)
+    assert (made.verdict, "locked" in made.found) == (verdict, verdict == "ok")
+
+
+def test_a_robot_on_wheels_that_rolls_on_after_the_stop():
+    rolled = Tried(stopped_s=0.5, states=states((0.0, 0.0, 0.0), (0.1, 0.0, 0.0)))
+    assert checks.stop_in_motion(standing(WHEELS), rolled).verdict == "bad"
+    assert checks.stop_in_motion(standing(WHEELS), Tried(stopped_s=0.5)).verdict == "ok"
+
+
+@pytest.mark.parametrize(
+    ("robot", "end", "verdict", "remedy"),
+    [
+        (DRONE, (0.02, 0.5, 0.21), "ok", ""),
+        (DRONE, (0.0, 0.5, 0.05), "bad", "does not keep its height"),
+        (DRONE, (0.3, 0.5, 0.2), "bad", "drifts"),
+        (WHEELS, (0.1, 0.5, 0.0), "ok", ""),
+        (WHEELS, (0.0, 0.5, 0.0), "bad", "told to drive and does not"),
+        (WHEELS, (0.2, 0.5, 0.0), "bad", "its speed is not what it is told"),
+    ],
+)
+def test_hops_and_drives(robot, end, verdict, remedy):
+    tried = Tried(states=states((0.0, 0.5, 0.0), end), volts=3.7, charge=0.6)
+    made = checks.hop(standing(robot), tried, Safety())
+    assert made.verdict == verdict
+    assert made.remedy.startswith(remedy)
+    assert made.found.endswith("; battery 60%, 3.70 V under load")
+
+
+def test_a_battery_that_sags_under_load():
+    tried = Tried(states=states((0.0, 0.5, 0.0), (0.0, 0.5, 0.2)), charge=0.05)
+    assert checks.hop(standing(), tried, Safety()).verdict == "bad"
+
+
+def test_robots_are_checked_without_formation_and_low():
+    read = document.load("robotic-park")
+    case = alone(next(iter(read.cases().values())))
+    plan = Plan(case)
+    assert len(plan.links) == 0
+    assert {case.robots[leg.robot].kind for leg in case.timeline} == {"khepera4", "turtlebot3"}
+    assert {robot.hover for robot in case.robots.values()} == {None, checks.HOP_M}

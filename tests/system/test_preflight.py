@@ -1,0 +1,65 @@
+"""`zenpark preflight`: robots checked one by one, by the processes of a run."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.system.lab import ENVIRONMENT, ROOT
+from tests.waiting import until
+
+pytestmark = pytest.mark.system
+
+TWO = """
+title = "one that hops, one that is not there"
+duration_s = 30.0
+start = { deadline_s = 8.0 }
+[robots]
+CF01 = { kind = "crazyflie", start = [-0.3, 0.0], hover = 0.5 }
+KH01 = { kind = "khepera4", start = [0.3, 0.0], body = "BODY" }
+[formation.links]
+"CF01 - KH01" = 0.8
+"""
+
+
+def begin(folder: Path, *options: str, body: str) -> subprocess.Popen[str]:
+    file = folder / "two.toml"
+    file.write_text(TWO.replace("BODY", body))
+    command = [sys.executable, "-m", "tools.guard", "preflight", str(file), "--json", "--out", str(folder / "out")]
+    return subprocess.Popen(
+        [*command, *options], cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+@pytest.mark.timeout(90)
+def test_one_hops_and_is_stopped_and_the_other_is_red(tmp_path: Path) -> None:
+    process = begin(tmp_path, "--hop", "--stop", body="khepera4://127.0.0.1:9")
+    out, err = process.communicate(timeout=80)
+    assert process.returncode == 1, err
+    said = json.loads(out)
+    drone, wheels = ({check["check"]: check for check in robot["checks"]} for robot in said["robots"])
+    assert {name: drone[name]["verdict"] for name in ("ready", "stop, motors off", "hop", "stop, motors on")} == (
+        dict.fromkeys(("ready", "stop, motors off", "hop", "stop, motors on"), "ok")
+    )
+    assert "Connection refused" in wheels["address"]["found"]
+    assert wheels["drive"]["verdict"] == "unknown"
+    assert not said["ok"]
+
+
+@pytest.mark.mechanism("preflight: a hop that is interrupted")
+@pytest.mark.timeout(90)
+def test_ctrl_c_lands_the_robot_that_hops(tmp_path: Path) -> None:
+    process = begin(tmp_path, "--hop", body="twin")
+    log = tmp_path / "out" / "logs" / "preflight-CF01.log"
+    until(lambda: log.exists() and "airborne" in log.read_text(), "it is in the air", 60.0)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    hop = next(check for check in json.loads(out)["robots"][0]["checks"] if check["check"] == "hop")
+    assert (hop["verdict"], hop["found"]) == ("unknown", "interrupted; it is down")
+    assert log.read_text().rstrip().splitlines()[-1].startswith("CF01: done")
