@@ -1,37 +1,57 @@
-"""The trigger of the documentation, installed from outside of this repository."""
+"""The plug-ins of docs/plugins.md, installed from outside of this repository."""
 
 import json
 import os
 import re
+import shlex
+import socket
 import subprocess
 import sys
+import threading
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from agents.body.interface import BodyError
 from agents.formation.graph import Links
+from tests.waiting import until
 
 ROOT = Path(__file__).parents[3]
 
 
-def installed(folder):
-    """The example as an installer would leave it: its module, and what its distribution registers."""
-    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
-    (source,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "SendEvery" in block]
-    (project,) = [block for block in re.findall(r"```toml\n(.*?)```", text, re.DOTALL) if "my-triggers" in block]
+GUIDE = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
+# `my_laws.py`, registered as `spring = "my_laws:Spring"` under `[project.entry-points."zenpark.laws"]`
+REGISTERED = re.findall(
+    r'`([\w-]+) = "(\w+):(\w+)"`\s+under\s+`\[project\.entry-points\."(zenpark\.\w+)"\]`', GUIDE, re.DOTALL
+)
+
+
+def source_of(name):
+    (source,) = [block for block in BLOCKS if f"class {name}" in block]
+    return source
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """The examples as an installer would leave them: their modules, and what their distribution registers."""
+    folder = tmp_path_factory.mktemp("plugins")
+    (project,) = [block for block in re.findall(r"```toml\n(.*?)```", GUIDE, re.DOTALL) if "my-triggers" in block]
     about = tomllib.loads(project)["project"]
-    assert len(source.splitlines()) <= 20
-    (folder / "my_triggers.py").write_text(source, encoding="utf-8")
-    told = folder / f"my_triggers-{about['version']}.dist-info"
-    told.mkdir()
-    (told / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {about['name']}\nVersion: {about['version']}\n")
-    lines = [
-        f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in made.items())
-        for group, made in about["entry-points"].items()
-    ]
-    (told / "entry_points.txt").write_text("\n".join(lines))
+    groups = about["entry-points"]
+    (folder / "my_triggers.py").write_text(source_of("SendEvery"), encoding="utf-8")
+    for name, module, made, group in REGISTERED:
+        (folder / f"{module}.py").write_text(source_of(f"{made}"), encoding="utf-8")
+        groups.setdefault(group, {})[name] = f"{module}:{made}"
+    written = folder / f"my_triggers-{about['version']}.dist-info"
+    written.mkdir()
+    (written / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {about['name']}\nVersion: {about['version']}\n")
+    lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in made.items()) for group, made in groups.items()]
+    (written / "entry_points.txt").write_text("\n".join(lines))
+    return folder
 
 
 def zenpark(folder, *arguments):
@@ -42,25 +62,116 @@ def zenpark(folder, *arguments):
     )  # fmt: skip
 
 
+def test_every_group_of_plugins_has_an_example():
+    assert {group for _, _, _, group in REGISTERED} | {"zenpark.triggers"} == {
+        *("zenpark.triggers", "zenpark.predictors", "zenpark.laws", "zenpark.planners"),
+        *("zenpark.avoidances", "zenpark.engines", "zenpark.bodies"),
+    }
+
+
 @pytest.mark.slow
-def test_the_trigger_of_the_docs_runs_from_outside(tmp_path):
-    installed(tmp_path)
-    assert re.search(r"Triggers: .*\bsend-every\b", zenpark(tmp_path, "list").stdout)
+def test_the_trigger_of_the_docs_runs_from_outside(installed):
+    assert len(source_of("SendEvery").splitlines()) <= 20
+    listed = zenpark(installed, "list").stdout
+    assert re.search(r"Triggers: .*\bsend-every\b", listed)
+    assert not [name for name, _, _, group in REGISTERED if group != "zenpark.bodies" and name not in listed]
     choice = 'cases.event.trigger={ kind = "send-every", metres = 0.02, maximum_silence_s = 5.0 }'
-    run = zenpark(tmp_path, "run", "triangle", "--virtual", "--json", "--set", "duration_s=5", "--set", choice)
+    run = zenpark(installed, "run", "triangle", "--virtual", "--json", "--set", "duration_s=5", "--set", choice)
     assert run.returncode == 0, run.stderr
     cases = json.loads(run.stdout)["cases"]
     assert 0.0 < cases["event"]["mean"]["f_hz"] < 0.1 * cases["periodic"]["mean"]["f_hz"]
-    wrong = zenpark(tmp_path, "run", "triangle", "--virtual", "--set", choice.replace("metres", "meters"))
+    wrong = zenpark(installed, "run", "triangle", "--virtual", "--set", choice.replace("metres", "meters"))
     assert wrong.returncode != 0
     assert "did you mean 'metres'?" in wrong.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("line", re.findall(r"^    \./zenpark (run triangle --virtual .*)$", GUIDE, re.MULTILINE))
+def test_every_run_of_the_guide_ends_well(installed, line, tmp_path):
+    words = shlex.split(line)
+    done = zenpark(installed, *words, "--set", "duration_s=8", "--no-report", "--out", str(tmp_path / "run"))
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run" / "metrics.csv").exists()
+
+
+class Rover(threading.Thread):
+    """Robot of the guide: turns and drives by the twists that it gets over UDP, and answers with its pose."""
+
+    def __init__(self):
+        super().__init__(daemon=True)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.pose, self.twists = [0.0, 0.0, 0.0], []
+
+    @property
+    def address(self):
+        return "rover://{}:{}".format(*self.socket.getsockname())
+
+    def run(self):
+        while True:
+            payload, sender = self.socket.recvfrom(1500)
+            if payload == b"end":
+                return
+            twist = json.loads(payload)
+            self.twists.append((twist["v"], twist["w"]))
+            self.pose[2] += 0.02 * twist["w"]
+            self.pose[0] += 0.02 * twist["v"] * np.cos(self.pose[2])
+            self.pose[1] += 0.02 * twist["v"] * np.sin(self.pose[2])
+            self.socket.sendto(b"not a pose", sender)
+            self.socket.sendto(json.dumps(dict(zip(("x", "y", "yaw"), self.pose, strict=True))).encode(), sender)
+
+
+@pytest.fixture
+def rover():
+    robot = Rover()
+    robot.start()
+    yield robot
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
+        end.sendto(b"end", robot.socket.getsockname())
+    robot.join(5.0)
+    robot.socket.close()
+
+
+def rovers(*addresses):
+    names: dict[str, type] = {"__name__": "my_body"}
+    exec(source_of("Rovers"), names)
+    count = len(addresses)
+    request = SimpleNamespace(
+        names=tuple(f"R{k}" for k in range(count)),
+        addresses=addresses,
+        start=np.zeros((count, 3)),
+        yaw=np.zeros(count),
+    )
+    return names["Rovers"](request)
+
+
+def test_the_body_of_the_docs_drives_a_robot_over_udp(rover):
+    body = rovers(rover.address)
+    body.open()
+    for _ in range(3):
+        body.command(np.array([[0.5, 0.0, 0.0, 0.0]]))
+    until(lambda: body.read(7.0).position[0, 0] > 0.0299)
+    state = body.read(7.0)
+    assert state.position[0] == pytest.approx([0.03, 0.0, 0.0])
+    assert state.time == pytest.approx([7.0])
+    body.stop(np.array([0]))
+    body.command(np.array([[0.5, 0.0, 0.0, 0.0]]))
+    until(lambda: len(rover.twists) >= 5 and rover.twists[-2:] == [(0.0, 0.0)] * 2)
+    body.close()
+
+
+def test_the_body_of_the_docs_refuses_what_is_no_address_and_a_robot_that_is_not_there():
+    with pytest.raises(BodyError, match="no address"):
+        rovers("rover://nowhere")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+        silent.bind(("127.0.0.1", 0))
+        with pytest.raises(BodyError, match="no pose within 3 s"):
+            rovers("rover://{}:{}".format(*silent.getsockname())).open()
+
+
 def test_the_law_of_the_docs_pulls_to_the_distance_of_the_link():
-    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
-    (source,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "Spring" in block]
     names: dict[str, type] = {"__name__": "my_laws"}
-    exec(source, names)
+    exec(source_of("Spring"), names)
     law = names["Spring"](constant=0.3)
     links = Links(np.array([0]), np.array([1]), np.array([0.5]), np.array([1.0]))
     position, heard = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0]])
