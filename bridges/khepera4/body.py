@@ -13,6 +13,7 @@ from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState, RangeScan, Rays, settings
+from agents.network.messages import Inspection
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4.drivers import awake
 from bridges.khepera4.link import Address, Link
@@ -103,6 +104,11 @@ class KheperaBody:
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
         """See `Body.locate`."""
         self._external.update(row, t, position, yaw)
+
+    def inspect(self, row: int) -> Inspection:
+        """See `agents.body.interface.Inspectable`."""
+        server = self._links[row].server if self._links else ""
+        return Inspection(firmware=f"server {server}" if server else None)
 
     def close(self) -> None:
         """See `Body.close`."""

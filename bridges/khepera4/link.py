@@ -149,6 +149,7 @@ class Link:
         self.setpoint = (0.0, 0.0, -math.inf)  # v [m/s], ω [rad/s], time [s, `awake`] of what it was decided on
         self.halted_since = math.inf  # monotonic [s]; infinity while the robot may move
         self.refused = False  # the server must not be driven; it is not tried again
+        self.server = ""  # that runs on the robot, by its answers; empty while not known
         self.trouble = f"{address}: not connected yet"  # for users; empty while connected
         self._address, self._settings, self._server = address, chosen, address.server_of(name, chosen)
         self._odometer = Odometer(*start)
@@ -201,11 +202,13 @@ class Link:
                 self.trouble = f"{self._address}: {error.strerror or error}; {self._remedy(error)}"
             else:
                 try:
-                    self._run_connection(
-                        KTeam(wire, self._settings)
-                        if self._address.kteam
-                        else identify(wire, self._settings, self._server)
-                    )
+                    if self._address.kteam:
+                        self.server = "kteam"
+                        self._run_connection(KTeam(wire, self._settings))
+                    else:
+                        park = identify(wire, self._settings, self._server)
+                        self.server = next(name for name, kind in protocol.PARK.items() if kind is park.server)
+                        self._run_connection(park)
                 except TROUBLE as error:  # of any kind: the wheels must stop
                     why = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
                     self.trouble = f"{self._address}: {why or error}"

@@ -17,6 +17,7 @@ from agents.body.external_pose import External
 from agents.body.interface import Body, BodyError, BodyRequest, BodyState, Rays, call_all
 from agents.network import session as network
 from agents.network.endpoints import EndpointError
+from agents.network.messages import Inspection, number
 from agents.network.shutdown import leave
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2_node import Participant
@@ -174,6 +175,10 @@ class TurtleBot3:
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
         """See `Body.locate`."""
         self._external.update(row, t, position, yaw)
+
+    def inspect(self, row: int) -> Inspection:
+        """See `agents.body.interface.Inspectable`."""
+        return Inspection(volts=number(self._robots[row].volts))
 
     def close(self) -> None:
         """Stop all robots, wait until they stand (3 s at most), and leave the network."""

@@ -46,6 +46,7 @@ class Robot:
         self._clock = request.clock
         self.pose = (nan, nan, nan)  # x, y [m] and yaw [rad] in the arena; NaN before the first odometry
         self.speed = (0.0, 0.0)  # v [m/s] and ω [rad/s] by odometry
+        self.volts = nan  # of the battery [V]
         self.battery = nan  # charge, 0 to 1
         self.scan: RangeScan | None = None  # the newest
         self.odometry_received = -np.inf  # time of the last odometry, monotonic [s]
@@ -99,6 +100,7 @@ class Robot:
             self.scan = ranges(scan, t)
         if (battery := self._battery.newest()) is not None:
             self.battery = turtlebot3.charge(battery.voltage, battery.percentage)
+            self.volts = float(battery.voltage)
         for sample in network.received(self._watch.handler):
             token = str(sample.key_expr)
             if sample.kind == zenoh.SampleKind.DELETE:

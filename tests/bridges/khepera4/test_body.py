@@ -208,6 +208,7 @@ def test_robots_drive_to_their_goals(served, speaks, bearings):
         body.land(np.arange(2))
         drive.until(lambda: np.abs(drive.state.velocity).max() < 0.01)
         state, (position, yaw) = drive.state, twins.truth()
+        assert [body.inspect(row).firmware for row in (0, 1)] == [f"server {each['server']}" for each in speaks]
         if bearings:
             drive.until(lambda: drive.state.rays is not None)
             assert len(drive.state.rays.scan_of(0).bearing) == bearings

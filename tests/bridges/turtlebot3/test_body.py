@@ -156,6 +156,7 @@ def test_drives_to_goals(hub, style, distro):
         assert (state.notes, state.flying.any()) == (("", ""), False)
         assert (stage.t - state.time < 0.2).all()
         assert (state.battery > 0.99).all()
+        assert stage.body.inspect(0).volts > 12.0
         assert np.bincount(state.rays.row).tolist() == [360, 360]
         assert np.isnan(state.rays.scan_of(0).distance).all()
 
