@@ -161,6 +161,10 @@ class Change(Part, frozen=True):
         dict[str, Positive | Target],
         Meta(description="links that ask for something else then"),
     ] = {}
+    shape: Annotated[
+        dict[Name, Vector],
+        Meta(description="places of robots, x, y (, z) [m]: new targets of the links that have theirs from a shape"),
+    ] = {}
     scale: Annotated[Positive, Meta(description="of the shape seen from above, as it is then; heights stay")] = 1.0
     rotate: Annotated[float, Meta(description="to the left [rad]; not for distances, which know no direction")] = 0.0
 
@@ -197,11 +201,22 @@ class Formation(Part, frozen=True):
     tracking_gain: Annotated[NotNegative, Meta(description="k [1/(m²·decision)] (paper, eq. (7))")] = 3.0
     leader: Annotated[Name | None, Meta(description="left out: every robot without neighbours")] = None
     links: Annotated[
-        dict[str, Positive | Link], Meta(description='"A > B": B receives from A; "A - B": both receive; distance [m]')
+        dict[str, Positive | Link],
+        Meta(
+            description='"A > B": B receives from A; "A - B": both receive; distance [m], a table with another target,'
+            ' or "shape": as in [formation.shape]'
+        ),
     ] = {}
     anchors: Annotated[
         dict[Name, Positive | Anchor],
         Meta(description="by robot: distance to the origin [m], or to another place"),
+    ] = {}
+    shape: Annotated[
+        dict[Name, Vector],
+        Meta(
+            description='places of robots, x, y (, z) [m], wherever the shape is drawn: a link `"A > B" = "shape"`'
+            " has its distance, offset or bearing from there, as the law needs; z left out: as they hold their heights"
+        ),
     ] = {}
     changes: Annotated[list[Change], Meta(description="other shapes, in order of time")] = []
     proximity: Annotated[Proximity | None, Meta(description="links by range; left out: they are always there")] = None

@@ -17,9 +17,11 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
     """All contradictions in [formation]."""
     found = list(_links(experiment))
     yield from found
-    for name in experiment.formation.anchors:
+    formation = experiment.formation
+    places = [("anchors", name) for name in formation.anchors] + [("shape", name) for name in formation.shape]
+    for table, name in places:
         if name not in experiment.robots:
-            path = ("formation", "anchors", name)
+            path = ("formation", table, name)
             yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, experiment.robots), on_key=True)
     if found:
         return  # what follows looks links up

@@ -20,7 +20,7 @@ from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.file import arena_file, catalogue, consistency, structure
 from experiments.file.arena_file import ArenaFile
-from experiments.file.overrides import Override, assign, chosen_parameters, merged, parse
+from experiments.file.overrides import Override, assign, chosen_parameters, fill_from_shape, merged, parse
 from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places, refusal
 from experiments.file.problems import Path as Keys
 from experiments.file.text import content, decoded, parsed
@@ -137,8 +137,8 @@ class _Reading:
             for name, table in tables.items()
             if "cases" in table
         ]
-        first = structure.faults(base)
-        found = {name: structure.faults(case) for name, case in cases.items()}
+        first = [*fill_from_shape(base), *structure.faults(base)]
+        found = {name: [*fill_from_shape(case), *structure.faults(case)] for name, case in cases.items()}
         self._refuse([*nested, *first, *_of_cases(tables, found, first)], overrides, files)
 
         experiment = msgspec.convert(base, Experiment)

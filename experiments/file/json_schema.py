@@ -14,6 +14,7 @@ import msgspec
 from agents.body.kinds import KINDS
 from agents.plugins import registry
 from experiments.definition.experiment import Experiment
+from experiments.file.overrides import SHAPE
 
 _CHOICES: Final = (
     ("Experiment", "trigger", registry.TRIGGERS),
@@ -38,6 +39,7 @@ def schema() -> dict[str, Any]:
         definitions[owner]["properties"][name] = {**kept, **_choice(group, definitions)}
     for name, field in definitions["LinkChannel"]["properties"].items():  # as at the channel
         field["description"] = definitions["Channel"]["properties"][name]["description"]
+    definitions["Formation"]["properties"]["links"]["additionalProperties"]["anyOf"].append({"enum": [SHAPE]})
     definitions["Robot"]["properties"]["kind"]["enum"] = list(KINDS)
     partial = {name + _CASE: _partial(each) for name, each in definitions.items()}
     del partial["Experiment" + _CASE]["properties"]["cases"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -10,14 +11,18 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, Final
 
+from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.definition.links import link_pairs
-from experiments.file.problems import DocumentError, Path, refusal
+from experiments.file.problems import DocumentError, Fault, Path, refusal
 from experiments.file.structure import group_of, parameters
 
 _PART: Final = re.compile(r"\s*+(?:\"([^\"]*)\"|'([^']*)'|([^.\"']++))\s*+(?:\.|$)")
 _SHAPES: Final = frozenset({"box", "radius", "wall"})
+SHAPE: Final = "shape"  # a link with its target from [formation.shape]
+_TARGETS: Final = frozenset({"distance", "offset", "bearing"})
+_TARGET_OF: Final = {"relative": "offset", "bearing": "bearing"}  # by what a law needs; else a distance
 _DEFAULTS: Final = Experiment(title="", robots={}, duration_s=1.0)
 
 
@@ -128,6 +133,82 @@ def merged(document: Mapping[str, Any], changes: Mapping[str, Any], path: Path =
     return result
 
 
+def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
+    """Gives the links without a target of their own, in place, the one that the places of [formation.shape] have.
+
+    What is malformed otherwise is left for the checks that follow.
+    """
+    formation = document.get("formation")
+    links = formation.get("links") if isinstance(formation, dict) else None
+    if not isinstance(formation, dict) or not isinstance(links, dict):
+        return []
+    shape, faults = formation.get("shape"), list[Fault]()
+    bare = [
+        text
+        for text, given in links.items()
+        if given == SHAPE or (shape is not None and isinstance(given, dict) and not _TARGETS & given.keys())
+    ]
+    word = _TARGET_OF.get(_need(formation.get("law", _DEFAULTS.formation.law)), "distance")
+    for text in bare:
+        try:
+            target = _target_in(shape or {}, document.get("robots"), text, word)
+        except _NoPlace as error:
+            faults.append(Fault(("formation", "links", text), *error.args))
+            target = 1.0 if word == "distance" else [1.0, 0.0]
+        given = links[text]
+        links[text] = {**given, word: target} if isinstance(given, dict) else {word: target}
+    changes = formation.get("changes")
+    for number, change in enumerate(changes if isinstance(changes, list) else []):
+        if isinstance(change, dict) and isinstance(change.get("shape"), dict):
+            own = change.setdefault("links", {})
+            for text in (text for text in bare if isinstance(own, dict) and text not in own):
+                try:
+                    own[text] = {word: _target_in(change["shape"], document.get("robots"), text, word)}
+                except _NoPlace as error:
+                    faults.append(Fault(("formation", "changes", number, "shape"), *error.args))
+    return faults
+
+
+class _NoPlace(ValueError):
+    """A link between robots without places; message and remedy."""
+
+
+def _need(law: object) -> str:
+    """What a law needs of every link; "any" if no such law is installed."""
+    name = law.get("kind") if isinstance(law, Mapping) else law
+    if not isinstance(name, str) or name not in registry.names(registry.LAWS):
+        return "any"
+    return str(getattr(registry.struct(registry.LAWS, name), "NEEDS", "any"))
+
+
+def _target_in(shape: Mapping[str, Any], robots: object, text: str, word: str) -> float | list[float]:
+    """Distance [m], offset [m] or bearing of a link between places.
+
+    Raises:
+        _NoPlace: If one of the two has no place, or both have the same.
+    """
+    if not _ends(text):
+        return 1.0 if word == "distance" else [1.0, 0.0]
+    second, first = link_pairs(text)[0]
+    places = []
+    for name in (first, second):
+        place = shape.get(name)
+        if not (isinstance(place, list) and 2 <= len(place) <= 3 and all(type(x) in (int, float) for x in place)):
+            hint = f"add {name} = [0.5, 0.0] to [formation.shape], or give the link a distance"
+            raise _NoPlace(f"{name} has no place in the shape", hint)
+        robot = robots.get(name) if isinstance(robots, Mapping) else None
+        height = robot.get("hover") if isinstance(robot, Mapping) else None
+        places.append([*place, height if type(height) in (int, float) else 0.0][:3])
+    offset = [b - a for a, b in zip(*places, strict=True)]
+    length = math.hypot(*offset)
+    if length == 0.0:
+        raise _NoPlace(f"{first} and {second} are at one place of the shape", "move one of them")
+    if word == "distance":
+        return length
+    planar = len(shape[first]) == len(shape[second]) == 2
+    return offset[:2] if planar else offset
+
+
 def chosen_parameters(document: Mapping[str, Any], path: Path) -> Iterable[str]:
     """The parameters of the plug-in that a document chooses at `path`."""
     at: Any = document
@@ -170,6 +251,8 @@ def _as_table(value: object, path: Path) -> object:
         return {"kind": value}
     if path[:-1] == ("formation", "links") and isinstance(value, int | float) and not isinstance(value, bool):
         return {"distance": value}
+    if path[:-1] == ("formation", "links") and value == SHAPE:
+        return {}
     return value
 
 
