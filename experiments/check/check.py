@@ -7,7 +7,7 @@ That a file can be read at all is for `experiments.file.document` to say; here t
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import msgspec
@@ -16,16 +16,13 @@ import numpy as np
 from agents.network.messages import MAX_PAYLOAD
 from experiments.check import motion, safety, theory
 from experiments.check import obstacles as surroundings
-from experiments.check.analysis import Analysis, analyse, link_errors
+from experiments.check.analysis import Analysis, analyse
 from experiments.check.findings import FORGIVEN, Claim, Severity, first_of_each_code
-from experiments.check.ideal_run import Prediction, message_rate, predict, undisturbed
+from experiments.check.ideal_run import message_rate, predict, undisturbed
 from experiments.definition import standby
-from experiments.definition.experiment import Channel, Experiment, Network
-from experiments.definition.plan import Plan
-from experiments.file.document import Document
-from experiments.file.overrides import parse
-from experiments.file.problems import Path, Problem, line_column, nearest, places
-from experiments.file.text import parsed
+from experiments.definition.experiment import Experiment
+from experiments.file.document import Document, Source
+from experiments.file.problems import Fault, Path, Problem, nearest
 
 NOT_RANDOM: Final = "not-random"
 HEARD_BYTES: Final = 200  # of one heard pose in telemetry
@@ -122,27 +119,21 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     predicted_s: float  # how much of the run was predicted
 
 
-def check(given: Document, settings: Sequence[str] = ()) -> list[Finding]:
-    """Findings of all cases: errors first, then warnings, then notes.
-
-    Args:
-        given: As `document.read` returned it.
-        settings: The overrides that it was read with, so that a finding can point at one.
-    """
-    return _findings(given, settings, _analyses(given.cases()))
+def check(given: Document) -> list[Finding]:
+    """Findings of all cases: errors first, then warnings, then notes."""
+    return _findings(given, _analyses(given.cases()))
 
 
-def examine(given: Document, settings: Sequence[str] = ()) -> tuple[list[Finding], dict[str, Figures]]:
+def examine(given: Document) -> tuple[list[Finding], dict[str, Figures]]:
     """Findings of all cases, as `check`, and the figures of each case by its name."""
     analyses = _analyses(given.cases())
     figures_of = {name: _figures(analysis) for name, analysis in analyses.items()}
-    return _findings(given, settings, analyses), figures_of
+    return _findings(given, analyses), figures_of
 
 
 def unreadable(problem: Problem) -> Finding:
     """A problem of the file as a finding."""
-    where = f"{problem.file}:{problem.line}:{problem.column}" if problem.line else problem.file
-    return Finding("error", "document", problem.message, problem.hint, where)
+    return Finding("error", "document", problem.message, problem.hint, problem.place)
 
 
 def figures(experiment: Experiment) -> Figures:
@@ -152,94 +143,34 @@ def figures(experiment: Experiment) -> Figures:
 
 @QUIET
 def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
-    """Analysis of each case; geometry is computed once for cases that differ only in trigger, channel and noise."""
-    flights: dict[bytes, Prediction] = {}
-    known: dict[bytes, Analysis] = {}
-    found = {}
-    for name, case in cases.items():
-        case = standby.without_standby(case)  # noqa: PLW2901
-        quiet = undisturbed(case)
-        flight = msgspec.json.encode(quiet)
-        if flight not in flights:
-            flights[flight] = predict(quiet)
-        bare = msgspec.structs.replace(
-            case,
-            trigger="periodic",
-            prediction=None,
-            architecture="distributed",
-            channel=Channel(),
-            network=Network(),
-            disturbance={},
-            cases={},
-        )
-        key, prediction = msgspec.json.encode(bare), flights[flight]
-        if key not in known:
-            known[key] = analyse(bare, prediction)
-        found[name] = _of_case(known[key], case, prediction)
-    return found
-
-
-def _of_case(known: Analysis, case: Experiment, prediction: Prediction) -> Analysis:
-    """The analysis of a case whose links, shape and plans are those of `known`."""
-    plan = Plan(case)
-    assignment = replace(known.assignment, trigger=plan.trigger, predictor=plan.predictor)
-    error = link_errors(assignment.law, known.pattern, prediction)
-    if error[-1].max(initial=0.0) > case.tolerance >= known.error[-1].max(initial=0.0):
-        known = analyse(known.experiment, prediction)  # it ends elsewhere: another shape may be near
-    return replace(known, plan=plan, assignment=assignment, prediction=prediction, error=error)
+    cases = {name: standby.without_standby(case) for name, case in cases.items()}
+    return {name: analyse(case, predict(undisturbed(case))) for name, case in cases.items()}
 
 
 @QUIET
-def _findings(given: Document, settings: Sequence[str], analyses: Mapping[str, Analysis]) -> list[Finding]:
+def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding]:
     """Findings, each once; those of only some cases name these cases."""
     holders: dict[Claim, list[str]] = {}
     for name, analysis in analyses.items():
         for subject in SUBJECTS:
             for claim in first_of_each_code(subject(analysis)):
                 holders.setdefault(claim, []).append(name)
-    index = _Index(given, settings)
+    source = given.source
     found = []
     for claim, names in holders.items():
         message = claim.message
         if len(names) < len(analyses):
             said = ", ".join(f"'{name}'" for name in names)
             message = f"in case{'s' * (len(names) > 1)} {said}: {message}"
-        where = index.where(claim.path, names) if claim.path else ""
+        where = _place(source, claim.path, names) if claim.path else ""
         found.append(Finding(claim.severity, claim.code, message, claim.remedy, where))
     return sorted(found, key=lambda each: ORDER.index(each.severity))
 
 
-class _Index:
-    """Places of the paths of a document, in its file or in a `--set`."""
-
-    def __init__(self, given: Document, settings: Sequence[str]) -> None:
-        is_json = given.path.suffix.lower() == ".json"
-        content = parsed(given.text, str(given.path), json=is_json)
-        self._document, self._places = given, places(given.text, json=is_json)
-        self._overrides = [parse(setting, content) for setting in settings]
-
-    def where(self, path: Path, cases: Sequence[str]) -> str:
-        """The place of `path`, or of the nearest table around it; in the first of `cases` that changes it, if any."""
-        for override in reversed(self._overrides):
-            short = min(len(override.path), len(path))
-            if override.path[:short] == path[:short] and override.case in (None, *cases):
-                return f"--set {override.flag}"
-        stands, place = nearest(self._places, path)
-        for name in cases:
-            own, there = nearest(self._places, ("cases", name, *path))
-            if len(own) > 2:
-                stands, place = own, there
-                break
-        file = self._document.arenas.get(cases[0], self._document.arenas.get("")) if cases else None
-        if file is not None and path[:1] == ("arena",):
-            inside, within = nearest(file.places, path)
-            if len(inside) > len(stands) - 2 * (stands[:1] == ("cases",)):
-                line, column = line_column(file.text, within.value)
-                return f"{file.label}:{line}:{column}"
-        if not stands:
-            return str(self._document.path)
-        line, column = line_column(self._document.text, place.value)
-        return f"{self._document.path}:{line}:{column}"
+def _place(source: Source, path: Path, cases: Sequence[str]) -> str:
+    """The place of `path` in the file or in a `--set`; in the first of `cases` that changes it, if any."""
+    own = next((p for name in cases if len(nearest(source.places, p := ("cases", name, *path))[0]) > 2), path)
+    return source.located(Fault(own, "")).place
 
 
 def _finite(value: float) -> float | None:

@@ -6,7 +6,7 @@ for name, experiment in document.cases().items(): ...
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,7 +15,6 @@ from typing import Any, Final
 
 import msgspec
 
-from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.file import arena_file, catalogue, consistency, structure
@@ -42,7 +41,13 @@ class Document:
     experiment: Experiment
     resolved: Mapping[str, Experiment]
     # the arena file of each case that has one; of the file without cases under the empty name
-    arenas: Mapping[str, ArenaFile] = field(default_factory=dict)
+    arenas: dict[str, ArenaFile] = field(default_factory=dict)
+    overrides: Sequence[Override] = ()  # behind `--set`
+
+    @property
+    def source(self) -> Source:
+        """Places of its keys."""
+        return Source(str(self.path), self.text, _is_json(self.path), self.overrides, self.arenas)
 
     def cases(self) -> dict[str, Experiment]:
         """Each case as an experiment of its own, in the order of the file; one called "default" if it has none."""
@@ -80,30 +85,88 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
     return _document(file, label, text, overrides)
 
 
-def read_text(text: str, overrides: Sequence[str] = ()) -> Document:
-    """As `read`, of an experiment that stands in no file: its text, in TOML; arena files are those of this folder.
+def load(file: str | Path, *overrides: str) -> Document:
+    """As `read`."""
+    return read(file, overrides)
 
-    Raises:
-        DocumentError: As `read`; places are those in `TEXT`.
-    """
+
+def loads(text: str, *overrides: str) -> Document:
+    """As `read`, of an experiment in TOML that stands in no file; its arena files are those of this folder."""
     return _document(Path(TEXT), TEXT, decoded(text.encode(), TEXT), overrides)
 
 
-def _document(file: Path, label: str, text: str, overrides: Sequence[str]) -> Document:
-    is_json = file.suffix.lower() == ".json"
+def received(text: str, label: str) -> Document:
+    """As `read`, of an experiment that came as JSON over a pipe; its arena is in it."""
+    return _document(Path(label), label, text, (), is_json=True)
+
+
+def _is_json(file: Path) -> bool:
+    return file.suffix.lower() == ".json"
+
+
+def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_json: bool | None = None) -> Document:
+    is_json = _is_json(file) if is_json is None else is_json
     try:
-        return _Reading(file, label, text, is_json, parsed(text, label, json=is_json), tuple(overrides)).document()
+        content = parsed(text, label, json=is_json)
+        source = Source(label, text, is_json, _overrides(flags, content))
+        return _Reading(file, source, content).document()
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
 
 
-def received(text: str, label: str) -> Document:
-    """An experiment that came as JSON over a pipe; its arena is in it.
+def _overrides(flags: Sequence[str], content: _Table) -> list[Override]:
+    overrides, problems = [], []
+    for flag in flags:
+        try:
+            override = parse(flag, content)
+        except DocumentError as error:
+            problems += error.problems
+            continue
+        overrides.append(override)
+        for fault in structure.number_faults(override.value, override.path):
+            problems += override.refused(fault.message, fault.hint).problems
+    if problems:
+        raise DocumentError(problems)
+    return overrides
 
-    Raises:
-        DocumentError: With everything that is wrong with it.
-    """
-    return _Reading(Path(label), label, text, True, parsed(text, label, json=True), ()).document()
+
+@dataclass(frozen=True)
+class Source:
+    """Text of an experiment with its changes and its arena files: where each fault has its place."""
+
+    label: str  # the file, as the user named it
+    text: str
+    is_json: bool
+    overrides: Sequence[Override] = ()
+    arenas: dict[str, ArenaFile] = field(default_factory=dict)
+
+    @cached_property
+    def places(self) -> dict[Keys, Place]:
+        return places(self.text, json=self.is_json)
+
+    def refuse(self, faults: Iterable[Fault]) -> None:
+        """Raise DocumentError if there is any fault, all in the order of the file."""
+        problems = dict.fromkeys(map(self.located, faults))
+        if problems:
+            ours = (self.label, *(problem.file for problem in problems if not problem.line))
+            raise DocumentError(sorted(problems, key=lambda each: (each.file not in ours, each.line, each.column)))
+
+    def located(self, fault: Fault) -> Problem:
+        """A fault in the text, in an arena file or in a `--set`."""
+        path = fault.path
+        case, inside = (path[1], path[2:]) if path[:1] == ("cases",) and len(path) > 1 else ("", path)
+        for override in reversed(self.overrides):
+            whole = override.whole
+            if path[: len(whole)] == whole or (override.case is None and inside[: len(whole)] == whole):
+                return override.refused(fault.message, fault.hint).problems[0]
+            if whole[: len(path)] == path and path not in self.places:
+                return override.refused(fault.message, fault.hint).problems[0]
+        stands, place = nearest(self.places, path)
+        file = self.arenas.get(str(case), self.arenas.get(""))
+        if file is not None and len(nearest(file.places, inside)[0]) > len(stands) - (len(path) - len(inside)):
+            return file.located(replace(fault, path=inside))
+        offset = place.key if fault.on_key and stands == path else place.value
+        return at_offset(self.label, self.text, offset, fault.message, fault.hint)
 
 
 def listed(texts: Sequence[str]) -> str:
@@ -118,20 +181,17 @@ def write_json(experiment: Experiment) -> bytes:
 
 @dataclass(frozen=True)
 class _Reading:
-    """State of one reading, from which errors are located."""
+    """One reading of a parsed text."""
 
     file: Path
-    label: str
-    text: str
-    is_json: bool
-    content: dict[str, Any]
-    flags: tuple[str, ...]
+    source: Source  # its arena files are added while it is read
+    content: _Table
 
     def document(self) -> Document:
         """See `read`."""
-        overrides = self._overrides()
-        self._refuse(structure.number_faults(self.content), overrides)
-        base, tables, cases, files = self._changed(overrides)
+        source = self.source
+        source.refuse(structure.number_faults(self.content))
+        base, tables, cases = self._changed(source.overrides)
         nested = [
             Fault(("cases", name, "cases"), "a case cannot hold cases", "leave them out", on_key=True)
             for name, table in tables.items()
@@ -139,19 +199,18 @@ class _Reading:
         ]
         first = [*fill_from_shape(base), *structure.faults(base)]
         found = {name: [*fill_from_shape(case), *structure.faults(case)] for name, case in cases.items()}
-        self._refuse([*nested, *first, *_of_cases(tables, found, first)], overrides, files)
+        source.refuse([*nested, *first, *_of_cases(tables, found, first)])
 
         experiment = msgspec.convert(base, Experiment)
         resolved = {name: msgspec.convert(case, Experiment) for name, case in cases.items()}
         first = list(consistency.faults(experiment))
         found = {name: list(consistency.faults(case)) for name, case in resolved.items()}
-        self._refuse([*first, *_of_cases(tables, found, first)], overrides, files)
-        return Document(self.file, self.text, experiment, resolved or {"default": experiment}, files)
+        source.refuse([*first, *_of_cases(tables, found, first)])
+        cases_of = resolved or {"default": experiment}
+        return Document(self.file, source.text, experiment, cases_of, source.arenas, source.overrides)
 
-    def _changed(
-        self, overrides: Sequence[Override]
-    ) -> tuple[_Table, dict[str, _Table], dict[str, _Table], dict[str, ArenaFile]]:
-        """The document with `--set`, the tables of its cases, each case merged into the document, and arena files.
+    def _changed(self, overrides: Sequence[Override]) -> tuple[_Table, dict[str, _Table], dict[str, _Table]]:
+        """The document with `--set`, the tables of its cases, and each case merged into the document.
 
         What an arena file holds is put below what the experiment says of its arena, and `--set` finds it there. Only a
         change of which file that is must come first.
@@ -165,8 +224,7 @@ class _Reading:
             table = plain if override.case is None else _tables(plain).get(override.case, {})
             if override not in late and assign(table, override, part=override.case is not None):
                 unused.discard(override)
-        files: dict[str, ArenaFile] = {}
-        base = self._furnished(plain, "", overrides, files)
+        base = self._furnished(plain, "")
         tables, cases = _tables(plain), {}
         for name, table in tables.items():
             own = deepcopy(merged(_without_cases(plain), _without_cases(table)))
@@ -174,7 +232,7 @@ class _Reading:
             for override in mine:
                 if override in above:
                     assign(own, override)
-            cases[name] = self._furnished(own, name, overrides, files)
+            cases[name] = self._furnished(own, name)
             for override in mine:
                 if override not in above and assign(cases[name], override):
                     unused.discard(override)
@@ -184,13 +242,11 @@ class _Reading:
         if unused:
             known = [base, *cases.values()]
             raise DocumentError([_unused(override, known) for override in of_all if override in unused])
-        return base, tables, cases, files
+        return base, tables, cases
 
-    def _furnished(
-        self, document: _Table, case: str, overrides: Sequence[Override], files: dict[str, ArenaFile]
-    ) -> _Table:
-        """Merge the arena file of a document; the file is added to `files`."""
-        name = arena_file.arena_file_name(document)
+    def _furnished(self, document: _Table, case: str) -> _Table:
+        """Merge the arena file of a document."""
+        name, files = arena_file.arena_file_name(document), self.source.arenas
         if name is None:
             return document
         try:
@@ -198,55 +254,8 @@ class _Reading:
             files[case] = next(known, None) or arena_file.load(name, self.file.parent)
         except arena_file.Misnamed as error:
             path = ("cases", case, *error.fault.path) if case else error.fault.path
-            self._refuse([replace(error.fault, path=path)], overrides)
+            self.source.refuse([replace(error.fault, path=path)])
         return deepcopy(arena_file.with_arena_file(document, files[case]))
-
-    def _overrides(self) -> list[Override]:
-        overrides, problems = [], []
-        for flag in self.flags:
-            try:
-                override = parse(flag, self.content)
-            except DocumentError as error:
-                problems += error.problems
-                continue
-            overrides.append(override)
-            for fault in structure.number_faults(override.value, override.path):
-                problems += override.refused(fault.message, fault.hint).problems
-        if problems:
-            raise DocumentError(problems)
-        return overrides
-
-    def _refuse(
-        self,
-        faults: Iterator[Fault] | Sequence[Fault],
-        overrides: Sequence[Override],
-        files: Mapping[str, ArenaFile] | None = None,
-    ) -> None:
-        """Raise DocumentError if there is any fault, all in the order of the file."""
-        problems = dict.fromkeys(self._located(fault, overrides, files or {}) for fault in faults)
-        if problems:
-            ours = (self.label, *(problem.file for problem in problems if not problem.line))
-            raise DocumentError(sorted(problems, key=lambda each: (each.file not in ours, each.line, each.column)))
-
-    def _located(self, fault: Fault, overrides: Sequence[Override], files: Mapping[str, ArenaFile]) -> Problem:
-        path = fault.path
-        inside = path[2:] if path[:1] == ("cases",) else path
-        for override in reversed(overrides):
-            whole = override.whole
-            if path[: len(whole)] == whole or (override.case is None and inside[: len(whole)] == whole):
-                return override.refused(fault.message, fault.hint).problems[0]
-            if whole[: len(path)] == path and path not in self._places:
-                return override.refused(fault.message, fault.hint).problems[0]
-        stands, place = nearest(self._places, path)
-        file = files.get("")
-        if file is not None and len(nearest(file.places, path)[0]) > len(stands):
-            return file.located(fault)
-        offset = place.key if fault.on_key and stands == path else place.value
-        return at_offset(self.label, self.text, offset, fault.message, fault.hint)
-
-    @cached_property
-    def _places(self) -> dict[Keys, Place]:
-        return places(self.text, json=self.is_json)
 
 
 def _unused(override: Override, documents: Sequence[Mapping[str, Any]]) -> Problem:
@@ -301,36 +310,8 @@ def case_document(experiment: Experiment) -> bytes:
 
 
 def chosen_case(read: Document, name: str | None) -> Experiment:
-    """A case of an experiment by name; the first if none is named.
-
-    Raises:
-        DocumentError: If it has no such case.
-    """
-    cases = read.cases()
-    if name is None:
-        return next(iter(cases.values()))
-    if name not in cases:
-        hint = registry.did_you_mean(name, cases)
-        raise DocumentError([Problem(str(read.path), 0, 0, f"no case '{name}' in this experiment", hint)])
-    return cases[name]
-
-
-def load(file: str | Path, *changes: str) -> Document:
-    """An experiment by its file or its name in the catalogue, with fields changed as behind `--set`.
-
-    Raises:
-        DocumentError: With everything that is wrong and where.
-    """
-    return read(file, changes)
-
-
-def loads(text: str, *changes: str) -> Document:
-    """As `load`, of an experiment that is written where it is used, in a notebook or a script.
-
-    Raises:
-        DocumentError: With everything that is wrong and where.
-    """
-    return read_text(text, changes)
+    """A case of an experiment by name, the first if none is named; raises as `chosen`."""
+    return next(iter(chosen(read, [] if name is None else [name]).values()))
 
 
 def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Experiment]:
@@ -342,6 +323,5 @@ def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Experiment]:
     cases = read.cases()
     for name in names:
         if name not in cases:
-            hint = f"its cases: {', '.join(cases)}"
-            raise DocumentError([Problem(f"--case {name}", 0, 0, "no such case in this experiment", hint)])
+            raise refusal(str(read.path), f"no case '{name}' in this experiment", did_you_mean(name, cases))
     return {name: case for name, case in cases.items() if not names or name in names}

@@ -179,9 +179,12 @@ class Problem:
     hint: str = ""  # what to do
     source: str = ""  # the line of text
 
+    @property
+    def place(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+
     def __str__(self) -> str:
-        place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
-        parts = [f"{_printable(place)}: {_printable(self.message)}"]
+        parts = [f"{_printable(self.place)}: {_printable(self.message)}"]
         if self.line:
             shown, caret = _window(self.source, self.column - 1)
             parts += [f"{self.line:>6} | {shown}", f"       | {caret}^"]

@@ -30,15 +30,14 @@ def check(file: File, settings: Settings = None, as_json: AsJson = False) -> int
     from experiments.file import document
     from experiments.file.problems import DocumentError
 
-    changes = settings or []
     try:
-        given = document.read(file, changes)
+        given = document.read(file, settings or [])
     except DocumentError as error:
         if not as_json:
             raise
         _print_json(file, [unreadable(each) for each in error.problems], {})
         return 2
-    found, numbers = examine(given, changes)
+    found, numbers = examine(given)
     if as_json:
         _print_json(str(given.path), found, numbers)
     else:

@@ -68,7 +68,7 @@ def run(
     read = load(file, *changes)
     _refuse(options, virtual=virtual, seeds=seeds)
     chosen(read, options.cases)
-    if not sound(read, changes, seeds=seeds) and not anyway:
+    if not sound(read, seeds=seeds) and not anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     folder = new_folder(read, out)
@@ -177,11 +177,11 @@ def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:
             raise DocumentError([Problem(option, 0, 0, "is for real time", "leave out --virtual")])
 
 
-def sound(read: Document, changes: Sequence[str], *, seeds: int) -> bool:
+def sound(read: Document, *, seeds: int) -> bool:
     """Print the warnings and errors of the check of a run of so many seeds; False if there are errors."""
     from experiments.check.check import NOT_RANDOM, check
 
-    found = [finding for finding in check(read, changes) if finding.severity != "note"]
+    found = [finding for finding in check(read) if finding.severity != "note"]
     if seeds == 1:
         found = [finding for finding in found if finding.code != NOT_RANDOM]
     for finding in found:

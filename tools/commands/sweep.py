@@ -84,7 +84,7 @@ def sweep(
     from tools.commands.run import sound
 
     changes = settings or []
-    if not sound(load(file, *changes), changes, seeds=2) and not anyway:
+    if not sound(load(file, *changes), seeds=2) and not anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     request = _Request(

@@ -45,7 +45,7 @@ def bad(name: str, *changes: str) -> dict[str, tuple[str, str, str, str]]:
     read = document.read(name, changes)
     if not any(change.startswith("cases.") for change in changes):
         read = dataclasses.replace(read, resolved=dict(list(read.cases().items())[-1:]))
-    for each in check(read, changes):
+    for each in check(read):
         if each.severity != "note":
             said.setdefault(each.code, (each.severity, each.message, each.remedy, each.where))
     return said
