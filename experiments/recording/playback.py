@@ -38,6 +38,7 @@ EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the w
 LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
 NOWHERE: Final = (math.nan, math.nan, math.nan)
 UNKNOWN: Final = (*NOWHERE, math.nan)
+OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that a trace may lack
 
 S = TypeVar("S", bound=msgspec.Struct)
 M = TypeVar("M", State, SentPose, Status)
@@ -195,17 +196,11 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
     ]
     statuses = _by_robot(content[Status], robots)
     last = [_by_the_end(own, start + duration) for own in statuses]
-    sampled = [_Sampled.of_states(own, start, time, HOLD_PERIODS / rate) for own in states]
-
-    def column(what: str) -> Array:
-        return np.stack([getattr(own, what) for own in sampled], axis=1)
-
-    turned = any(state.attitude is not None for state in content[State])
-    shadowed = any(state.shadow_position is not None for state in content[State])
-    contacts, world = (
-        messages_in_run(content[Contact], start, duration),
-        messages_in_run(content[WorldState], start, duration),
-    )
+    sampled = [_sampled(own, start, time, HOLD_PERIODS / rate) for own in states]
+    columns = {what: np.stack([own[what] for own in sampled], axis=1) for what in sampled[0]}
+    known = {what: each for what, each in columns.items() if what not in OPTIONAL or np.isfinite(each).any()}
+    contacts = messages_in_run(content[Contact], start, duration)
+    world = messages_in_run(content[WorldState], start, duration)
     plan = Plan(experiment)
     goals = _goals(content, states, robots, start, duration) if plan.guided else None
     return Trace(
@@ -215,11 +210,6 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         robots=robots,
         clock=about[2],
         time=time,
-        position=column("position"),
-        yaw=column("yaw")[:, :, 0],
-        true_position=column("true_position"),
-        goal=column("goal"),
-        setpoint=column("setpoint"),
         sent=_sent(poses, start, duration),
         received=_received(states, plan, start, duration),
         lost=lost(robots, poses, statuses, (start, start + duration), experiment.rates.pose_hz)
@@ -235,11 +225,9 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         avoided=_counted(last, "avoided"),
         contacts=contacts if contacts_watched(contacts, world) else None,
         world=world,
-        attitude=column("attitude") if turned else None,
-        shadow_position=column("shadow_position") if shadowed else None,
-        shadow_yaw=column("shadow_yaw")[:, :, 0] if shadowed else None,
         goals=goals,
         clocks=Correction(content[HostClock]).offsets(),
+        **known,
     )
 
 
@@ -262,39 +250,26 @@ def _by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:
     return [sorted(own, key=lambda message: message.stamp) for own in found.values()]
 
 
-@dataclass(frozen=True)
-class _Sampled:
-    """One robot's telemetry on the grid, each (T, k)."""
+def _sampled(states: list[State], start: float, time: Array, hold: float) -> dict[str, Array]:
+    """Columns of `Trace` from the telemetry of one robot on the grid `time` (T,): (T, k) or (T,) each."""
+    t = np.array([state.stamp for state in states]) - start
+    grid = (time, hold)
 
-    position: Array
-    yaw: Array
-    true_position: Array
-    goal: Array
-    setpoint: Array
-    attitude: Array
-    shadow_position: Array
-    shadow_yaw: Array
+    def column(what: str, unknown: tuple[float, ...]) -> Array:
+        values = [getattr(state, what) for state in states]
+        return np.array([unknown if each is None else each for each in values], dtype=float).reshape(-1, len(unknown))
 
-    @classmethod
-    def of_states(cls, states: list[State], start: float, time: Array, hold: float) -> _Sampled:
-        t = np.array([state.stamp for state in states]) - start
-        grid = (time, hold)
-
-        def column(values: list[Any], width: int) -> Array:
-            return np.array(values, dtype=float).reshape(-1, width)
-
-        measured = column([state.position or NOWHERE for state in states], 3)
-        truth = column([state.true_position or NOWHERE for state in states], 3)
-        return cls(
-            position=line(t, measured, *grid),
-            yaw=turn(t, column([_number(state.yaw) for state in states], 1), *grid),
-            true_position=line(t, np.where(np.isfinite(truth), truth, measured), *grid),
-            goal=step(t, column([state.goal or NOWHERE for state in states], 3), *grid),
-            setpoint=step(t, column([state.setpoint or UNKNOWN for state in states], 4), *grid),
-            attitude=attitude(t, column([state.attitude or UNKNOWN for state in states], 4), *grid),
-            shadow_position=line(t, column([state.shadow_position or NOWHERE for state in states], 3), *grid),
-            shadow_yaw=turn(t, column([_number(state.shadow_yaw) for state in states], 1), *grid),
-        )
+    measured, truth = column("position", NOWHERE), column("true_position", NOWHERE)
+    return {
+        "position": line(t, measured, *grid),
+        "yaw": turn(t, column("yaw", (math.nan,)), *grid)[:, 0],
+        "true_position": line(t, np.where(np.isfinite(truth), truth, measured), *grid),
+        "goal": step(t, column("goal", NOWHERE), *grid),
+        "setpoint": step(t, column("setpoint", UNKNOWN), *grid),
+        "attitude": attitude(t, column("attitude", UNKNOWN), *grid),
+        "shadow_position": line(t, column("shadow_position", NOWHERE), *grid),
+        "shadow_yaw": turn(t, column("shadow_yaw", (math.nan,)), *grid)[:, 0],
+    }
 
 
 def _number(value: float | None) -> float:

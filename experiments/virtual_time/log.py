@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterator, Sequence
 from itertools import repeat
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from msgspec.structs import replace
 
-from agents.arrays import Array, Index, Mask
+from agents.arrays import Array, Index
 from agents.decision.lifecycle import Phase
 from agents.formation.graph import Links
 from agents.network import messages
@@ -34,7 +34,9 @@ from experiments.recording.trace import (
 )
 from experiments.recording.writer import Recording
 from experiments.virtual_time.network import CentreLog
-from experiments.virtual_time.simulation import Log
+from experiments.virtual_time.simulation import OPTIONAL, Log
+
+SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # columns of a log that a trace has as well
 
 
 def goal_messages(steered: CentreLog, names: Sequence[str], first: int) -> Iterator[tuple[float, messages.Goal]]:
@@ -138,10 +140,10 @@ class Logbook:
         log, mine, duration = self._log, self._mine, self._experiment.duration_s
         run = (log.time >= -ROUNDING_S) & (log.time <= duration + ROUNDING_S)
         rows = len(log.names)
-        contacts, world = (
-            messages_in_run(self._contacts(), EPOCH, duration),
-            messages_in_run(self._world(), EPOCH, duration),
-        )
+        contacts = messages_in_run(self._contacts(), EPOCH, duration)
+        world = messages_in_run(self._world(), EPOCH, duration)
+        columns: dict[str, Any] = {what: getattr(log, what) for what in (*SAMPLED, *OPTIONAL)}
+        columns = {what: None if each is None else each[run, mine] for what, each in columns.items()}
         return Trace(
             case=self._case,
             experiment=self._experiment,
@@ -149,11 +151,6 @@ class Logbook:
             robots=log.names,
             clock="virtual",
             time=np.round(log.time[run], 9),
-            position=log.position[run, mine],
-            yaw=log.yaw[run, mine],
-            true_position=log.true_position[run, mine],
-            goal=log.goal[run, mine],
-            setpoint=log.setpoint[run, mine],
             sent=sent_in_run(self._sent, duration),
             received=received_in_run(self._received, duration),
             lost=np.zeros(rows, dtype=np.intp),
@@ -167,11 +164,9 @@ class Logbook:
             avoided=log.avoided[mine],
             contacts=contacts if contacts_watched(contacts, world) else None,
             world=world,
-            attitude=_part(log.attitude, run, mine),
-            shadow_position=_part(log.shadow_position, run, mine),
-            shadow_yaw=_part(log.shadow_yaw, run, mine),
             dropped=self._dropped,
             goals=self._goals,
+            **columns,
         )
 
     def record(self, path: Path, document: str) -> None:
@@ -232,7 +227,7 @@ class Logbook:
         log, mine = self._log, self._mine
         words = [phase.word for phase in Phase]
         columns = (log.phase, log.position, log.velocity, log.yaw, log.goal, log.setpoint, log.error)
-        rest = (log.attitude, log.shadow_position, log.shadow_yaw)
+        rest = [getattr(log, what) for what in OPTIONAL]
         samples = zip(
             log.time.tolist(),
             *(column[:, mine].tolist() for column in (*columns, log.true_position, log.true_yaw)),
@@ -261,8 +256,8 @@ class Logbook:
                         messages.vector(truth[row]),
                         messages.heading(true_yaw[row]),
                         heard.get((k, row), []),
-                        *_three(more, row),
-                        followed.get((k, row), []),
+                        **{what: each and _known(each[row]) for what, each in zip(OPTIONAL, more, strict=True)},
+                        followed=followed.get((k, row), []),
                     )
                     for row, name in enumerate(log.names)
                 ],
@@ -365,11 +360,9 @@ class Logbook:
 
     def _events(self) -> Iterator[tuple[float, str, str, str]]:
         """Events of the conductor and hazards, in order of time."""
-        yield from sorted([*self._conducted(), *self._hazards()], key=lambda event: event[0])
-
-    def _hazards(self) -> Iterator[tuple[float, str, str, str]]:
-        for each in self._incidents():
-            yield each.time, "hazard", self._log.names[each.row - self._mine.start], each.text
+        first, names = self._mine.start, self._log.names
+        hazards = ((each.time, "hazard", names[each.row - first], each.text) for each in self._incidents())
+        yield from sorted([*self._conducted(), *hazards], key=lambda event: event[0])
 
     def _incidents(self) -> Iterator[Incident]:
         """Hazards of the robots of this repetition."""
@@ -384,18 +377,8 @@ class Logbook:
         yield self._experiment.duration_s, "phase", "conductor", "landing"
 
 
-def _part(column: Array | None, run: Mask, mine: slice) -> Array | None:
-    return None if column is None else column[run, mine]
-
-
 def _known(value: Any) -> Any:  # noqa: ANN401 - a number or a list of them
     """As messages have it: a tuple; None if it is NaN."""
     if isinstance(value, list):
         return None if math.isnan(value[0]) else tuple(value)
     return None if math.isnan(value) else value
-
-
-def _three(columns: Sequence[Any], row: int) -> tuple[Any, Any, Any]:
-    """Of a row: attitude, position and yaw of its shadow twin; None where it has none."""
-    attitude, position, yaw = (None if column is None else _known(column[row]) for column in columns)
-    return attitude, position, yaw

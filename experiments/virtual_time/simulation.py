@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from agents.agent import Agent
 from agents.arrays import Array, Index, Mask, PoseTable, some
-from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
 from agents.safety.hazards import Incident
 from experiments.definition import bodies
@@ -26,6 +25,9 @@ from experiments.virtual_time.conductor import VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from twins.body import TwinBody
 from twins.engines.engine import Touch
+
+STATE: Final = ("position", "velocity", "yaw", "true_position", "true_yaw")  # columns from the state of the bodies
+OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that exist in all samples or in none
 
 
 @dataclass(frozen=True)
@@ -66,20 +68,6 @@ class Log:
     incidents: tuple[Incident, ...] = ()  # hazards of robots
 
 
-class _Samples:
-    """Samples of a log that grows."""
-
-    def __init__(self) -> None:
-        self._columns: list[tuple[Any, ...]] = []
-
-    def add(self, *values: Array | Index | float) -> None:
-        self._columns.append(values)
-
-    def stacked(self) -> tuple[Any, ...]:
-        """As arrays with the samples as first axis."""
-        return tuple(np.array(column) for column in zip(*self._columns, strict=True))
-
-
 def simulate(
     experiment: Experiment,
     seeds: Sequence[int],
@@ -114,10 +102,9 @@ def simulate(
     log_every = round(assignment.body_hz / experiment.rates.state_hz)
     interventions, avoided = np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
     touches: list[Touch] = []
-    states, seen = _Samples(), _Samples()
+    samples: dict[str, list[Any]] = {}
     conductor = VirtualConductor(agent, names)
     nothing = np.zeros((rows, 0))
-    blank = (nothing,) * 4
     tick = 0
     while not conductor.over:
         t = tick * dt
@@ -137,33 +124,31 @@ def simulate(
         touches += twin.touches()
         if (agent.tick - 1) % log_every == 0:  # the agent's count begins anew at the common start
             progress(t - conductor.start_at)
-            whole = (agent.lifecycle.phase.copy(), *_measured(state), agent.goal, actions.setpoint, agent.error)
-            states.add(t, *((*blank, state.true_position, *blank) if lean else whole))
-            more = () if lean else tuple(value for value in _extra(state) if value is not None)
-            seen.add(nothing if lean else np.array(twin.engine.obstacles), *more)
+            sample = {
+                **{what: getattr(state, what) for what in (*STATE, *OPTIONAL)},
+                "phase": agent.lifecycle.phase.copy(),
+                "goal": agent.goal,
+                "setpoint": actions.setpoint,
+                "error": agent.error,
+                "obstacles": np.array(twin.engine.obstacles),
+            }
+            if lean:
+                kept = {**dict.fromkeys(OPTIONAL), "true_position": state.true_position}
+                sample = dict.fromkeys(sample, nothing) | kept
+            for what, value in {**sample, "time": t}.items():
+                samples.setdefault(what, []).append(value)
         if not landing and t - conductor.start_at >= experiment.duration_s - 0.5 * dt:
             break
         conductor.give_orders(t, dt)
         twin.begun_at = conductor.start_at
         tick += 1
     begin = conductor.start_at
-    time, phase, position, velocity, yaw, true_position, true_yaw, goal, setpoint, error = states.stacked()
-    obstacles, *rest = seen.stacked()
-    extra = [None if lean or value is None else rest.pop(0) for value in _extra(state)]
+    columns: dict[str, Any] = {what: None if each[0] is None else np.array(each) for what, each in samples.items()}
+    columns["time"] = columns["time"] - begin
     return Log(
         names=names,
         seeds=tuple(seeds),
         lean=lean,
-        time=time - begin,
-        phase=phase.astype(np.intp),
-        position=position,
-        velocity=velocity,
-        yaw=yaw,
-        true_position=true_position,
-        true_yaw=true_yaw,
-        goal=goal,
-        setpoint=setpoint,
-        error=error,
         sent=network.sent(begin),
         received=network.received(begin),
         lost=network.lost,
@@ -175,20 +160,8 @@ def simulate(
         ticks=round(experiment.duration_s / dt),
         airborne=conductor.airborne_at - begin,
         ended=tick * dt - begin,
-        attitude=extra[0],
-        obstacles=obstacles,
-        shadow_position=extra[1],
-        shadow_yaw=extra[2],
         waited=conductor.waited,
         steered=network.steered(begin),
         incidents=tuple(each._replace(time=each.time - begin) for each in agent.hazards.incidents),
+        **columns,
     )
-
-
-def _measured(state: BodyState) -> tuple[Array, ...]:
-    return state.position, state.velocity, state.yaw, state.true_position, state.true_yaw
-
-
-def _extra(state: BodyState) -> tuple[Array | None, ...]:
-    """Columns that exist in all samples or in none."""
-    return state.attitude, state.shadow_position, state.shadow_yaw
