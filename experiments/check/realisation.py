@@ -17,6 +17,11 @@ from agents.plugins.laws import Law, Mixed
 
 TAKES: Final = {"distance": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 TINY: Final = 1e-18  # [m²] no length is zero
+EXACT: Final = 1e-9  # [m] link errors below this are arithmetic
+ENOUGH: Final = 3e-4  # [m] distances written with four decimals are met as well as can be; a better shape is not sought
+SLOWLY: Final = 1e-2  # of what is left: improvements of an error that is small already are not worth their time
+ROUNDED: Final = 1e-3  # [m] distances written with three decimals contradict one another by less
+POINT: Final = 1e-6  # [m] robots that are nearer than this to each other stand in one point, which nothing turns
 
 
 @dataclass(frozen=True)
@@ -123,13 +128,6 @@ def _of_anchors(anchors: Anchors, position: Array) -> Residuals:
         np.full(len(tail), -1),
         np.concatenate([direction, matrix[on][:, :, :2].reshape(-1, 2)]),
     )
-
-
-EXACT = 1e-9  # [m] link errors below this are arithmetic
-ENOUGH = 3e-4  # [m] distances written with four decimals are met as well as can be; a better shape is not sought
-SLOWLY = 1e-2  # of what is left: improvements of an error that is small already are not worth their time
-ROUNDED = 1e-3  # [m] distances written with three decimals contradict one another by less
-POINT = 1e-6  # [m] robots that are nearer than this to each other stand in one point, which nothing turns
 
 
 @dataclass(frozen=True)

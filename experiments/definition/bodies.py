@@ -19,15 +19,18 @@ from twins.scene import Scene, World
 from twins.sensing.range_sensors import OF_KIND
 
 TRIES: Final = 200  # places that are drawn for a robot before it stays where the file puts it
-
-
 CLEAR: Final = 0.02  # [m] between robots that are scattered
-
-
 WORLD: Final = "world"  # the body of a robot that lives in the twin service
-
-
 VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
+# what `--bodies protocol` makes of each kind: its protocol twin, the process that its robots share (several Crazyflies
+# hang on one radio, all Tellos of a computer on one port), and the source of its position
+PROTOCOL: Final[dict[str, tuple[str, str | None, str]]] = {
+    "crazyflie": ("crazyflie-twin", "radio0", "body"),
+    "tello": ("tello-twin", "tellos", "external"),
+    "khepera4": ("khepera4-twin", None, "external"),
+    "turtlebot3": ("turtlebot3-twin", None, "external"),
+}
+BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
 
 
 def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
@@ -157,19 +160,6 @@ def body_request(
         endpoints=tuple(endpoints),
         keys=Keys(experiment.network.realm),
     )
-
-
-# what `--bodies protocol` makes of each kind: its protocol twin, the process that its robots share (several Crazyflies
-# hang on one radio, all Tellos of a computer on one port), and the source of its position
-PROTOCOL: Final[dict[str, tuple[str, str | None, str]]] = {
-    "crazyflie": ("crazyflie-twin", "radio0", "body"),
-    "tello": ("tello-twin", "tellos", "external"),
-    "khepera4": ("khepera4-twin", None, "external"),
-    "turtlebot3": ("turtlebot3-twin", None, "external"),
-}
-
-
-BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
 
 
 def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:

@@ -19,7 +19,7 @@ import numpy as np
 from agents.body.kinds import KINDS
 from experiments.authoring.robotic_park.file import Park, Robot, Threshold, read
 from experiments.authoring.robotic_park.heights import Heights, heights_of
-from experiments.authoring.robotic_park.links import Described, Notes, described, named, tasks
+from experiments.authoring.robotic_park.links import Described, described, named
 from experiments.authoring.robotic_park.starts import starts_from
 from experiments.catalogue import index
 from experiments.file import catalogue as entries
@@ -72,14 +72,15 @@ def imported(text: str, label: str, duration_s: float, poses: str | None = None)
     Raises:
         DocumentError: With what is wrong with theirs, by the path of the key.
     """
-    notes = Notes()
+    notes: list[str] = []
     park = read(label, text, {} if poses is None else starts_from(poses))
     _tools(park, notes)
     rates = _rates(park, notes)
     trigger, update = _trigger(park, rates, notes), _update(park, notes)
     found = heights_of(park, notes)
     formation = described(park, found, notes)
-    return _written(park, label, duration_s, rates, (trigger, update), found, formation, notes.said), notes.said
+    notes = list(dict.fromkeys(notes))
+    return _written(park, label, duration_s, rates, (trigger, update), found, formation, notes), notes
 
 
 def _written(  # noqa: PLR0917 - everything that was found out
@@ -174,99 +175,102 @@ def _body(robot: Robot) -> tuple[str, str]:
     return "", ""
 
 
-def _tools(park: Park, notes: Notes) -> None:
+def _tools(park: Park, notes: list[str]) -> None:
     """Notes on their tools, for which zenpark has its own."""
     if park.tool and park.mode != "physical":
-        notes.say(f"Operation: the simulator and its world ({park.tool}); twins are zenpark's own, in an empty arena")
+        notes.append(
+            f"Operation: the simulator and its world ({park.tool}); twins are zenpark's own, in an empty arena"
+        )
     if park.kind != "formation":
-        notes.say(f"Experience: type {park.kind}; only formations are known")
+        notes.append(f"Experience: type {park.kind}; only formations are known")
     if park.architecture not in {"distributed", "centralized"}:
-        notes.say(f"Architecture: {park.architecture}; every robot decides for itself here")
+        notes.append(f"Architecture: {park.architecture}; every robot decides for itself here")
     if park.others:
-        notes.say(f"{', '.join(park.others)}: zenpark records, watches and reports by itself")
+        notes.append(f"{', '.join(park.others)}: zenpark records, watches and reports by itself")
     away = [robot.name for robot in park.robots if robot.place != "virtual" and not _body(robot)[0]]
     if away:
-        notes.say(f"{named(away)} {_is(away)} real, but no address of a kind that is known is given: twins instead")
+        notes.append(f"{named(away)} {_is(away)} real, but no address of a kind that is known is given: twins instead")
     if len(away) < sum(robot.place != "virtual" for robot in park.robots):
-        notes.say("real robots keep their addresses; try the file with --virtual or --bodies twin first")
+        notes.append("real robots keep their addresses; try the file with --virtual or --bodies twin first")
     if any(robot.external for robot in park.robots):
-        notes.say("positioning Extern: the motion capture's address is not in their file; positioning is a twin of it")
+        notes.append(
+            "positioning Extern: the motion capture's address is not in their file; positioning is a twin of it"
+        )
     gated = [robot.name for robot in park.robots if robot.gated]
     if gated:
-        notes.say(f"{named(gated)}: position controllers that act on events; zenpark's run at every tick")
-    roles = Counter(task.role for _, task in tasks(park) if task.role != "consensus")
+        notes.append(f"{named(gated)}: position controllers that act on events; zenpark's run at every tick")
+    roles = Counter(task.role for _, task in park.tasks if task.role != "consensus")
     if roles:
-        notes.say(f"task.role: {', '.join(roles)}; leaders are the robots without neighbours")
+        notes.append(f"task.role: {', '.join(roles)}; leaders are the robots without neighbours")
     idle = [robot for robot in park.robots if robot.idle]
     if idle:
         count = sum(robot.idle for robot in idle)
         names = named([robot.name for robot in idle])
-        notes.say(
+        notes.append(
             f"task.enable is False for {names}: {count} relations are left out, and these robots have no neighbours"
         )
-    for remark in park.remarks:
-        notes.say(remark)
+    notes += park.remarks
 
 
-def _rates(park: Park, notes: Notes) -> Rates:
-    period = _most("task.controller.period", [task.period for _, task in tasks(park)], 0.1, notes)
+def _rates(park: Park, notes: list[str]) -> Rates:
+    period = _most("task.controller.period", [task.period for _, task in park.tasks], 0.1, notes)
     asked = _most("local_pose.T", [robot.pose_s for robot in park.robots], 0.02, notes)
     return Rates(_divisor("poses", 1.0 / asked, notes), _divisor("decisions", 1.0 / period, notes))
 
 
-def _divisor(what: str, hz: float, notes: Notes) -> float:
+def _divisor(what: str, hz: float, notes: list[str]) -> float:
     """The nearest rate that divides that of bodies."""
     divisors = [RATE_HZ / times for times in range(1, 1001) if (1000 * RATE_HZ / times).is_integer()]
     nearest = min(divisors, key=lambda each: abs(np.log(each / hz)))
     if abs(nearest - hz) > 1e-6 * hz:
-        notes.say(f"{what} at {hz:g} Hz become {nearest:g} Hz, which divides the {RATE_HZ:g} Hz of bodies")
+        notes.append(f"{what} at {hz:g} Hz become {nearest:g} Hz, which divides the {RATE_HZ:g} Hz of bodies")
     return nearest
 
 
-def _trigger(park: Park, rates: Rates, notes: Notes) -> str:
+def _trigger(park: Park, rates: Rates, notes: list[str]) -> str:
     """Trigger of poses, one for all robots."""
-    speaks = _most_thresholds("communication", [robot.speaks for robot in park.robots], notes)
-    if not speaks.event:
+    chosen = _most_thresholds("communication", [robot.communication for robot in park.robots], notes)
+    if not chosen.event:
         return f'{{ kind = "periodic", period_s = {1.0 / rates.pose_hz:g} }}'
-    if speaks.relative:
-        notes.say(f"communication.threshold.ai = {speaks.relative:g}: the part of the threshold that grows")
-    return f'{{ kind = "send-on-delta", threshold = {speaks.constant:g} }}'
+    if chosen.relative:
+        notes.append(f"communication.threshold.ai = {chosen.relative:g}: the part of the threshold that grows")
+    return f'{{ kind = "send-on-delta", threshold = {chosen.constant:g} }}'
 
 
-def _update(park: Park, notes: Notes) -> str:
+def _update(park: Park, notes: list[str]) -> str:
     """Control trigger; empty: the law is computed at every decision."""
-    given = [task.update for _, task in tasks(park)]
-    if not given:
-        return ""
-    update = _most_thresholds("task.controller", given, notes)
-    if not update.event:
+    given = [task.update for _, task in park.tasks]
+    update = _most_thresholds("task.controller", given, notes) if given else None
+    if update is None or not update.event:
         return ""
     return f'{{ kind = "relative-control", floor = {update.constant:g}, share = {update.relative:g} }}'
 
 
-def _most_thresholds(what: str, given: Sequence[Threshold], notes: Notes) -> Threshold:
+def _most_thresholds(what: str, given: Sequence[Threshold], notes: list[str]) -> Threshold:
     """The threshold that most robots have, whatever kind they call it."""
     odd = Counter(each.kind for each in given if each.event and each.kind != "Constant")
     if odd:
-        notes.say(f"{what}.threshold.type: {', '.join(odd)}; taken as a constant one with what ai adds")
+        notes.append(f"{what}.threshold.type: {', '.join(odd)}; taken as a constant one with what ai adds")
     plain = [
         Threshold(True, each.constant, each.relative, "") if each.event else Threshold(False, 0.0, 0.0, "")
         for each in given
     ]
     counted = Counter(plain)
     if len(counted) > 1:
-        notes.say(f"{what}: {len(counted)} sorts among the robots; all get the commonest")
+        notes.append(f"{what}: {len(counted)} sorts among the robots; all get the commonest")
     return counted.most_common(1)[0][0]
 
 
-def _most(what: str, given: Sequence[float], default: float, notes: Notes) -> float:
+def _most(what: str, given: Sequence[float], default: float, notes: list[str]) -> float:
     """The value that most robots have."""
     if not given:
         return default
     counted = Counter(given)
     value = counted.most_common(1)[0][0]
     if len(counted) > 1:
-        notes.say(f"{what}: {', '.join(f'{each:g}' for each in sorted(counted))} s among the robots; all get {value:g}")
+        notes.append(
+            f"{what}: {', '.join(f'{each:g}' for each in sorted(counted))} s among the robots; all get {value:g}"
+        )
     return value
 
 

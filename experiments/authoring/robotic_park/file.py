@@ -91,7 +91,7 @@ class Robot:
     uri: str  # of a Crazyflie
     host: str  # of a robot on Wi-Fi, with its port if there is one
     external: bool  # position measured from outside
-    speaks: Threshold
+    communication: Threshold
     pose_s: float  # period of its pose [s]
     gated: bool  # its position controller acts on events
     task: Task | None  # None without one, or if it is switched off
@@ -110,6 +110,11 @@ class Park:
     others: tuple[str, ...] = ()  # sections that are switched on and are about their own tools
     recent: bool = False  # for the drivers of 2024 on, which read `mars_data`
     remarks: tuple[str, ...] = ()  # on the file itself, for its user
+
+    @property
+    def tasks(self) -> list[tuple[Robot, Task]]:
+        """Robots that have a task."""
+        return [(robot, robot.task) for robot in self.robots if robot.task is not None]
 
 
 class _Threshold(Struct, frozen=True):
@@ -361,7 +366,7 @@ def _robot(entry: Entry, listed: _Robot, own: Entry, given: _Robot, task: Task |
     host, port = given.agent_ip or given.ip, given.port_number
     at = own.get("communication")
     word = isinstance(given.communication, str)  # in 2023
-    speaks = replace(at, value={"type": at.value} if word else at.value).typed(_Communication)
+    given_trigger = replace(at, value={"type": at.value} if word else at.value).typed(_Communication)
     relations = _parts(own.get("task").typed(_TaskHead).relationship)
     return Robot(
         name=name,
@@ -371,7 +376,7 @@ def _robot(entry: Entry, listed: _Robot, own: Entry, given: _Robot, task: Task |
         uri=listed.uri,
         host=f"{host}:{port}" if host and port else host,
         external=given.positioning != "Intern",
-        speaks=_threshold(at, speaks.threshold, event=speaks.type != "Continuous"),
+        communication=_threshold(at, given_trigger.threshold, event=given_trigger.type != "Continuous"),
         pose_s=1e-3 * given.local_pose.T,
         gated=given.controller.protocol == "EventBased" or "EventBased" in given.controller_type,
         task=task,

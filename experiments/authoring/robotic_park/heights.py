@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
 from agents.body.kinds import KINDS
-from experiments.authoring.robotic_park.file import Park, Robot, Task
+from experiments.authoring.robotic_park.file import Park
 from experiments.check.realisation import ENOUGH
 
 ROUNDS: Final = 300
@@ -21,6 +21,11 @@ DRAWN: Final = 4  # beginnings before the random ones
 ATTEMPTS: Final = 40  # random beginnings
 SPREAD: Final = (0.05, 0.1, 0.3, 0.6)  # [m] standard deviations of theirs
 TINY: Final = 1e-12
+SHAPE_MET: Final = 0.01  # [m] what is missed by more is another shape
+LOWEST: Final = 0.3  # [m] of a drone
+ALOFT: Final = 0.7  # [m] where drones hover whose pose has no height, as in the authors' files
+MOVED: Final = 0.02  # [m] a height that is another than at the start
+SPACING: Final = 0.6  # [m] between robots whose start is made up
 
 
 @dataclass(frozen=True)
@@ -78,14 +83,14 @@ def placed(wanted: Wanted, start: Array, climbs: Mask) -> Placed:
 
 def _beginnings(start: Array, climbs: Mask) -> Iterator[tuple[Array, Mask]]:
     """Guesses (N, 3) [m] at the places, each with the robots (N,) whose heights are free."""
-    nobody = np.zeros_like(climbs)
+    none = np.zeros_like(climbs)
     middle = start[:, :2].mean(axis=0)
     away = start[:, :2] - middle
     way = norm(away)
     mirrored = start.copy()
     mirrored[:, 1] = 2.0 * middle[1] - start[:, 1]
-    yield start, nobody
-    yield mirrored, nobody
+    yield start, none
+    yield mirrored, none
     if not climbs.any():
         return
     dome = start.copy()
@@ -145,25 +150,6 @@ def _residuals(wanted: Wanted, position: Array) -> tuple[Array, Array]:
     return np.concatenate(value), slope[:, :rows]
 
 
-SHAPE_MET: Final = 0.01  # [m] what is missed by more is another shape
-LOWEST: Final = 0.3  # [m] of a drone
-ALOFT: Final = 0.7  # [m] where drones hover whose pose has no height, as in the authors' files
-MOVED: Final = 0.02  # [m] a height that is another than at the start
-SPACING: Final = 0.6  # [m] between robots whose start is made up
-
-
-@dataclass
-class Notes:
-    """Notes on what is not carried over, each once."""
-
-    said: list[str] = field(default_factory=list)
-
-    def say(self, note: str) -> None:
-        """Adds a note."""
-        if note not in self.said:
-            self.said.append(note)
-
-
 @dataclass(frozen=True)
 class Heights:
     """Start and goal of N robots."""
@@ -175,14 +161,7 @@ class Heights:
     centre: tuple[float, float, float]  # place of the origin [m]
 
 
-def tasks(park: Park) -> Iterator[tuple[Robot, Task]]:
-    """Robots that have one."""
-    for robot in park.robots:
-        if robot.task is not None:
-            yield robot, robot.task
-
-
-def heights_of(park: Park, notes: Notes) -> Heights:
+def heights_of(park: Park, notes: list[str]) -> Heights:
     """The heights, from the shape in space if links tell one.
 
     The origin of their files is a point about which drones spread while they climb: where the shape is not flat, no
@@ -197,52 +176,52 @@ def heights_of(park: Park, notes: Notes) -> Heights:
     plain = Heights(start, start, np.round(start[:, 2], 3), len(wanted.pairs) == 0, (0.0, 0.0, 0.0))
     if not len(wanted.pairs):
         return plain
-    told = any(relation.centre is not None for _, task in tasks(park) for relation in task.relations)
+    given = any(relation.centre is not None for _, task in park.tasks for relation in task.relations)
     found, anchored = placed(wanted, start, flies), len(wanted.row) > 0
-    off = found.worst
-    if anchored and off > SHAPE_MET:
+    missed = found.worst
+    if anchored and missed > SHAPE_MET:
         found, anchored = placed(wanted.without_points(), start, flies), False
         if found.links <= SHAPE_MET:
-            notes.say(
+            notes.append(
                 "distances to the origin: no shape was found that meets them and those between robots; the best one"
-                f" misses by {1e3 * off:.0f} mm, so those to the origin are left out"
+                f" misses by {1e3 * missed:.0f} mm, so those to the origin are left out"
             )
     if found.links > SHAPE_MET:
-        notes.say(
+        notes.append(
             f"the distances: no shape was found that meets them, even in space; the best one misses by"
             f" {1e3 * found.links:.0f} mm, so drones hold the heights at which they start"
         )
         return plain
     shape, lift = found.position, 0.0
     flat = not (np.abs(shape[:, 2] - start[:, 2])[flies] > MOVED).any()
-    if flies.all() and not told and not flat:
+    if flies.all() and not given and not flat:
         lift = float(start[:, 2].min() - shape[:, 2].min())
         shape = shape + np.array([0.0, 0.0, lift])
     hover = np.where(flies, np.round(shape[:, 2], 3), 0.0)
     if hover[flies].min(initial=LOWEST) < LOWEST:
-        notes.say(f"the shape needs a drone at {hover[flies].min():.2f} m: drones hold the heights of their starts")
+        notes.append(f"the shape needs a drone at {hover[flies].min():.2f} m: drones hold the heights of their starts")
         return replace(plain, anchored=False)
     if (np.abs(hover - start[:, 2])[flies] > MOVED).any():
-        notes.say(
+        notes.append(
             "their drones climb while they form the shape, zenpark's hold a height: each takes off to that which it has"
             " in the shape"
         )
     if anchored and abs(lift) > MOVED:
-        notes.say(f"the origin: lifted to {lift:.2f} m, so that the lowest drone hovers where it was to start")
+        notes.append(f"the origin: lifted to {lift:.2f} m, so that the lowest drone hovers where it was to start")
     return Heights(start, shape, hover, anchored, (0.0, 0.0, round(lift, 3)))
 
 
-def _starts(park: Park, notes: Notes) -> Array:
+def _starts(park: Park, notes: list[str]) -> Array:
     """Starts (N, 3) [m]; robots whose start is not told stand on a ring, in the order of the file."""
     count = len(park.robots)
     angle = 2.0 * np.pi * np.arange(count) / max(count, 1)
     radius = max(SPACING, count * SPACING / (2.0 * np.pi))
     ring = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)]).round(2)
-    lost = [robot.name for robot in park.robots if robot.pose is None]
-    if lost:
-        notes.say(
-            f"starts: the file has none for {', '.join(lost)}; MADE UP here, on a ring; name a file that has them with"
-            " --poses (an index of robots, a Webots world or a table)"
+    unplaced = [robot.name for robot in park.robots if robot.pose is None]
+    if unplaced:
+        notes.append(
+            f"starts: the file has none for {', '.join(unplaced)}; MADE UP here, on a ring; name a file that has them"
+            " with --poses (an index of robots, a Webots world or a table)"
         )
     return np.array([ring[row] if robot.pose is None else robot.pose for row, robot in enumerate(park.robots)])
 
@@ -251,7 +230,7 @@ def _wanted(park: Park, start: Array, flies: Mask) -> Wanted:
     row = {robot.name: number for number, robot in enumerate(park.robots)}
     pairs, distance, relative = [], [], []
     anchored, point, radius = [], [], []
-    for robot, task in tasks(park):
+    for robot, task in park.tasks:
         i = row[robot.name]
         for relation in task.relations:
             if relation.name in row:

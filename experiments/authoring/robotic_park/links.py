@@ -9,14 +9,13 @@ from typing import Final
 
 import numpy as np
 
-from experiments.authoring.robotic_park.file import CENTRAL, SURFACES, Park, Relation, Robot, Task
-from experiments.authoring.robotic_park.heights import Heights, Notes, tasks
-
-__all__ = ["Described", "Notes", "described", "named", "tasks"]
+from experiments.authoring.robotic_park.file import CENTRAL, PLACES, SURFACES, Park, Relation, Robot, Task
+from experiments.authoring.robotic_park.heights import Heights
 
 SAME: Final = 1e-6  # [m] two ends of a link mean the same
 LEVEL: Final = 0.02  # [m] heights that differ by less are the same
 KNOWN: Final = ("gradient", "pid")
+TASKS: Final = {"distance": "distance", "pose": "displacement"}  # their kinds of tasks, and the law of each
 
 
 @dataclass
@@ -28,7 +27,7 @@ class Described:
     anchors: list[str] = field(default_factory=list)
 
 
-def described(park: Park, found: Heights, notes: Notes) -> Described:
+def described(park: Park, found: Heights, notes: list[str]) -> Described:
     """Links, anchors, law and gains.
 
     The gradient law of their drivers is u = k (d² − ‖x‖²) x for each neighbour with x = p_i − p_j, which is zenpark's
@@ -36,16 +35,16 @@ def described(park: Park, found: Heights, notes: Notes) -> Described:
     controller, u = k (d − ‖x‖) x/‖x‖, is zenpark's near d with μ = k/d². One μ serves all links, that at the mean
     distance: only links of robots with another μ than most get one of their own.
     """
-    jobs = list(tasks(park))
+    jobs = park.tasks
     made = Described()
     if not jobs:
         made.settings.append('law = "distance"')
         return made
     laws = Counter(task.law for _, task in jobs)
     if unknown := [law for law in laws if law not in KNOWN]:
-        notes.say(f"task.controller.type: {', '.join(unknown)}; taken as gradient")
+        notes.append(f"task.controller.type: {', '.join(unknown)}; taken as gradient")
     kinds = {task.kind for _, task in jobs}
-    law = {"distance": "distance", "pose": "displacement"}[kinds.pop()] if len(kinds) == 1 else "mixed"
+    law = TASKS[kinds.pop()] if len(kinds) == 1 else "mixed"
     distances = [
         relation.values[0]
         for _, task in jobs
@@ -54,24 +53,23 @@ def described(park: Park, found: Heights, notes: Notes) -> Described:
     ]
     mean = float(np.mean(distances)) if distances else 1.0
     gains = {robot.name: _gain(park, robot, task, mean) for robot, task in jobs}
-    usual = {kind: _usual([gains[robot.name] for robot, task in jobs if task.kind == kind]) for kind in
-             ("distance", "pose")}  # fmt: skip
+    usual = {kind: _usual([gains[robot.name] for robot, task in jobs if task.kind == kind]) for kind in TASKS}
     clamps = Counter(task.clamp for _, task in jobs)
     if len(clamps) > 1:
-        notes.say("task.controller.upperLimit: several; all get the commonest")
+        notes.append("task.controller.upperLimit: several; all get the commonest")
     made.settings.append(f'law = "{law}"')
     if usual["distance"] is not None:
         made.settings.append(f"gain = {usual['distance']:.4g}")
         scaled = [robot.name for robot, task in jobs if task.law == "pid" or _divides(park, robot)]
         if scaled:
-            notes.say(
+            notes.append(
                 f"gain of {named(scaled)}: their driver divides by the distance, so its pull is zenpark's near"
                 " the distance that is wanted and weaker beyond"
             )
     if usual["pose"] is not None:
         made.settings.append(f"stiffness = {usual['pose']:.4g}")
         if any(task.kind == "pose" and task.law != "pid" for _, task in jobs):
-            notes.say("pose tasks by gradient: theirs knows no sides and acts on x and y apart; here it is linear")
+            notes.append("pose tasks by gradient: theirs knows no sides and acts on x and y apart; here it is linear")
     made.settings.append(f"clamp = {clamps.most_common(1)[0][0]:g}")
     own = {robot.name: gains[robot.name] for robot, task in jobs if gains[robot.name] != usual[task.kind]}
     made.links += _links(park, found, own, notes)
@@ -80,7 +78,7 @@ def described(park: Park, found: Heights, notes: Notes) -> Described:
 
 
 def _is_robot(relation: Relation) -> bool:
-    return relation.name not in ("origin", "line", *SURFACES)
+    return relation.name not in PLACES
 
 
 def _divides(park: Park, robot: Robot) -> bool:
@@ -119,16 +117,16 @@ def _usual(gains: Sequence[float]) -> float | None:
     return Counter(gains).most_common(1)[0][0] if gains else None
 
 
-def _links(park: Park, found: Heights, own: dict[str, float], notes: Notes) -> list[str]:
+def _links(park: Park, found: Heights, own: dict[str, float], notes: list[str]) -> list[str]:
     """One line for each link that both ends ask for alike, one for each end else."""
     row = {robot.name: number for number, robot in enumerate(park.robots)}
     asked: dict[tuple[str, str], tuple[Relation, Task]] = {}
-    for robot, task in tasks(park):
+    for robot, task in park.tasks:
         for relation in task.relations:
             if not _is_robot(relation):
                 continue
             if (robot.name, relation.name) in asked:
-                notes.say(f"{robot.name}: the second relation to {relation.name}")
+                notes.append(f"{robot.name}: the second relation to {relation.name}")
                 continue
             asked[robot.name, relation.name] = relation, task
     lines, done = [], set()
@@ -139,7 +137,7 @@ def _links(park: Park, found: Heights, own: dict[str, float], notes: Notes) -> l
         alike = back is not None and back[1].kind == task.kind and own.get(name) == own.get(other)
         mirrored = back is not None and _mirrored(relation, back[0], task.kind)
         if back is not None and back[1].kind == task.kind and not mirrored:
-            notes.say(f"{name} and {other} ask for different things of their link: each keeps to its own")
+            notes.append(f"{name} and {other} ask for different things of their link: each keeps to its own")
         both = alike and mirrored
         if both:
             done.add((other, name))
@@ -147,7 +145,7 @@ def _links(park: Park, found: Heights, own: dict[str, float], notes: Notes) -> l
         if task.kind == "pose":
             rise = float(found.hover[row[name]] - found.hover[row[other]])
             if abs(relation.values[2] - rise) > LEVEL:
-                notes.say(f"{name}: {relation.values[2]:g} m above {other}; they hold heights {rise:.2f} m apart")
+                notes.append(f"{name}: {relation.values[2]:g} m above {other}; they hold heights {rise:.2f} m apart")
     return lines
 
 
@@ -166,15 +164,15 @@ def _line(name: str, other: str, relation: Relation, task: Task, gain: float | N
     return f"{link} = {{ {what}{'' if gain is None else f', gain = {gain:.4g}'} }}"
 
 
-def _anchors(park: Park, found: Heights, gains: dict[str, float], notes: Notes) -> list[str]:
+def _anchors(park: Park, found: Heights, gains: dict[str, float], notes: list[str]) -> list[str]:
     lines = []
-    for robot, task in tasks(park):
+    for robot, task in park.tasks:
         places = [relation for relation in task.relations if not _is_robot(relation)]
         if surfaces := [relation.name for relation in places if relation.name in SURFACES]:
-            notes.say(f"{robot.name}: {', '.join(surfaces)}; zenpark has points, lines and planes")
+            notes.append(f"{robot.name}: {', '.join(surfaces)}; zenpark has points, lines and planes")
         there = [relation for relation in places if relation.name not in SURFACES]
         if len(there) > 1:
-            notes.say(f"{robot.name}: {len(there)} places to keep a distance to; only the first is kept")
+            notes.append(f"{robot.name}: {len(there)} places to keep a distance to; only the first is kept")
         for relation in there[:1]:
             if relation.name == "origin" and len(relation.values) == 1 and not found.anchored:
                 continue
