@@ -21,9 +21,7 @@ from experiments.definition.experiment import Experiment, Robot
 from experiments.definition.plan import Plan
 
 FAR: Final = ("external", bodies.WORLD)  # bodies whose poses come from the process that carries them
-MANY: Final = (
-    16  # from so many senders on, if they are all robots, the right is "*": a router reads N² keys for minutes
-)
+MANY: Final = 16  # senders from which on the right is "*", if they are all robots: a router reads N² keys for minutes
 ROS: Final = ("ros2dds", "rmw")
 ROS_TWIN: Final = "turtlebot3-twin"
 
@@ -41,34 +39,37 @@ def needed_identities(experiment: Experiment, operator: str = "operator") -> lis
     """Identities whose certificates a run needs on the machine that starts it."""
     robots = experiment.robots.values()
     abroad = {robot for host in experiment.hosts.values() for robot in host.robots}
-    found = ["router", operator, "recorder", *(name for name in experiment.robots if name not in abroad)]
-    if any(bodies.WORLD in (robot.body, robot.ranges) for robot in robots):
-        found.append("world")
-    if any(robot.body in registry.names(registry.DEVICES) for robot in robots) or experiment.positioning == VICON_TWIN:
-        found.append("twin")
-    if experiment.positioning is not None:
-        found.append("positioning")
-    if Plan(experiment).guided:
-        found.append("centre")
-    return found
+    twins = any(robot.body in registry.names(registry.DEVICES) for robot in robots)
+    services = {
+        "world": has_world(experiment),
+        "twin": twins or experiment.positioning == VICON_TWIN,
+        "positioning": experiment.positioning is not None,
+        "centre": bool(Plan(experiment).guided),
+    }
+    here = [name for name in experiment.robots if name not in abroad]
+    return ["router", operator, "recorder", *here, *(name for name, needed in services.items() if needed)]
+
+
+def has_world(experiment: Experiment) -> bool:
+    """Whether a run in real time needs the process of the world."""
+    return any(bodies.WORLD in (robot.body, robot.ranges) for robot in experiment.robots.values())
 
 
 def _rights(experiment: Experiment) -> Rights:
     keys = Keys(experiment.network.realm)
-    hears, steered = senders_by_receiver(experiment), Plan(experiment).guided
+    senders, guided = senders_by_receiver(experiment), Plan(experiment).guided
     robots: dict[str, Grant] = {}
     for group in process_groups(experiment):
-        others = sorted({speaker for name in group for speaker in hears[name]})
+        others = sorted({sender for name in group for sender in senders[name]})
         if len(others) >= MANY and {*others, *group} == set(experiment.robots):
             others = ["*"]
-        led = [name for name in group if name in steered]
-        told = [*_each(group, keys.position, keys.ranges), *map(keys.goal, led)]
+        led = [name for name in group if name in guided]
+        inputs = [*_each(group, keys.position, keys.ranges), *map(keys.goal, led)]
         own = [keys.below(name) for name in group]
-        foreign = [key for name in group for key in _foreign(name, experiment.robots[name])]
-        tokens = [key for name in group for key in _foreign_tokens(name, experiment.robots[name])]
+        foreign, tokens = _ros_keys(group, experiment)
         grant = Grant(
             say=[*own, *foreign],
-            hear=[*told, *map(keys.pose, others), keys.estop, keys.experiment, *foreign],
+            hear=[*inputs, *map(keys.pose, others), keys.estop, keys.experiment, *foreign],
             answer=own,
             reached=[keys.pose("*"), keys.order("*")],
             be=[*own, *tokens],
@@ -94,17 +95,16 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
     twins = [name for name, robot in names.items() if robot.body in registry.names(registry.DEVICES)]
     measured = sorted({*located, *twins})
     goals = _each(plan.guided, keys.goal)
-    foreign = sorted({key for name, robot in names.items() for key in _foreign(name, robot)})
-    tokens = sorted({key for name, robot in names.items() for key in _foreign_tokens(name, robot)})
+    foreign, tokens = _ros_keys(names, experiment)
     everything = [keys.everything]
-    look = Grant(hear=everything, ask=[keys.pose("*"), ADMIN], watch=everything)
+    observer = Grant(hear=everything, ask=[keys.pose("*"), ADMIN], watch=everything)
     return {
-        "observer": look,
+        "observer": observer,
         "recorder": Grant(hear=everything, watch=everything, be=[keys.recorder]),
         "operator": Grant(
             say=[keys.estop, keys.below("run")],
             hear=everything,
-            ask=[keys.order("*"), keys.world_order, keys.run_order, *look.ask],
+            ask=[keys.order("*"), keys.world_order, keys.run_order, *observer.ask],
             answer=[keys.run_order],
             be=[keys.below("run")],
             watch=everything,
@@ -155,8 +155,8 @@ def senders_by_receiver(experiment: Experiment) -> dict[str, set[str]]:
     plan = Plan(experiment)
     links = plan.pose_links
     found: dict[str, set[str]] = {name: set() for name in plan.names}
-    for listener, speaker in zip(links.receiver.tolist(), links.sender.tolist(), strict=True):
-        found[plan.names[listener]].add(plan.names[speaker])
+    for receiver, sender in zip(links.receiver.tolist(), links.sender.tolist(), strict=True):
+        found[plan.names[receiver]].add(plan.names[sender])
     return found
 
 
@@ -171,17 +171,12 @@ def _ros(name: str, robot: Robot) -> turtlebot3.Address | None:
     return turtlebot3.twin(name, chosen) if body == ROS_TWIN else turtlebot3.address(name, robot.body, chosen)
 
 
-def _foreign(name: str, robot: Robot) -> list[str]:
-    """Keys outside the realm on which a robot of ROS 2 sends and receives."""
-    where = _ros(name, robot)
-    if where is None:
-        return []
-    below = f"{where.namespace}/**" if where.namespace else "*"
-    return [f"{where.domain}/{below}" if where.style == "rmw" else below]
-
-
-def _foreign_tokens(name: str, robot: Robot) -> list[str]:
-    where = _ros(name, robot)
-    if where is None:
-        return []
-    return [f"@ros2_lv/{where.domain}/**" if where.style == "rmw" else "@/*/@ros2_lv/**"]
+def _ros_keys(names: Iterable[str], experiment: Experiment) -> tuple[list[str], list[str]]:
+    """Keys outside the realm on which robots of ROS 2 send and receive, and their liveliness tokens."""
+    addresses = [_ros(name, experiment.robots[name]) for name in names]
+    keys, tokens = set(), set()
+    for address in filter(None, addresses):
+        below, rmw = f"{address.namespace}/**" if address.namespace else "*", address.style == "rmw"
+        keys.add(f"{address.domain}/{below}" if rmw else below)
+        tokens.add(f"@ros2_lv/{address.domain}/**" if rmw else "@/*/@ros2_lv/**")
+    return sorted(keys), sorted(tokens)

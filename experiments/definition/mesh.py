@@ -9,7 +9,7 @@ from agents.network import endpoints as topology
 from agents.network import lab
 from agents.network.access_control import Rights
 from agents.network.endpoints import Endpoint, free_endpoint
-from experiments.definition import access_rights, bodies
+from experiments.definition import access_rights
 from experiments.definition.bodies import VICON_TWIN
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
@@ -32,7 +32,7 @@ def member_endpoints(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
         for group in access_rights.process_groups(case):
             given = next((case.network.addresses[name] for name in group if name in case.network.addresses), "")
             found.setdefault(topology.TOGETHER.join(group), given)
-        if any(bodies.WORLD in (robot.body, robot.ranges) for robot in case.robots.values()):
+        if access_rights.has_world(case):
             services["world"] = None
         if Plan(case).guided:
             services["centre"] = None

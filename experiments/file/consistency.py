@@ -13,7 +13,7 @@ from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Arena, Experiment, Hybrid, Robot
 from experiments.file import consistency_formation, consistency_network
-from experiments.file.problems import Fault
+from experiments.file.problems import Fault, after_the_end, unknown_robot
 from twins import scene as outlines
 from twins.scene import Scene
 from twins.sensing.range_sensors import SENSORS
@@ -49,14 +49,7 @@ def standby_faults(experiment: Experiment) -> Iterator[Fault]:
         yield Fault(("on_loss",), message, 'add [spares.NAME], or say on_loss = "restart"')
 
 
-_RESERVED: Final = (
-    "all",
-    "estop",
-    "run",
-    "world",
-    "centre",
-    *KINDS,
-)  # they mean something in keys and in [disturbance]
+_RESERVED: Final = ("all", "estop", "run", "world", "centre", *KINDS)  # words of keys and of [disturbance]
 _WALL: Final = "wall"  # name of the border of the arena in contacts
 
 
@@ -144,11 +137,8 @@ def _rates(experiment: Experiment) -> Iterator[Fault]:
     for name in ("pose_hz", "coordination_hz", "state_hz"):
         ratio = body / getattr(experiment.rates, name)
         if abs(ratio - max(1, round(ratio))) > 1e-9 * ratio:
-            yield Fault(
-                ("rates", name),
-                f"{name} = {body / ratio:g} does not divide body_hz = {body:g}",
-                f"the nearest that does: {name} = {_divisor(body, body / ratio):g}",
-            )
+            hint = f"the nearest that does: {name} = {_divisor(body, body / ratio):g}"
+            yield Fault(("rates", name), f"{name} = {body / ratio:g} does not divide body_hz = {body:g}", hint)
 
     samples = experiment.duration_s * experiment.rates.state_hz
     if samples < 1.0 - 1e-9:
@@ -167,9 +157,8 @@ def _divisor(body: float, wanted: float) -> float:
 def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
     name = path[1]
     if name in _RESERVED:
-        yield Fault(
-            path, f"a robot cannot be called '{name}', which has a meaning of its own", "rename it", on_key=True
-        )
+        message = f"a robot cannot be called '{name}', which has a meaning of its own"
+        yield Fault(path, message, "rename it", on_key=True)
     body = registry.body_name(robot.body)
     bodies = [*registry.names(registry.BODIES), *registry.names(registry.DEVICES)]
     if body not in bodies:
@@ -184,11 +173,8 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
             yield Fault((*path, "sensors", number), message, did_you_mean(sensor, SENSORS))
     for axis, size in enumerate(experiment.arena.size[:2]):
         if abs(robot.start[axis]) > size / 2:
-            yield Fault(
-                (*path, "start", axis),
-                f"'{name}' starts outside of the arena",
-                f"{'xy'[axis]} lies between {-size / 2:g} and {size / 2:g}; or enlarge size in [arena]",
-            )
+            hint = f"{'xy'[axis]} lies between {-size / 2:g} and {size / 2:g}; or enlarge size in [arena]"
+            yield Fault((*path, "start", axis), f"'{name}' starts outside of the arena", hint)
     if len(robot.start) == 3 and abs(robot.start[2]) > 2 * math.pi:
         radians = math.remainder(math.radians(robot.start[2]), 2 * math.pi)
         yield Fault((*path, "start", 2), "the yaw is in radians", f"{robot.start[2]:g} degrees are {radians:.4f}")
@@ -198,18 +184,15 @@ def _hover(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
     name, top, margin = path[1], experiment.arena.size[2], experiment.safety.margin
     if not KINDS[robot.kind].flies:
         if robot.hover is not None:
-            yield Fault(
-                (*path, "hover"), f"'{name}' is a {robot.kind}, which does not fly", "leave hover out", on_key=True
-            )
+            message = f"'{name}' is a {robot.kind}, which does not fly"
+            yield Fault((*path, "hover"), message, "leave hover out", on_key=True)
     elif robot.hover is None:
         message = f"'{name}' is a {robot.kind}, which flies: it needs a height to hold"
         yield Fault(path, message, f"add hover = {min(0.8, top / 2):g}, in metres")
     elif robot.hover > top - margin:
-        yield Fault(
-            (*path, "hover"),
-            f"'{name}' cannot hover at {robot.hover:g} m: the arena is {top:g} m high, less a margin of {margin:g} m",
-            f"use a hover of at most {max(0.0, top - margin):g}, or enlarge size in [arena]",
-        )
+        inside = f"the arena is {top:g} m high, less a margin of {margin:g} m"
+        hint = f"use a hover of at most {max(0.0, top - margin):g}, or enlarge size in [arena]"
+        yield Fault((*path, "hover"), f"'{name}' cannot hover at {robot.hover:g} m: {inside}", hint)
 
 
 def _triggers(experiment: Experiment) -> Iterator[Fault]:
@@ -243,9 +226,8 @@ def _architecture(experiment: Experiment) -> Iterator[Fault]:
     if not isinstance(hybrid, Hybrid):
         return
     for number, name in enumerate(hybrid.robots):
-        if name not in experiment.robots:
-            yield Fault((*path, number), f"no robot is called '{name}'", did_you_mean(name, experiment.robots))
-        elif name in hybrid.robots[:number]:
+        yield from unknown_robot((*path, number), name, experiment.robots)
+        if name in hybrid.robots[:number]:
             yield Fault((*path, number), f"'{name}' is named twice", "name it once")
     if set(experiment.robots) <= set(hybrid.robots):
         message = "a hybrid architecture in which the centre guides every robot is a centralised one"
@@ -256,16 +238,10 @@ def _timeline(experiment: Experiment) -> Iterator[Fault]:
     before: dict[str, float] = {}
     for number, leg in enumerate(experiment.timeline):
         path = ("timeline", number)
-        if leg.robot not in experiment.robots:
-            yield Fault(
-                (*path, "robot"), f"no robot is called '{leg.robot}'", did_you_mean(leg.robot, experiment.robots)
-            )
-        if leg.at_s >= experiment.duration_s:
-            message = f"this leg begins at {leg.at_s:g} s, when the run of {experiment.duration_s:g} s is over"
-            yield Fault((*path, "at_s"), message, "begin earlier, or give a longer duration_s")
+        yield from unknown_robot((*path, "robot"), leg.robot, experiment.robots)
+        yield from after_the_end((*path, "at_s"), "leg", leg.at_s, experiment.duration_s)
         if leg.at_s <= before.get(leg.robot, -1.0):
             message = f"this leg of '{leg.robot}' begins at {leg.at_s:g} s, not after the one before it"
-            yield Fault(
-                (*path, "at_s"), message, f"sort its legs by time; the one before begins at {before[leg.robot]:g} s"
-            )
+            hint = f"sort its legs by time; the one before begins at {before[leg.robot]:g} s"
+            yield Fault((*path, "at_s"), message, hint)
         before[leg.robot] = max(leg.at_s, before.get(leg.robot, -1.0))

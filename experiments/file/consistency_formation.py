@@ -8,7 +8,7 @@ from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Change, Experiment, Link, Target
 from experiments.definition.links import FORM, held_height, link_pairs
-from experiments.file.problems import Fault, Path
+from experiments.file.problems import Fault, Path, after_the_end, unknown_robot
 
 ROUNDED = 1e-3  # [m] heights written with three decimals
 
@@ -20,17 +20,14 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
     formation = experiment.formation
     places = [("anchors", name) for name in formation.anchors] + [("shape", name) for name in formation.shape]
     for table, name in places:
-        if name not in experiment.robots:
-            path = ("formation", table, name)
-            yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, experiment.robots), on_key=True)
+        yield from unknown_robot(("formation", table, name), name, experiment.robots, on_key=True)
     if found:
         return  # what follows looks links up
     for text, link in experiment.formation.links.items():
         path = ("formation", "links", text)
         yield from _asked(experiment, text, link, path)
-        if isinstance(link, Link) and link.from_s >= experiment.duration_s:
-            message = f"this link begins at {link.from_s:g} s, when the run of {experiment.duration_s:g} s is over"
-            yield Fault((*path, "from_s"), message, "begin earlier, or give a longer duration_s")
+        if isinstance(link, Link):
+            yield from after_the_end((*path, "from_s"), "link", link.from_s, experiment.duration_s)
     for number, change in enumerate(experiment.formation.changes):
         yield from _change(experiment, number, change)
     near = experiment.formation.proximity
@@ -42,10 +39,9 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
 
 def _links(experiment: Experiment) -> Iterator[Fault]:
     robots = experiment.robots
-    leader = experiment.formation.leader
-    if leader is not None and leader not in robots:
-        yield Fault(("formation", "leader"), f"no robot is called '{leader}'", did_you_mean(leader, robots))
-    said: dict[tuple[str, str], str] = {}
+    if experiment.formation.leader is not None:
+        yield from unknown_robot(("formation", "leader"), experiment.formation.leader, robots)
+    given: dict[tuple[str, str], str] = {}
     for text in experiment.formation.links:
         path = ("formation", "links", text)
         try:
@@ -55,17 +51,16 @@ def _links(experiment: Experiment) -> Iterator[Fault]:
             yield Fault(path, f"{text!r} is no link", hint if hint == FORM else f"{hint}; {FORM}", on_key=True)
             continue
         for name in dict.fromkeys(reversed(both[0])):
-            if name not in robots:
-                yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, robots), on_key=True)
+            yield from unknown_robot(path, name, robots, on_key=True)
         if both[0][0] == both[0][1]:
             yield Fault(path, f"'{both[0][0]}' cannot receive from itself", "name two robots", on_key=True)
             continue
-        again = [pair for pair in both if pair in said]
+        again = [pair for pair in both if pair in given]
         if again:
-            listener, speaker = again[0]
-            message = f"the link {speaker} > {listener} is already given by '{said[again[0]]}'"
+            receiver, sender = again[0]
+            message = f"the link {sender} > {receiver} is already given by '{given[again[0]]}'"
             yield Fault(path, message, "keep one of the two", on_key=True)
-        said.update(dict.fromkeys(both, text))
+        given.update(dict.fromkeys(both, text))
 
 
 def kind_of(given: Target | float) -> str:
@@ -104,9 +99,7 @@ def _asked(experiment: Experiment, text: str, given: Target | float, path: Path)
 
 def _change(experiment: Experiment, number: int, change: Change) -> Iterator[Fault]:
     path = ("formation", "changes", number)
-    if change.at_s >= experiment.duration_s:
-        message = f"this change begins at {change.at_s:g} s, when the run of {experiment.duration_s:g} s is over"
-        yield Fault((*path, "at_s"), message, "begin earlier, or give a longer duration_s")
+    yield from after_the_end((*path, "at_s"), "change", change.at_s, experiment.duration_s)
     before = {pair: given for text, given in experiment.formation.links.items() for pair in link_pairs(text)}
     kinds = {kind_of(given) for given in before.values()}
     for text, given in change.links.items():

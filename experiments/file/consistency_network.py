@@ -9,12 +9,11 @@ from typing import Final
 from agents.network.channel_model import LinkEffects
 from agents.network.endpoints import Endpoint
 from agents.plugins import registry
-from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment, LinkChannel
 from experiments.definition.link_conditions import link_effects
 from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
-from experiments.file.problems import Fault, Path, shown
+from experiments.file.problems import Fault, Path, after_the_end, shown, unknown_robot
 
 _WHAT: Final = {"address": "address that ssh takes", "zenpark": "path of a command", "lab": "path of a folder"}
 _WRITE: Final = {
@@ -35,7 +34,7 @@ def host_faults(experiment: Experiment) -> Iterator[Fault]:
         for number, robot in enumerate(each.robots):
             path = ("hosts", host, "robots", number)
             if robot not in experiment.robots:
-                yield Fault(path, f"no robot is called '{robot}'", did_you_mean(robot, experiment.robots))
+                yield from unknown_robot(path, robot, experiment.robots)
             elif robot in where:
                 message = f"'{robot}' runs on '{where[robot]}' already"
                 yield Fault(path, message, "name it once: a robot is one process on one machine")
@@ -114,8 +113,7 @@ def _mesh(experiment: Experiment) -> Iterator[Fault]:
             yield Fault(("network", "topology"), message, hint)
     for robot, endpoint in network.addresses.items():
         path = ("network", "addresses", robot)
-        if robot not in experiment.robots:
-            yield Fault(path, f"no robot is called '{robot}'", did_you_mean(robot, experiment.robots))
+        yield from unknown_robot(path, robot, experiment.robots)
         try:
             found = Endpoint.parse(endpoint)
         except ValueError as error:
@@ -135,29 +133,25 @@ def channel_faults(experiment: Experiment) -> Iterator[Fault]:
     """All contradictions in [channel]."""
     channel = experiment.channel
     yield from _bursts(channel, ("channel",), channel)
-    there = _heard(experiment) if channel.links or any(outage.links for outage in channel.outages) else None
-    said: dict[tuple[str, str], str] = {}
+    there = _pose_pairs(experiment) if channel.links or any(outage.links for outage in channel.outages) else None
+    given: dict[tuple[str, str], str] = {}
     for text, own in channel.links.items():
         path = (*AT, text)
         yield from _link(experiment, there, text, path, on_key=True)
         yield from _bursts(link_effects(channel, own), path, own)
         for pair in _pairs(text):
-            if pair in said:
-                message = f"the link {pair[1]} > {pair[0]} has its settings by '{said[pair]}' already"
+            if pair in given:
+                message = f"the link {pair[1]} > {pair[0]} has its settings by '{given[pair]}' already"
                 yield Fault(path, message, "keep one of the two", on_key=True)
                 break
-            said[pair] = text
+            given[pair] = text
     for number, outage in enumerate(channel.outages):
         where = ("channel", "outages", number)
-        if outage.from_s >= experiment.duration_s:
-            message = f"this outage begins at {outage.from_s:g} s, when the run of {experiment.duration_s:g} s is over"
-            yield Fault((*where, "from_s"), message, "begin earlier, or give a longer duration_s")
+        yield from after_the_end((*where, "from_s"), "outage", outage.from_s, experiment.duration_s)
         for k, text in enumerate(outage.links):
             yield from _link(experiment, there, text, (*where, "links", k))
         for k, robot in enumerate(outage.robots):
-            if robot not in experiment.robots:
-                hint = did_you_mean(robot, experiment.robots)
-                yield Fault((*where, "robots", k), f"no robot is called '{robot}'", hint)
+            yield from unknown_robot((*where, "robots", k), robot, experiment.robots)
 
 
 def _pairs(text: str) -> tuple[tuple[str, str], ...]:
@@ -176,19 +170,19 @@ def _link(
     if not both:
         yield Fault(path, f"{text!r} is no link", FORM, on_key=on_key)
         return
-    unknown = [name for name in dict.fromkeys(reversed(both[0])) if name not in experiment.robots]
-    for name in unknown:
-        yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, experiment.robots), on_key=on_key)
-    if unknown:
+    names = dict.fromkeys(reversed(both[0]))
+    for name in names:
+        yield from unknown_robot(path, name, experiment.robots, on_key=on_key)
+    if not names.keys() <= experiment.robots.keys():
         return
-    isolated = [pair for pair in both if there is not None and pair not in there]
-    if isolated:
-        listener, speaker = isolated[0]
+    absent = [pair for pair in both if there is not None and pair not in there]
+    if absent:
+        receiver, sender = absent[0]
         hint = f"leave it out, or add the link to [formation.links]; {FORM}"
-        yield Fault(path, f"there is no link {speaker} > {listener}", hint, on_key=on_key)
+        yield Fault(path, f"there is no link {sender} > {receiver}", hint, on_key=on_key)
 
 
-def _heard(experiment: Experiment) -> set[tuple[str, str]] | None:
+def _pose_pairs(experiment: Experiment) -> set[tuple[str, str]] | None:
     """The (receiver, sender) pairs of all links, for formation and avoidance; None if other faults hide them."""
     try:
         links = Plan(experiment).pose_links

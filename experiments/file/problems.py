@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import msgspec
+
+from agents.plugins.registry import did_you_mean
 
 Path = tuple[str | int, ...]
 
@@ -166,6 +168,19 @@ class Fault:
     message: str  # what is wrong
     hint: str = ""  # what to do
     on_key: bool = False  # the key itself is wrong, not its value
+
+
+def unknown_robot(path: Path, name: str, robots: Iterable[str], *, on_key: bool = False) -> Iterator[Fault]:
+    """The fault of a name that no robot has, if it has none."""
+    if name not in (known := list(robots)):
+        yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, known), on_key)
+
+
+def after_the_end(path: Path, what: str, from_s: float, duration_s: float) -> Iterator[Fault]:
+    """The fault of what begins when the run is over, if it does."""
+    if from_s >= duration_s:
+        message = f"this {what} begins at {from_s:g} s, when the run of {duration_s:g} s is over"
+        yield Fault(path, message, "begin earlier, or give a longer duration_s")
 
 
 @dataclass(frozen=True)
