@@ -61,8 +61,8 @@ def circulant(count: int, jumps: Sequence[int], spacing: float) -> Layout:
     position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)])
     first = np.arange(count)
     both = np.concatenate([np.column_stack([first, (first + jump) % count]) for jump in jumps])
-    said = ", ".join(map(str, sorted(set(jumps))))
-    return Layout(f"{count} robots on a circulant graph with jumps {said}", position, _each_once(both))
+    words = ", ".join(map(str, sorted(set(jumps))))
+    return Layout(f"{count} robots on a circulant graph with jumps {words}", position, _each_once(both))
 
 
 def grid(rows: int, columns: int, spacing: float) -> Layout:

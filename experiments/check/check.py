@@ -22,10 +22,10 @@ from experiments.check.ideal_run import message_rate, predict, undisturbed
 from experiments.definition import standby
 from experiments.definition.experiment import Experiment
 from experiments.file.document import Document, Source
-from experiments.file.problems import Fault, Path, Problem, nearest
+from experiments.file.problems import Fault, Path, Place, Problem, nearest
 
 NOT_RANDOM: Final = "not-random"
-HEARD_BYTES: Final = 200  # of one heard pose in telemetry
+RECEIVED_BYTES: Final = 200  # of one received pose in telemetry
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
 MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}
 ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")
@@ -61,12 +61,12 @@ def telemetry(analysis: Analysis) -> Iterator[Claim]:
     experiment, links = analysis.experiment, analysis.plan.pose_links
     if not len(links):
         return
-    heard = np.bincount(links.receiver)
-    size = float(heard.max()) * experiment.rates.pose_hz / experiment.rates.state_hz * HEARD_BYTES
+    received = np.bincount(links.receiver)
+    size = float(received.max()) * experiment.rates.pose_hz / experiment.rates.state_hz * RECEIVED_BYTES
     if size > MAX_PAYLOAD:
-        name = analysis.names[int(heard.argmax())]
+        name = analysis.names[int(received.argmax())]
         message = (
-            f"{name} may receive {size / HEARD_BYTES:.0f} poses between two samples of telemetry, "
+            f"{name} may receive {size / RECEIVED_BYTES:.0f} poses between two samples of telemetry, "
             f"{size / 1024.0:.0f} kB: each sample is sent in {int(np.ceil(size / MAX_PAYLOAD))} messages or more"
         )
         yield Claim("warning", "telemetry-split", message, "raise rates.state_hz", ("rates", "state_hz"))
@@ -160,8 +160,8 @@ def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding
     for claim, names in holders.items():
         message = claim.message
         if len(names) < len(analyses):
-            said = ", ".join(f"'{name}'" for name in names)
-            message = f"in case{'s' * (len(names) > 1)} {said}: {message}"
+            words = ", ".join(f"'{name}'" for name in names)
+            message = f"in case{'s' * (len(names) > 1)} {words}: {message}"
         where = _place(source, claim.path, names) if claim.path else ""
         found.append(Finding(claim.severity, claim.code, message, claim.remedy, where))
     return sorted(found, key=lambda each: ORDER.index(each.severity))
@@ -169,7 +169,8 @@ def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding
 
 def _place(source: Source, path: Path, cases: Sequence[str]) -> str:
     """The place of `path` in the file or in a `--set`; in the first of `cases` that changes it, if any."""
-    own = next((p for name in cases if len(nearest(source.places, p := ("cases", name, *path))[0]) > 2), path)
+    keys = source.places | {override.whole: Place(0, 0) for override in source.overrides}
+    own = next((p for name in cases if len(nearest(keys, p := ("cases", name, *path))[0]) > 2), path)
     return source.located(Fault(own, "")).place
 
 

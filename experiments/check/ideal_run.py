@@ -1,8 +1,8 @@
 """Ideal run: one flight on the virtual clock, without noise, in an empty, endless room.
 
 Everything else is that of a run: bodies with their limits and their inertia, triggers, updates, the modelled network,
-the plans, and the 5 mm at which robots on wheels stop. Walls, obstacles and avoidance are left out, because what is
-looked for is who would meet them.
+the plans, and the 5 mm at which robots on wheels stop. Walls, obstacles and avoidance are left out: robots that would
+meet them are sought.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from experiments.definition.experiment import Experiment, World
 from experiments.recording.trace import ROUNDING_S, sent_in_run
 from experiments.virtual_time import conductor, simulation
 
-FAR: Final = 1e6  # [m] walls that nobody meets
+FAR: Final = 1e6  # [m] walls that no robot meets
 TICK_COST: Final = 200.0  # robots whose arithmetic takes as long as what a tick costs in any case
 WORK: Final = 6e6  # robot ticks, with that added, that are flown: 290 s of seven robots, 50 s of a thousand
 REPETITIONS: Final = 5  # flights with noise, each with another seed

@@ -140,7 +140,7 @@ def softness(analysis: Analysis) -> Iterator[Claim]:
             return
         spans.append((formed, until))
     count = repetitions(bare)
-    lost, worst, said = 0, experiment.tolerance + FORGIVEN, ""
+    lost, worst, worst_link = 0, experiment.tolerance + FORGIVEN, ""
     for flight in fly_repeatedly(bare, count):
         if flight.stuck:
             continue
@@ -152,7 +152,7 @@ def softness(analysis: Analysis) -> Iterator[Claim]:
         if largest > worst:
             worst = largest
             at, link = np.unravel_index(off.argmax(), off.shape)
-            said = f"{analysis.link(int(link))} is {1e3 * worst:.0f} mm off at {time[due][at]:.1f} s"
+            worst_link = f"{analysis.link(int(link))} is {1e3 * worst:.0f} mm off at {time[due][at]:.1f} s"
     if lost < min(2, count):  # one of five may be chance: of such experiments one in four was lost with other seeds
         return
     free = f"{loop.free} mode{'s' * (loop.free > 1)} slower than the run"
@@ -161,7 +161,7 @@ def softness(analysis: Analysis) -> Iterator[Claim]:
     message = (
         f"soft formation, {modes}: acquired after {spans[0][0]:.1f} s without noise, but with the noise of "
         f"[disturbance] outside the tolerance of {1e3 * experiment.tolerance:g} mm later, in {lost} of {count} flights "
-        f"({seeds}): {said}"
+        f"({seeds}): {worst_link}"
     )
     remedy = "raise the gain, add links that stiffen the formation, or allow a larger tolerance"
     yield Claim("warning", "soft", message, remedy, ("formation", "links"))
@@ -192,7 +192,7 @@ def walls(analysis: Analysis) -> Iterator[Claim]:
     beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
     outside = beyond.max(axis=2) > FORGIVEN
     tight = beyond[..., :2].max(axis=2) > FORGIVEN - limits.margin
-    tight &= ~tight[0]  # who starts there has been told
+    tight &= ~tight[0]  # a start there is a finding of `starts`
     problems = [_left(analysis, int(row), outside[:, row]) for row in np.flatnonzero(outside.any(axis=0))]
     for row in np.flatnonzero(tight.any(axis=0) & ~outside.any(axis=0)):
         time, place = _first(analysis, int(row), tight[:, row])

@@ -67,16 +67,16 @@ def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: boo
     which = int(near.argmax(axis=0).argmin())
     first, at = int(rows[which]), int(near[:, which].argmax())
     x, y = prediction.position[at, first, :2]
-    who = listed([names[row] for row in rows])
+    subject = listed([names[row] for row in rows])
     when = f"at {prediction.time[at]:.1f} s, around ({x:.2f}, {y:.2f})"
     when = f", {names[first]} first {when}" if len(rows) > 1 else f" {when}"
     if keeps:
-        message = f"the path of {who} crosses '{name}'{when}: avoidance will have to act"
+        message = f"the path of {subject} crosses '{name}'{when}: avoidance will have to act"
         return Claim("note", "avoidance-acts", message, "", path)
     if np.isfinite(scene.mass[number]):
-        return Claim("note", "pushes", f"{who} would push '{name}'{when}", "", path)
+        return Claim("note", "pushes", f"{subject} would push '{name}'{when}", "", path)
     remedy = f"lead the formation around it, {AVOID}"
-    return Claim("warning", "hits-obstacle", f"{who} would run into '{name}'{when}", remedy, path)
+    return Claim("warning", "hits-obstacle", f"{subject} would run into '{name}'{when}", remedy, path)
 
 
 def contacts(analysis: Analysis) -> Iterator[Claim]:
@@ -111,8 +111,8 @@ def perception(analysis: Analysis) -> Iterator[Claim]:
     for row, name in enumerate(analysis.names):
         if _eyes(experiment.robots[name]) or not experiment.robots[name].avoids:
             continue
-        seen = [k for k in range(len(scene.names)) if outlines.at_height(scene, k, low[row], high[row])]
-        there = [f"'{scene.names[k]}'" for k in seen]
+        in_height = [k for k in range(len(scene.names)) if outlines.at_height(scene, k, low[row], high[row])]
+        there = [f"'{scene.names[k]}'" for k in in_height]
         flies = analysis.assignment.kinds[row].flies
         remedy = f'give it some: sensors = ["{"multiranger" if flies else "lds01"}"] in [robots.{name}]'
         if there:
@@ -146,8 +146,8 @@ def reality(analysis: Analysis) -> Iterator[Claim]:
             yield Claim("warning", "shadow-of-twin", message, "leave shadow out", ("robots", name, "shadow"))
     alone = [name for name, robot in robots.items() if robot.body == "twin" and robot.ranges != "world"]
     if alone and (experiment.arena.obstacles or experiment.avoidance is not None):
-        who = f"{listed(alone)} {'is' if len(alone) == 1 else 'are'}"
-        message = f'in real time {who} in no common place and without range sensors, unless body = "world"'
+        subject = f"{listed(alone)} {'is' if len(alone) == 1 else 'are'}"
+        message = f'in real time {subject} in no common place and without range sensors, unless body = "world"'
         yield Claim("note", "alone", message, "", ("robots", alone[0]))
 
 

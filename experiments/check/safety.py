@@ -21,16 +21,10 @@ def safety(analysis: Analysis) -> Iterator[Claim]:
     """Report settings of `[safety]` that contradict each other or the experiment."""
     chosen = analysis.experiment.safety
     if chosen.battery_min < chosen.battery_low:
-        message = (
-            f"a robot takes off with a charge of {chosen.battery_min:.0%} and lands below {chosen.battery_low:.0%}, "
-            "as soon as it is up"
-        )
+        message = f"robots take off at {chosen.battery_min:.0%} of charge, and land below {chosen.battery_low:.0%}"
         yield Claim("warning", "battery", message, "raise battery_min above battery_low", ("safety", "battery_min"))
     if chosen.cut_outside <= OUTSIDE_M:
-        message = (
-            f"motors are cut {chosen.cut_outside:g} m outside the arena, before a drone lands, which it does at "
-            f"{OUTSIDE_M:g} m"
-        )
+        message = f"motors are cut {chosen.cut_outside:g} m outside the arena, but drones land {OUTSIDE_M:g} m outside"
         yield Claim("warning", "cut-outside", message, f"raise it above {OUTSIDE_M:g}", ("safety", "cut_outside"))
     for name, robot in analysis.experiment.robots.items():
         if robot.hover is not None and robot.hover > SLOW_M_S * chosen.landing_s:
@@ -44,30 +38,27 @@ def safety(analysis: Analysis) -> Iterator[Claim]:
 def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
     """Check the separation of linked pairs: at the start, at their target, and on their way."""
     names, path = tuple(analysis.experiment.robots), ("safety", "separation")
-    links, heard = analysis.plan.links, analysis.plan.pose_links
-    pairs = sorted({tuple(sorted(pair)) for pair in zip(heard.receiver.tolist(), heard.sender.tolist(), strict=True)})
+    links, poses = analysis.plan.links, analysis.plan.pose_links
+    pairs = sorted({tuple(sorted(pair)) for pair in zip(poses.receiver.tolist(), poses.sender.tolist(), strict=True)})
     wanted = {
         tuple(sorted(pair)): distance
         for *pair, distance in zip(links.receiver.tolist(), links.sender.tolist(), links.distance.tolist(), strict=True)
     }
     start, _ = bodies.start_poses(analysis.experiment, names)
-    quiet = True
+    nearer, quiet = f"nearer than the separation of {limit:g} m", True
     for first, second in pairs:
-        who = f"{names[first]} and {names[second]}"
+        both = f"{names[first]} and {names[second]}"
         apart = float(norm(start[first] - start[second]))
         track = analysis.prediction.position
         least = float(norm(track[:, first] - track[:, second]).min())
         if apart < limit - FORGIVEN:
-            message = f"{who} start {apart:.2f} m apart, nearer than the separation of {limit:g} m: neither takes off"
+            message = f"{both} start {apart:.2f} m apart, {nearer}: neither takes off"
             yield Claim("error", "separation-start", message, "start them farther apart, or reduce separation", path)
         elif wanted.get((first, second), np.inf) < limit - FORGIVEN:
-            message = (
-                f"{who} are to be {wanted[first, second]:.2f} m apart, nearer than the separation of {limit:g} m: they "
-                "hold before they are there"
-            )
+            message = f"{both} are to be {wanted[first, second]:.2f} m apart, {nearer}: they hold before they are there"
             yield Claim("warning", "separation-link", message, "reduce separation, or ask for more distance", path)
         elif least < limit - FORGIVEN:
-            message = f"{who} come within {least:.2f} m, nearer than the separation of {limit:g} m: they hold there"
+            message = f"{both} come within {least:.2f} m, {nearer}: they hold there"
             yield Claim("warning", "separation-path", message, "start elsewhere, or reduce separation", path)
         else:
             continue
@@ -80,22 +71,20 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
 def architecture(analysis: Analysis) -> Iterator[Claim]:
     """Describe the architecture; check the age of goals, and that the trigger suits guided robots."""
     experiment, path = analysis.experiment, ("architecture",)
-    steered = analysis.plan.guided
-    if not steered:
+    guided = analysis.plan.guided
+    if not guided:
         return
-    everyone, rate = len(steered) == len(experiment.robots), experiment.rates.coordination_hz
-    whom = f"all {len(steered)} robots" if everyone else listed(steered)
-    rest = "" if everyone else "; the others decide for themselves, and receive their poses as before"
+    all_guided, rate = len(guided) == len(experiment.robots), experiment.rates.coordination_hz
+    subject = f"all {len(guided)} robots" if all_guided else listed(guided)
+    rest = "" if all_guided else "; the others decide for themselves, and receive their poses as before"
     hold = f"if it is gone, or its goals are older than {experiment.safety.link_silence_s:g} s, they hold"
-    what = "centralised" if everyone else "hybrid"
-    yield Claim("note", what, f"{what}: a centre decides for {whom} {rate:g} times a second{rest}; {hold}", "", path)
+    what = "centralised" if all_guided else "hybrid"
+    yield Claim("note", what, f"{what}: a centre decides for {subject} {rate:g} times a second{rest}; {hold}", "", path)
     if experiment.safety.link_silence_s <= 1.0 / rate:
         message = f"goals come every {1.0 / rate:g} s, and are too old after {experiment.safety.link_silence_s:g} s"
         remedy = "give safety.link_silence_s more than twice that, or decide more often"
         yield Claim("error", "goals-too-old", message, remedy, ("safety", "link_silence_s"))
     if getattr(analysis.plan.trigger, "judges_errors", False):
         kind, _ = registry.split(experiment.trigger)
-        message = (
-            f"the trigger '{kind}' judges by the formation error, which robots that are guided do not know: it is 0"
-        )
+        message = f"the trigger '{kind}' judges by the formation error, which is 0 where the centre guides"
         yield Claim("warning", "error-unknown", message, "take another one, such as send-on-delta", ("trigger",))

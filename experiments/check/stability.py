@@ -56,9 +56,9 @@ def modes(
         within_s: Modes with a longer time constant than this are free [s].
     """
     anchored = np.zeros(0, dtype=np.intp) if anchors is None else anchors.row
-    listeners = np.unique(np.concatenate([links.receiver, anchored]))
-    share = np.repeat(closed[listeners], 2)
-    slope = -_derivative(law, links, position, anchors, listeners)
+    receivers = np.unique(np.concatenate([links.receiver, anchored]))
+    share = np.repeat(closed[receivers], 2)
+    slope = -_derivative(law, links, position, anchors, receivers)
     if not np.isfinite(slope).all():
         return Modes(math.inf, math.inf, math.inf)
     # H M and H^½ M H^½ have the same eigenvalues, and the second is symmetric where M is
@@ -66,9 +66,9 @@ def modes(
     taken = root[:, None] * slope * root[None, :]
     offset = law.offset(position, position[links.sender], links)
     offset = offset if anchors is None else offset + anchors.offset(position)
-    turned = np.stack([-offset[listeners, 1], offset[listeners, 0]], axis=1).ravel()
+    turned = np.stack([-offset[receivers, 1], offset[receivers, 0]], axis=1).ravel()
     expected = np.stack([0.0 * turned, 0.0 * turned, -root * turned], axis=1)
-    taken = _without(taken, _whole(position, listeners, len(position)) / root[:, None], expected)
+    taken = _without(taken, _whole(position, receivers, len(position)) / root[:, None], expected)
     scale = float(np.abs(taken).max(initial=0.0))
     if np.abs(taken - taken.T).max(initial=0.0) <= EVEN * scale:
         values = np.linalg.eigvalsh(0.5 * (taken + taken.T)).astype(complex)
@@ -83,43 +83,43 @@ def modes(
     return Modes(float(values.real.max(initial=0.0)), float(left.max(initial=0.0)), float(slowest), free)
 
 
-def _derivative(law: Law, links: Links, position: Array, anchors: Anchors | None, listeners: Index) -> Array:
-    """∂u/∂p (2 L, 2 L) of the listeners.
+def _derivative(law: Law, links: Links, position: Array, anchors: Anchors | None, receivers: Index) -> Array:
+    """∂u/∂p (2 L, 2 L) of the receivers.
 
-    What a robot decides depends on where it is and on what it hears on its own links, and on nothing else. So all
-    robots may be moved at once while nobody hears of it, and then one link of every robot at once: two evaluations
-    for each coordinate and link of a robot, however many robots there are.
+    The decision of a robot depends on its own position and on the poses received on its own links alone. So all robots
+    are moved at once with the received poses kept, and then one link of every robot at once: two evaluations for each
+    coordinate and link of a robot, however many robots there are.
     """
-    rows, count = len(position), len(listeners)
+    rows, count = len(position), len(receivers)
     column = np.full(rows, -1)
-    column[listeners] = np.arange(count)
-    heard = position[links.sender]
+    column[receivers] = np.arange(count)
+    received = position[links.sender]
     blocks = np.zeros((count, 2, count, 2))
     rank = np.arange(len(links)) - np.searchsorted(links.receiver, links.receiver)
     for axis in (0, 1):
         step = np.zeros(3)
         step[axis] = STEP
-        own = law.offset(position + step, heard, links) - law.offset(position - step, heard, links)
+        own = law.offset(position + step, received, links) - law.offset(position - step, received, links)
         if anchors is not None:
             own = own + anchors.offset(position + step) - anchors.offset(position - step)
-        blocks[np.arange(count), :, np.arange(count), axis] += own[listeners, :2] / (2.0 * STEP)
+        blocks[np.arange(count), :, np.arange(count), axis] += own[receivers, :2] / (2.0 * STEP)
         for turn in range(int(rank.max(initial=-1)) + 1):
             mine = rank == turn
             shift = mine[:, None] * step
-            answer = law.offset(position, heard + shift, links) - law.offset(position, heard - shift, links)
-            listener, speaker = links.receiver[mine], column[links.sender[mine]]
-            listens = speaker >= 0
-            at = column[listener[listens]], speaker[listens]
-            blocks[at[0], :, at[1], axis] += answer[listener[listens], :2] / (2.0 * STEP)
+            answer = law.offset(position, received + shift, links) - law.offset(position, received - shift, links)
+            receiver, sender = links.receiver[mine], column[links.sender[mine]]
+            known = sender >= 0
+            at = column[receiver[known]], sender[known]
+            blocks[at[0], :, at[1], axis] += answer[receiver[known], :2] / (2.0 * STEP)
     return blocks.reshape(2 * count, 2 * count)
 
 
-def _whole(position: Array, listeners: Index, rows: int) -> Array:
+def _whole(position: Array, receivers: Index, rows: int) -> Array:
     """Motions of the whole (2 L, 3): along x, along y, and turning, about the leaders if there are any."""
-    led = np.setdiff1d(np.arange(rows), listeners)
-    centre = position[led if len(led) else listeners].mean(axis=0)[:2]
-    way = position[listeners, :2] - centre
-    zero, one = np.zeros(len(listeners)), np.ones(len(listeners))
+    led = np.setdiff1d(np.arange(rows), receivers)
+    centre = position[led if len(led) else receivers].mean(axis=0)[:2]
+    way = position[receivers, :2] - centre
+    zero, one = np.zeros(len(receivers)), np.ones(len(receivers))
     motions = ((one, zero), (zero, one), (-way[:, 1], way[:, 0]))
     return np.stack([np.stack(each, axis=1).ravel() for each in motions], axis=1)
 

@@ -31,16 +31,16 @@ def network(analysis: Analysis) -> Iterator[Claim]:
         return
     rows = len(names)
     sources = np.array([names.index(name) for name in leaders], dtype=np.intp)
-    listens = np.isin(np.arange(rows), links.receiver)
+    receives = np.isin(np.arange(rows), links.receiver)
     anchors = analysis.assignment.anchors
-    if anchors is not None and len(sources):  # who knows a place is led by it
+    if anchors is not None and len(sources):  # an anchored robot is led by its place
         sources = np.union1d(sources, anchors.row)
     problems = []
     if len(sources):
-        lost = np.flatnonzero(~reachable(links, rows, sources) & listens)
+        lost = np.flatnonzero(~reachable(links, rows, sources) & receives)
         if len(lost):
-            who = listed([names[row] for row in lost])
-            message = f"{who} cannot be reached by the leader ({listed(leaders)}), neither directly nor through others"
+            subject = listed([names[row] for row in lost])
+            message = f"{subject} cannot be reached by the leader ({listed(leaders)}), directly or through others"
             remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
             problems.append(Claim("error", "leader-unknown", message, remedy, path))
     linked = np.union1d(links.receiver, links.sender)
@@ -64,13 +64,9 @@ def network(analysis: Analysis) -> Iterator[Claim]:
             problems.append(Claim("error" if len(leaders) == 1 else "warning", "leader-unheard", message, remedy, path))
     yield from problems
     if not problems:
-        said = (
-            f"every robot is reached by {listed(leaders)}"
-            if leaders
-            else "no leader: the formation finds its own place"
-        )
         whole = "the network is whole; " if analysis.parts == 1 else ""
-        yield Claim("note", "connected", f"{whole}{said}")
+        reached = f"every robot is reached by {listed(leaders)}" if leaders else "no leader: the formation finds a place"
+        yield Claim("note", "connected", whole + reached)
 
 
 def realisation(analysis: Analysis) -> Iterator[Claim]:
@@ -96,8 +92,7 @@ def _asked(analysis: Analysis) -> str:
     wants = analysis.asked.wants
     found = {BY_DISTANCE} if wants is None else set(wants[analysis.standing].tolist())
     words = {BY_DISTANCE: "distances", BY_RELATIVE: "offsets", BY_BEARING: "bearings"}
-    said = [word for want, word in words.items() if want in found]
-    return "the " + " and ".join(said or ["anchors"])
+    return "the " + " and ".join([word for want, word in words.items() if want in found] or ["anchors"])
 
 
 def _later(analysis: Analysis) -> list[tuple[int, Shape]]:
@@ -171,15 +166,15 @@ def _pair(analysis: Analysis, link: int | np.intp) -> str:
 
 def _sides(analysis: Analysis, conflict: Conflict) -> str:
     distance = analysis.asked.distance
-    said = {_pair(analysis, k): f"{_pair(analysis, k)} ({distance[k]:g} m)" for k in _inside(analysis, conflict)}
-    return ", ".join(said.values())
+    sides = {_pair(analysis, k): f"{_pair(analysis, k)} ({distance[k]:g} m)" for k in _inside(analysis, conflict)}
+    return ", ".join(sides.values())
 
 
 def _too_high(analysis: Analysis, conflict: Conflict, off: str) -> Claim:
     names = analysis.names
-    who = listed([names[row] for row in conflict.high])
+    subject = listed([names[row] for row in conflict.high])
     held = max(float(np.nan_to_num(analysis.assignment.hover[row])) for row in conflict.high)
-    message = f"{who} is too high at {held:g} m for {_sides(analysis, conflict)}; {off}"
+    message = f"{subject} is too high at {held:g} m for {_sides(analysis, conflict)}; {off}"
     remedy = f"hover lower than {conflict.ceiling:.3f} m, or lengthen these links"
     return Claim("error", "too-high", message, remedy, ("robots", names[conflict.high[0]], "hover"))
 
@@ -270,7 +265,7 @@ def stability(analysis: Analysis) -> Iterator[Claim]:
         yield Claim("error", "hunts", f"the formation hunts: {took}, and from {HUNTS:g} on it grows", calm, path)
     elif shape.worst <= FORGIVEN and loop.radius > 1.0 + FORGIVEN:
         message = f"the formation drifts away from its shape: an error grows by {loop.radius:.4f} with every decision"
-        remedy = "let more links be heard by both ends; a ring of one-way links can turn for ever"
+        remedy = "give more links both ways; a ring of one-way links can turn for ever"
         yield Claim("error", "unstable", message, remedy, ("formation", "links"))
     elif loop.gain > RINGS:
         yield Claim(

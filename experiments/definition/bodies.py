@@ -173,10 +173,10 @@ def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
         return experiment
     if bodies == "protocol":
         return behind_protocols(experiment)
-    seen = bodies == WORLD and experiment.positioning == VICON_TWIN
+    captured = bodies == WORLD and experiment.positioning == VICON_TWIN
     robots = {
         name: msgspec.structs.replace(
-            robot, body=bodies, position=robot.position if seen else "body", ranges="body", device={}
+            robot, body=bodies, position=robot.position if captured else "body", ranges="body", device={}
         )
         for name, robot in experiment.robots.items()
     }

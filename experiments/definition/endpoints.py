@@ -25,7 +25,7 @@ def routers(experiment: Experiment, file: Path, connect: Sequence[str], chosen: 
     """Routers of an experiment, each with its lab if there is one; empty if neither file nor command names any.
 
     Args:
-        experiment: Its `network.connect` holds if nothing else is said.
+        experiment: Its `network.connect` holds if the command line names none.
         file: The experiment's.
         connect: Of the command line.
         chosen: The lab of the command line.

@@ -113,8 +113,8 @@ class Target(Part, frozen=True):
     def __post_init__(self) -> None:
         given = [name for name in ("distance", "offset", "bearing") if getattr(self, name) is not None]
         if len(given) != 1:
-            said = " and ".join(given) or "none of them"
-            raise ValueError(f"a link asks for distance, offset or bearing, not for {said}; give one of the three")
+            words = " and ".join(given) or "none of them"
+            raise ValueError(f"a link asks for distance, offset or bearing, not for {words}; give one of the three")
         if self.bearing is not None and not any(self.bearing):
             raise ValueError("a bearing of zeros has no direction; give x, y, such as [1.0, 0.0]")
 

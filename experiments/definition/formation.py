@@ -25,7 +25,7 @@ AT_ONCE: Final = 200_000  # errors of links that are held in memory at once
 class FormationArrays:
     """Every possible link with its first target, the changes of the targets, and the times of presence."""
 
-    links: Links  # (E), sorted by listener, then speaker
+    links: Links  # (E), sorted by receiver, then sender
     changes: tuple[Change, ...]  # of their targets, in order of time
     presence: Presence | None  # when they are there; None if always
 
@@ -55,9 +55,9 @@ class FormationArrays:
 
     def to_receivers(self, rows: Index) -> FormationArrays:
         """Links on which these rows receive, as `Links.of` gives them."""
-        at, listener = self.links.indices_to_receivers(rows)
+        at, receiver = self.links.indices_to_receivers(rows)
         mine = self.select(at)
-        return replace(mine, links=replace(mine.links, receiver=listener))
+        return replace(mine, links=replace(mine.links, receiver=receiver))
 
     def without_receivers(self, rows: Index) -> FormationArrays:
         """Links on which other rows than these receive."""

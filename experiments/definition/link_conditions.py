@@ -66,8 +66,8 @@ def conditions_to_centre(experiment: Experiment, senders: Index) -> Conditions:
 
 def conditions_from_centre(experiment: Experiment, receivers: Sequence[str]) -> Conditions:
     """Conditions of goals to the guided ones of the robots `receivers`, in their order, on a real network."""
-    names, told = tuple(experiment.robots), Plan(experiment).guided
-    link_pairs = [(row, names.index(name)) for row, name in enumerate(receivers) if name in told]
+    names, guided = tuple(experiment.robots), Plan(experiment).guided
+    link_pairs = [(row, names.index(name)) for row, name in enumerate(receivers) if name in guided]
     return receiver_conditions(experiment, links(link_pairs), receivers, stream=FROM_CENTRE)
 
 

@@ -69,11 +69,11 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
     found = []
     for text, link in formation.links.items():
         given = link if isinstance(link, Link) else Link(distance=link)
-        for listener, speaker in link_pairs(text):
-            wanted = link_target(experiment, text, given, listener)
+        for receiver, sender in link_pairs(text):
+            wanted = link_target(experiment, text, given, receiver)
             gain = _gain(experiment, law, wanted.wants) if given.gain is None else given.gain
             until = math.inf if given.until_s is None else given.until_s
-            found.append(OneWay(listener, speaker, wanted, gain, given.from_s, until, reach, release, text))
+            found.append(OneWay(receiver, sender, wanted, gain, given.from_s, until, reach, release, text))
     if near is not None and near.distance is not None:
         there = {(link.receiver, link.sender) for link in found}
         wanted = LinkTarget(BY_DISTANCE, near.distance)
@@ -88,20 +88,20 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
     return sorted(found, key=lambda link: (row[link.receiver], row[link.sender]))
 
 
-def link_target(experiment: Experiment, text: str, given: Target | float, listener: str) -> LinkTarget:
+def link_target(experiment: Experiment, text: str, given: Target | float, receiver: str) -> LinkTarget:
     """Target of a link for one of its ends, as distance, offset and bearing.
 
     Args:
         experiment: For the heights that robots hold.
         text: The link, which says what is the first robot and what the second.
         given: What stands behind it.
-        listener: The end that is asked.
+        receiver: The end that is asked.
     """
     given = given if isinstance(given, Target) else Target(distance=given)
     if given.distance is not None:
         return LinkTarget(BY_DISTANCE, given.distance)
     second, first = link_pairs(text)[0]
-    sign = 1.0 if listener == second else -1.0
+    sign = 1.0 if receiver == second else -1.0
     if given.bearing is not None:
         length = math.hypot(*given.bearing)
         toward = [sign * value / length for value in given.bearing]

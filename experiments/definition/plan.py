@@ -110,11 +110,11 @@ class Plan:
 
         Robots that the centre guides have no law of their own.
         """
-        avoidance, nobody, centrally = self.avoidance, links([], [], []), set(self.guided)
+        avoidance, none, centrally = self.avoidance, links([], [], []), set(self.guided)
         if avoidance is None or not (avoidance.hears == "all" or centrally):
-            return nobody
+            return none
         linked = {(link.receiver, link.sender) for link in self.one_way_links}
-        there = {(listener, speaker) for listener, speaker in linked if listener not in centrally}
+        there = {(receiver, sender) for receiver, sender in linked if receiver not in centrally}
         robots = list(enumerate(self.names))
         listening = [(i, a) for i, a in robots if self.experiment.robots[a].avoids]
         pairs = [
@@ -123,7 +123,7 @@ class Plan:
             for j, b in robots
             if i != j and (a, b) not in there and (avoidance.hears == "all" or (a, b) in linked)
         ]
-        return links(pairs, [1.0] * len(pairs), [1.0] * len(pairs)) if pairs else nobody
+        return links(pairs, [1.0] * len(pairs), [1.0] * len(pairs)) if pairs else none
 
     @cached_property
     def pose_links(self) -> Links:
@@ -210,11 +210,11 @@ class Plan:
         return self._assignment(self.names, copies, centrally=True)
 
     def _assignment(self, names: Sequence[str], copies: int, *, centrally: bool) -> Assignment:
-        experiment, everyone, steered = self.experiment, self.names, self.guided
-        if copies > 1 and tuple(names) != everyone:
+        experiment, all_names, guided = self.experiment, self.names, self.guided
+        if copies > 1 and tuple(names) != all_names:
             raise ValueError("only the whole experiment can be repeated")
         rows = self.rows(names)
-        others = [name for name in everyone if (name in steered) != centrally]
+        others = [name for name in all_names if (name in guided) != centrally]
         mine = [name for name in names if name not in others]
         formation = self.formation.without_receivers(self.rows(others)).to_receivers(rows)
         watched = links([], [], []) if centrally else self.avoidance_links.to_receivers(rows)
@@ -236,7 +236,7 @@ class Plan:
             names=tuple(names) * copies,
             kinds=kinds(experiment, names) * copies,
             hover=np.tile(hover_heights(experiment, names), copies),
-            robots=everyone * copies,
+            robots=all_names * copies,
             links=formation.links,
             changes=formation.changes,
             presence=formation.presence,
@@ -258,7 +258,7 @@ class Plan:
             decide_every=round(rates.body_hz / rates.coordination_hz),
             duration=experiment.duration_s,
             patience_s=experiment.start.deadline_s if experiment.start.missing == "go-on" else None,
-            guided=np.array([name in steered for name in names] * copies) if steered else None,
+            guided=np.array([name in guided for name in names] * copies) if guided else None,
             awaited=self._waited_for(formation.links, copies),
             start=np.tile(start_poses(experiment, names)[0][:, :2], (copies, 1)) if within else None,
             start_within=within + math.sqrt(2.0) * experiment.start.scatter,

@@ -18,7 +18,7 @@ def without_standby(experiment: Experiment) -> Experiment:
     robots = {name: robot for name, robot in experiment.robots.items() if not robot.standby}
     if len(robots) == len(experiment.robots):
         return experiment
-    formation, channel, who = experiment.formation, experiment.channel, experiment.architecture
+    formation, channel, architecture = experiment.formation, experiment.channel, experiment.architecture
     links = _between(formation.links, robots)
     changes = [
         msgspec.structs.replace(change, links={text: to for text, to in change.links.items() if text in links})
@@ -36,9 +36,10 @@ def without_standby(experiment: Experiment) -> Experiment:
         short for short, whole in zip(outages, channel.outages, strict=True)
         if short.links or short.robots or not (whole.links or whole.robots)
     ]  # fmt: skip
-    if isinstance(who, Hybrid):
-        led = [name for name in who.robots if name in robots]
-        who = "distributed" if not led else "centralised" if len(led) == len(robots) else Hybrid(who.kind, led)
+    if isinstance(architecture, Hybrid):
+        led = [name for name in architecture.robots if name in robots]
+        hybrid = Hybrid(architecture.kind, led)
+        architecture = "distributed" if not led else "centralised" if len(led) == len(robots) else hybrid
     return msgspec.structs.replace(
         experiment,
         robots=robots,
@@ -50,7 +51,7 @@ def without_standby(experiment: Experiment) -> Experiment:
             changes=changes,
         ),
         timeline=[leg for leg in experiment.timeline if leg.robot in robots],
-        architecture=who,
+        architecture=architecture,
         channel=msgspec.structs.replace(channel, links=_between(channel.links, robots), outages=outages),
         hosts={
             name: msgspec.structs.replace(host, robots=[robot for robot in host.robots if robot in robots])

@@ -120,7 +120,7 @@ def _others(folder: Path) -> list[str]:
         try:
             text = file.read_text("utf-8", errors="replace")
         except OSError:
-            continue  # a folder, or nobody may read it
+            continue  # a folder, or without permission to read
         if "[arena" in text and "[robots" not in text:
             found.append(file.name)
     return list(dict.fromkeys([*found, *index.arenas()]))

@@ -216,7 +216,7 @@ def _triggers(experiment: Experiment) -> Iterator[Fault]:
         message = f"'{kind}' decides when a robot transmits, not when the law is computed anew"
         yield Fault(("formation", "update"), message, "take another one, such as send-on-delta or relative-control")
     if given_too.get("smoothing_s"):
-        message = "smoothing_s is for what is said; nothing is said where the law is computed"
+        message = "smoothing_s is for transmissions, and there are none where the law is computed"
         yield Fault(("formation", "update", "smoothing_s"), message, "leave it out", on_key=True)
 
 

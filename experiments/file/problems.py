@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -45,7 +45,7 @@ def places(text: str, *, json: bool = False) -> dict[Path, Place]:
     return scan.found
 
 
-def nearest(found: dict[Path, Place], path: Path) -> tuple[Path, Place]:
+def nearest(found: Mapping[Path, Place], path: Path) -> tuple[Path, Place]:
     """The longest beginning of `path` that stands in the text."""
     for length in range(len(path), 0, -1):
         if path[:length] in found:
@@ -212,10 +212,8 @@ class DocumentError(ValueError):
     """Experiment that cannot be read, with all of its problems."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
-        told = [str(problem) for problem in problems[:MOST]]
-        if len(problems) > MOST:
-            told.append(f"and {len(problems) - MOST} more")
-        super().__init__("\n".join(told))
+        more = [f"and {len(problems) - MOST} more"] if len(problems) > MOST else []
+        super().__init__("\n".join([*map(str, problems[:MOST]), *more]))
         self.problems = list(problems)
 
 

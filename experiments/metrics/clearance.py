@@ -61,13 +61,13 @@ def collisions(trace: Trace, clearance: Clearance) -> tuple[Collision, ...]:
     if trace.contacts is None:
         return clearance.overlaps
     carried = {name for name in trace.robots if trace.clock == "virtual" or _lives_in_world(trace, name)}
-    seen = [
+    reported = [
         Collision(each.stamp, each.first, each.second, each.impulse, each.overlap)
         for each in trace.contacts
         if each.first in trace.robots or each.second in trace.robots
     ]
-    unseen = [each for each in clearance.overlaps if not carried & {each.first, each.second}]
-    return tuple(sorted([*seen, *unseen], key=lambda each: each.time_s))
+    computed = [each for each in clearance.overlaps if not carried & {each.first, each.second}]
+    return tuple(sorted([*reported, *computed], key=lambda each: each.time_s))
 
 
 def _lives_in_world(trace: Trace, name: str) -> bool:
@@ -110,20 +110,21 @@ def _gap(level: Array, upright: Array, free: Mask) -> Array:
     return np.where(np.isfinite(gap), gap, np.inf)
 
 
-def _nearer(known: Approach | None, time: Array, gap: Array, who: tuple[str, str]) -> Approach | None:
+def _nearer(known: Approach | None, time: Array, gap: Array, between: tuple[str, str]) -> Approach | None:
     """The closest of what is known and of gaps (T,) over time."""
     k = int(gap.argmin())
     if not np.isfinite(gap[k]) or (known is not None and known.gap <= gap[k]):
         return known
-    return Approach(who, float(gap[k]), float(time[k]))
+    return Approach(between, float(gap[k]), float(time[k]))
 
 
-def _overlaps(time: Array, gap: Array, who: tuple[str, str]) -> list[Collision]:
+def _overlaps(time: Array, gap: Array, between: tuple[str, str]) -> list[Collision]:
     """One collision for each maximal time in which a gap (T,) is negative."""
     inside = gap < -TOUCH_M
     if not inside.any():
         return []
-    return [Collision(float(time[begin]), *who, None, -float(gap[begin:end].min())) for begin, end in _spans(inside)]
+    spans = _spans(inside)
+    return [Collision(float(time[begin]), *between, None, -float(gap[begin:end].min())) for begin, end in spans]
 
 
 def _spans(inside: Mask) -> list[tuple[int, int]]:

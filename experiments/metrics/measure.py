@@ -181,15 +181,15 @@ def _robots(
     settled = after_last(unsettled & (there[:, None] | np.isfinite(total)), time)
     sent, recorded = transmissions(trace)
     size = np.bincount(trace.sent.link, weights=trace.sent.bytes, minlength=rows)
-    linked = np.zeros((rows, rows), dtype=bool)  # what only avoidance listens to does not belong to the formation
-    told = centralised.guided_rows(trace)[errors.net.receiver]  # what they would listen to, the centre hears
-    linked[errors.net.receiver[~told], errors.net.sender[~told]] = True
+    linked = np.zeros((rows, rows), dtype=bool)  # links for avoidance alone do not belong to the formation
+    guided = centralised.guided_rows(trace)[errors.net.receiver]  # the centre receives their neighbours' poses
+    linked[errors.net.receiver[~guided], errors.net.sender[~guided]] = True
     net, received = trace.plan.pose_links, trace.received.link
     counted = linked[net.receiver, net.sender][received]
-    heard = np.bincount(net.sender[received[counted]], minlength=rows)
-    listeners = np.bincount(errors.net.sender[~told], minlength=rows) + centralised.centre_hears(trace)
+    delivered = np.bincount(net.sender[received[counted]], minlength=rows)
+    listeners = np.bincount(errors.net.sender[~guided], minlength=rows) + centralised.centre_hears(trace)
     if trace.goals is not None:
-        heard += trace.goals.received
+        delivered += trace.goals.received
     goals, goal_bytes, late = *centralised.goals_to(trace), centralised.delays(trace)
     waits = [(wait.min(), float(np.median(wait)), wait.max()) if len(wait) else (np.nan,) * 3 for wait in gaps(trace)]
     own = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
@@ -222,7 +222,7 @@ def _robots(
             gap_max_s=_number(waits[i][2]),
             recorded=int(recorded[i]),
             listeners=int(listeners[i]),
-            heard=int(heard[i]),
+            heard=int(delivered[i]),
             coverage=float(coverage[i]),
             known=float(errors.alive[there, i].mean()),
             collisions=len(own[i]),
@@ -267,7 +267,7 @@ def _slowest(trace: Trace) -> float | None:
     """Lowest real-time factor of the world; while it is paused, time is to stand still."""
     if trace.clock == "virtual":
         return None
-    return min((said.factor for said in trace.world if not said.paused), default=None)
+    return min((report.factor for report in trace.world if not report.paused), default=None)
 
 
 def _cost(robot: RobotMetrics) -> float:

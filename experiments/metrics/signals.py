@@ -45,10 +45,10 @@ def leaders(trace: Trace) -> tuple[str, ...]:
 def own_links(net: Links, rows: int) -> Array:
     """Links that count for each robot (E, N): those on which it receives, or without any, those on which it sends."""
     link = np.arange(len(net))
-    hears, heard = np.zeros((2, len(net), rows))
-    hears[link, net.receiver] = 1.0
-    heard[link, net.sender] = 1.0
-    return np.where(hears.any(axis=0), hears, heard)
+    as_receiver, as_sender = np.zeros((2, len(net), rows))
+    as_receiver[link, net.receiver] = 1.0
+    as_sender[link, net.sender] = 1.0
+    return np.where(as_receiver.any(axis=0), as_receiver, as_sender)
 
 
 @dataclass(frozen=True)
@@ -115,25 +115,25 @@ class LinkErrors:
 
 
 def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:
-    """Holes that all robots share and that end: not the robots, the network was gone.
+    """Holes that all robots share and that end: not the robots, the network was away.
 
     Args:
         alive: (T, N) whether a robot's position is known.
         time: (T,) [s].
 
     Returns:
-        For how long nobody's position was known [s], and the rows (T,) within `RETURN_S` of that at which some are not.
+        Time without any known position [s], and the rows (T,) within `RETURN_S` of that at which some are not known.
     """
-    nobody: Mask = np.asarray(~alive.any(axis=1))
+    none_known: Mask = np.asarray(~alive.any(axis=1))
     ends = np.flatnonzero(alive.any(axis=1))
-    nobody[(ends[-1] if len(ends) else 0) :] = False  # robots that never come back have gone
-    if alive.shape[1] < 2 or not nobody.any():
+    none_known[(ends[-1] if len(ends) else 0) :] = False  # robots that never come back are lost
+    if alive.shape[1] < 2 or not none_known.any():
         return 0.0, np.zeros(len(time), dtype=bool)
-    moments = time[nobody]
+    moments = time[none_known]
     after = np.searchsorted(moments, time)
     padded = np.concatenate([[-np.inf], moments, [np.inf]])
     near = np.minimum(time - padded[after], padded[after + 1] - time) <= RETURN_S
-    return float(nobody.sum() * (time[1] - time[0])), np.asarray((near & ~alive.all(axis=1)) | nobody)
+    return float(none_known.sum() * (time[1] - time[0])), np.asarray((near & ~alive.all(axis=1)) | none_known)
 
 
 def formation_errors(trace: Trace) -> Array:
@@ -196,22 +196,23 @@ def beliefs(trace: Trace, net: Links) -> Array:
 
     NaN before the first pose, and after a death.
     """
-    rows, heard, links = len(trace.robots), trace.received, trace.plan.pose_links
+    rows, received, links = len(trace.robots), trace.received, trace.plan.pose_links
     number = np.full((rows, rows), -1)
     number[net.receiver, net.sender] = np.arange(len(net))
-    link = number[links.receiver, links.sender][heard.link]
+    link = number[links.receiver, links.sender][received.link]
     error = np.full((len(trace.time), len(net)), np.nan)
     order = np.argsort(link, kind="stable")
     ends = np.searchsorted(link[order], np.arange(len(net) + 1))
     for k, (begin, end) in enumerate(pairwise(ends)):
         mine = order[begin:end]
-        mine = mine[heard.stamp[mine] >= np.maximum.accumulate(heard.stamp[mine])]  # overtaken samples are ignored
+        stamp = received.stamp[mine]
+        mine = mine[stamp >= np.maximum.accumulate(stamp)]  # overtaken samples are ignored
         if not len(mine):
             continue
-        at = np.searchsorted(heard.arrival[mine], trace.time, side="right") - 1
+        at = np.searchsorted(received.arrival[mine], trace.time, side="right") - 1
         newest = mine[at]
-        age = np.maximum(trace.time - heard.stamp[newest], 0.0)
-        believed = trace.plan.predictor.position(heard.position[newest], heard.velocity[newest], age)
+        age = np.maximum(trace.time - received.stamp[newest], 0.0)
+        believed = trace.plan.predictor.position(received.position[newest], received.velocity[newest], age)
         error[:, k] = norm(believed - trace.true_position[:, net.sender[k]])
         error[at < 0, k] = np.nan
     return error
@@ -254,19 +255,19 @@ def passages(trace: Trace) -> tuple[Passage, ...]:
     links, received = trace.plan.pose_links, trace.received
     count, link, took = len(links), received.link, received.arrival - received.stamp
     dropped = np.zeros(count, dtype=np.intp) if trace.dropped is None else trace.dropped
-    heard = np.bincount(link, minlength=count)
+    counts = np.bincount(link, minlength=count)
     total = np.bincount(link, weights=took, minlength=count)
     longest = np.full(count, -np.inf)
     np.maximum.at(longest, link, took)
-    columns = zip(links.receiver.tolist(), links.sender.tolist(), heard.tolist(), dropped.tolist(), strict=True)
+    columns = zip(links.receiver.tolist(), links.sender.tolist(), counts.tolist(), dropped.tolist(), strict=True)
     return tuple(
         Passage(
             listener=trace.robots[i],
             speaker=trace.robots[j],
             heard=number,
-            dropped=gone,
+            dropped=lost,
             delay_mean=float(total[k]) / number if number else None,
             delay_max=float(longest[k]) if number else None,
         )
-        for k, (i, j, number, gone) in enumerate(columns)
+        for k, (i, j, number, lost) in enumerate(columns)
     )

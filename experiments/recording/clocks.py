@@ -52,12 +52,12 @@ class ClockOffset:
         return (self.last - self.first) / self.over if self.over > 0.0 else None
 
 
-def correction_series(said: Sequence[HostClock]) -> tuple[Array, Array]:
+def correction_series(clocks: Sequence[HostClock]) -> tuple[Array, Array]:
     """Times [s] and corrections [s] that robots of a host subtracted from its clock, to be interpolated: they went from
     each to the next as fast as their clock does."""
-    now = said[0].offset if said[0].applied is None else said[0].applied
-    points = [(said[0].stamp, now)]
-    for each in said[1:]:
+    now = clocks[0].offset if clocks[0].applied is None else clocks[0].applied
+    points = [(clocks[0].stamp, now)]
+    for each in clocks[1:]:
         if each.applied is not None and each.applied != now:
             points += [(each.stamp, now), (each.stamp + abs(each.applied - now) / SLEW, each.applied)]
             now = each.applied
@@ -87,24 +87,24 @@ class Correction:
         stamps, offsets, when, what = self._series[robot]
         return stamp - float(np.interp(stamp, stamps, offsets) - np.interp(stamp, when, what))
 
-    def state(self, said: State) -> State:
+    def state(self, state: State) -> State:
         """Telemetry with all stamps corrected: its own, and those of received poses and goals.
 
         Goals are stamped by the central controller, which runs on the conductor's machine.
         """
-        heard = [
-            replace(each, stamp=self(each.speaker, each.stamp), arrived=self(said.robot, each.arrived))
-            for each in said.heard
+        received = [
+            replace(each, stamp=self(each.speaker, each.stamp), arrived=self(state.robot, each.arrived))
+            for each in state.heard
         ]
-        followed = [
-            replace(each, pose=self(said.robot, each.pose), acted=self(said.robot, each.acted))
-            for each in said.followed
+        receipts = [
+            replace(each, pose=self(state.robot, each.pose), acted=self(state.robot, each.acted))
+            for each in state.followed
         ]
-        return replace(said, stamp=self(said.robot, said.stamp), heard=heard, followed=followed)
+        return replace(state, stamp=self(state.robot, state.stamp), heard=received, followed=receipts)
 
-    def status(self, said: Status) -> Status:
+    def status(self, status: Status) -> Status:
         """A status with its stamp and its start corrected."""
-        return replace(said, stamp=self(said.robot, said.stamp), started=self(said.robot, said.started))
+        return replace(status, stamp=self(status.robot, status.stamp), started=self(status.robot, status.started))
 
     def offsets(self) -> tuple[ClockOffset, ...]:
         """The offset of each host."""
@@ -122,8 +122,8 @@ class Correction:
         )
 
 
-def _worst(said: Sequence[HostClock]) -> float:
+def _worst(clocks: Sequence[HostClock]) -> float:
     """Largest difference between a measured offset and the correction at that time [s]."""
-    stamps = np.array([each.stamp for each in said])
-    offsets = np.array([each.offset for each in said])
-    return float(np.abs(offsets - np.interp(stamps, *correction_series(said))).max())
+    stamps = np.array([each.stamp for each in clocks])
+    offsets = np.array([each.offset for each in clocks])
+    return float(np.abs(offsets - np.interp(stamps, *correction_series(clocks))).max())

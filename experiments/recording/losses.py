@@ -45,18 +45,18 @@ def lost(
     """
     total: Counter[str] = Counter()
     begin, end = run[0] - ROUNDING_S, run[1] + ROUNDING_S
-    for robot, own, said in zip(robots, poses, statuses, strict=True):
+    for robot, own, reports in zip(robots, poses, statuses, strict=True):
         mine = [(pose.stamp, pose.seq) for pose in own if begin <= pose.stamp <= end]
-        total[robot] += unrecorded(mine, rate) + _tail(own, said, run, rate)
-        total.update(_by_speaker(said, run, "lost"))
+        total[robot] += unrecorded(mine, rate) + _tail(own, reports, run, rate)
+        total.update(_by_sender(reports, run, "lost"))
     return np.array([total[robot] for robot in robots], dtype=np.intp)
 
 
 def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float], rate: float) -> int:
-    said = [status for status in statuses if run[0] < status.stamp <= run[1] + STATUS_S]
-    if not said:
+    reports = [status for status in statuses if run[0] < status.stamp <= run[1] + STATUS_S]
+    if not reports:
         return 0
-    last = said[-1]
+    last = reports[-1]
     recorded = [(pose.seq, pose.stamp) for pose in poses if pose.stamp <= last.stamp + ROUNDING_S]
     before = [(status.sent, run[0]) for status in statuses if status.stamp <= run[0] and status.pid == last.pid]
     number, stamp = max(recorded[-1:] + before[-1:], default=(0, run[0]))
@@ -66,12 +66,12 @@ def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float
 def dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
     """(E,) poses that the modelled network dropped on each of `Plan.pose_links`; `statuses` of each robot."""
     links, robots = plan.pose_links, plan.names
-    found = [_by_speaker(said, run, "dropped") for said in statuses]
+    found = [_by_sender(reports, run, "dropped") for reports in statuses]
     ends = zip(links.receiver.tolist(), links.sender.tolist(), strict=True)
     return np.array([found[i][robots[j]] for i, j in ends], dtype=np.intp)
 
 
-def _by_speaker(statuses: list[Status], run: tuple[float, float], what: Literal["lost", "dropped"]) -> Counter[str]:
+def _by_sender(statuses: list[Status], run: tuple[float, float], what: Literal["lost", "dropped"]) -> Counter[str]:
     """Poses lost or dropped in the run by one receiver, by sender."""
     return growth(((status.pid, status.stamp, getattr(status, what)) for status in statuses), *run)
 

@@ -67,7 +67,7 @@ def read(path: Path) -> Playback:
 
     `lost` of a robot adds up what its sequence numbers prove: (1) gaps among its poses recorded in the run, where a
     number that goes back is a publisher that began anew at 1; (2) what its last status of the run counts as sent beyond
-    the last pose recorded until then; (3) what the last status of each listener counts as lost from it, less what the
+    the last pose recorded until then; (3) what the last status of each receiver counts as lost from it, less what the
     same process counted before the common start. A pose that two listeners and the recorder missed counts three times:
     each of them was owed it. What the modelled network dropped is no loss: `dropped` is what the listeners counted.
 
@@ -139,23 +139,23 @@ class _Content:
 
     def start(self, announced: float | None) -> float | None:
         """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
-        said = [event.stamp for event in self[Event] if event.kind == "start" and math.isfinite(event.stamp)]
+        starts = [event.stamp for event in self[Event] if event.kind == "start" and math.isfinite(event.stamp)]
         began = [status.started for status in self[Status] if status.started > 0.0]
-        if said or announced is not None:
-            return said[0] if said else announced
+        if starts or announced is not None:
+            return starts[0] if starts else announced
         return min(began, default=None)
 
     def length(self, start: float, duration: float) -> float:
         """Length of the run from the common start on [s], at most `duration`."""
-        said = [
+        landings = [
             (event.stamp - start, event.text != "landing")
             for event in self[Event]
             if (event.kind, event.source) == ("phase", "conductor")
             and event.text.startswith("landing")
             and math.isfinite(event.stamp)
         ]
-        if said:
-            end, interrupted = min(said)
+        if landings:
+            end, interrupted = min(landings)
             return min(end, duration) if interrupted or end < duration - EARLY_S else duration
         last: dict[str, float] = {}
         for state in self[State]:
@@ -236,9 +236,9 @@ def _counted(last: Sequence[Status | None], what: str) -> Index:
     return np.array([getattr(status, what) if status else 0 for status in last], dtype=np.intp)
 
 
-def _by_the_end(said: list[Status], end: float) -> Status | None:
+def _by_the_end(statuses: list[Status], end: float) -> Status | None:
     """The last status that counts for the run; the first one after it if there is none."""
-    return next((status for status in reversed(said) if status.stamp <= end + STATUS_S), next(iter(said), None))
+    return next((status for status in reversed(statuses) if status.stamp <= end + STATUS_S), next(iter(statuses), None))
 
 
 def _by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:

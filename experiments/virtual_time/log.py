@@ -39,15 +39,15 @@ from experiments.virtual_time.simulation import OPTIONAL, Log
 SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # columns of a log that a trace has as well
 
 
-def goal_messages(steered: CentreLog, names: Sequence[str], first: int) -> Iterator[tuple[float, messages.Goal]]:
+def goal_messages(centre: CentreLog, names: Sequence[str], first: int) -> Iterator[tuple[float, messages.Goal]]:
     """Goals of one repetition, and when they were sent since the common start [s].
 
     Args:
-        steered: Of all repetitions.
+        centre: Of all repetitions.
         names: Of the robots.
         first: Row of the first of them.
     """
-    own = steered.sent.between(first, first + len(names))
+    own = centre.sent.between(first, first + len(names))
     assert own.yaw is not None
     assert own.extra is not None
     columns = (own.stamp, own.link, own.seq, own.position.round(6), own.yaw.round(6), own.extra[:, 0])
@@ -60,10 +60,10 @@ def goal_messages(steered: CentreLog, names: Sequence[str], first: int) -> Itera
 
 
 def centre_receipts(
-    steered: CentreLog, sample: Array, first: int, rows: int
+    centre: CentreLog, sample: Array, first: int, rows: int
 ) -> dict[tuple[int, int], list[messages.GoalReceipt]]:
     """Goals that reached robots of one repetition, by number of the `sample` (T,) and row."""
-    own = steered.followed.between(first, first + rows)
+    own = centre.followed.between(first, first + rows)
     assert own.extra is not None
     at = np.searchsorted(sample, own.arrival - ROUNDING_S)
     found: dict[tuple[int, int], list[messages.GoalReceipt]] = {}
@@ -96,19 +96,19 @@ def centre_report(goals: Goals, names: Sequence[str], duration: float) -> messag
 
 
 def goals_of(
-    steered: CentreLog, names: Sequence[str], first: int, duration: float, encoding: messages.Encoding
+    centre: CentreLog, names: Sequence[str], first: int, duration: float, encoding: messages.Encoding
 ) -> Goals:
     """Goals of one repetition in virtual time, whose first row is `first`."""
     rows, end = len(names), first + len(names)
-    sizes = [len(messages.encode(goal, encoding)) for _, goal in goal_messages(steered, names, first)]
-    received = received_in_run(steered.received.between(first, end), duration)
+    sizes = [len(messages.encode(goal, encoding)) for _, goal in goal_messages(centre, names, first)]
+    received = received_in_run(centre.received.between(first, end), duration)
     return Goals.of_run(
-        replace(steered.sent.between(first, end), bytes=np.array(sizes, dtype=np.intp)),
-        steered.followed.between(first, end),
+        replace(centre.sent.between(first, end), bytes=np.array(sizes, dtype=np.intp)),
+        centre.followed.between(first, end),
         duration,
         received=np.bincount(received.link, minlength=rows),
         lost=np.zeros(rows, dtype=np.intp),
-        dropped=steered.lost_poses[first:end],
+        dropped=centre.lost_poses[first:end],
     )
 
 
@@ -223,7 +223,7 @@ class Logbook:
             yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw)
 
     def _states(self) -> Iterator[tuple[float, list[messages.State]]]:
-        """Telemetry, sample by sample, with the poses that each robot heard since the sample before."""
+        """Telemetry, sample by sample, with the poses that each robot received since the sample before."""
         log, mine = self._log, self._mine
         words = [phase.word for phase in Phase]
         columns = (log.phase, log.position, log.velocity, log.yaw, log.goal, log.setpoint, log.error)
@@ -234,10 +234,10 @@ class Logbook:
             *(repeat(None, len(log.time)) if column is None else column[:, mine].tolist() for column in rest),
             strict=True,
         )
-        heard = self._heard_by_sample()
-        followed: dict[tuple[int, int], list[messages.GoalReceipt]] = {}
+        received = self._received_by_sample()
+        receipts: dict[tuple[int, int], list[messages.GoalReceipt]] = {}
         if log.steered is not None:
-            followed = centre_receipts(log.steered, log.time, mine.start, len(log.names))
+            receipts = centre_receipts(log.steered, log.time, mine.start, len(log.names))
         for k, (t, phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw, *more) in enumerate(samples):
             yield (
                 t,
@@ -255,20 +255,20 @@ class Logbook:
                         error[row],
                         messages.vector(truth[row]),
                         messages.heading(true_yaw[row]),
-                        heard.get((k, row), []),
+                        received.get((k, row), []),
                         **{what: each and _known(each[row]) for what, each in zip(OPTIONAL, more, strict=True)},
-                        followed=followed.get((k, row), []),
+                        followed=receipts.get((k, row), []),
                     )
                     for row, name in enumerate(log.names)
                 ],
             )
 
-    def _heard_by_sample(self) -> dict[tuple[int, int], list[messages.Heard]]:
+    def _received_by_sample(self) -> dict[tuple[int, int], list[messages.Heard]]:
         names, got = self._log.names, self._received
         sample = np.searchsorted(self._log.time, got.arrival - ROUNDING_S)
-        listener, speaker = self._links.receiver[got.link], self._links.sender[got.link]
+        receiver, sender = self._links.receiver[got.link], self._links.sender[got.link]
         found: dict[tuple[int, int], list[messages.Heard]] = {}
-        columns = (sample, listener, speaker, got.seq, got.stamp, got.arrival, got.position, got.velocity)
+        columns = (sample, receiver, sender, got.seq, got.stamp, got.arrival, got.position, got.velocity)
         for k, row, whose, number, taken, arrived, where, moves in zip(*(c.tolist() for c in columns), strict=True):
             news = messages.Heard(names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where), tuple(moves))
             found.setdefault((k, row), []).append(news)
@@ -278,7 +278,7 @@ class Logbook:
         """The counters at the end of the run and at the end of everything."""
         log = self._log
         sent = self._counts(self._sent.link, self._sent.stamp)
-        heard = self._counts(self._links.receiver[self._received.link], self._received.arrival)
+        received = self._counts(self._links.receiver[self._received.link], self._received.arrival)
         unsafe = {each.row - self._mine.start: each.text for each in self._incidents() if each.outcome >= Outcome.LAND}
         for end, phase, done in ((self._experiment.duration_s, "landing", 0), (log.ended, "done", 1)):
             for row, name in enumerate(log.names):
@@ -292,7 +292,7 @@ class Logbook:
                     body="",
                     battery=None,
                     sent=int(sent[done][row]),
-                    heard=int(heard[done][row]),
+                    heard=int(received[done][row]),
                     lost={log.names[s]: 0 for s in self._links.sender[mine].tolist()},
                     dropped={log.names[s]: n for s, n in each if n},
                     malformed=0,

@@ -81,8 +81,8 @@ def simulate(
     Args:
         experiment: The case.
         seeds: One for each repetition.
-        lean: Keep `true_position` and who sent when, and nothing of the other columns: a seventh of the memory, for
-            sweeps. They are empty, and so is everything that was heard.
+        lean: Keep `true_position`, and of the poses sent numbers and times: a seventh of the memory, for sweeps. The
+            other columns are empty, and so is the table of received poses.
         landing: Let the robots land; else the log ends with the run.
         progress: Called at state_hz with the time of the experiment [s]; NaN before its start is known.
 
@@ -93,7 +93,7 @@ def simulate(
     assignment = Plan(experiment).assignment(names, copies=len(seeds))
     agent = Agent(assignment)
     request = bodies.body_request(experiment, names, seeds)
-    request = replace(request, external=(False,) * len(request.names))  # nobody measures in virtual time
+    request = replace(request, external=(False,) * len(request.names))  # no motion capture in virtual time
     twin = TwinBody(request, bodies.shared_world(experiment, names, len(seeds)))
     body = shadowed(twin, request, bodies.shadow_periods(experiment, names, len(seeds)))
     network = VirtualNetwork(experiment, agent, seeds, lean=lean)
@@ -109,8 +109,8 @@ def simulate(
     while not conductor.over:
         t = tick * dt
         state = body.read(t)
-        said = network.carry(t, state)
-        actions = agent.act(t, state, said)
+        sent = network.carry(t, state)
+        actions = agent.act(t, state, sent)
         if actions.commands is not None:
             body.takeoff(actions.commands.takeoff, assignment.hover[actions.commands.takeoff])
             body.land(actions.commands.land)

@@ -37,7 +37,7 @@ KINDS: Final = (  # their launcher knows robots by their names as well
 )
 CENTRAL: Final = "centralized"
 CENTRES: Final = ("origin", "sphere")
-NOTHING: Final = ("none", "null")  # a relationship with nobody
+NOTHING: Final = ("none", "null")  # a relationship without another end
 SURFACES: Final = ("cone", "ellipsoid")
 PLACES: Final = ("origin", "line", *SURFACES)  # relations that are no robots
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -63,7 +63,7 @@ class Relation:
 
     name: str
     values: tuple[float, ...]
-    centre: Pose | None = None  # of an origin that is told where it is
+    centre: Pose | None = None  # [m] of an origin that stands elsewhere
 
 
 @dataclass(frozen=True)
@@ -233,13 +233,13 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc] # PyYAML has no types
     """PyYAML's safe loader, which refuses a key that stands twice."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:  # noqa: ANN401 - as PyYAML has it
-        seen = set()
+        keys = set()
         for key, _ in node.value:
-            if key.value in seen and isinstance(key, yaml.ScalarNode):
+            if key.value in keys and isinstance(key, yaml.ScalarNode):
                 raise yaml.constructor.ConstructorError(
                     None, None, f"'{key.value}' stands twice in its table", key.start_mark
                 )
-            seen.add(str(key.value))
+            keys.add(str(key.value))
         return super().construct_mapping(node, deep)
 
 

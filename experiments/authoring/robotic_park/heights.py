@@ -165,7 +165,7 @@ def heights_of(park: Park, notes: list[str]) -> Heights:
     """The heights, from the shape in space if links tell one.
 
     The origin of their files is a point about which drones spread while they climb: where the shape is not flat, no
-    robot stands on the floor and the origin is not told otherwise, the whole is lifted so that the lowest drone keeps
+    robot stands on the floor and the origin has no place of its own, the whole is lifted so that the lowest drone keeps
     the height at which it starts.
     """
     flies = np.array([KINDS[robot.kind].flies for robot in park.robots])
@@ -212,7 +212,7 @@ def heights_of(park: Park, notes: list[str]) -> Heights:
 
 
 def _starts(park: Park, notes: list[str]) -> Array:
-    """Starts (N, 3) [m]; robots whose start is not told stand on a ring, in the order of the file."""
+    """Starts (N, 3) [m]; robots without a start stand on a ring, in the order of the file."""
     count = len(park.robots)
     angle = 2.0 * np.pi * np.arange(count) / max(count, 1)
     radius = max(SPACING, count * SPACING / (2.0 * np.pi))
